@@ -1,0 +1,201 @@
+"""What a robot uses: features now, tare, who is alive.
+
+Five lines::
+
+    from palpate.protos.client import Client
+
+    with Client() as robot:
+        estimate = robot.features("finger", max_age_s=0.05)
+        print(estimate.force, estimate.contact_location)
+
+Every failure is a ``PalpateError``: nothing hangs, nothing old is returned as fresh.
+"""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from palpate.protos.codec import (
+    MODEL_METADATA,
+    SERVICE_REQUEST,
+    SIMULATION_REPLY,
+    SIMULATION_REQUEST,
+    STATUS,
+    TARE,
+    TARE_REQUEST,
+)
+from palpate.protos.config import DEFAULT_ROUTER, LinkConfig
+from palpate.protos.errors import PalpateError, StaleError
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    ModelMetadata,
+    ServiceRequest,
+    SimulationReply,
+    SimulationRequest,
+    Status,
+    SynthesisEstimate,
+    Tare,
+    TareRequest,
+)
+from palpate.protos.session import Alive, Delivery, Received, Session, Subscriber
+from palpate.protos.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
+
+M = TypeVar("M")
+
+
+class Client:
+    """A robot's view of a station.
+
+    Args:
+        connect: Endpoint of the router.
+        station: Name of the station.
+        timeout_s: How long joining the bus, and by default a question, may take [s].
+
+    Raises:
+        LinkError: No router at ``connect``.
+    """
+
+    def __init__(
+        self, connect: str = DEFAULT_ROUTER, *, station: str = "lab", timeout_s: float = 2.0
+    ) -> None:
+        self._timeout_s = timeout_s
+        self._subscribers: dict[tuple[str, str], Subscriber[Any]] = {}
+        link = LinkConfig(connect=(connect,), wait_for_router_s=timeout_s)
+        self.session = Session.open(link, station=station)
+
+    def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
+        """Contact location and force of one finger now.
+
+        The first call subscribes and waits up to the client's timeout for a first estimate.
+
+        Args:
+            sensor: Name of the sensor.
+            max_age_s: The oldest reading that may be used [s], by the time it was taken.
+
+        Raises:
+            StaleError: There is none so young.
+        """
+        return self._latest(FEATURES, sensor, max_age_s)
+
+    def electrodes(self, sensor: str, *, max_age_s: float = 0.05) -> ElectrodeFrame:
+        """Raw counts of one finger now; see ``features``."""
+        return self._latest(ELECTRODES, sensor, max_age_s)
+
+    def field(self, sensor: str, *, max_age_s: float = 0.2) -> FieldEstimate:
+        """Displacement of each skin node now; see ``features``."""
+        return self._latest(FIELD, sensor, max_age_s)
+
+    def synthesis(self, sensor: str, *, max_age_s: float = 0.2) -> SynthesisEstimate:
+        """Synthesised tared counts now; see ``features``."""
+        return self._latest(SYNTHESIS, sensor, max_age_s)
+
+    def next_features(self, sensor: str, *, timeout_s: float = 1.0) -> Received[FeatureEstimate]:
+        """Wait for the next estimate that was not returned yet.
+
+        Raises:
+            StreamTimeout: None came in time.
+        """
+        return self._subscriber(FEATURES, sensor).next(timeout_s)
+
+    def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
+        """Take the untouched finger as zero now.
+
+        Args:
+            sensor: Name of the sensor.
+            frames: Frames to average; 0 = the gateway's own number.
+            timeout_s: How long it may take [s].
+
+        Raises:
+            RemoteError: The gateway refuses, e.g. because the finger is touched.
+        """
+        return self.session.query(
+            "tare",
+            sensor=sensor,
+            request=TareRequest(frames=frames),
+            request_codec=TARE_REQUEST,
+            reply_codec=TARE,
+            timeout_s=timeout_s,
+        )
+
+    def simulate(
+        self, request: SimulationRequest, *, sensor: str = "twin", timeout_s: float = 60.0
+    ) -> SimulationReply:
+        """Indent the finite-element fingertip.
+
+        Raises:
+            LinkError: No finite-element service runs.
+            RemoteError: It refuses the request.
+        """
+        return self.session.query(
+            "simulate",
+            sensor=sensor,
+            request=request,
+            request_codec=SIMULATION_REQUEST,
+            reply_codec=SIMULATION_REPLY,
+            timeout_s=timeout_s,
+        )
+
+    def model(self, *, service: str = "features") -> ModelMetadata:
+        """What the served bundle says of itself."""
+        return self.session.query(
+            "model",
+            service=service,
+            request=ServiceRequest(),
+            request_codec=SERVICE_REQUEST,
+            reply_codec=MODEL_METADATA,
+            timeout_s=self._timeout_s,
+        )
+
+    def alive(self) -> list[Alive]:
+        """Who is there, and who is ready."""
+        return self.session.alive()
+
+    def status(self) -> list[Status]:
+        """What every process of the station says of itself; broken answers are left out."""
+        answers = self.session.query_all(
+            "status",
+            request=ServiceRequest(),
+            request_codec=SERVICE_REQUEST,
+            reply_codec=STATUS,
+            timeout_s=self._timeout_s,
+        )
+        return [answer for answer in answers if not isinstance(answer, PalpateError)]
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self.session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _subscriber(self, topic: Topic[M], sensor: str) -> Subscriber[M]:
+        key = (topic.name, sensor)
+        if key not in self._subscribers:
+            self._subscribers[key] = self.session.subscriber(
+                topic, sensor=sensor, delivery=Delivery.NEWEST
+            )
+        return self._subscribers[key]
+
+    def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
+        first = (topic.name, sensor) not in self._subscribers
+        subscriber = self._subscriber(topic, sensor)
+        deadline = time.monotonic() + (self._timeout_s if first else 0.0)
+        while True:
+            try:
+                return subscriber.latest(max_age_s).message
+            except StaleError:
+                if time.monotonic() >= deadline:
+                    raise
+                time.sleep(0.005)

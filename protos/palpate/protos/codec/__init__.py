@@ -1,0 +1,57 @@
+"""Values to bytes and back, checked both ways. One ``Codec`` for each message of ``palpate.v1``."""
+
+from palpate.protos.codec.base import Codec
+from palpate.protos.codec.estimates import FEATURE_ESTIMATE, FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
+from palpate.protos.codec.frames import ELECTRODE_FRAME, INDENTER_POSE_FRAME, WRENCH_FRAME
+from palpate.protos.codec.service import (
+    ERROR,
+    MODEL_METADATA,
+    SERVICE_REQUEST,
+    STATUS,
+    TARE,
+    TARE_REQUEST,
+)
+from palpate.protos.codec.simulation import (
+    SIMULATION_PROGRESS,
+    SIMULATION_REPLY,
+    SIMULATION_REQUEST,
+)
+
+CODECS = (
+    ELECTRODE_FRAME,
+    WRENCH_FRAME,
+    INDENTER_POSE_FRAME,
+    FEATURE_ESTIMATE,
+    FIELD_ESTIMATE,
+    SYNTHESIS_ESTIMATE,
+    TARE,
+    TARE_REQUEST,
+    SERVICE_REQUEST,
+    STATUS,
+    MODEL_METADATA,
+    ERROR,
+    SIMULATION_REQUEST,
+    SIMULATION_PROGRESS,
+    SIMULATION_REPLY,
+)
+"""All codecs of the contract."""
+
+__all__ = [
+    "CODECS",
+    "ELECTRODE_FRAME",
+    "ERROR",
+    "FEATURE_ESTIMATE",
+    "FIELD_ESTIMATE",
+    "INDENTER_POSE_FRAME",
+    "MODEL_METADATA",
+    "SERVICE_REQUEST",
+    "SIMULATION_PROGRESS",
+    "SIMULATION_REPLY",
+    "SIMULATION_REQUEST",
+    "STATUS",
+    "SYNTHESIS_ESTIMATE",
+    "TARE",
+    "TARE_REQUEST",
+    "WRENCH_FRAME",
+    "Codec",
+]

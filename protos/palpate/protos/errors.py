@@ -1,0 +1,165 @@
+"""Errors of palpate: what was wrong, by name, and what to do about it.
+
+::
+
+    PalpateError
+    ├── ConfigError(ValueError)          a file, key or flag is wrong; names key and file
+    ├── MissingExtraError(ImportError)   an optional dependency is not installed; gives install line
+    ├── DeviceError(OSError)             a sensor or its recording
+    │   ├── DeviceLost                   it was there and is gone
+    │   ├── DeviceTimeout(TimeoutError)  it did not answer in time
+    │   └── RecordingError               a log or record is truncated or damaged
+    ├── WireError(ValueError)            bytes that do not decode or break the contract
+    ├── LinkError(OSError)               no router, port in use, session lost
+    ├── StreamTimeout(TimeoutError)      nothing arrived in time
+    ├── StaleError(TimeoutError)         the newest that arrived is too old to be used
+    ├── BundleError(ValueError)          a model bundle breaks its contract
+    ├── DatasetError(ValueError)         a data set breaks its schema
+    ├── SimulationError(RuntimeError)    a simulation cannot be run or did not converge
+    └── RemoteError                      a service answered with a typed error
+
+Each carries ``remedy``: one sentence that says what to do. ``str(error)`` holds both.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ErrorCode(IntEnum):
+    """Codes of ``palpate.v1.Error``; the numbers are the wire's."""
+
+    UNSPECIFIED = 0
+    INVALID_REQUEST = 1
+    NOT_FOUND = 2
+    UNAVAILABLE = 3
+    RESOURCE_EXHAUSTED = 4
+    DEADLINE_EXCEEDED = 5
+    WRONG_CONTRACT = 6
+    DEVICE = 7
+    DISK = 8
+    SIMULATION = 9
+    INTERNAL = 10
+
+
+class PalpateError(Exception):
+    """Base of all errors that palpate raises on purpose.
+
+    Args:
+        problem: What was wrong, naming the file, key, channel or message.
+        remedy: What to do about it.
+    """
+
+    code = ErrorCode.INTERNAL
+
+    def __init__(self, problem: str, *, remedy: str) -> None:
+        super().__init__(f"{problem} -> {remedy}")
+        self.problem = problem
+        self.remedy = remedy
+
+
+class ConfigError(PalpateError, ValueError):
+    """A configuration file, key or flag is wrong."""
+
+    code = ErrorCode.INVALID_REQUEST
+
+
+class MissingExtraError(PalpateError, ImportError):
+    """An optional dependency is not installed."""
+
+    code = ErrorCode.UNAVAILABLE
+
+    def __init__(self, module: str, *, extra: str) -> None:
+        super().__init__(
+            f"the Python package {module!r} is not installed",
+            remedy=f'install it: pip install "palpate[{extra}]"',
+        )
+        self.extra = extra
+
+
+class DeviceError(PalpateError, OSError):
+    """A sensor, or a recording that stands for one, misbehaves."""
+
+    code = ErrorCode.DEVICE
+
+
+class DeviceLost(DeviceError):
+    """The device was there and is gone."""
+
+
+class DeviceTimeout(DeviceError, TimeoutError):
+    """The device did not answer in time."""
+
+
+class RecordingError(DeviceError):
+    """A log or record is truncated, damaged, or not what it claims to be."""
+
+
+class WireError(PalpateError, ValueError):
+    """Bytes do not decode, break the contract, or speak another version of it.
+
+    Args:
+        problem: What was wrong.
+        remedy: What to do.
+        reason: Short name to count rejects by, e.g. ``"electrode_count"``.
+    """
+
+    code = ErrorCode.WRONG_CONTRACT
+
+    def __init__(self, problem: str, *, remedy: str, reason: str) -> None:
+        super().__init__(problem, remedy=remedy)
+        self.reason = reason
+
+
+class LinkError(PalpateError, OSError):
+    """No router, port in use, or the session is gone."""
+
+    code = ErrorCode.UNAVAILABLE
+
+
+class StreamTimeout(PalpateError, TimeoutError):
+    """No message arrived in time."""
+
+    code = ErrorCode.DEADLINE_EXCEEDED
+
+
+class StaleError(PalpateError, TimeoutError):
+    """The newest message is older than the caller accepts."""
+
+    code = ErrorCode.DEADLINE_EXCEEDED
+
+
+class BundleError(PalpateError, ValueError):
+    """A model bundle breaks its contract."""
+
+    code = ErrorCode.WRONG_CONTRACT
+
+
+class DatasetError(PalpateError, ValueError):
+    """A data set breaks its schema."""
+
+    code = ErrorCode.INVALID_REQUEST
+
+
+class SimulationError(PalpateError, RuntimeError):
+    """A simulation cannot be run or did not converge."""
+
+    code = ErrorCode.SIMULATION
+
+
+class RemoteError(PalpateError):
+    """A service answered a query with a typed error.
+
+    Args:
+        problem: The service's message.
+        remedy: The service's remedy.
+        code: The service's code.
+        retry_after_s: Ask again after this time [s]; 0 = do not.
+    """
+
+    def __init__(
+        self, problem: str, *, remedy: str, code: ErrorCode, retry_after_s: float = 0.0
+    ) -> None:
+        super().__init__(problem, remedy=remedy)
+        self.code = code
+        self.retry_after_s = retry_after_s

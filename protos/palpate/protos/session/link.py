@@ -1,0 +1,285 @@
+"""Joining the bus."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+import zenoh
+
+from palpate.protos.codec import Codec
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import LinkError, PalpateError
+from palpate.protos.session.presence import Alive, Presence, alive
+from palpate.protos.session.publish import Publisher
+from palpate.protos.session.query import Queryable, ask_all, ask_one
+from palpate.protos.session.queues import Delivery
+from palpate.protos.session.settings import zenoh_config
+from palpate.protos.session.subscribe import Subscriber, Tap
+from palpate.protos.topics import Topic, sensor_key, service_key
+
+M = TypeVar("M")
+Q = TypeVar("Q")
+R = TypeVar("R")
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+K = TypeVar("K", bound=_Closable)
+
+_IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
+
+
+class Session:
+    """A process's place on the bus. Always used as a context manager.
+
+    A process that ends with an open Zenoh session may hang in its thread shutdown; ``with`` closes
+    it on every path.
+    """
+
+    def __init__(self, raw: zenoh.Session, station: str) -> None:
+        self._raw = raw
+        self.station = station
+        self._closing: list[Callable[[], None]] = []
+
+    @classmethod
+    def open(cls, link: LinkConfig, *, station: str = "lab") -> Self:
+        """Join the bus as a peer.
+
+        Args:
+            link: Where the router is and how long to wait for it.
+            station: The station whose keys this session uses by default.
+
+        Raises:
+            LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
+        """
+        raw = _open(link, "peer")
+        if link.wait_for_router_s >= 0 and link.connect:
+            deadline = time.monotonic() + link.wait_for_router_s
+            while not raw.info.routers_zid() and not raw.info.peers_zid():
+                if time.monotonic() > deadline:
+                    raw.close()
+                    raise LinkError(
+                        f"no router at {', '.join(link.connect)}",
+                        remedy="start one with `palpate up`, or name yours with --connect",
+                    )
+                time.sleep(0.02)
+        return cls(raw, station)
+
+    def publisher(
+        self,
+        topic: Topic[M],
+        *,
+        sensor: str | None = None,
+        service: str = "",
+        instance: str = "",
+        lossless: bool = False,
+    ) -> Publisher[M]:
+        """Publish a topic of a sensor (or, for a service's topic, of a service's instance).
+
+        Args:
+            topic: From ``palpate.protos.topics``.
+            sensor: Name of the sensor.
+            service: Name of the service, for a service's topic.
+            instance: Name of its instance.
+            lossless: Wait for slow subscribers instead of dropping. Offline replay only.
+        """
+        key = self._key(topic, sensor, service, instance, None)
+        return self._keep(Publisher(self._raw, topic, key, lossless=lossless))
+
+    def subscriber(
+        self,
+        topic: Topic[M],
+        *,
+        sensor: str = "*",
+        service: str = "*",
+        instance: str = "*",
+        station: str | None = None,
+        delivery: Delivery = Delivery.NEWEST,
+        capacity: int = 4096,
+    ) -> Subscriber[M]:
+        """Subscribe to a topic; ``"*"`` = any sensor, service, instance or station."""
+        key = self._key(topic, sensor, service, instance, station)
+        return self._keep(Subscriber(self._raw, topic, key, delivery=delivery, capacity=capacity))
+
+    def tap(
+        self,
+        topics: Sequence[Topic[Any]],
+        *,
+        sensor: str = "*",
+        station: str | None = None,
+        delivery: Delivery = Delivery.QUEUE,
+        capacity: int = 65536,
+    ) -> Tap:
+        """Receive several topics undecoded, in order of arrival."""
+        keys = [(topic, self._key(topic, sensor, "*", "*", station)) for topic in topics]
+        return self._keep(Tap(self._raw, keys, delivery=delivery, capacity=capacity))
+
+    def queryable(
+        self,
+        endpoint: str,
+        *,
+        sensor: str,
+        request: Codec[Q],
+        reply: Codec[R],
+        handler: Callable[[Q], R],
+        capacity: int = 16,
+    ) -> Queryable:
+        """Answer questions about a sensor; the handler may raise any ``PalpateError``."""
+        key = sensor_key(self.station, sensor, endpoint)
+        return self._keep(Queryable(self._raw, key, request, reply, handler, capacity=capacity))
+
+    def service_queryable(
+        self,
+        endpoint: str,
+        *,
+        service: str,
+        instance: str,
+        request: Codec[Q],
+        reply: Codec[R],
+        handler: Callable[[Q], R],
+        capacity: int = 16,
+    ) -> Queryable:
+        """Answer questions to a service's instance."""
+        key = service_key(self.station, service, instance, endpoint)
+        return self._keep(Queryable(self._raw, key, request, reply, handler, capacity=capacity))
+
+    def query(
+        self,
+        endpoint: str,
+        *,
+        sensor: str | None = None,
+        service: str = "*",
+        instance: str = "*",
+        request: Q,
+        request_codec: Codec[Q],
+        reply_codec: Codec[R],
+        timeout_s: float = 1.0,
+    ) -> R:
+        """Ask a sensor's endpoint (``sensor`` given) or a service's.
+
+        Raises:
+            LinkError: Nobody serves it.
+            StreamTimeout: No answer in time.
+            RemoteError: The service's typed error.
+        """
+        key = self._endpoint(endpoint, sensor, service, instance)
+        return ask_one(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
+
+    def query_all(
+        self,
+        endpoint: str,
+        *,
+        sensor: str | None = None,
+        service: str = "*",
+        instance: str = "*",
+        request: Q,
+        request_codec: Codec[Q],
+        reply_codec: Codec[R],
+        timeout_s: float = 1.0,
+    ) -> list[R | PalpateError]:
+        """Every answer; errors are returned, not raised."""
+        key = self._endpoint(endpoint, sensor, service, instance)
+        return ask_all(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
+
+    def presence(self, service: str, *, instance: str) -> Presence:
+        """Declare this process alive; call ``ready`` on the result when it serves."""
+        return self._keep(Presence(self._raw, self.station, service, instance))
+
+    def alive(self, *, station: str | None = None) -> list[Alive]:
+        """Who is alive, and who is ready."""
+        return alive(self._raw, self.station if station is None else station)
+
+    def has_router(self) -> bool:
+        """Whether a router is connected at present."""
+        return bool(self._raw.info.routers_zid())
+
+    def close(self) -> None:
+        """Leave the bus."""
+        for close in reversed(self._closing):
+            try:
+                close()
+            except zenoh.ZError:  # already undeclared, or the session is gone
+                continue
+        self._closing.clear()
+        self._raw.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _keep(self, thing: K) -> K:
+        self._closing.append(thing.close)
+        return thing
+
+    def _key(
+        self,
+        topic: Topic[Any],
+        sensor: str | None,
+        service: str,
+        instance: str,
+        station: str | None,
+    ) -> str:
+        where = self.station if station is None else station
+        if topic.per_service:
+            return service_key(where, service, instance, topic.name)
+        if sensor is None:
+            raise TypeError(f"topic {topic.name!r} needs a sensor")
+        return sensor_key(where, sensor, topic.name)
+
+    def _endpoint(self, endpoint: str, sensor: str | None, service: str, instance: str) -> str:
+        if sensor is not None:
+            return sensor_key(self.station, sensor, endpoint)
+        return service_key(self.station, service, instance, endpoint)
+
+
+def _open(link: LinkConfig, mode: str) -> zenoh.Session:
+    try:
+        return zenoh.open(zenoh_config(link, mode))
+    except zenoh.ZError as error:
+        if _IN_USE.search(str(error)):
+            raise LinkError(
+                f"port in use: {', '.join(link.listen)}",
+                remedy=(
+                    "another palpate runs there (palpate status); stop it or choose another "
+                    "port for the listener"
+                ),
+            ) from error
+        raise LinkError(
+            f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
+        ) from error
+
+
+def run_router(
+    listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
+) -> None:
+    """Be the router until ``stop`` is set.
+
+    Args:
+        listen: Endpoints, e.g. ``("tcp/127.0.0.1:7447",)``.
+        stop: Set it to end.
+        link: Lease and certificates; None = defaults.
+
+    Raises:
+        LinkError: A port is in use.
+    """
+    base = link or LinkConfig()
+    config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
+    raw = _open(config, "router")
+    try:
+        stop.wait()
+    finally:
+        raw.close()

@@ -1,0 +1,66 @@
+from palpate.v1 import common_pb2 as _common_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class FeatureEstimate(_message.Message):
+    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "in_contact", "force", "force_sd", "contact_location", "contact_location_sd")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
+    BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    TARE_ID_FIELD_NUMBER: _ClassVar[int]
+    IN_CONTACT_FIELD_NUMBER: _ClassVar[int]
+    FORCE_FIELD_NUMBER: _ClassVar[int]
+    FORCE_SD_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_LOCATION_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_LOCATION_SD_FIELD_NUMBER: _ClassVar[int]
+    source: _common_pb2.Stamp
+    sensor_serial: str
+    bundle_sha256: bytes
+    tare_id: int
+    in_contact: bool
+    force: _common_pb2.Vector3
+    force_sd: _common_pb2.Vector3
+    contact_location: _common_pb2.Vector3
+    contact_location_sd: _common_pb2.Vector3
+    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., in_contact: _Optional[bool] = ..., force: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., force_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ...) -> None: ...
+
+class FieldEstimate(_message.Message):
+    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "mesh_sha256", "displacement", "displacement_sd", "contact_force")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
+    BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    TARE_ID_FIELD_NUMBER: _ClassVar[int]
+    MESH_SHA256_FIELD_NUMBER: _ClassVar[int]
+    DISPLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    DISPLACEMENT_SD_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_FORCE_FIELD_NUMBER: _ClassVar[int]
+    source: _common_pb2.Stamp
+    sensor_serial: str
+    bundle_sha256: bytes
+    tare_id: int
+    mesh_sha256: bytes
+    displacement: _containers.RepeatedScalarFieldContainer[float]
+    displacement_sd: _containers.RepeatedScalarFieldContainer[float]
+    contact_force: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., mesh_sha256: _Optional[bytes] = ..., displacement: _Optional[_Iterable[float]] = ..., displacement_sd: _Optional[_Iterable[float]] = ..., contact_force: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class SynthesisEstimate(_message.Message):
+    __slots__ = ("source", "sensor_serial", "bundle_sha256", "mesh_sha256", "tared_counts", "tared_counts_sd")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
+    BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    MESH_SHA256_FIELD_NUMBER: _ClassVar[int]
+    TARED_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    TARED_COUNTS_SD_FIELD_NUMBER: _ClassVar[int]
+    source: _common_pb2.Stamp
+    sensor_serial: str
+    bundle_sha256: bytes
+    mesh_sha256: bytes
+    tared_counts: _containers.RepeatedScalarFieldContainer[float]
+    tared_counts_sd: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., mesh_sha256: _Optional[bytes] = ..., tared_counts: _Optional[_Iterable[float]] = ..., tared_counts_sd: _Optional[_Iterable[float]] = ...) -> None: ...

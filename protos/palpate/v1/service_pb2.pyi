@@ -1,0 +1,182 @@
+from palpate.v1 import common_pb2 as _common_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class ServiceState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SERVICE_STATE_UNSPECIFIED: _ClassVar[ServiceState]
+    SERVICE_STATE_STARTING: _ClassVar[ServiceState]
+    SERVICE_STATE_READY: _ClassVar[ServiceState]
+    SERVICE_STATE_DEGRADED: _ClassVar[ServiceState]
+    SERVICE_STATE_FINISHED: _ClassVar[ServiceState]
+    SERVICE_STATE_STOPPING: _ClassVar[ServiceState]
+
+class ErrorCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ERROR_CODE_UNSPECIFIED: _ClassVar[ErrorCode]
+    ERROR_CODE_INVALID_REQUEST: _ClassVar[ErrorCode]
+    ERROR_CODE_NOT_FOUND: _ClassVar[ErrorCode]
+    ERROR_CODE_UNAVAILABLE: _ClassVar[ErrorCode]
+    ERROR_CODE_RESOURCE_EXHAUSTED: _ClassVar[ErrorCode]
+    ERROR_CODE_DEADLINE_EXCEEDED: _ClassVar[ErrorCode]
+    ERROR_CODE_WRONG_CONTRACT: _ClassVar[ErrorCode]
+    ERROR_CODE_DEVICE: _ClassVar[ErrorCode]
+    ERROR_CODE_DISK: _ClassVar[ErrorCode]
+    ERROR_CODE_SIMULATION: _ClassVar[ErrorCode]
+    ERROR_CODE_INTERNAL: _ClassVar[ErrorCode]
+SERVICE_STATE_UNSPECIFIED: ServiceState
+SERVICE_STATE_STARTING: ServiceState
+SERVICE_STATE_READY: ServiceState
+SERVICE_STATE_DEGRADED: ServiceState
+SERVICE_STATE_FINISHED: ServiceState
+SERVICE_STATE_STOPPING: ServiceState
+ERROR_CODE_UNSPECIFIED: ErrorCode
+ERROR_CODE_INVALID_REQUEST: ErrorCode
+ERROR_CODE_NOT_FOUND: ErrorCode
+ERROR_CODE_UNAVAILABLE: ErrorCode
+ERROR_CODE_RESOURCE_EXHAUSTED: ErrorCode
+ERROR_CODE_DEADLINE_EXCEEDED: ErrorCode
+ERROR_CODE_WRONG_CONTRACT: ErrorCode
+ERROR_CODE_DEVICE: ErrorCode
+ERROR_CODE_DISK: ErrorCode
+ERROR_CODE_SIMULATION: ErrorCode
+ERROR_CODE_INTERNAL: ErrorCode
+
+class Tare(_message.Message):
+    __slots__ = ("tare_id", "stamp", "sensor_serial", "electrodes", "electrodes_sd", "pdc", "pac", "tac", "tdc", "frames_averaged")
+    TARE_ID_FIELD_NUMBER: _ClassVar[int]
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
+    ELECTRODES_FIELD_NUMBER: _ClassVar[int]
+    ELECTRODES_SD_FIELD_NUMBER: _ClassVar[int]
+    PDC_FIELD_NUMBER: _ClassVar[int]
+    PAC_FIELD_NUMBER: _ClassVar[int]
+    TAC_FIELD_NUMBER: _ClassVar[int]
+    TDC_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_AVERAGED_FIELD_NUMBER: _ClassVar[int]
+    tare_id: int
+    stamp: _common_pb2.Stamp
+    sensor_serial: str
+    electrodes: _containers.RepeatedScalarFieldContainer[float]
+    electrodes_sd: _containers.RepeatedScalarFieldContainer[float]
+    pdc: float
+    pac: float
+    tac: float
+    tdc: float
+    frames_averaged: int
+    def __init__(self, tare_id: _Optional[int] = ..., stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., electrodes: _Optional[_Iterable[float]] = ..., electrodes_sd: _Optional[_Iterable[float]] = ..., pdc: _Optional[float] = ..., pac: _Optional[float] = ..., tac: _Optional[float] = ..., tdc: _Optional[float] = ..., frames_averaged: _Optional[int] = ...) -> None: ...
+
+class TareRequest(_message.Message):
+    __slots__ = ("tare_id", "frames")
+    TARE_ID_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    tare_id: int
+    frames: int
+    def __init__(self, tare_id: _Optional[int] = ..., frames: _Optional[int] = ...) -> None: ...
+
+class ServiceRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class Status(_message.Message):
+    __slots__ = ("service", "instance", "state", "monotonic_ns", "wall_ns", "uptime_s", "version", "counters", "gauges", "sensors", "message", "last_error")
+    class CountersEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    class GaugesEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    SERVICE_FIELD_NUMBER: _ClassVar[int]
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+    WALL_NS_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    COUNTERS_FIELD_NUMBER: _ClassVar[int]
+    GAUGES_FIELD_NUMBER: _ClassVar[int]
+    SENSORS_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    LAST_ERROR_FIELD_NUMBER: _ClassVar[int]
+    service: str
+    instance: str
+    state: ServiceState
+    monotonic_ns: int
+    wall_ns: int
+    uptime_s: float
+    version: str
+    counters: _containers.ScalarMap[str, int]
+    gauges: _containers.ScalarMap[str, float]
+    sensors: _containers.RepeatedScalarFieldContainer[str]
+    message: str
+    last_error: Error
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., state: _Optional[_Union[ServiceState, str]] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., version: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., sensors: _Optional[_Iterable[str]] = ..., message: _Optional[str] = ..., last_error: _Optional[_Union[Error, _Mapping]] = ...) -> None: ...
+
+class TensorInfo(_message.Message):
+    __slots__ = ("name", "dtype", "shape", "unit")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    DTYPE_FIELD_NUMBER: _ClassVar[int]
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    dtype: str
+    shape: _containers.RepeatedScalarFieldContainer[int]
+    unit: str
+    def __init__(self, name: _Optional[str] = ..., dtype: _Optional[str] = ..., shape: _Optional[_Iterable[int]] = ..., unit: _Optional[str] = ...) -> None: ...
+
+class ModelMetadata(_message.Message):
+    __slots__ = ("name", "version", "task", "bundle_sha256", "contract_version", "inputs", "outputs", "training_data_sha256", "metrics", "trained_on")
+    class MetricsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    TASK_FIELD_NUMBER: _ClassVar[int]
+    BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    CONTRACT_VERSION_FIELD_NUMBER: _ClassVar[int]
+    INPUTS_FIELD_NUMBER: _ClassVar[int]
+    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
+    TRAINING_DATA_SHA256_FIELD_NUMBER: _ClassVar[int]
+    METRICS_FIELD_NUMBER: _ClassVar[int]
+    TRAINED_ON_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    version: int
+    task: str
+    bundle_sha256: bytes
+    contract_version: int
+    inputs: _containers.RepeatedCompositeFieldContainer[TensorInfo]
+    outputs: _containers.RepeatedCompositeFieldContainer[TensorInfo]
+    training_data_sha256: str
+    metrics: _containers.ScalarMap[str, float]
+    trained_on: str
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[int] = ..., task: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., contract_version: _Optional[int] = ..., inputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., training_data_sha256: _Optional[str] = ..., metrics: _Optional[_Mapping[str, float]] = ..., trained_on: _Optional[str] = ...) -> None: ...
+
+class Error(_message.Message):
+    __slots__ = ("code", "message", "remedy", "retry_after_ms")
+    CODE_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    REMEDY_FIELD_NUMBER: _ClassVar[int]
+    RETRY_AFTER_MS_FIELD_NUMBER: _ClassVar[int]
+    code: ErrorCode
+    message: str
+    remedy: str
+    retry_after_ms: int
+    def __init__(self, code: _Optional[_Union[ErrorCode, str]] = ..., message: _Optional[str] = ..., remedy: _Optional[str] = ..., retry_after_ms: _Optional[int] = ...) -> None: ...

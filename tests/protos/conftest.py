@@ -1,0 +1,165 @@
+"""One valid example of every message of the contract."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.protos.errors import ErrorCode
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    ErrorReply,
+    FeatureEstimate,
+    FieldEstimate,
+    IndenterPoseFrame,
+    ModelMetadata,
+    Origin,
+    Pose,
+    SensorType,
+    ServiceRequest,
+    ServiceState,
+    SimulationParameters,
+    SimulationProgress,
+    SimulationReply,
+    SimulationRequest,
+    SimulationStep,
+    Stamp,
+    Status,
+    SynthesisEstimate,
+    Tare,
+    TareRequest,
+    TensorInfo,
+    WrenchFrame,
+)
+
+
+def _floats(*values: float) -> Any:
+    return np.array(values, np.float32)
+
+
+@pytest.fixture(scope="session")
+def examples() -> dict[str, Any]:
+    """Message name -> a valid value, the same on every machine."""
+    stamp = Stamp(
+        sequence=41,
+        device_tick=1042,
+        monotonic_ns=9_876_543_210,
+        wall_ns=1_763_719_200_123_456_789,
+        clock_id=0xC10C1D,
+        origin=Origin.SIMULATED,
+        missed_before=2,
+    )
+    digest, mesh = bytes(range(32)), bytes(range(32, 64))
+    nodes = np.linspace(-0.001, 0.002, 12, dtype=np.float32).reshape(4, 3)
+    pose = Pose((0.001, -0.002, -0.0093), (1.0, 0.0, 0.0, 0.0))
+    step = SimulationStep(
+        pose, _floats(0.1, -0.2, 3.0), _floats(0.01, 0.02, 0.03), 1750.5, nodes, nodes * 10
+    )
+    return {
+        "ElectrodeFrame": ElectrodeFrame(
+            stamp,
+            "BT000123",
+            SensorType.BIOTAC,
+            np.arange(19, dtype=np.uint16) * 100 + 2000,
+            1297,
+            np.arange(22, dtype=np.uint16) + 2030,
+            2050,
+            1912,
+            (1 << 44) - 2,
+            227_273,
+            0xFEED,
+        ),
+        "WrenchFrame": WrenchFrame(
+            stamp, "FT-7", _floats(0.5, -0.25, 4.0), _floats(0.01, -0.02, 0.0), True
+        ),
+        "IndenterPoseFrame": IndenterPoseFrame(
+            stamp,
+            "sphere_3-5mm",
+            np.array([0.001, -0.002, -0.0093]),
+            np.array([0.5, 0.5, -0.5, 0.5]),
+            True,
+        ),
+        "FeatureEstimate": FeatureEstimate(
+            stamp,
+            "BT000123",
+            digest,
+            0xFEED,
+            True,
+            _floats(0.5, -0.25, 4.0),
+            _floats(0.1, 0.1, 0.2),
+            _floats(0.001, -0.002, -0.009),
+            _floats(0.0005, 0.0006, 0.0007),
+        ),
+        "FieldEstimate": FieldEstimate(
+            stamp,
+            "BT000123",
+            digest,
+            0xFEED,
+            mesh,
+            nodes,
+            _floats(1e-5, 2e-5, 3e-5, 4e-5),
+            nodes * 100,
+        ),
+        "SynthesisEstimate": SynthesisEstimate(
+            stamp,
+            "BT000123",
+            digest,
+            mesh,
+            np.linspace(-400, 50, 19, dtype=np.float32),
+            np.full(19, 3, np.float32),
+        ),
+        "Tare": Tare(
+            0xFEED,
+            stamp,
+            "BT000123",
+            np.linspace(2900, 3400, 19, dtype=np.float32),
+            np.full(19, 0.5, np.float32),
+            1297.5,
+            2040.25,
+            2050.0,
+            1912.0,
+            50,
+        ),
+        "TareRequest": TareRequest(0xFEED, 50),
+        "ServiceRequest": ServiceRequest(),
+        "Status": Status(
+            "features",
+            "features",
+            ServiceState.DEGRADED,
+            9_876_543_210,
+            1_763_719_200_123_456_789,
+            12.5,
+            "0.1.0",
+            {"frames_received": 100},
+            {"latency_p50_s": 0.0009},
+            ("finger",),
+            "1 frame dropped",
+            ErrorReply(ErrorCode.DISK, "disk full", "free space", 0.5),
+        ),
+        "ModelMetadata": ModelMetadata(
+            "features-virtual",
+            1,
+            "features",
+            digest,
+            1,
+            (TensorInfo("electrodes", "float32", (-1, 19), "tared counts"),),
+            (TensorInfo("force", "float32", (-1, 3), "N"),),
+            "ab" * 32,
+            {"force_magnitude_median_n": 0.1},
+            "the virtual finger",
+        ),
+        "Error": ErrorReply(ErrorCode.RESOURCE_EXHAUSTED, "queue full", "ask later", 0.25),
+        "SimulationRequest": SimulationRequest(
+            "r-1",
+            "sphere_3-5mm",
+            (pose, Pose((0.0, 0.0, -0.007), (0.0, 1.0, 0.0, 0.0))),
+            SimulationParameters(skin_thickness_m=0.00157, friction_coefficient=0.186),
+            8.0,
+            True,
+            False,
+        ),
+        "SimulationProgress": SimulationProgress("r-1", 3, 20, 1.25),
+        "SimulationReply": SimulationReply("r-1", mesh, (step, step), "diverged at step 3", 4.5),
+    }

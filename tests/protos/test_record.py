@@ -1,0 +1,214 @@
+"""The record: what is written comes back; what is cut off is neither lost nor taken for whole."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.protos.codec import ELECTRODE_FRAME, WRENCH_FRAME
+from palpate.protos.errors import RecordingError, WireError
+from palpate.protos.record import (
+    RecordWriter,
+    check_readable,
+    descriptor_set,
+    read_record,
+    recover,
+    summarise,
+)
+from palpate.protos.topics import sensor_key
+
+KEY = sensor_key("lab", "finger", "electrodes")
+
+
+def write(path: Path, payload: bytes, count: int) -> None:
+    with RecordWriter(path, {"station": "lab"}) as writer:
+        for i in range(count):
+            writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1000 + i, sequence=i)
+
+
+def write_many(writer: RecordWriter, payload: bytes) -> None:
+    for _ in range(10_000):
+        writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1)
+    writer.flush()
+
+
+@pytest.fixture
+def payload(examples: dict[str, Any]) -> bytes:
+    return ELECTRODE_FRAME.encode(examples["ElectrodeFrame"])
+
+
+def test_what_is_written_comes_back(tmp_path: Path, payload: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    write(path, payload, 500)
+    items = list(read_record(path))
+    assert [item.sequence for item in items] == list(range(500))
+    assert {item.payload for item in items} == {payload}
+    assert items[0].address.sensor == "finger"
+    summary = summarise(path)
+    assert summary.counts == {KEY: 500}
+    assert summary.metadata["station"] == "lab"
+    assert summary.complete
+    check_readable(path)
+
+
+def test_the_embedded_schema_is_enough_to_read_it_without_palpate(
+    tmp_path: Path, payload: bytes
+) -> None:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    path = tmp_path / "run.mcap"
+    write(path, payload, 1)
+    files = descriptor_pb2.FileDescriptorSet.FromString(
+        descriptor_set(ELECTRODE_FRAME.message_type)
+    )
+    pool = descriptor_pool.DescriptorPool()
+    for file in files.file:
+        pool.Add(file)
+    generic = message_factory.GetMessageClass(
+        pool.FindMessageTypeByName("palpate.v1.ElectrodeFrame")
+    )
+    message: Any = generic.FromString(next(iter(read_record(path))).payload)
+    assert message.sensor_serial == "BT000123"
+
+
+def test_the_name_tells_an_unfinished_record(tmp_path: Path, payload: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RecordWriter(path)
+    writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1)
+    assert not path.exists()
+    assert writer.part.exists()
+    with pytest.raises(RecordingError, match=r"run.mcap.part exists"):
+        RecordWriter(path)
+    writer.close()
+    assert path.exists()
+    assert not writer.part.exists()
+
+
+def test_every_truncation_is_noticed_and_whole_messages_are_recovered(
+    tmp_path: Path, payload: bytes
+) -> None:
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path) as writer:
+        for i in range(60):
+            writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1000 + i, sequence=i)
+            if i % 10 == 9:
+                writer.flush()
+    whole = path.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    most = 0
+    for size in range(0, len(whole) - 1, 37):
+        cut.write_bytes(whole[:size])
+        with pytest.raises(RecordingError, match=r"cut.mcap"):
+            list(read_record(cut))
+        part = tmp_path / "cut.mcap.part"
+        part.write_bytes(whole[:size])
+        try:
+            target = recover(part)
+        except RecordingError:
+            part.unlink()  # nothing readable: nothing was removed, nothing written
+            assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.mcap", "run.mcap"]
+            continue
+        sequences = [item.sequence for item in read_record(target)]
+        assert sequences == list(range(len(sequences)))
+        most = max(most, len(sequences))
+        target.unlink()
+    assert most == 60
+
+
+def test_flipped_bits_never_raise_anything_but_recording_errors(
+    tmp_path: Path, payload: bytes
+) -> None:
+    path = tmp_path / "run.mcap"
+    write(path, payload, 20)
+    whole = bytearray(path.read_bytes())
+    damaged = tmp_path / "damaged.mcap"
+    for bit in range(0, 8 * len(whole), 61):
+        changed = bytearray(whole)
+        changed[bit >> 3] ^= 1 << (bit & 7)
+        damaged.write_bytes(changed)
+        with contextlib.suppress(RecordingError):
+            assert len(list(read_record(damaged))) == 20  # e.g. a bit of an unused index
+
+
+def test_a_foreign_or_empty_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    with pytest.raises(RecordingError, match="does not exist"):
+        list(read_record(path))
+    for content in (b"", b"time,value\n1,2\n", b"\x89MCAP0\r\n"):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=r"x\.mcap"):
+            list(read_record(path))
+
+
+def test_an_unknown_schema_is_not_recorded(tmp_path: Path) -> None:
+    writer = RecordWriter(tmp_path / "run.mcap")
+    with pytest.raises(WireError, match=r"palpate\.v9\.Frame"):
+        writer.write(KEY, "palpate.v9.Frame", b"", log_time_ns=1)
+    writer.abandon()
+
+
+def test_a_full_disk_is_named(tmp_path: Path, payload: bytes) -> None:
+    """/dev/full stands for the disk: every write fails with ENOSPC."""
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full on this system")
+    writer = RecordWriter(tmp_path / "run.mcap")
+    os.dup2(os.open("/dev/full", os.O_WRONLY), writer._file.fileno())
+    with pytest.raises(RecordingError, match=r"No space left.*free space"):
+        write_many(writer, payload)
+    writer.abandon()
+
+
+_CHILD = """
+import sys, time
+from pathlib import Path
+from palpate.protos.record import RecordWriter
+writer = RecordWriter(Path(sys.argv[1]))
+payload = sys.stdin.buffer.read()
+i = 0
+while True:
+    i += 1
+    writer.write(sys.argv[2], sys.argv[3], payload, log_time_ns=time.time_ns(), sequence=i)
+    sys.stdout.write(f"{i}\\n"); sys.stdout.flush()
+    time.sleep(0.01)
+"""
+
+
+def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, Any]) -> None:
+    """At 100 Hz 0.3 s are 30 messages; the count is compared, not a clock."""
+    path = tmp_path / "run.mcap"
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            _CHILD,
+            str(path),
+            KEY.replace("electrodes", "wrench"),
+            WRENCH_FRAME.schema,
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    child.stdin.write(WRENCH_FRAME.encode(examples["WrenchFrame"]))
+    child.stdin.close()
+    written = 0
+    started = time.monotonic()
+    while time.monotonic() - started < 1.5:
+        written = int(child.stdout.readline())
+    child.send_signal(signal.SIGKILL)
+    rest = child.stdout.read().split()
+    written = int(rest[-1]) if rest else written
+    child.wait()
+    target = recover(path.with_name("run.mcap.part"))
+    kept = [item.sequence for item in read_record(target)]
+    assert kept == list(range(1, len(kept) + 1))
+    assert written - len(kept) <= 30
