@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+from palpate.protos import clock
+from palpate.protos.config import LinkConfig
 from palpate.protos.errors import ErrorCode
 from palpate.protos.messages import (
     ElectrodeFrame,
@@ -33,6 +38,7 @@ from palpate.protos.messages import (
     TensorInfo,
     WrenchFrame,
 )
+from palpate.protos.session import Session
 
 
 def _floats(*values: float) -> Any:
@@ -163,3 +169,39 @@ def examples() -> dict[str, Any]:
         "SimulationProgress": SimulationProgress("r-1", 3, 20, 1.25),
         "SimulationReply": SimulationReply("r-1", mesh, (step, step), "diverged at step 3", 4.5),
     }
+
+
+@pytest.fixture
+def frame_of(examples: dict[str, Any]) -> Callable[..., ElectrodeFrame]:
+    def make(sequence: int, **stamp: Any) -> ElectrodeFrame:
+        monotonic_ns, wall_ns = clock.now()
+        facts = {
+            "sequence": sequence,
+            "monotonic_ns": monotonic_ns,
+            "wall_ns": wall_ns,
+            "clock_id": clock.CLOCK_ID,
+        }
+        frame: ElectrodeFrame = examples["ElectrodeFrame"]
+        return dataclasses.replace(
+            frame, stamp=dataclasses.replace(frame.stamp, **{**facts, **stamp})
+        )
+
+    return make
+
+
+@pytest.fixture
+def wait_until() -> Callable[..., None]:
+    def wait(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, "did not happen in time"
+            time.sleep(0.01)
+
+    return wait
+
+
+@pytest.fixture
+def pair(link: LinkConfig) -> Iterator[tuple[Session, Session]]:
+    """Two sessions on one bus."""
+    with Session.open(link) as a, Session.open(link) as b:
+        yield a, b

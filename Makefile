@@ -1,0 +1,118 @@
+# Two commands do all on a machine with Python >= 3.11:  make demo   and   make test
+# Everything lives in .venv beside this file; nothing is installed elsewhere.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: help setup demo test check bench docs fmt proto bundle build clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+# Tried in this order; `make PYTHON=python3.12 demo` names one.
+PYTHONS := $(or $(PYTHON),python3 python3.13 python3.12 python3.11)
+TORCH := torch==2.13.0
+BASELINE := tests/golden/palpate-v1.binpb
+
+help:  ## this list
+	@echo "palpate: make <target>"
+	@awk -F ':.*## | [|] ' '/^[a-z]+:.*## / {printf "  %-7s %-66s %s\n", $$1, $$2, $$3}' $(firstword $(MAKEFILE_LIST))
+
+setup: $(VENV)/.dev  ## make the full environment in .venv, with torch and tools | 3-8 min, once
+	@echo "palpate: ready; try: make demo"
+
+demo: $(VENV)/.demo  ## virtual finger -> features -> recorder: live table and pictures | 30 s after a first install of 1-3 min
+	@$(BIN)/palpate demo
+
+test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 5-10 min after setup
+	@$(BIN)/pytest
+
+# The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.
+check: $(VENV)/.dev  ## format, lint, types, borders, wire contract, house tests | 1-2 min
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/buf lint
+	$(BIN)/buf format --diff --exit-code
+	$(BIN)/buf breaking --against $(BASELINE)
+	$(BIN)/pytest tests/house --ignore=tests/house/test_style.py
+
+bench: $(VENV)/.dev  ## latency and throughput beside their bare floor | 2-5 min
+	$(BIN)/palpate bench e2e
+	@for bench in $(wildcard tests/benchmarks/bench_*.py); do echo "$$bench"; $(BIN)/python "$$bench"; done
+
+docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links | 20 s
+	$(BIN)/python docs/make_messages.py
+	$(BIN)/python docs/make_electrode_map.py
+	$(BIN)/towncrier build --draft >/dev/null
+	$(BIN)/pytest -q tests/house/test_docs.py
+
+fmt: $(VENV)/.dev  ## format Python and .proto files, repair what lint can | 5 s
+	$(BIN)/ruff check --fix-only --quiet
+	$(BIN)/ruff format
+	$(BIN)/buf format --write
+
+proto: $(VENV)/.dev  ## regenerate the Python of the .proto files and their page | 5 s
+	$(BIN)/python -m grpc_tools.protoc -Iprotos --python_out=protos --pyi_out=protos protos/palpate/v1/*.proto
+	$(BIN)/python docs/make_messages.py
+
+bundle: $(VENV)/.dev  ## train the shipped bundle again, on the virtual finger | 1-5 min
+	$(BIN)/palpate bundle virtual
+
+build: $(VENV)/.dev  ## the wheel, into dist/ | 20 s
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	@ls -1 dist/*.whl
+
+clean:  ## remove caches and built files; keep .venv and recordings | 1 s
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+# --- the environment ---------------------------------------------------------------------------
+# A stamp is touched after its install succeeded, so an interrupted one is simply done again; it
+# depends on pyproject.toml, so changed dependencies are installed by the next command.
+
+# One line per package instead of pip's own output; pip's errors still come through.
+show := awk '/^(Collecting|Processing) / { n = split($$2, part, "/"); name = part[n]; \
+                 sub(/[^A-Za-z0-9_.-].*|-[0-9].*/, "", name); printf "  %s\n", name; fflush() } \
+             /^Installing collected/ { print "  unpacking ..."; fflush() }'
+pip_install = $(BIN)/python -m pip install --disable-pip-version-check --progress-bar off
+
+$(VENV)/.made:
+	@if $(BIN)/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	    touch $@; exit 0; \
+	fi; \
+	without_venv=; \
+	for python in $(PYTHONS); do \
+	    "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || continue; \
+	    if ! "$$python" -c 'import ensurepip, venv' 2>/dev/null; then \
+	        without_venv="$$python"; continue; \
+	    fi; \
+	    echo "palpate: making $(VENV) with $$("$$python" --version)"; \
+	    "$$python" -m venv --clear $(VENV); touch $@; exit 0; \
+	done; \
+	if [ -n "$$without_venv" ]; then \
+	    version="$$("$$without_venv" -c 'import sys; print("%d.%d" % sys.version_info[:2])')"; \
+	    echo "palpate: $$without_venv cannot make a virtual environment (ensurepip is missing)" >&2; \
+	    echo "  -> Debian, Ubuntu: sudo apt install python$$version-venv ; then run make again" >&2; \
+	else \
+	    echo "palpate: no Python >= 3.11 found (tried: $(PYTHONS))" >&2; \
+	    echo "  -> install one (Debian 12+, Ubuntu 24.04+: sudo apt install python3 python3-venv)," >&2; \
+	    echo "     or name yours: make PYTHON=/path/to/python3.12 demo" >&2; \
+	fi; \
+	exit 1
+
+$(VENV)/.demo: $(VENV)/.made pyproject.toml
+	@echo "palpate: installing what the demo needs into $(VENV) (about 250 MB, no torch), 1-3 minutes"
+	@$(pip_install) -e '.[gateway,services]' | $(show)
+	@touch $@
+
+# torch goes first, alone, and by exact version: `==2.13.0` is also met by the CPU build
+# `2.13.0+cpu` where the index offers one. Any looser request takes the newest release instead, and
+# on Linux that brings gigabytes of CUDA libraries. tests/house compares this pin with pyproject.toml.
+$(VENV)/.dev: $(VENV)/.made pyproject.toml
+	@echo "palpate: installing everything into $(VENV) (torch and the developer's tools), 3-8 minutes"
+	@$(pip_install) '$(TORCH)' | $(show)
+	@$(pip_install) -e '.[all,dev]' | $(show)
+	@touch $(VENV)/.demo $@

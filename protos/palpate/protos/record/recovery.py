@@ -1,0 +1,39 @@
+"""Recovery of a record whose writer was killed."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+from palpate.protos.errors import RecordingError
+from palpate.protos.record.reading import metadata_of, read_record
+from palpate.protos.record.writing import RecordWriter
+
+
+def recover(part: Path) -> Path:
+    """Rewrite the whole messages of a cut-off record as ``NAME.recovered.mcap``; remove the part.
+
+    Raises:
+        RecordingError: Nothing in it can be read.
+    """
+    name = part.name.removesuffix(".part").removesuffix(".mcap")
+    target = part.with_name(f"{name}.recovered.mcap")
+    facts = {**metadata_of(part), "recovered_from": part.name}
+    items = read_record(part, allow_partial=True)
+    first = next(items, None)
+    if first is None:
+        raise RecordingError(
+            f"{part} holds no whole message", remedy="there is nothing to recover; delete it"
+        )
+    with RecordWriter(target, facts) as writer:
+        for item in itertools.chain((first,), items):
+            writer.write(
+                item.key,
+                item.schema,
+                item.payload,
+                log_time_ns=item.log_time_ns,
+                publish_time_ns=item.publish_time_ns,
+                sequence=item.sequence,
+            )
+    part.unlink()
+    return target

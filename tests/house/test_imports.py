@@ -1,0 +1,146 @@
+"""Who may import whom: the contracts hold, and each is seen to catch a planted violation."""
+
+from __future__ import annotations
+
+import ast
+import site
+import subprocess
+import sys
+import sysconfig
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("protos", "gateway", "fem", "training", "services", "deploy")
+LINTER: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+    "tool"
+]["importlinter"]
+
+# Packages with one home.  import-linter can forbid a package to a room but cannot say "only here".
+HOMES = {
+    "zenoh": ("protos/palpate/protos/session/",),
+    "serial": ("gateway/",),
+    "can": ("gateway/",),
+    "torch": ("training/",),
+    "warp": ("fem/",),
+    "onnxruntime": ("services/", "training/palpate/training/export.py"),
+    "rerun": ("services/",),
+    "google": ("protos/",),
+    "palpate.v1": ("protos/",),
+}
+
+# file to plant in, line to plant, a word of the contract that must catch it
+PLANTS = [
+    ("services/palpate/services/planted.py", "import palpate.gateway", "Rooms share only protos"),
+    ("protos/palpate/protos/planted.py", "import palpate.training", "Rooms share only protos"),
+    ("gateway/palpate/gateway/planted.py", "import palpate.deploy", "Rooms share only protos"),
+    ("fem/palpate/extra/__init__.py", "", "Rooms share only protos"),
+    (
+        "gateway/palpate/gateway/planted.py",
+        "from palpate.v1 import frames_pb2",
+        "generated wire classes",
+    ),
+    ("gateway/palpate/gateway/planted.py", "import zenoh", "protos.session speaks Zenoh"),
+    ("protos/palpate/protos/codec/planted.py", "import zenoh", "Messages are plain data"),
+    ("services/palpate/services/planted.py", "import serial", "Ports stay in the gateway"),
+    ("services/palpate/services/planted.py", "import torch", "Torch stays in training"),
+    ("services/palpate/services/planted.py", "import warp", "Warp stays in fem"),
+]
+
+
+def _lint(sources: Path, settings: Path) -> subprocess.CompletedProcess[str]:
+    """Run import-linter on the rooms below ``sources`` only.
+
+    ``-S`` leaves out the ``.pth`` file of the editable install, which would mix in the real rooms.
+    """
+    paths = [str(sources / room) for room in ROOMS]
+    packages = [
+        sysconfig.get_path("purelib"),
+        sysconfig.get_path("platlib"),
+        *site.getsitepackages(),
+    ]
+    program = (
+        f"import sys; sys.path[:0] = {paths!r}; sys.path += {packages!r}\n"
+        "from importlinter.cli import lint_imports_command\n"
+        f"lint_imports_command(['--config', {str(settings)!r}, '--no-cache'])"
+    )
+    return subprocess.run(
+        [sys.executable, "-S", "-c", program],
+        cwd=sources,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def _write(path: Path, text: str = "") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def stub_house(tmp_path: Path) -> Path:
+    """Our rooms as empty modules, with every module that a contract names, under our settings."""
+    for room in ROOMS:
+        _write(tmp_path / room / "palpate" / room / "__init__.py")
+    _write(tmp_path / "protos/palpate/v1/frames_pb2.py")
+    _write(tmp_path / "protos/palpate/v1/__init__.py")
+    for contract in LINTER["contracts"]:
+        for name in (*contract.get("source_modules", ()), *contract.get("forbidden_modules", ())):
+            parts = name.split(".")
+            if parts[0] == "palpate" and len(parts) > 2:
+                _write(tmp_path.joinpath(parts[1], *parts, "__init__.py"))
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    _write(tmp_path / "pyproject.toml", text[text.index("[tool.importlinter]") :])
+    return tmp_path
+
+
+def test_contracts_hold() -> None:
+    result = _lint(ROOT, ROOT / "pyproject.toml")
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_contracts_hold_on_the_stub_house(stub_house: Path) -> None:
+    """Else the planted violations below would prove nothing."""
+    result = _lint(stub_house, stub_house / "pyproject.toml")
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(("where", "line", "contract"), PLANTS)
+def test_planted_violation_is_caught(
+    stub_house: Path, where: str, line: str, contract: str
+) -> None:
+    _write(stub_house / where, f'"""Planted."""\n{line}\n')
+    result = _lint(stub_house, stub_house / "pyproject.toml")
+    assert result.returncode == 1, result.stdout + result.stderr
+    broken = [text for text in result.stdout.splitlines() if text.endswith("BROKEN")]
+    assert any(contract in text for text in broken), result.stdout
+
+
+def _imported(path: Path) -> set[str]:
+    """Every module that a file imports, also inside functions."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return names
+
+
+@pytest.mark.parametrize("package", HOMES)
+def test_package_is_imported_only_at_home(package: str) -> None:
+    strangers = []
+    for room in ROOMS:
+        for path in (ROOT / room).rglob("*.py"):
+            name = path.relative_to(ROOT).as_posix()
+            if name.startswith(HOMES[package]):
+                continue
+            if any(f"{found}.".startswith(f"{package}.") for found in _imported(path)):
+                strangers.append(name)
+    assert not strangers, f"{package} may be imported only in {HOMES[package]}"

@@ -1,0 +1,230 @@
+"""Queries that always answer, presence, health, tares, the robot's client, joining the bus."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import zenoh
+
+from palpate.protos.client import Client
+from palpate.protos.codec import TARE, TARE_REQUEST
+from palpate.protos.config import LinkConfig, parse_config
+from palpate.protos.errors import (
+    ConfigError,
+    DeviceError,
+    ErrorCode,
+    LinkError,
+    RemoteError,
+    StaleError,
+    StreamTimeout,
+)
+from palpate.protos.health import Health, HealthReporter
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    FeatureEstimate,
+    ServiceState,
+    Tare,
+    TareRequest,
+)
+from palpate.protos.session import Delivery, Session, run_router
+from palpate.protos.tares import TareBook
+from palpate.protos.topics import FEATURES, STATUS, sensor_key
+
+FrameOf = Callable[..., ElectrodeFrame]
+WaitUntil = Callable[..., None]
+
+
+def test_a_query_always_answers(pair: Any, examples: dict[str, Any], wait_until: WaitUntil) -> None:
+    a, b = pair
+    tare: Tare = examples["Tare"]
+
+    def handler(request: TareRequest) -> Tare:
+        if request.tare_id == 1:
+            raise DeviceError("electrode E7 moves by 40 counts", remedy="lift the finger")
+        if request.tare_id == 2:
+            raise ZeroDivisionError("a defect")
+        return tare
+
+    a.queryable("tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=handler)
+
+    def ask(tare_id: int, **more: Any) -> Tare:
+        reply: Tare = b.query(
+            "tare",
+            request=TareRequest(tare_id),
+            request_codec=TARE_REQUEST,
+            reply_codec=TARE,
+            **{"sensor": "finger", **more},
+        )
+        return reply
+
+    wait_until(lambda: b.alive() == [])
+    deadline = time.monotonic() + 5
+    while True:
+        try:
+            assert ask(0).tare_id == tare.tare_id
+            break
+        except LinkError:
+            assert time.monotonic() < deadline
+    with pytest.raises(RemoteError, match="E7 moves") as caught:
+        ask(1)
+    assert caught.value.code is ErrorCode.DEVICE
+    assert caught.value.remedy == "lift the finger"
+    with pytest.raises(RemoteError, match="ZeroDivisionError") as caught:
+        ask(2)
+    assert caught.value.code is ErrorCode.INTERNAL
+    with pytest.raises(LinkError, match="nobody answers"):
+        ask(0, sensor="thumb")
+    for encoding, wanted in (
+        ("application/protobuf;palpate.v1.TareRequest", b"do not parse"),
+        ("zenoh/bytes", b"TareRequest"),
+    ):
+        (reply,) = b._raw.get(
+            sensor_key("lab", "finger", "tare"),
+            payload=b"\xff\xff",
+            encoding=zenoh.Encoding(encoding),
+        )
+        assert reply.err is not None
+        assert wanted in reply.err.payload.to_bytes()
+
+
+def test_a_slow_or_overloaded_service_is_told_as_such(pair: Any, examples: dict[str, Any]) -> None:
+    a, b = pair
+    release = threading.Event()
+
+    def slow(_: TareRequest) -> Tare:
+        release.wait(10)
+        tare: Tare = examples["Tare"]
+        return tare
+
+    a.queryable("tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=slow, capacity=1)
+    codes: list[object] = []
+
+    def ask() -> None:
+        try:
+            b.query(
+                "tare",
+                sensor="finger",
+                request=TareRequest(),
+                request_codec=TARE_REQUEST,
+                reply_codec=TARE,
+                timeout_s=1.0,
+            )
+        except (RemoteError, StreamTimeout) as error:
+            codes.append(error.code)
+
+    time.sleep(0.2)
+    askers = [threading.Thread(target=ask) for _ in range(6)]
+    for asker in askers:
+        asker.start()
+        time.sleep(0.02)
+    for asker in askers:
+        asker.join()
+    release.set()
+    assert codes.count(ErrorCode.RESOURCE_EXHAUSTED) == 4
+    assert codes.count(ErrorCode.DEADLINE_EXCEEDED) == 2
+
+
+def test_presence_comes_and_goes(pair: Any, wait_until: WaitUntil) -> None:
+    a, b = pair
+    with a.presence("features", instance="features") as presence:
+        wait_until(lambda: [(x.service, x.ready) for x in b.alive()] == [("features", False)])
+        presence.ready()
+        wait_until(lambda: [x.ready for x in b.alive()] == [True])
+        presence.not_ready()
+        wait_until(lambda: [x.ready for x in b.alive()] == [False])
+    wait_until(lambda: b.alive() == [])
+
+
+def test_no_router_is_said_and_what_to_do(free_port: int) -> None:
+    link = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port}",), wait_for_router_s=0.3)
+    with pytest.raises(LinkError, match=rf"no router at tcp/127.0.0.1:{free_port}.*palpate up"):
+        Session.open(link)
+
+
+def test_port_in_use_is_said_and_what_to_do(link: LinkConfig) -> None:
+    time.sleep(0.3)
+    with pytest.raises(LinkError, match="port in use: tcp/"):
+        run_router(link.connect, threading.Event())
+
+
+def test_an_exposed_listener_needs_mutual_tls() -> None:
+    with pytest.raises(ConfigError, match="without mutual TLS"):
+        parse_config(LinkConfig, {"listen": ["tcp/0.0.0.0:7447"]}, where="lab.toml [link]")
+
+
+def test_an_unknown_key_names_file_key_and_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"lab.toml \[link\]: unknown key 'conect'.*'connect'"):
+        parse_config(LinkConfig, {"conect": []}, where="lab.toml [link]")
+
+
+def test_names_that_cannot_stand_in_a_key_are_refused() -> None:
+    with pytest.raises(ConfigError, match="'Left Finger'"):
+        sensor_key("lab", "Left Finger", "electrodes")
+
+
+def test_health_is_published_and_answers(pair: Any) -> None:
+    a, b = pair
+    health = Health("features", "features")
+    statuses = b.subscriber(STATUS, delivery=Delivery.QUEUE)
+    time.sleep(0.2)
+    with HealthReporter(a, health, period_s=0.05):
+        health.count("frames_received", 3)
+        health.fail(DeviceError("unplugged", remedy="plug it in"))
+        seen = statuses.next(timeout_s=2).message
+        while seen.state is not ServiceState.DEGRADED:
+            seen = statuses.next(timeout_s=2).message
+    assert seen.counters["frames_received"] == 3
+    assert seen.last_error is not None
+    assert seen.last_error.remedy == "plug it in"
+
+
+def test_a_tare_book_asks_when_it_does_not_know(pair: Any, examples: dict[str, Any]) -> None:
+    a, b = pair
+    tare: Tare = examples["Tare"]
+    asked: list[int] = []
+
+    def handler(request: TareRequest) -> Tare:
+        asked.append(request.tare_id)
+        return tare
+
+    a.queryable("tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=handler)
+    book = TareBook(b, query_timeout_s=2)
+    time.sleep(0.3)
+    assert book.baseline("finger", tare.tare_id).tare_id == tare.tare_id
+    assert book.baseline("finger", tare.tare_id).tare_id == tare.tare_id
+    assert asked == [tare.tare_id]
+
+
+def test_a_robot_needs_five_lines(
+    link: LinkConfig, frame_of: FrameOf, examples: dict[str, Any]
+) -> None:
+    estimate: FeatureEstimate = dataclasses.replace(
+        examples["FeatureEstimate"], source=frame_of(1).stamp
+    )
+    stop = threading.Event()
+
+    def serve() -> None:
+        with Session.open(link) as session:
+            publisher = session.publisher(FEATURES, sensor="finger")
+            sequence = 0
+            while not stop.is_set():
+                sequence += 1
+                publisher.put(dataclasses.replace(estimate, source=frame_of(sequence).stamp))
+                time.sleep(0.01)
+
+    server = threading.Thread(target=serve)
+    server.start()
+    try:
+        with Client(link.connect[0]) as robot:
+            now = robot.features("finger", max_age_s=0.5)
+            assert now.force.tolist() == estimate.force.tolist()
+            with pytest.raises(StaleError):
+                robot.features("thumb")
+    finally:
+        stop.set()
+        server.join()

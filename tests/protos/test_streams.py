@@ -1,0 +1,205 @@
+"""Streams on loopback: what each delivery promises, and what is refused is counted."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from palpate.protos.codec import ELECTRODE_FRAME
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import (
+    StaleError,
+    StreamTimeout,
+)
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    Origin,
+)
+from palpate.protos.session import Delivery, Session
+from palpate.protos.topics import ELECTRODES, sensor_key
+
+FrameOf = Callable[..., ElectrodeFrame]
+WaitUntil = Callable[..., None]
+
+
+def test_frames_arrive_equal_and_in_order(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    for sequence in range(1, 51):
+        publisher.put(frame_of(sequence))
+        received = subscriber.next(timeout_s=2)
+        assert received.message.stamp.sequence == sequence
+        assert (received.station, received.sensor) == ("lab", "finger")
+    assert subscriber.counters["delivered"] == 50
+    assert "lost_on_bus" not in subscriber.counters
+
+
+def test_newest_wins_and_the_dropped_are_counted_but_not_as_lost(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES, delivery=Delivery.NEWEST)
+    fingers = [a.publisher(ELECTRODES, sensor=name) for name in ("left", "right")]
+    wait_until(lambda: all(p.matched() for p in fingers))
+    for sequence in range(1, 21):
+        for publisher in fingers:
+            publisher.put(frame_of(sequence))
+    wait_until(lambda: subscriber.counters["received"] == 40)
+    got = {subscriber.next(1).sensor: None for _ in range(2)}
+    assert set(got) == {"left", "right"}
+    with pytest.raises(StreamTimeout):
+        subscriber.next(timeout_s=0.05)
+    fingers[0].put(frame_of(21))
+    fingers[1].put(frame_of(24))
+    assert {subscriber.next(1).message.stamp.sequence for _ in range(2)} == {21, 24}
+    assert subscriber.counters["dropped"] == 38
+    assert subscriber.counters["lost_on_bus"] == 3  # 21, 22, 23 of the right finger
+
+
+def test_every_loses_nothing_with_a_slow_consumer(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES, delivery=Delivery.EVERY, capacity=8)
+    publisher = a.publisher(ELECTRODES, sensor="finger", lossless=True)
+    wait_until(publisher.matched)
+    count = 3000
+
+    def send() -> None:
+        for sequence in range(1, count + 1):
+            publisher.put(frame_of(sequence, origin=Origin.REPLAYED))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    for sequence in range(1, count + 1):
+        if sequence % 100 == 0:
+            time.sleep(0.002)
+        assert subscriber.next(timeout_s=5).message.stamp.sequence == sequence
+    sender.join()
+    assert "overflow" not in subscriber.counters
+
+
+def test_a_full_queue_counts_what_it_refuses(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES, delivery=Delivery.QUEUE, capacity=10)
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    for sequence in range(1, 31):
+        publisher.put(frame_of(sequence))
+    wait_until(lambda: subscriber.counters["received"] == 30)
+    assert [subscriber.next(1).message.stamp.sequence for _ in range(10)] == list(range(1, 11))
+    assert subscriber.counters["overflow"] == 20
+
+
+def test_latest_never_returns_an_old_reading(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES)
+    with pytest.raises(StaleError, match="ever arrived"):
+        subscriber.latest(max_age_s=1)
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    publisher.put(frame_of(1))
+    wait_until(lambda: subscriber.counters.get("received"))
+    assert subscriber.latest(max_age_s=5).message.stamp.sequence == 1
+    assert subscriber.latest(max_age_s=5).message.stamp.sequence == 1  # nothing was consumed
+    # Old by its stamp though it has just arrived.
+    publisher.put(frame_of(2, monotonic_ns=time.monotonic_ns() - 10_000_000_000))
+    wait_until(lambda: subscriber.counters["received"] == 2)
+    with pytest.raises(StaleError, match="s old"):
+        subscriber.latest(max_age_s=5)
+    # From another host's clock, so the wall clock decides.
+    publisher.put(frame_of(3, clock_id=1, monotonic_ns=0))
+    wait_until(lambda: subscriber.counters["received"] == 3)
+    assert subscriber.latest(max_age_s=5).message.stamp.sequence == 3
+
+
+def test_duplicates_are_dropped_and_a_restarted_sender_is_followed(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    first, fifth = frame_of(1), frame_of(5)
+    for frame in (first, fifth, fifth, first, frame_of(1)):
+        publisher.put(frame)
+    assert [subscriber.next(1).message.stamp.sequence for _ in range(3)] == [1, 5, 1]
+    assert subscriber.counters["reordered"] == 2
+    assert subscriber.counters["restarts"] == 1
+    assert subscriber.counters["lost_on_bus"] == 3
+
+
+def test_bad_payloads_are_counted_and_skipped(
+    link: LinkConfig, frame_of: FrameOf, examples: dict[str, Any], wait_until: WaitUntil
+) -> None:
+    """Wrong schema, future contract, 18 electrodes, noise: counted by reason; good frames flow."""
+    key = sensor_key("lab", "finger", "electrodes")
+    good = ELECTRODE_FRAME.encode(frame_of(1))
+    message = ELECTRODE_FRAME.message_type.FromString(good)
+    message.electrodes = b"\0" * 36  # type: ignore[attr-defined]
+    encoding = "application/protobuf;palpate.v1.ElectrodeFrame"
+    bad = [
+        (good, "application/protobuf;palpate.v1.WrenchFrame", "schema"),
+        (good, "application/protobuf;palpate.v2.ElectrodeFrame", "future_contract"),
+        (good, "text/plain", "schema"),
+        (message.SerializeToString(), encoding, "electrode_count"),
+        (b"\xff" * 40, encoding, "parse"),
+        (b"", encoding, "sensor_type"),
+    ]
+    with Session.open(link) as session, Session.open(link) as other:
+        subscriber = session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+        raw = other._raw  # a sender that does not keep the contract
+        publisher = other.publisher(ELECTRODES, sensor="finger")
+        wait_until(publisher.matched)
+        for payload, wrong, _ in bad:
+            raw.put(key, payload, encoding=zenoh.Encoding(wrong))
+        # Another priority would overtake them.
+        wait_until(lambda: subscriber.counters.get("received") == len(bad))
+        publisher.put(frame_of(1))
+        assert subscriber.next(timeout_s=2).message.stamp.sequence == 1
+        rejected = {k: v for k, v in subscriber.counters.items() if k.startswith("rejected_")}
+        assert sum(rejected.values()) == len(bad)
+        assert rejected["rejected_schema"] == 2
+        for _, _, reason in bad:
+            assert f"rejected_{reason}" in rejected
+
+
+def test_ten_thousand_random_payloads_on_the_bus_are_all_accounted_for(
+    link: LinkConfig, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    random = np.random.default_rng(7)
+    key = sensor_key("lab", "finger", "electrodes")
+    good = ELECTRODE_FRAME.encode(frame_of(1))
+    count = 10_000
+    with Session.open(link) as session, Session.open(link) as other:
+        subscriber = session.subscriber(ELECTRODES, delivery=Delivery.QUEUE, capacity=count)
+        publisher = other.publisher(ELECTRODES, sensor="finger", lossless=True)
+        wait_until(publisher.matched)
+        for _ in range(count):
+            payload = bytearray(good)
+            payload[int(random.integers(len(payload)))] ^= 1 << int(random.integers(8))
+            publisher.put_payload(bytes(payload))
+        wait_until(lambda: subscriber.counters["received"] == count, 20)
+        with contextlib.suppress(StreamTimeout):
+            while True:
+                subscriber.next(timeout_s=0.2)
+        counters = subscriber.counters
+        rejected = sum(v for k, v in counters.items() if k.startswith("rejected_"))
+        assert rejected + counters["delivered"] + counters.get("reordered", 0) == count
+        assert rejected > count / 20
+    assert key.endswith("/finger/electrodes")
