@@ -130,10 +130,13 @@ class Session:
         reply: Codec[R],
         handler: Callable[[Q], R],
         capacity: int = 16,
+        workers: int = 1,
     ) -> Queryable:
         """Answer questions about a sensor; the handler may raise any ``PalpateError``."""
         key = sensor_key(self.station, sensor, endpoint)
-        return self._keep(Queryable(self._raw, key, request, reply, handler, capacity=capacity))
+        return self._keep(
+            Queryable(self._raw, key, request, reply, handler, capacity=capacity, workers=workers)
+        )
 
     def service_queryable(
         self,

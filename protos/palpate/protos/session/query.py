@@ -45,7 +45,10 @@ def error_reply(error: BaseException) -> ErrorReply:
 
 
 class Queryable:
-    """Answers queries with ``handler`` in its own thread. Made by ``Session.queryable``.
+    """Answers queries with ``handler`` in its own threads. Made by ``Session.queryable``.
+
+    With one worker queries are answered one after another; more let a quick question overtake a slow
+    one.
 
     A handler that raises, a request that does not decode, a full queue: each is answered with a
     typed error. Zenoh itself would give the caller silence.
@@ -60,6 +63,7 @@ class Queryable:
         handler: Callable[[Q], R],
         *,
         capacity: int = 16,
+        workers: int = 1,
     ) -> None:
         self.key = key
         self._request = request
@@ -68,8 +72,12 @@ class Queryable:
         self._queries: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
         self._reply_encoding = zenoh.Encoding(ENCODING_PREFIX + reply.schema)
         self._error_encoding = zenoh.Encoding(ENCODING_PREFIX + ERROR.schema)
-        self._worker = threading.Thread(target=self._run, name=f"query {key}", daemon=True)
-        self._worker.start()
+        self._workers = [
+            threading.Thread(target=self._run, name=f"query {key} {i}", daemon=True)
+            for i in range(workers)
+        ]
+        for worker in self._workers:
+            worker.start()
         self._queryable = session.declare_queryable(key, self._on_query, complete=True)
 
     def _on_query(self, query: zenoh.Query) -> None:
@@ -121,8 +129,10 @@ class Queryable:
     def close(self) -> None:
         """Undeclare; queries already accepted are answered."""
         self._queryable.undeclare()
-        self._queries.put(_STOP)
-        self._worker.join(timeout=5)
+        for _ in self._workers:
+            self._queries.put(_STOP)
+        for worker in self._workers:
+            worker.join(timeout=5)
 
 
 def ask_all(

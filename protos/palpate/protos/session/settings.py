@@ -50,9 +50,13 @@ def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
                     "lease": round(link.lease_s * 1000),
                     "keep_alive": 4,
                     "queue": {
+                        # Express messages take a batch each: with the default of two, twenty
+                        # sensors that publish in the same millisecond lose frames.
+                        "size": {"real_time": 16},
                         "congestion_control": {
-                            "block": {"wait_before_close": round(LOSSLESS_STALL_S * 1e6)}
-                        }
+                            "drop": {"wait_before_drop": 2000},
+                            "block": {"wait_before_close": round(LOSSLESS_STALL_S * 1e6)},
+                        },
                     },
                 },
                 "rx": {"max_message_size": MAX_MESSAGE_BYTES},

@@ -1,0 +1,1 @@
+"""The gateway: devices in, stamped and tared frames out."""

@@ -1,0 +1,191 @@
+"""The gateway's process: every sensor in its own thread, one status, one presence."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from functools import partial
+
+from palpate.gateway.config import GatewayConfig, SensorConfig
+from palpate.gateway.device import Device
+from palpate.gateway.drivers import make_device
+from palpate.gateway.pipeline import Pipeline
+from palpate.gateway.worker import SensorWorker
+from palpate.protos.codec import TARE as TARE_CODEC
+from palpate.protos.codec import TARE_REQUEST
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import PalpateError
+from palpate.protos.health import Health, HealthReporter
+from palpate.protos.messages import ServiceState
+from palpate.protos.session import Presence, Session
+from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+
+_log = logging.getLogger(__name__)
+
+SERVICE = "gateway"
+
+_POLL_S = 0.05
+_SETTLE_S = 0.3
+"""Between a consumer's presence and the first frame of a lossless replay [s]: presence and
+subscriptions travel apart, and a frame that overtakes the subscription would be lost."""
+
+
+def run(
+    config: GatewayConfig,
+    link: LinkConfig,
+    station: str,
+    stop: threading.Event,
+    *,
+    instance: str = SERVICE,
+) -> None:
+    """Serve the configured sensors until ``stop`` is set, or with ``exit_at_end`` until they end.
+
+    Args:
+        config: Sensors, pace, tare.
+        link: How to join the bus.
+        station: Name of the station.
+        stop: Set it to end.
+        instance: Name of this gateway among several.
+
+    Raises:
+        ConfigError: An unknown driver or option; before the bus is joined.
+        LinkError: The bus cannot be joined.
+        RecordingError: With ``exit_at_end``, a recording was damaged; all before it was published.
+    """
+    devices = [_device(sensor) for sensor in config.sensors]
+    health = Health(SERVICE, instance)
+    health.set_sensors(tuple(sensor.name for sensor in config.sensors))
+    with Session.open(link, station=station) as session:
+        workers = []
+        for sensor, device in zip(config.sensors, devices, strict=True):
+            # A live source must never wait for a slow subscriber, whatever the pace of others.
+            lossless = config.pace == "fast" and not device.info.live
+            worker = SensorWorker(
+                sensor.name,
+                device,
+                Pipeline(
+                    device.info,
+                    tare_frames=config.tare_frames,
+                    max_sd_counts=config.tare_max_sd_counts,
+                ),
+                {
+                    topic.name: session.publisher(topic, sensor=sensor.name, lossless=lossless)
+                    for topic in (ELECTRODES, WRENCH, POSE, TARE)
+                },
+                health,
+                pace=config.pace,
+                stop=stop,
+            )
+            session.queryable(
+                "tare",
+                sensor=sensor.name,
+                request=TARE_REQUEST,
+                reply=TARE_CODEC,
+                handler=worker.tare,
+                # Taring takes half a second; looking up a known tare must not wait for it.
+                workers=2,
+            )
+            workers.append(worker)
+        refresh = partial(_refresh, health, workers)
+        presence = session.presence(SERVICE, instance=instance)
+        with HealthReporter(session, health, refresh=refresh):
+            try:
+                _serve(config, session, workers, health, presence, stop)
+            finally:
+                if not all(worker.ended.is_set() for worker in workers):
+                    health.set_state(ServiceState.STOPPING)
+                stop.set()
+                presence.not_ready()
+                for worker in workers:
+                    worker.join(2.0)
+                refresh()
+
+
+def _device(sensor: SensorConfig) -> Device:
+    return make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
+
+
+def _serve(
+    config: GatewayConfig,
+    session: Session,
+    workers: list[SensorWorker],
+    health: Health,
+    presence: Presence,
+    stop: threading.Event,
+) -> None:
+    if config.wait_for and not _wait_for(config.wait_for, session, health, stop):
+        return
+    for worker in workers:
+        worker.start()
+    finished = False
+    while not stop.is_set():
+        for worker in workers:
+            if worker.crash is not None:
+                raise worker.crash
+        _tell(health, workers, presence)
+        if not finished and all(worker.ended.is_set() for worker in workers):
+            finished = True
+            _finish(health, workers)
+            if config.exit_at_end:
+                stop.wait(config.linger_s)
+                for worker in workers:
+                    if worker.error is not None:
+                        raise worker.error
+                return
+        stop.wait(_POLL_S)
+
+
+def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> None:
+    """Ready while every sensor delivers or has ended well."""
+    if all(worker.ended.is_set() for worker in workers):
+        return
+    if all(worker.serving or worker.ended.is_set() for worker in workers):
+        presence.ready()
+        if health.state is not ServiceState.READY and not any(worker.error for worker in workers):
+            health.set_state(ServiceState.READY, "all sensors deliver")
+    else:
+        presence.not_ready()
+
+
+def _finish(health: Health, workers: list[SensorWorker]) -> None:
+    """Every source has ended: account for it in the status."""
+    _refresh(health, workers)
+    frames = sum(worker.pipeline.counters["frames_published"] for worker in workers)
+    failed = [worker for worker in workers if worker.error is not None]
+    if failed:
+        error = failed[0].error
+        assert error is not None
+        health.fail(error)
+        return
+    health.set_state(ServiceState.FINISHED, f"all sources have ended, {frames} frames published")
+    _log.info("all sources have ended, %d frames published", frames)
+
+
+def _refresh(health: Health, workers: list[SensorWorker]) -> None:
+    """Take over the sensors' counters; several sensors are told apart by a prefix."""
+    for worker in workers:
+        prefix = f"{worker.name}." if len(workers) > 1 else ""
+        health.set_counts({prefix + name: value for name, value in worker.counters().items()})
+
+
+def _wait_for(
+    names: tuple[str, ...], session: Session, health: Health, stop: threading.Event
+) -> bool:
+    """Wait until each service is ready; False if stopped meanwhile."""
+    health.set_state(ServiceState.STARTING, f"waiting for {', '.join(names)}")
+    told_s = time.monotonic()
+    while not stop.is_set():
+        try:
+            ready = {item.service for item in session.alive() if item.ready}
+        except PalpateError as error:
+            health.fail(error, degraded=False)
+            ready = set()
+        missing = [name for name in names if name not in ready]
+        if not missing:
+            return not stop.wait(_SETTLE_S)
+        if time.monotonic() - told_s > 5.0:
+            told_s = time.monotonic()
+            _log.info("waiting for %s to be ready", ", ".join(missing))
+        stop.wait(_POLL_S)
+    return False

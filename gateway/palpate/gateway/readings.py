@@ -1,0 +1,100 @@
+"""What a device yields: readings in the device's own time, before the gateway adds its facts.
+
+A device knows its tick and its time; sequence numbers, host clocks and tares are the gateway's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.protos.messages import CountArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ElectrodeReading:
+    """One sampling round of a BioTac, raw.
+
+    Attributes:
+        tick: The device's own unwrapped frame counter.
+        time_s: The device's time at the first slot [s], from an origin of its own.
+        missed_before: Frames the device is known to have lost directly before this one.
+        electrodes: Raw counts E1..E19, uint16, shape ``(19,)``.
+        pdc: Raw static pressure [counts].
+        pac: Raw dynamic pressure in order of sampling [counts], uint16, shape ``(22,)``.
+        tac: Raw dynamic temperature [counts].
+        tdc: Raw static temperature [counts].
+        validity: Bit set = channel good; the order is that of ``ElectrodeFrame.validity``.
+    """
+
+    tick: int
+    time_s: float
+    missed_before: int
+    electrodes: CountArray
+    pdc: int
+    pac: CountArray
+    tac: int
+    tdc: int
+    validity: int
+
+
+@dataclass(frozen=True, slots=True)
+class WrenchReading:
+    """One reading of a force/torque sensor.
+
+    Attributes:
+        tick: The device's own unwrapped counter.
+        time_s: The device's time [s].
+        force: Force on the BioTac [N], sensor frame, float32, shape ``(3,)``.
+        torque: Torque on the BioTac about the sensor frame's origin [N m], shape ``(3,)``.
+        serial: Serial number of the force/torque sensor.
+        overload: The device says its range is exceeded.
+    """
+
+    tick: int
+    time_s: float
+    force: FloatArray
+    torque: FloatArray
+    serial: str
+    overload: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PoseReading:
+    """Where the indenter is.
+
+    Attributes:
+        tick: The device's own unwrapped counter.
+        time_s: The device's time [s].
+        indenter: Standard name, e.g. ``"sphere_14mm"``.
+        position: Tip of the indenter [m], sensor frame, float64, shape ``(3,)``.
+        orientation: Unit quaternion w x y z of the indenter in the sensor frame, shape ``(4,)``.
+        in_contact: Whether it touches the skin.
+    """
+
+    tick: int
+    time_s: float
+    indenter: str
+    position: npt.NDArray[np.float64]
+    orientation: npt.NDArray[np.float64]
+    in_contact: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedMessage:
+    """A message of a palpate record, to be published again byte for byte.
+
+    Attributes:
+        topic: Stream name, e.g. ``"electrodes"``.
+        payload: The encoded message as it was recorded.
+        time_s: When it was recorded [s since the Unix epoch].
+    """
+
+    topic: str
+    payload: bytes
+    time_s: float
+
+
+Reading = ElectrodeReading | WrenchReading | PoseReading | RecordedMessage

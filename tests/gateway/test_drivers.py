@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import sys
+from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.gateway import drivers
+from palpate.gateway.virtual import Virtual
+from palpate.protos.errors import ConfigError, MissingExtraError
+
+
+def test_built_in_drivers() -> None:
+    assert {"virtual", "text_log", "record"} <= set(drivers.driver_names())
+    for name in drivers.DRIVERS:
+        assert drivers.load_driver(name).options_class
+
+
+def test_unknown_driver_names_the_nearest() -> None:
+    with pytest.raises(ConfigError, match="unknown driver 'virtul' -> did you mean 'virtual'"):
+        drivers.make_device("virtul")
+    with pytest.raises(ConfigError, match="known drivers: record, text_log, virtual"):
+        drivers.make_device("zzzzzz")
+
+
+def test_unknown_option_names_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"options of driver 'virtual'.*'sed'.*'seed'"):
+        drivers.make_device("virtual", {"sed": 3})
+    with pytest.raises(ConfigError, match="key 'path' is missing"):
+        drivers.make_device("text_log", {})
+    with pytest.raises(ConfigError, match="indenter"):
+        drivers.make_device("virtual", {"indenter": "sphere_9mm"})
+
+
+def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("mine", "palpate.gateway.virtual:Virtual", drivers.ENTRY_POINTS)
+
+    def fake(**query: Any) -> EntryPoints:
+        return EntryPoints([point]).select(**query)
+
+    monkeypatch.setattr(drivers, "entry_points", fake)
+    assert "mine" in drivers.driver_names()
+    assert drivers.load_driver("mine") is Virtual
+
+
+@pytest.mark.parametrize(
+    ("target", "error", "message"),
+    [
+        ("palpate.gateway.nothing:X", ConfigError, "module 'palpate.gateway.nothing'"),
+        ("palpate.gateway.virtual:Nothing", ConfigError, "no device class"),
+        ("palpate.gateway.virtual:math", ConfigError, "no device class"),
+    ],
+)
+def test_broken_table_entry(
+    monkeypatch: pytest.MonkeyPatch, target: str, error: type[Exception], message: str
+) -> None:
+    monkeypatch.setitem(drivers.DRIVERS, "broken", target)
+    with pytest.raises(error, match=message):
+        drivers.load_driver("broken")
+
+
+def test_missing_extra_gives_the_install_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "driver_that_needs_more.py").write_text("import package_that_is_not_there\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(drivers.DRIVERS, "more", "driver_that_needs_more:X")
+    with pytest.raises(MissingExtraError, match=r"package_that_is_not_there.*palpate\[gateway\]"):
+        drivers.load_driver("more")
+
+
+def test_table_is_lazy() -> None:
+    import subprocess
+
+    code = "import sys, palpate.gateway.drivers; print('palpate.gateway.virtual' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,155 @@
+"""The gateway as a process with live sensors: in a thread, on a real bus over loopback."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.gateway import node, virtual
+from palpate.gateway.config import GatewayConfig
+from palpate.gateway.drivers import DRIVERS
+from palpate.gateway.readings import Reading
+from palpate.protos.config import LinkConfig, parse_config
+from palpate.protos.errors import ConfigError, DeviceLost, ErrorCode, LinkError, RemoteError
+from palpate.protos.messages import Origin, ServiceState
+from palpate.protos.session import Delivery
+from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+
+PATIENCE_S = 10.0
+
+
+def test_live_virtual_finger(bus: Any) -> None:
+    sensor = {"name": "finger", "driver": "virtual", "options": {"seed": 1, "rate_hz": 200}}
+    with bus.gateway({"sensors": [sensor], "tare_frames": 20}) as running:
+        electrodes = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+        wrench = bus.session.subscriber(WRENCH, delivery=Delivery.QUEUE)
+        pose = bus.session.subscriber(POSE, delivery=Delivery.QUEUE)
+        frames = [electrodes.next(timeout_s=PATIENCE_S).message for _ in range(60)]
+        assert frames[-1].tare_id != 0
+        assert frames[-1].stamp.origin is Origin.SIMULATED
+        sequences = [frame.stamp.sequence for frame in frames]
+        assert sequences == list(range(sequences[0], sequences[0] + 60))
+        assert wrench.next(timeout_s=PATIENCE_S).sensor == "finger"
+        assert pose.next(timeout_s=PATIENCE_S).message.indenter == "sphere_14mm"
+
+        bus.until(lambda: [a for a in bus.session.alive() if a.service == "gateway" and a.ready])
+        now = bus.state(ServiceState.READY)
+        assert now.sensors == ("finger",)
+        assert now.counters["frames_published"] >= 60
+        assert now.counters["tares"] == 1
+
+        known = bus.ask_tare("finger", tare_id=frames[-1].tare_id)
+        assert known.tare_id == frames[-1].tare_id
+        with pytest.raises(RemoteError, match="tare 77 is not known") as caught:
+            bus.ask_tare("finger", tare_id=77)
+        assert caught.value.code is ErrorCode.NOT_FOUND
+        running.stop.set()
+        running.thread.join(PATIENCE_S)
+        assert running.error is None
+        bus.until(lambda: not [a for a in bus.session.alive() if a.service == "gateway"])
+
+
+def test_tare_on_demand(bus: Any) -> None:
+    options = {"rate_hz": 200, "untouched_s": 60}
+    values = {"sensors": [{"driver": "virtual", "options": options}], "tare_frames": 20}
+    with bus.gateway(values):
+        tares = bus.session.subscriber(TARE, delivery=Delivery.QUEUE)
+        bus.state(ServiceState.READY)
+        asked = bus.ask_tare("finger", frames=10)
+        assert asked.frames_averaged == 10
+        seen = bus.until(lambda: tares.next(timeout_s=PATIENCE_S).message.tare_id == asked.tare_id)
+        assert seen
+
+
+def test_damaged_recording_does_not_end_the_other_sensor(bus: Any, tmp_path: Path) -> None:
+    (tmp_path / "empty.btd").write_bytes(b"")
+    values = {
+        "sensors": [
+            {"name": "broken", "driver": "text_log", "options": {"path": tmp_path / "empty.btd"}},
+            {"name": "good", "driver": "virtual", "options": {"rate_hz": 200}},
+        ]
+    }
+    with bus.gateway(values):
+        frames = bus.session.subscriber(ELECTRODES, sensor="good", delivery=Delivery.QUEUE)
+        now = bus.state(ServiceState.DEGRADED)
+        assert now.last_error is not None
+        assert "the file is empty" in now.last_error.message
+        for _ in range(20):
+            frames.next(timeout_s=PATIENCE_S)
+        now = bus.until(lambda: bus.status())
+        assert now.counters["good.frames_published"] >= 20
+        assert now.counters["broken.frames_published"] == 0
+
+
+class Flaky(virtual.Virtual):
+    """A virtual finger whose cable comes loose after 30 frames, and that cannot be opened once."""
+
+    opened = 0
+
+    def _open(self) -> Any:
+        Flaky.opened += 1
+        if Flaky.opened == 2:
+            raise DeviceLost("the port is gone", remedy="plug it in")
+        return super()._open()
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        if Flaky.opened == 1 and self.counters["frames"] >= 30:
+            raise DeviceLost("the cable came loose", remedy="plug it in")
+        return super()._read(timeout_s)
+
+
+def test_lost_device_is_opened_again(bus: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(DRIVERS, "flaky", "flaky_driver:Flaky")
+    module = types.ModuleType("flaky_driver")
+    module.Flaky = Flaky  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "flaky_driver", module)
+    Flaky.opened = 0
+    values = {
+        "sensors": [
+            {"name": "flaky", "driver": "flaky", "options": {"rate_hz": 200}},
+            {"name": "good", "driver": "virtual", "options": {"rate_hz": 200}},
+        ]
+    }
+    frames = bus.session.subscriber(ELECTRODES, sensor="flaky", delivery=Delivery.QUEUE)
+    others = bus.session.subscriber(ELECTRODES, sensor="good", delivery=Delivery.QUEUE)
+    with bus.gateway(values):
+        sequences = [frames.next(timeout_s=PATIENCE_S).message.stamp.sequence for _ in range(60)]
+        assert sequences == list(range(sequences[0], sequences[0] + 60))
+        good = [others.next(timeout_s=PATIENCE_S).message.stamp.sequence for _ in range(60)]
+        assert good == list(range(good[0], good[0] + 60))
+        now = bus.state(ServiceState.READY)
+    assert now.counters["flaky.device_lost"] == 2
+    assert now.last_error is not None
+    assert "device_lost" not in {k.removeprefix("good.") for k in now.counters}
+
+
+def test_defect_of_a_driver_ends_the_process(bus: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: virtual.Virtual, timeout_s: float) -> list[Reading]:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(virtual.Virtual, "_read", broken)
+    with pytest.raises(ZeroDivisionError):
+        node.run(GatewayConfig(), bus.link, "lab", threading.Event())
+
+
+def test_wrong_option_is_told_before_the_bus_is_joined() -> None:
+    config = parse_config(
+        GatewayConfig, {"sensors": [{"name": "a", "options": {"sed": 1}}]}, where="test"
+    )
+    with pytest.raises(ConfigError, match="options of sensor 'a': unknown key 'sed'"):
+        node.run(config, LinkConfig(), "lab", threading.Event())
+
+
+def test_no_router() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    link = LinkConfig(connect=(f"tcp/127.0.0.1:{port}",), wait_for_router_s=0.2)
+    with pytest.raises(LinkError, match=f"no router at tcp/127.0.0.1:{port}"):
+        node.run(GatewayConfig(), link, "lab", threading.Event())

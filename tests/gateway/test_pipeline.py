@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.gateway.clock_map import FileClock, LiveClock, PacedClock
+from palpate.gateway.device import DeviceIdentity, DeviceInfo
+from palpate.gateway.drivers import make_device
+from palpate.gateway.pipeline import Outgoing, Pipeline
+from palpate.gateway.readings import ElectrodeReading, Reading
+from palpate.protos.codec import ELECTRODE_FRAME
+from palpate.protos.errors import DeviceError
+from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate.protos.topics import TOPICS
+
+IDENTITY = DeviceIdentity("BT1", 1 / 4400)
+
+
+def info(*, live: bool) -> DeviceInfo:
+    return DeviceInfo("virtual", SensorType.BIOTAC, "test", 100.0, live, not live, Origin.SIMULATED)
+
+
+def readings(count: int, *, first: int = 0, value: int = 2000, missed: int = 0) -> list[Reading]:
+    return [
+        ElectrodeReading(
+            tick=k,
+            time_s=k * 0.01,
+            missed_before=missed,
+            electrodes=np.full(19, value, np.uint16),
+            pdc=2400,
+            pac=np.full(22, 2040, np.uint16),
+            tac=2050,
+            tdc=1900,
+            validity=(1 << 44) - 1,
+        )
+        for k in range(first, first + count)
+    ]
+
+
+def pipeline(*, live: bool, tare_frames: int = 10) -> Pipeline:
+    made = Pipeline(info(live=live), tare_frames=tare_frames)
+    made.begin(IDENTITY, LiveClock() if live else FileClock("BT1", None))
+    return made
+
+
+def frames(out: list[Outgoing]) -> list[ElectrodeFrame]:
+    return [item.message for item in out if isinstance(item.message, ElectrodeFrame)]
+
+
+def tares(out: list[Outgoing]) -> list[Tare]:
+    return [item.message for item in out if isinstance(item.message, Tare)]
+
+
+def test_live_frames_go_out_at_once_and_carry_the_tare_later() -> None:
+    made = pipeline(live=True)
+    out = made.push(readings(25), arrival_ns=10**9)
+    ids = [frame.tare_id for frame in frames(out)]
+    assert ids[:10] == [NO_TARE] * 10
+    (tare,) = tares(out)
+    assert ids[10:] == [tare.tare_id] * 15
+    assert out[10].message is tare  # before the first frame that names it
+    assert made.counters["frames_untared"] == 10
+    assert made.ledger.find(tare.tare_id) is tare
+
+
+def test_recording_is_held_until_its_tare() -> None:
+    made = pipeline(live=False)
+    assert made.push(readings(9), 0) == []
+    out = made.push(readings(5, first=9), 0)
+    (tare,) = tares(out)
+    assert out[0].message is tare
+    assert [frame.tare_id for frame in frames(out)] == [tare.tare_id] * 14
+    assert [frame.stamp.sequence for frame in frames(out)] == list(range(1, 15))
+    assert made.counters["frames_untared"] == 0
+
+
+def test_short_recording_goes_out_untared_and_says_so() -> None:
+    made = pipeline(live=False)
+    made.push(readings(9), 0)
+    out = made.finish()
+    assert [frame.tare_id for frame in frames(out)] == [NO_TARE] * 9
+    assert "BT1 delivered 9 frames, a tare needs 10" in str(made.tare_error)
+    assert made.finish() == []
+
+
+def test_recording_that_starts_touched_is_held_for_ten_attempts_only() -> None:
+    made = pipeline(live=False)
+    moving = [readings(1, first=k, value=2000 + 300 * (k % 2))[0] for k in range(105)]
+    out = made.push(moving, 0)
+    assert [frame.tare_id for frame in frames(out)] == [NO_TARE] * 105
+    assert made.counters["tares_refused"] == 10
+    assert "E1 varies by 150 counts" in str(made.tare_error)
+    # A quiet stretch later still gives a tare.
+    assert len(tares(made.push(readings(20, first=105), 0))) == 1
+    assert made.tare_error is None
+
+
+def test_sequences_go_on_when_the_device_is_opened_again() -> None:
+    made = pipeline(live=True)
+    made.push(readings(5), 10**9)
+    made.begin(IDENTITY, LiveClock())
+    out = frames(made.push(readings(5), 2 * 10**9))
+    assert [frame.stamp.sequence for frame in out] == [6, 7, 8, 9, 10]
+
+
+def test_gaps_are_stamped_and_counted() -> None:
+    made = pipeline(live=True)
+    out = frames(made.push(readings(3, missed=2), 10**9))
+    assert [frame.stamp.missed_before for frame in out] == [2, 2, 2]
+    assert made.counters["missing_frames"] == 6
+
+
+def test_tare_on_demand_uses_the_next_frames() -> None:
+    made = pipeline(live=True)
+    made.push(readings(10), 10**9)
+    future = made.ask_tare(5)
+    made.push(readings(4, first=10, value=1500), 10**9)
+    assert not future.done()
+    out = made.push(readings(3, first=14, value=1500), 10**9)
+    tare = future.result(timeout=0)
+    assert tare.electrodes.tolist() == [1500.0] * 19
+    assert tares(out) == [tare]
+    assert [frame.tare_id == tare.tare_id for frame in frames(out)] == [False, True, True]
+
+
+def test_tare_on_demand_of_a_touched_finger_is_refused() -> None:
+    made = pipeline(live=True)
+    future = made.ask_tare(4)
+    made.push([readings(1, first=k, value=2000 + 300 * (k % 2))[0] for k in range(4)], 10**9)
+    with pytest.raises(DeviceError, match="E1 varies by 150 counts"):
+        future.result(timeout=0)
+
+
+def test_no_tare_after_the_end() -> None:
+    made = pipeline(live=False)
+    future = made.ask_tare(5)
+    made.finish()
+    with pytest.raises(DeviceError, match="not tared: the recording has ended"):
+        future.result(timeout=0)
+    with pytest.raises(DeviceError, match="cannot be tared: the recording has ended"):
+        made.ask_tare(5)
+
+
+def test_paced_items_are_due_at_their_stamp() -> None:
+    made = Pipeline(info(live=False), tare_frames=10)
+    made.begin(IDENTITY, PacedClock())
+    out = made.push(readings(20), 0)
+    assert all(i.due_ns == f.stamp.monotonic_ns for i, f in zip(out[1:], frames(out), strict=True))
+    assert out[0].due_ns == out[1].due_ns
+
+
+def test_replaying_twice_gives_the_same_bytes() -> None:
+    runs = []
+    for _ in range(2):
+        with make_device("virtual", {"realtime": False, "frames": 100}) as device:
+            made = Pipeline(device.info)
+            made.begin(device.identity, FileClock(device.identity.serial, None))
+            out: list[Outgoing] = []
+            while got := device.read(1.0):
+                out += made.push(got, 0)
+            runs.append([TOPICS[item.topic].codec.encode(item.message) for item in out])
+    assert runs[0] == runs[1]
+    assert len(runs[0]) == 301
+
+
+def test_record_passes_unchanged_and_its_tares_are_known(record: Callable[..., Path]) -> None:
+    with make_device("record", {"path": record(60)}) as device:
+        made = Pipeline(device.info)
+        made.begin(device.identity, FileClock("x", None))
+        out: list[Any] = []
+        while got := device.read(1.0):
+            out += made.push(got, 0)
+    assert made.counters["frames_published"] == 60
+    assert made.counters["tares"] == 1
+    first = next(item for item in out if item.topic == "electrodes")
+    frame = ELECTRODE_FRAME.decode(first.message)
+    assert made.ledger.find(frame.tare_id).tare_id == frame.tare_id
+    with pytest.raises(DeviceError, match="it is a record, which brings its own tares"):
+        made.ask_tare(5)
+
+
+def test_real_capture_is_tared_from_its_first_frames(shared_data: Path) -> None:
+    path = shared_data / "syntouch_btd_raw" / "data.btd.gz"
+    if not path.is_file():
+        pytest.skip("the public BTD capture is not beside the project")
+    with make_device("text_log", {"path": path}) as device:
+        made = Pipeline(device.info)
+        identity = device.identity
+        made.begin(identity, FileClock(identity.serial, identity.start_wall_ns))
+        out: list[Outgoing] = []
+        while got := device.read(1.0):
+            out += made.push(got, 0)
+        out += made.finish()
+    assert made.counters["frames_published"] == 2124
+    assert made.counters["missing_frames"] == 530
+    assert made.counters["frames_untared"] == 0
+    for item in out:
+        TOPICS[item.topic].codec.encode(item.message)
