@@ -129,6 +129,42 @@ def test_a_slow_or_overloaded_service_is_told_as_such(pair: Any, examples: dict[
     assert codes.count(ErrorCode.DEADLINE_EXCEEDED) == 2
 
 
+def test_a_quick_question_overtakes_a_slow_one(pair: Any, examples: dict[str, Any]) -> None:
+    """Looking up a known tare must not wait for a tare that is being taken."""
+    a, b = pair
+    release = threading.Event()
+
+    def handler(request: TareRequest) -> Tare:
+        if request.tare_id == 0:
+            release.wait(10)
+        tare: Tare = examples["Tare"]
+        return tare
+
+    a.queryable(
+        "tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=handler, workers=2
+    )
+    time.sleep(0.3)
+
+    def ask(tare_id: int) -> Tare:
+        reply: Tare = b.query(
+            "tare",
+            sensor="finger",
+            request=TareRequest(tare_id),
+            request_codec=TARE_REQUEST,
+            reply_codec=TARE,
+            timeout_s=5,
+        )
+        return reply
+
+    slow = threading.Thread(target=ask, args=(0,))
+    slow.start()
+    time.sleep(0.1)
+    assert ask(7).tare_id == examples["Tare"].tare_id
+    assert slow.is_alive()
+    release.set()
+    slow.join()
+
+
 def test_presence_comes_and_goes(pair: Any, wait_until: WaitUntil) -> None:
     a, b = pair
     with a.presence("features", instance="features") as presence:

@@ -55,7 +55,7 @@ def test_newest_wins_and_the_dropped_are_counted_but_not_as_lost(
     for sequence in range(1, 21):
         for publisher in fingers:
             publisher.put(frame_of(sequence))
-    wait_until(lambda: subscriber.counters["received"] == 40)
+    wait_until(lambda: subscriber.counters.get("received") == 40)
     got = {subscriber.next(1).sensor: None for _ in range(2)}
     assert set(got) == {"left", "right"}
     with pytest.raises(StreamTimeout):
@@ -65,6 +65,23 @@ def test_newest_wins_and_the_dropped_are_counted_but_not_as_lost(
     assert {subscriber.next(1).message.stamp.sequence for _ in range(2)} == {21, 24}
     assert subscriber.counters["dropped"] == 38
     assert subscriber.counters["lost_on_bus"] == 3  # 21, 22, 23 of the right finger
+
+
+def test_a_deeper_newest_keeps_the_last_few_in_order(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    subscriber = b.subscriber(ELECTRODES, delivery=Delivery.NEWEST, depth=3)
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    for sequence in range(1, 11):
+        publisher.put(frame_of(sequence))
+    wait_until(lambda: subscriber.counters.get("received") == 10)
+    assert [subscriber.next(1).message.stamp.sequence for _ in range(3)] == [8, 9, 10]
+    with pytest.raises(StreamTimeout):
+        subscriber.next(timeout_s=0.05)
+    assert subscriber.counters["dropped"] == 7
+    assert "lost_on_bus" not in subscriber.counters
 
 
 def test_every_loses_nothing_with_a_slow_consumer(
@@ -99,7 +116,7 @@ def test_a_full_queue_counts_what_it_refuses(
     wait_until(publisher.matched)
     for sequence in range(1, 31):
         publisher.put(frame_of(sequence))
-    wait_until(lambda: subscriber.counters["received"] == 30)
+    wait_until(lambda: subscriber.counters.get("received") == 30)
     assert [subscriber.next(1).message.stamp.sequence for _ in range(10)] == list(range(1, 11))
     assert subscriber.counters["overflow"] == 20
 

@@ -103,10 +103,24 @@ class Session:
         station: str | None = None,
         delivery: Delivery = Delivery.NEWEST,
         capacity: int = 4096,
+        depth: int = 1,
     ) -> Subscriber[M]:
-        """Subscribe to a topic; ``"*"`` = any sensor, service, instance or station."""
+        """Subscribe to a topic; ``"*"`` = any sensor, service, instance or station.
+
+        Args:
+            topic: From ``palpate.protos.topics``.
+            sensor: Name of the sensor.
+            service: Name of the service, for a service's topic.
+            instance: Name of its instance.
+            station: Name of the station; None = the session's own.
+            delivery: What happens to messages that come faster than they are taken.
+            capacity: Messages that may wait, for ``QUEUE`` and ``EVERY``.
+            depth: Messages that may wait per sensor, for ``NEWEST``.
+        """
         key = self._key(topic, sensor, service, instance, station)
-        return self._keep(Subscriber(self._raw, topic, key, delivery=delivery, capacity=capacity))
+        return self._keep(
+            Subscriber(self._raw, topic, key, delivery=delivery, capacity=capacity, depth=depth)
+        )
 
     def tap(
         self,

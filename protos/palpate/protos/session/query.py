@@ -47,8 +47,7 @@ def error_reply(error: BaseException) -> ErrorReply:
 class Queryable:
     """Answers queries with ``handler`` in its own threads. Made by ``Session.queryable``.
 
-    With one worker queries are answered one after another; more let a quick question overtake a slow
-    one.
+    One worker answers one query after another; more let a quick question overtake a slow one.
 
     A handler that raises, a request that does not decode, a full queue: each is answered with a
     typed error. Zenoh itself would give the caller silence.

@@ -18,7 +18,8 @@ T = TypeVar("T")
 class Delivery(Enum):
     """What happens to messages that arrive faster than they are consumed.
 
-    ``NEWEST``: per key only the newest waits; overwritten ones are counted as ``dropped``.
+    ``NEWEST``: per key only the newest few (one by default) wait; older ones are counted as
+    ``dropped``.
     ``QUEUE``: first in, first out; beyond the capacity the newcomer is counted as ``overflow``.
     ``EVERY``: first in, first out; beyond the capacity the *sender* waits. Offline replay only.
     """
@@ -42,24 +43,35 @@ class Waiting(Protocol[T]):
 
 
 class NewestWins(Generic[T]):
-    """Per key only the newest item waits; keys are served in the order in which they waited."""
+    """Per key only the newest items wait; keys are served in the order in which they waited.
 
-    def __init__(self, counters: Counter[str]) -> None:
-        self._waiting: dict[str, T] = {}
+    Args:
+        counters: Where dropped items are counted.
+        depth: Items that may wait per key. More than one lets a consumer that was held up for a
+            moment catch up without loss; how old an item may be is the consumer's to check.
+    """
+
+    def __init__(self, counters: Counter[str], depth: int) -> None:
+        self._waiting: dict[str, deque[T]] = {}
         self._lost: Counter[str] = Counter()
         self._order: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._counters = counters
+        self._depth = depth
 
     def put(self, key: str, item: T) -> None:
         """See ``Waiting.put``."""
         with self._lock:
-            replaced = key in self._waiting
-            self._waiting[key] = item
-            if replaced:
+            items = self._waiting.get(key)
+            if items is None:
+                items = self._waiting[key] = deque()
+            full = len(items) == self._depth
+            if full:
+                items.popleft()
                 self._lost[key] += 1
                 self._counters["dropped"] += 1
-        if not replaced:
+            items.append(item)
+        if not full:  # else the turn of the dropped item is this one's
             self._order.put(key)
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
@@ -69,7 +81,7 @@ class NewestWins(Generic[T]):
         except queue.Empty:
             return None
         with self._lock:
-            return self._waiting.pop(key), self._lost[key]
+            return self._waiting[key].popleft(), self._lost[key]
 
     def close(self) -> None:
         """Nothing to release."""
@@ -118,8 +130,10 @@ class Fifo(Generic[T]):
             self._changed.notify_all()
 
 
-def waiting_for(delivery: Delivery, capacity: int, counters: Counter[str]) -> Waiting[T]:
-    """The queue that keeps ``delivery``'s promise."""
+def waiting_for(
+    delivery: Delivery, capacity: int, counters: Counter[str], *, depth: int = 1
+) -> Waiting[T]:
+    """The queue that keeps ``delivery``'s promise; ``depth`` is for ``NEWEST``."""
     if delivery is Delivery.NEWEST:
-        return NewestWins(counters)
+        return NewestWins(counters, depth)
     return Fifo(counters, capacity, sender_waits=delivery is Delivery.EVERY)

@@ -52,7 +52,7 @@ def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
                     "queue": {
                         # Express messages take a batch each: with the default of two, twenty
                         # sensors that publish in the same millisecond lose frames.
-                        "size": {"real_time": 16},
+                        "size": {"real_time": 16, "data_high": 16},
                         "congestion_control": {
                             "drop": {"wait_before_drop": 2000},
                             "block": {"wait_before_close": round(LOSSLESS_STALL_S * 1e6)},

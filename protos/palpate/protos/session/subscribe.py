@@ -74,12 +74,13 @@ class Subscriber(Generic[M]):
         *,
         delivery: Delivery,
         capacity: int,
+        depth: int = 1,
     ) -> None:
         self.topic = topic
         self.key = key
         self._counters: Counter[str] = Counter()
         self._waiting: Waiting[tuple[zenoh.Sample, int]] = waiting_for(
-            delivery, capacity, self._counters
+            delivery, capacity, self._counters, depth=depth
         )
         self._newest: dict[str, tuple[zenoh.Sample, int]] = {}
         self._addresses: dict[str, Address] = {}

@@ -1,0 +1,252 @@
+"""Small ONNX bundles, frames of an imagined finger, and a bus on loopback."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from palpate.protos import clock
+from palpate.protos.bundle import TASKS, Bundle, Manifest, read_bundle, write_bundle
+from palpate.protos.config import LinkConfig
+from palpate.protos.messages import (
+    PAC_SAMPLES,
+    ElectrodeFrame,
+    IndenterPoseFrame,
+    Origin,
+    SensorType,
+    Stamp,
+    Tare,
+    WrenchFrame,
+)
+from palpate.protos.session import run_router
+
+onnx = pytest.importorskip("onnx")
+helper = onnx.helper
+
+THRESHOLD_N = 0.2
+BASELINE_COUNTS = 2000.0
+
+
+@dataclasses.dataclass
+class Recipe:
+    """What the graph of a test bundle looks like; the defaults make a good one."""
+
+    inputs: tuple[str, ...] = ("electrodes",)
+    width: int = 19
+    outputs: tuple[str, ...] = ("force", "force_sd", "contact_location", "contact_location_sd")
+    dtype: int = onnx.TensorProto.FLOAT
+    poison: bool = False
+    opset: int = 17
+
+    def model(self) -> Any:
+        """The graph: each output is ``electrodes @ W``; a deviation is its magnitude."""
+        nodes, weights, source = [], [], self.inputs[0]
+        if self.dtype != onnx.TensorProto.FLOAT:
+            nodes.append(helper.make_node("Cast", [source], ["cast"], to=onnx.TensorProto.FLOAT))
+            source = "cast"
+        for at, name in enumerate(self.outputs):
+            values = np.random.default_rng(at).normal(0, 0.01, (self.width, 3)).astype(np.float32)
+            weights.append(onnx.numpy_helper.from_array(values, f"w_{name}"))
+            raw = f"raw_{name}" if name.endswith("_sd") or self.poison else name
+            nodes.append(helper.make_node("MatMul", [source, f"w_{name}"], [raw]))
+            if name.endswith("_sd"):
+                nodes.append(helper.make_node("Abs", [raw], [name]))
+            elif self.poison:  # zero / zero on every input
+                nodes.append(helper.make_node("Sub", [raw, raw], [f"zero_{name}"]))
+                nodes.append(helper.make_node("Div", [f"zero_{name}", f"zero_{name}"], [name]))
+        tensor = helper.make_tensor_value_info
+        graph = helper.make_graph(
+            nodes,
+            "test",
+            [tensor(name, self.dtype, ["N", self.width]) for name in self.inputs],
+            [tensor(name, onnx.TensorProto.FLOAT, ["N", 3]) for name in self.outputs],
+            weights,
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", self.opset)])
+        model.ir_version = 10
+        return model
+
+
+class MakeBundle(Protocol):
+    """Writes a test bundle and returns its folder."""
+
+    def __call__(
+        self,
+        recipe: Recipe | None = None,
+        *,
+        model: bytes | None = None,
+        golden_shift: float = 0.0,
+        **manifest: Any,
+    ) -> Path: ...
+
+
+@pytest.fixture
+def recipe() -> type[Recipe]:
+    return Recipe
+
+
+@pytest.fixture
+def make_bundle(tmp_path: Path) -> MakeBundle:
+    """Factory of bundles whose model may be spoiled while the manifest still claims the best."""
+    made: list[Path] = []
+
+    def make(
+        recipe: Recipe | None = None,
+        *,
+        model: bytes | None = None,
+        golden_shift: float = 0.0,
+        **changes: Any,
+    ) -> Path:
+        good = Recipe()
+        contract = TASKS["features"]
+        payload = (recipe or good).model().SerializeToString() if model is None else model
+        rng = np.random.default_rng(7)
+        golden = {"electrodes": rng.normal(0, 100, (8, 19)).astype(np.float32)}
+        for at, name in enumerate(good.outputs):
+            weights = np.random.default_rng(at).normal(0, 0.01, (19, 3)).astype(np.float32)
+            values = golden["electrodes"] @ weights + np.float32(golden_shift)
+            golden[name] = np.abs(values) if name.endswith("_sd") else values
+        manifest = Manifest(
+            name="test",
+            version=1,
+            task="features",
+            inputs=contract.inputs,
+            outputs=contract.outputs + contract.optional,
+            sensor_type="BIOTAC",
+            contact_threshold_n=THRESHOLD_N,
+            training_data_sha256="0" * 64,
+            trained_on="nothing",
+            metrics={"force_median_error_n": 0.1},
+            model_sha256="",
+            golden_sha256="",
+            created="2026-01-01T00:00:00Z",
+            palpate_version="0",
+            opset=17,
+        )
+        folder = tmp_path / "bundles" / str(len(made))
+        write_bundle(
+            folder,
+            model=payload,
+            golden=golden,
+            manifest=dataclasses.replace(manifest, **changes),
+        )
+        made.append(folder)
+        return folder
+
+    return make
+
+
+@pytest.fixture
+def bundle(make_bundle: MakeBundle) -> Bundle:
+    return read_bundle(make_bundle())
+
+
+@pytest.fixture
+def make_frame() -> Callable[..., ElectrodeFrame]:
+    """Factory of frames: the same sequence gives the same counts."""
+
+    def make(
+        sequence: int = 1,
+        *,
+        tare_id: int = 5,
+        origin: Origin = Origin.SIMULATED,
+        age_s: float = 0.0,
+        monotonic_ns: int | None = None,
+        validity: int | None = None,
+        sensor_type: SensorType = SensorType.BIOTAC,
+    ) -> ElectrodeFrame:
+        now_ns, wall_ns = clock.now()
+        taken_ns = now_ns - round(age_s * 1e9) if monotonic_ns is None else monotonic_ns
+        rng = np.random.default_rng(sequence)
+        press = 300 * np.sin(sequence / 40) ** 2
+        shape = sensor_type.electrode_count
+        counts = BASELINE_COUNTS - press * np.linspace(0, 1, shape) + rng.normal(0, 1, shape)
+        everything = (1 << sensor_type.validity_bits) - 1
+        return ElectrodeFrame(
+            Stamp(sequence, sequence, taken_ns, wall_ns, clock.CLOCK_ID, origin),
+            "BT-TEST",
+            sensor_type,
+            np.clip(counts, 0, 4095).astype(np.uint16),
+            1500 + round(press / 4),
+            (2000 + 50 * rng.normal(size=PAC_SAMPLES)).astype(np.uint16),
+            2100,
+            1900,
+            everything if validity is None else validity,
+            227_000,
+            tare_id,
+        )
+
+    return make
+
+
+@pytest.fixture
+def make_tare(make_frame: Callable[..., ElectrodeFrame]) -> Callable[..., Tare]:
+    def make(tare_id: int = 5) -> Tare:
+        return Tare(
+            tare_id,
+            make_frame().stamp,
+            "BT-TEST",
+            np.full(19, BASELINE_COUNTS, np.float32),
+            np.full(19, 1.5, np.float32),
+            1500.0,
+            2000.0,
+            2100.0,
+            1900.0,
+            100,
+        )
+
+    return make
+
+
+@pytest.fixture
+def make_truth() -> Callable[[ElectrodeFrame], tuple[WrenchFrame, IndenterPoseFrame]]:
+    """Force and indenter of a frame, as a force/torque sensor and a robot would tell them."""
+
+    def make(frame: ElectrodeFrame) -> tuple[WrenchFrame, IndenterPoseFrame]:
+        press = float(np.sin(frame.stamp.sequence / 40) ** 2)
+        force: npt.NDArray[np.float32] = np.array([0.2, -0.1, 3.0], np.float32) * np.float32(press)
+        position = np.array([-0.004 + 0.006 * np.sin(frame.stamp.sequence / 90), 0.0, -0.007])
+        return (
+            WrenchFrame(frame.stamp, "FT-TEST", force, np.zeros(3, np.float32)),
+            IndenterPoseFrame(
+                frame.stamp, "sphere", position, np.array([1.0, 0, 0, 0]), press > 0.05
+            ),
+        )
+
+    return make
+
+
+@pytest.fixture
+def link() -> Iterator[LinkConfig]:
+    """A router on a free loopback port, and how to reach it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    stop = threading.Event()
+    router = threading.Thread(target=run_router, args=((endpoint,), stop))
+    router.start()
+    yield LinkConfig(connect=(endpoint,), wait_for_router_s=10.0)
+    stop.set()
+    router.join(timeout=10)
+
+
+@pytest.fixture
+def until() -> Callable[[Callable[[], bool]], None]:
+    """Wait for a condition; fail after a long time."""
+
+    def wait(condition: Callable[[], bool], *, timeout_s: float = 15.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, "what was waited for did not happen"
+            time.sleep(0.01)
+
+    return wait

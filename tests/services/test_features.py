@@ -1,0 +1,269 @@
+"""The features service on a real bus: what it answers, what it refuses, what it counts."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.protos.codec import (
+    ELECTRODE_FRAME,
+    MODEL_METADATA,
+    SERVICE_REQUEST,
+    STATUS,
+    TARE_REQUEST,
+)
+from palpate.protos.codec import TARE as TARE_CODEC
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import ConfigError, StreamTimeout
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    FeatureEstimate,
+    Origin,
+    ServiceRequest,
+    ServiceState,
+    Status,
+    Tare,
+    TareRequest,
+)
+from palpate.protos.session import Delivery, Session
+from palpate.protos.topics import ELECTRODES, FEATURES, TARE
+from palpate.services import features
+from palpate.services.config import FeaturesConfig
+from palpate.services.estimator import estimate
+from palpate.services.runtime import Runtime
+
+Frames = Callable[..., ElectrodeFrame]
+Tares = Callable[..., Tare]
+Until = Callable[[Callable[[], bool]], None]
+Serve = Callable[..., AbstractContextManager[Session]]
+
+
+@pytest.fixture
+def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> Serve:
+    """Run the service while the block runs; the block gets a session of its own."""
+
+    @contextmanager
+    def running(**config: Any) -> Iterator[Session]:
+        stop = threading.Event()
+        settings = FeaturesConfig(bundle=str(make_bundle()), **config)
+        node = threading.Thread(target=features.run, args=(settings, link, "lab", stop))
+        node.start()
+        try:
+            with Session.open(link) as session:
+                until(lambda: any(a.service == "features" and a.ready for a in session.alive()))
+                yield session
+        finally:
+            stop.set()
+            node.join(timeout=10)
+        assert not node.is_alive()
+
+    return running
+
+
+def announce(session: Session, sensor: str, tare: Tare) -> None:
+    """Publish a tare as a gateway does, and answer for it: a frame may overtake the stream."""
+    session.queryable(
+        "tare", sensor=sensor, request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
+    )
+    session.publisher(TARE, sensor=sensor).put(tare)
+
+
+def ask_status(session: Session) -> Status:
+    return session.query(
+        "status",
+        service="features",
+        request=ServiceRequest(),
+        request_codec=SERVICE_REQUEST,
+        reply_codec=STATUS,
+        timeout_s=5.0,
+    )
+
+
+def counters(session: Session) -> dict[str, int]:
+    return dict(ask_status(session).counters)
+
+
+def test_answers_frames_and_says_what_it_is(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    with serve(max_age_s=10.0) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        announce(session, "finger", make_tare())
+        for sequence in range(1, 21):
+            frames.put(make_frame(sequence))
+            got = estimates.next(5.0)
+            assert got.sensor == "finger"
+            assert got.message.source.sequence == sequence
+        until(lambda: counters(session).get("estimates_published") == 20)
+        status = ask_status(session)
+        assert status.state is ServiceState.READY
+        assert status.sensors == ("finger",)
+        until(lambda: ask_status(session).gauges.get("latency_p50_s", 0.0) > 0)
+        metadata = session.query(
+            "model",
+            service="features",
+            request=ServiceRequest(),
+            request_codec=SERVICE_REQUEST,
+            reply_codec=MODEL_METADATA,
+        )
+        assert metadata.bundle_sha256 == got.message.bundle_sha256
+
+
+def test_refuses_what_it_must_and_counts_it(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    good = make_frame().validity
+    with serve(max_age_s=10.0) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        announce(session, "finger", make_tare())
+        wanted: dict[str, int] = {}
+        # One sensor each, so that newest-wins and the order of stamps play no part.
+        spoiled: dict[str, dict[str, Any]] = {
+            "stale": {"age_s": 60.0},
+            "untared": {"tare_id": 0},
+            "invalid_channels": {"validity": good ^ 1},
+            "replayed_refused": {"origin": Origin.REPLAYED},
+            "tare_unknown": {"tare_id": 77},
+        }
+        for name, changes in spoiled.items():
+            sensor = f"s-{name}"
+            if name != "tare_unknown":
+                announce(session, sensor, make_tare())
+            session.publisher(ELECTRODES, sensor=sensor).put(make_frame(**changes))
+            wanted[name] = 1
+            until(lambda: all(counters(session).get(k) == v for k, v in wanted.items()))
+        with pytest.raises(StreamTimeout):
+            estimates.next(0.1)
+        session.publisher(ELECTRODES, sensor="finger").put(make_frame(99))
+        assert estimates.next(5.0).message.source.sequence == 99
+
+
+def test_broken_payloads_are_counted_and_harm_nobody(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    good = ELECTRODE_FRAME.encode(make_frame(1))
+    eighteen: Any = ELECTRODE_FRAME.message_type.FromString(good)
+    eighteen.electrodes = eighteen.electrodes[:36]
+    with serve(max_age_s=10.0) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        frames.put_payload(eighteen.SerializeToString())
+        until(lambda: counters(session).get("rejected_electrode_count") == 1)
+        frames.put_payload(b"\xff" * 40)
+        until(lambda: counters(session).get("rejected_parse") == 1)
+        announce(session, "finger", make_tare())
+        frames.put(make_frame(2))
+        assert estimates.next(5.0).message.source.sequence == 2
+
+
+def test_nan_baseline_is_never_used(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    poisoned: Any = TARE_CODEC.message_type.FromString(TARE_CODEC.encode(make_tare()))
+    poisoned.electrodes[3] = float("nan")
+    with serve(max_age_s=10.0) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        session.publisher(TARE, sensor="finger").put_payload(poisoned.SerializeToString())
+        session.publisher(ELECTRODES, sensor="finger").put(make_frame())
+        until(lambda: counters(session).get("tare_unknown") == 1)
+        with pytest.raises(StreamTimeout):
+            estimates.next(0.1)
+
+
+def test_newest_frame_wins_behind_a_slow_model(
+    serve: Serve,
+    make_frame: Frames,
+    make_tare: Tares,
+    until: Until,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    quick = Runtime.run
+
+    def slow(self: Runtime, sample: Any) -> Any:
+        time.sleep(0.03)
+        return quick(self, sample)
+
+    with serve(max_age_s=None) as session:
+        monkeypatch.setattr(Runtime, "run", slow)
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        announce(session, "finger", make_tare())
+        for sequence in range(1, 101):
+            frames.put(make_frame(sequence))
+            time.sleep(0.002)
+        answered = [estimates.next(5.0).message.source.sequence]
+        while answered[-1] != 100:
+            answered.append(estimates.next(5.0).message.source.sequence)
+        assert answered == sorted(set(answered))
+        until(lambda: counters(session).get("estimates_published") == len(answered))
+        final = counters(session)
+        assert final["dropped_newest_wins"] == 100 - len(answered) > 0
+        assert final.get("lost_on_bus", 0) == 0
+
+
+def test_lost_tare_of_one_sensor_does_not_hold_up_another(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    release = threading.Event()
+
+    def hangs(_: TareRequest) -> Tare:
+        release.wait(20)
+        return make_tare(77)
+
+    with serve(max_age_s=None, tare_timeout_s=0.1) as session:
+        session.queryable(
+            "tare", sensor="lost", request=TARE_REQUEST, reply=TARE_CODEC, handler=hangs
+        )
+        estimates = session.subscriber(FEATURES, sensor="finger", delivery=Delivery.QUEUE)
+        announce(session, "finger", make_tare())
+        lost = session.publisher(ELECTRODES, sensor="lost")
+        finger = session.publisher(ELECTRODES, sensor="finger")
+        for sequence in range(1, 31):
+            lost.put(make_frame(sequence, tare_id=77))
+            finger.put(make_frame(sequence))
+            assert estimates.next(5.0).message.source.sequence == sequence
+        until(lambda: counters(session).get("tare_unknown", 0) > 20)
+        release.set()
+
+
+def test_lossless_replay_answers_every_frame_with_the_bytes_of_the_estimator(
+    serve: Serve, bundle: Any, make_frame: Frames, make_tare: Tares
+) -> None:
+    from palpate.protos.codec import FEATURE_ESTIMATE
+    from palpate.services.runtime import load
+
+    replayed = [make_frame(n, origin=Origin.REPLAYED, monotonic_ns=n) for n in range(1, 501)]
+    with serve(delivery="every", accept_replayed=True) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.EVERY)
+        announce(session, "finger", make_tare())
+        frames = session.publisher(ELECTRODES, sensor="finger", lossless=True)
+        for frame in replayed:
+            frames.put(frame)
+        answers = [estimates.next(5.0).payload for _ in replayed]
+    runtime = load(bundle, "features")
+    for frame, payload in zip(replayed, answers, strict=True):
+        wanted = estimate(frame, make_tare(), runtime)
+        assert isinstance(wanted, FeatureEstimate)
+        found = FEATURE_ESTIMATE.decode(payload)
+        np.testing.assert_array_equal(found.force, wanted.force)
+        assert found.source == wanted.source
+
+
+def test_ready_token_goes_when_it_stops(serve: Serve, link: LinkConfig, until: Until) -> None:
+    with Session.open(link) as observer:
+        with serve():
+            assert [a.ready for a in observer.alive()] == [True]
+        until(lambda: observer.alive() == [])
+
+
+def test_unknown_bundle_lists_what_there_is() -> None:
+    with pytest.raises(ConfigError, match="bundle 'no-such'"):
+        features.run(FeaturesConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event())

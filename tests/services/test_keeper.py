@@ -1,0 +1,227 @@
+"""Files of the recorder without a bus: rotation, full disks, what a killed run leaves behind."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.protos.codec import ELECTRODE_FRAME
+from palpate.protos.errors import ErrorCode
+from palpate.protos.health import Health
+from palpate.protos.messages import ElectrodeFrame, ServiceState
+from palpate.protos.record import RecordWriter, check_readable, read_record
+from palpate.protos.session import Sample
+from palpate.protos.topics import ELECTRODES, sensor_key
+from palpate.services import keeper as keeper_module
+from palpate.services.config import RecorderConfig
+from palpate.services.keeper import RecordKeeper
+from palpate.services.recovery import leftovers, recover_all
+
+Frames = Callable[..., ElectrodeFrame]
+Until = Callable[[Callable[[], bool]], None]
+
+
+def sample_of(payload: bytes) -> Sample:
+    key = sensor_key("lab", "finger", "electrodes")
+    return Sample(
+        "electrodes",
+        "lab",
+        "finger",
+        key,
+        ELECTRODES.encoding,
+        payload,
+        time.monotonic_ns(),
+        time.time_ns(),
+    )
+
+
+@pytest.fixture
+def sample(make_frame: Frames) -> Callable[[int], Sample]:
+    return lambda sequence: sample_of(ELECTRODE_FRAME.encode(make_frame(sequence)))
+
+
+@pytest.fixture
+def open_keeper(tmp_path: Path) -> Callable[..., Any]:
+    @contextmanager
+    def opened(**config: Any) -> Iterator[tuple[RecordKeeper, Health]]:
+        health = Health("recorder", "recorder")
+        settings = {"out": tmp_path / "runs", "rrd": False, "min_free_bytes": 0, **config}
+        keeper = RecordKeeper(RecorderConfig(**settings), "lab", health)
+        keeper.start()
+        try:
+            yield keeper, health
+        finally:
+            keeper.close()
+
+    return opened
+
+
+def test_record_holds_what_was_written(
+    open_keeper: Any, sample: Callable[[int], Sample], tmp_path: Path
+) -> None:
+    samples = [sample(n) for n in range(1, 50)]
+    with open_keeper() as (keeper, health):
+        for item in samples:
+            keeper.write(item)
+            keeper.tick()
+        assert keeper.path is not None
+    (record,) = (tmp_path / "runs").iterdir()
+    assert record.name.startswith("lab-2")
+    check_readable(record)
+    items = list(read_record(record))
+    assert [item.payload for item in items] == [item.payload for item in samples]
+    assert [item.sequence for item in items] == list(range(1, 50))
+    assert health.counters["recorded_electrodes"] == 49
+
+
+def test_broken_payload_is_kept_and_counted(open_keeper: Any, tmp_path: Path) -> None:
+    with open_keeper() as (keeper, health):
+        keeper.write(sample_of(b"\xff" * 30))
+    (record,) = (tmp_path / "runs").iterdir()
+    assert [item.payload for item in read_record(record)] == [b"\xff" * 30]
+    assert health.counters["invalid_parse"] == 1
+
+
+def test_rotation_by_size_loses_nothing(
+    open_keeper: Any,
+    sample: Callable[[int], Sample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(keeper_module, "CHECK_S", 0.0)
+    with open_keeper(rotate_bytes=64 * 1024) as (keeper, _):
+        for sequence in range(1, 1501):
+            keeper.write(sample(sequence))
+            keeper.tick()
+    records = sorted((tmp_path / "runs").iterdir())
+    assert len(records) > 1
+    sequences = [item.sequence for record in records for item in read_record(record)]
+    assert sequences == list(range(1, 1501))
+
+
+def test_too_little_space_is_reported_and_recording_resumes(
+    open_keeper: Any,
+    sample: Callable[[int], Sample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    free = [10**9]
+    monkeypatch.setattr(keeper_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(keeper_module, "RETRY_S", 0.0)
+    monkeypatch.setattr(keeper_module, "free_bytes", lambda _: free[0])
+    with open_keeper(min_free_bytes=10**8) as (keeper, health):
+        keeper.write(sample(1))
+        keeper.tick()
+        free[0] = 10**7
+        keeper.tick()
+        status = health.status()
+        assert status.state is ServiceState.DEGRADED
+        assert status.last_error is not None
+        assert status.last_error.code is ErrorCode.DISK
+        assert str(tmp_path / "runs") in status.last_error.message
+        assert "bytes free" in status.last_error.message
+        keeper.write(sample(2))
+        keeper.tick()
+        assert health.counters["lost_disk_full"] == 1
+        free[0] = 10**9
+        keeper.tick()
+        assert health.state is ServiceState.READY
+        keeper.write(sample(3))
+    records = sorted((tmp_path / "runs").iterdir())
+    assert [[item.sequence for item in read_record(r)] for r in records] == [[1], [3]]
+    assert all(record.suffix == ".mcap" for record in records)
+
+
+def test_write_error_of_the_disk_is_survived(
+    open_keeper: Any,
+    sample: Callable[[int], Sample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    until: Until,
+) -> None:
+    """A limit on the size of files stands for a disk that refuses in the middle of a record."""
+    monkeypatch.setattr(keeper_module, "CHECK_S", 0.0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with open_keeper() as (keeper, health):
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+            for sequence in range(1, 2001):
+                keeper.write(sample(sequence))
+                keeper.tick(idle=True)  # flushes, so that the limit is met after whole messages
+                if health.state is ServiceState.DEGRADED:
+                    break
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert health.state is ServiceState.DEGRADED
+        error = health.status().last_error
+        assert error is not None
+        assert error.code is ErrorCode.DISK
+        assert keeper.path is None
+        monkeypatch.setattr(keeper_module, "RETRY_S", 0.0)
+        keeper.tick()
+        keeper.write(sample(5000))
+        until(lambda: health.counters.get("recovered_records") == 1)
+    kept = [
+        item.sequence
+        for record in sorted((tmp_path / "runs").glob("*.mcap"))
+        for item in read_record(record)
+    ]
+    assert len(kept) > 20
+    assert kept == [*range(1, len(kept)), 5000]
+
+
+def test_leftovers_are_recovered_but_not_those_of_the_living(
+    open_keeper: Any, sample: Callable[[int], Sample], tmp_path: Path, until: Until
+) -> None:
+    runs = tmp_path / "runs"
+    writer = RecordWriter(runs / "lab-dead.mcap")
+    for sequence in range(1, 11):
+        item = sample(sequence)
+        writer.write(item.key, item.schema, item.payload, log_time_ns=1, sequence=sequence)
+    writer.flush()
+    writer.abandon()
+    with open_keeper() as (keeper, health):
+        until(lambda: health.counters.get("recovered_records") == 1)
+        keeper.write(sample(1))
+        assert leftovers(runs) == []
+        assert recover_all(leftovers(runs)) == []
+    items = list(read_record(runs / "lab-dead.recovered.mcap"))
+    assert [item.sequence for item in items] == list(range(1, 11))
+    assert not list(runs.glob("*.part"))
+
+
+def test_view_that_fails_leaves_the_record_alone(
+    open_keeper: Any,
+    sample: Callable[[int], Sample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with open_keeper(rrd=True) as (keeper, health):
+        for sequence in range(1, 21):
+            keeper.write(sample(sequence))
+    (record,) = (tmp_path / "runs").iterdir()
+    assert [item.sequence for item in read_record(record)] == list(range(1, 21))
+    assert health.counters["view_failed"] == 1
+
+
+def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    from palpate.services.view import View
+
+    path = tmp_path / "view.rrd"
+    with View(path, title="view", max_bytes=1) as view:
+        sizes = []
+        for sequence in range(1, 31):
+            view.add("finger", make_frame(sequence))
+            view.flush()
+            sizes.append(view.size())
+        assert view.full
+    assert path.stat().st_size == sizes[-1] > 0

@@ -1,0 +1,305 @@
+"""The recorder and the features service on one bus, as a station runs them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.protos.codec import SERVICE_REQUEST, STATUS, TARE_REQUEST
+from palpate.protos.codec import TARE as TARE_CODEC
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import ConfigError, ErrorCode
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    Origin,
+    ServiceRequest,
+    ServiceState,
+    Status,
+    Tare,
+)
+from palpate.protos.record import RecordWriter, read_record
+from palpate.protos.session import Delivery, Session
+from palpate.protos.topics import ELECTRODES, FEATURES, POSE, TARE, WRENCH, sensor_key
+from palpate.services import features, recorder
+from palpate.services.config import FeaturesConfig, RecorderConfig
+from palpate.services.recovery import leftovers, recover_all
+
+Frames = Callable[..., ElectrodeFrame]
+Until = Callable[[Callable[[], bool]], None]
+Station = Callable[..., AbstractContextManager[Session]]
+
+
+@pytest.fixture
+def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> Station:
+    """Run recorder and features service while the block runs."""
+    bundle = str(make_bundle())
+
+    @contextmanager
+    def running(*, lossless: bool = False, **config: Any) -> Iterator[Session]:
+        stops = {"features": threading.Event(), "recorder": threading.Event()}
+        serve = FeaturesConfig(
+            bundle=bundle,
+            delivery="every" if lossless else "newest",
+            accept_replayed=lossless,
+            max_age_s=None,
+        )
+        keep = RecorderConfig(delivery="every" if lossless else "queue", **config)
+        nodes = [
+            threading.Thread(target=features.run, args=(serve, link, "lab", stops["features"])),
+            threading.Thread(target=recorder.run, args=(keep, link, "lab", stops["recorder"])),
+        ]
+        for node in nodes:
+            node.start()
+        try:
+            with Session.open(link) as session:
+                until(lambda: sum(a.ready for a in session.alive()) == 2)
+                yield session
+                # The source is done; the recorder stops last, as the stack does it.
+                stops["features"].set()
+                nodes[0].join(timeout=10)
+                stops["recorder"].set()
+                nodes[1].join(timeout=15)
+        finally:
+            for stop in stops.values():
+                stop.set()
+            for node in nodes:
+                node.join(timeout=15)
+        assert not any(node.is_alive() for node in nodes)
+
+    return running
+
+
+def status_of(session: Session, service: str) -> Status:
+    return session.query(
+        "status",
+        service=service,
+        request=ServiceRequest(),
+        request_codec=SERVICE_REQUEST,
+        reply_codec=STATUS,
+        timeout_s=5.0,
+    )
+
+
+def announce(session: Session, tare: Tare) -> None:
+    session.queryable(
+        "tare", sensor="finger", request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
+    )
+    session.publisher(TARE, sensor="finger", lossless=True).put(tare)
+
+
+def payloads(folder: Path, topic: str) -> list[bytes]:
+    return [
+        item.payload
+        for record in sorted(folder.glob("*.mcap"))
+        for item in read_record(record)
+        if item.address.topic == topic
+    ]
+
+
+def test_replaying_the_same_frames_twice_gives_the_same_bytes(
+    station: Station, make_frame: Frames, make_tare: Callable[..., Tare], tmp_path: Path
+) -> None:
+    replayed = [make_frame(n, origin=Origin.REPLAYED, monotonic_ns=n) for n in range(1, 401)]
+    tare = make_tare()
+    for run in ("first", "second"):
+        with station(lossless=True, out=tmp_path / run, rrd=False) as session:
+            answers = session.subscriber(FEATURES, delivery=Delivery.EVERY)
+            announce(session, tare)
+            frames = session.publisher(ELECTRODES, sensor="finger", lossless=True)
+            for frame in replayed:
+                frames.put(frame)
+            for _ in replayed:
+                answers.next(10.0)
+    first = payloads(tmp_path / "first", "features")
+    assert len(first) == len(replayed)
+    assert first == payloads(tmp_path / "second", "features")
+    assert payloads(tmp_path / "first", "electrodes") == payloads(tmp_path / "second", "electrodes")
+
+
+@pytest.mark.slow
+def test_record_view_and_picture_of_a_session(
+    station: Station,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+    make_truth: Callable[..., Any],
+    tmp_path: Path,
+    until: Until,
+) -> None:
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    from palpate.services.plot import plot_record
+    from palpate.services.view import review
+
+    with station(lossless=True, out=tmp_path) as session:
+        answers = session.subscriber(FEATURES, delivery=Delivery.EVERY)
+        announce(session, make_tare())
+        frames = session.publisher(ELECTRODES, sensor="finger", lossless=True)
+        wrenches = session.publisher(WRENCH, sensor="finger", lossless=True)
+        poses = session.publisher(POSE, sensor="finger", lossless=True)
+        start_ns = time.monotonic_ns()
+        for sequence in range(1, 301):
+            frame = make_frame(sequence, monotonic_ns=start_ns + sequence * 10_000_000)
+            wrench, pose = make_truth(frame)
+            frames.put(frame)
+            wrenches.put(wrench)
+            poses.put(pose)
+        for _ in range(300):
+            answers.next(10.0)
+        until(lambda: status_of(session, "recorder").counters.get("recorded_features") == 300)
+    (record,) = tmp_path.glob("*.mcap")
+    for view in (record.with_suffix(".rrd"), review(record, tmp_path / "again.rrd")):
+        rows: dict[str, int] = {}
+        for chunk in RrdReader(str(view)).stream():
+            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+        assert rows["/finger/electrodes/tared"] >= 300
+        assert rows["/finger/pac"] >= 300 * 22
+        assert rows["/finger/force/x/truth"] >= 300
+        assert rows["/finger/force/z/estimate"] >= 300
+        assert rows["/finger/error/force"] >= 300
+        assert rows["/finger/finger/contact/truth"] >= 300
+    command = shutil.which("rerun", path=str(Path(sys.executable).parent))
+    if command is not None:
+        verified = subprocess.run([command, "rrd", "verify", str(view)], capture_output=True)
+        assert verified.returncode == 0, verified.stderr.decode()
+    summary = plot_record(record, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 20_000
+    assert summary["estimates"] == summary["matched"] == 300
+    assert summary["force_median_error_n"] > 0
+
+
+def test_full_disk_is_reported_and_inference_does_not_notice(
+    station: Station, make_frame: Frames, make_tare: Callable[..., Tare], tmp_path: Path
+) -> None:
+    with station(out=tmp_path, rrd=False, min_free_bytes=10**17) as session:
+        status = status_of(session, "recorder")
+        assert status.state is ServiceState.DEGRADED
+        assert status.last_error is not None
+        assert status.last_error.code is ErrorCode.DISK
+        assert str(tmp_path) in status.last_error.message
+        answers = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        announce(session, make_tare())
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        for sequence in range(1, 51):
+            frames.put(make_frame(sequence))
+            assert answers.next(5.0).message.source.sequence == sequence
+    assert list(tmp_path.glob("*.mcap*")) == []
+
+
+def test_disk_that_fills_up_while_recording(
+    station: Station,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+    tmp_path: Path,
+    until: Until,
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a small disk needs root")
+    try:
+        with station(out=disk / "runs", rrd=False, min_free_bytes=0) as session:
+            answers = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+            announce(session, make_tare())
+            frames = session.publisher(ELECTRODES, sensor="finger")
+
+            def answered(first: int, last: int) -> None:
+                for sequence in range(first, last):
+                    frames.put(make_frame(sequence))
+                    assert answers.next(5.0).message.source.sequence == sequence
+
+            answered(1, 20)
+            # Wait until they are on the disk: what a full disk cuts off is counted, not kept.
+            runs = disk / "runs"
+            until(lambda: status_of(session, "recorder").counters["recorded_features"] >= 19)
+            time.sleep(0.5)  # several flushes
+            ballast = disk / "ballast"
+            with open(ballast, "wb", buffering=0) as file:
+                try:
+                    while True:
+                        file.write(bytes(1024))
+                except OSError:
+                    pass
+            answered(20, 70)
+            until(lambda: status_of(session, "recorder").state is ServiceState.DEGRADED)
+            error = status_of(session, "recorder").last_error
+            assert error is not None
+            assert error.code is ErrorCode.DISK
+            answered(70, 90)
+            ballast.unlink()
+            until(lambda: status_of(session, "recorder").state is ServiceState.READY)
+            answered(90, 120)
+            until(lambda: status_of(session, "recorder").counters["recorded_features"] > 40)
+            # What the full disk cut off is saved by a thread of its own.
+            until(lambda: any(runs.glob("*.recovered.mcap")))
+        kept = payloads(disk / "runs", "electrodes")
+        assert len(kept) >= 40
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=True, capture_output=True)
+
+
+def test_unknown_topic_is_named() -> None:
+    with pytest.raises(ConfigError, match="unknown topic 'elektrodes'"):
+        recorder.run(RecorderConfig(topics=("elektrodes",)), LinkConfig(), "lab", threading.Event())
+
+
+KILLED = """
+import sys, threading
+from pathlib import Path
+from palpate.protos.config import LinkConfig
+from palpate.services import recorder
+from palpate.services.config import RecorderConfig
+
+config = RecorderConfig(out=Path(sys.argv[1]), rrd=False, min_free_bytes=0)
+recorder.run(config, LinkConfig(connect=(sys.argv[2],)), "lab", threading.Event())
+"""
+
+
+def test_kill_9_loses_a_moment_only(
+    link: LinkConfig, make_frame: Frames, tmp_path: Path, until: Until
+) -> None:
+    command = [sys.executable, "-c", KILLED, str(tmp_path), link.connect[0]]
+    process = subprocess.Popen(command)
+    with Session.open(link) as session:
+        until(lambda: any(a.ready for a in session.alive()))
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        for sequence in range(1, 151):
+            frames.put(make_frame(sequence))
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait(timeout=10)
+        until(lambda: not session.alive())
+    (record,) = recover_all(leftovers(tmp_path))
+    kept = [i.sequence for i in read_record(record) if i.address.topic == "electrodes"]
+    assert kept == list(range(kept[0], kept[-1] + 1))
+    assert kept[0] <= 2  # the first may pass before the subscription has reached the publisher
+    assert kept[-1] >= 150 - 30  # 0.3 s at 100 Hz
+    sys.stdout.write(f"lost {150 - kept[-1]} frames\n")
+
+
+def test_leftover_of_a_killed_recorder_is_recovered_by_the_next(
+    station: Station, make_frame: Frames, tmp_path: Path, until: Until
+) -> None:
+    writer = RecordWriter(tmp_path / "lab-killed.mcap")
+    payload = ELECTRODES.codec.encode(make_frame())
+    writer.write(
+        sensor_key("lab", "finger", "electrodes"), ELECTRODES.codec.schema, payload, log_time_ns=1
+    )
+    writer.flush()
+    writer.abandon()
+    with station(out=tmp_path, rrd=False) as session:
+        until(lambda: status_of(session, "recorder").counters.get("recovered_records") == 1)
+    items = list(read_record(tmp_path / "lab-killed.recovered.mcap"))
+    assert [item.payload for item in items] == [payload]

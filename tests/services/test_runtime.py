@@ -1,0 +1,135 @@
+"""A bundle is served only if it keeps its contract; every refusal names the thing."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.protos.bundle import Bundle, read_bundle
+from palpate.protos.errors import BundleError, MissingExtraError
+from palpate.services.external_data import has_external_data
+from palpate.services.runtime import load
+
+onnx = pytest.importorskip("onnx")
+
+Make = Callable[..., Path]
+
+
+def test_good_bundle_answers_its_golden_vectors(bundle: Bundle) -> None:
+    runtime = load(bundle, "features")
+    for at, sample in enumerate(bundle.golden["electrodes"]):
+        answer = runtime.run(sample)
+        assert answer is not None
+        for name, values in answer.items():
+            np.testing.assert_allclose(values, bundle.golden[name][at], rtol=1e-4, atol=1e-5)
+
+
+def test_answers_keep_their_memory(bundle: Bundle) -> None:
+    runtime = load(bundle, "features")
+    first = runtime.run(bundle.golden["electrodes"][0])
+    assert first is not None
+    before = first["force"].tobytes()
+    runtime.run(bundle.golden["electrodes"][1])
+    assert first["force"].tobytes() == before
+
+
+def test_corrupt_onnx(make_bundle: Make) -> None:
+    with pytest.raises(BundleError, match=r"test:1: model\.onnx does not load.*export"):
+        load(read_bundle(make_bundle(model=b"\x00not onnx" * 50)), "features")
+
+
+def test_model_replaced_after_export(make_bundle: Make) -> None:
+    folder = make_bundle()
+    with open(folder / "model.onnx", "ab") as model:
+        model.write(b"\0")
+    with pytest.raises(BundleError, match=r"model\.onnx.*digest differs"):
+        read_bundle(folder)
+
+
+def test_bundle_for_another_task(bundle: Bundle) -> None:
+    with pytest.raises(BundleError, match="for the task 'features', not 'field'"):
+        load(bundle, "field")
+
+
+def test_future_contract_version(bundle: Bundle, make_bundle: Make) -> None:
+    future = dataclasses.replace(bundle.manifest, contract_version=2)
+    with pytest.raises(BundleError, match=r"contract v2, this palpate knows v1.*upgrade"):
+        load(dataclasses.replace(bundle, manifest=future), "features")
+    with pytest.raises(BundleError, match="contract v2"):
+        read_bundle(make_bundle(contract_version=2))
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "complaint"),
+    [
+        ({"width": 18}, r"electrodes float32\[-1, 18\].*electrodes float32\[-1, 19\]"),
+        ({"outputs": ("force", "force_sd")}, "contact_location"),
+        ({"inputs": ("counts",)}, "counts float32"),
+        ({"dtype": onnx.TensorProto.DOUBLE}, "electrodes float64"),
+    ],
+)
+def test_graph_that_differs_from_its_manifest(
+    make_bundle: Make, recipe: Any, spoiled: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(BundleError, match=complaint):
+        load(read_bundle(make_bundle(recipe(**spoiled))), "features")
+
+
+def test_model_that_answers_nan(make_bundle: Make, recipe: Any) -> None:
+    with pytest.raises(BundleError, match="'force' is NaN or infinite"):
+        load(read_bundle(make_bundle(recipe(poison=True))), "features")
+
+
+def test_wrong_golden_vectors(make_bundle: Make) -> None:
+    with pytest.raises(BundleError, match=r"'force' deviates from golden\.npz"):
+        load(read_bundle(make_bundle(golden_shift=0.01)), "features")
+
+
+def test_opset_of_the_future(make_bundle: Make, recipe: Any) -> None:
+    with pytest.raises(BundleError, match="does not know its opset"):
+        load(read_bundle(make_bundle(recipe(opset=99))), "features")
+
+
+def test_external_data_is_refused_even_where_the_file_exists(
+    make_bundle: Make, recipe: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ONNX Runtime would load it: from bytes, it looks in the working directory."""
+    path = tmp_path / "model.onnx"
+    onnx.save(
+        recipe().model(), str(path), save_as_external_data=True, location="w.bin", size_threshold=0
+    )
+    assert (tmp_path / "w.bin").stat().st_size > 0
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BundleError, match="keeps weights in another file"):
+        load(read_bundle(make_bundle(model=path.read_bytes())), "features")
+
+
+def test_external_data_hidden_in_a_constant_node(recipe: Any) -> None:
+    model = recipe().model()
+    assert not has_external_data(model.SerializeToString())
+    tensor = onnx.numpy_helper.from_array(np.zeros((2, 2), np.float32), "hidden")
+    onnx.external_data_helper.set_external_data(tensor, location="elsewhere.bin")
+    inner = onnx.helper.make_graph(
+        [onnx.helper.make_node("Constant", [], ["c"], value=tensor)], "inner", [], []
+    )
+    model.graph.node.append(onnx.helper.make_node("If", ["x"], ["y"], then_branch=inner))
+    assert has_external_data(model.SerializeToString())
+
+
+def test_missing_extra(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(MissingExtraError, match=r'pip install "palpate\[services\]"'):
+        load(bundle, "features")
+
+
+def test_metadata_says_what_is_served(bundle: Bundle) -> None:
+    metadata = load(bundle, "features").metadata()
+    assert (metadata.name, metadata.version) == ("test", 1)
+    assert metadata.bundle_sha256 == bundle.sha256
+    assert metadata.metrics == {"force_median_error_n": 0.1}
