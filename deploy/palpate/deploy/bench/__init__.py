@@ -1,0 +1,1 @@
+"""Benchmarks: palpate beside the bare floor, measured in one run."""

@@ -1,0 +1,85 @@
+"""Benchmarks run and account for every frame. How fast they are is not a test."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.deploy.bench.harness import Gate, bench_counts, read_rows, write_rows
+from palpate.deploy.bench.results import append_history, latency, rounds
+from palpate.protos.errors import ConfigError
+from palpate.protos.messages import COUNTS_MAX
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def test_codec(palpate: Palpate) -> None:
+    result = palpate("bench", "codec", "--rounds", "1", "--json")
+    assert result.returncode == 0, result.stderr
+    values = json.loads(result.stdout)
+    assert values["codec.frame.encode_decode_s"] > 0
+    assert values["codec.frame.bytes"] > 82
+
+
+@pytest.mark.slow
+def test_e2e_reports_both_sides_and_the_load(palpate: Palpate, bundle: str) -> None:
+    result = palpate(
+        *("bench", "e2e", "--seconds", "1", "--rounds", "1", "--sensors", "3"),
+        *("--load-seconds", "2", "--no-ramp", "--json"),
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stderr
+    values = json.loads(result.stdout)
+    for side in ("palpate", "floor"):
+        numbers = values[f"e2e.{side}"]
+        assert numbers["count"] > 20
+        assert 0 < numbers["p50_s"] <= numbers["p99_s"] <= numbers["max_s"]
+    assert values["e2e.p50_ratio"] > 0
+    load = values["load"]
+    assert load["published"] >= 600
+    assert load["lost"] == load["published"] - load["received"] >= 0
+
+
+def test_rounds_are_cut_at_pauses_and_warmed_up() -> None:
+    stamps = np.concatenate([np.arange(5), 100 + np.arange(4)]) * 10_000_000
+    rows = np.stack([np.arange(9), stamps, stamps + 1_000_000 + (np.arange(9) % 2)], axis=1)
+    assert [len(part) for part in rounds(rows)] == [5, 4]
+    side = latency(rows, warm_up=2, lost=0)
+    assert side.count == 5
+    assert side.p50_s == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_frames_of_the_benchmark_are_valid_counts() -> None:
+    counts = bench_counts()
+    assert counts.shape[1] == 44
+    assert counts.max() <= COUNTS_MAX
+    assert (counts == bench_counts()).all()
+
+
+def test_gate_is_seen_by_another_mapping(tmp_path: Path) -> None:
+    first, second = (Gate(tmp_path / "gate", 1) for _ in range(2))
+    assert not second.is_open
+    first.set(True)
+    assert second.is_open
+
+
+def test_rows_survive(tmp_path: Path) -> None:
+    write_rows(tmp_path / "out.npz", ["a"], [(1, 2, 3)], dropped=4)
+    names, rows, dropped = read_rows(tmp_path / "out.npz")
+    assert (names.tolist(), rows.tolist(), dropped) == (["a"], [[1, 2, 3]], 4)
+
+
+def test_history_is_kept_in_the_working_tree_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="tests/benchmarks"):
+        append_history("codec", {"a": 1})
+    (tmp_path / "tests" / "benchmarks").mkdir(parents=True)
+    line = json.loads(append_history("codec", {"a": 1}).read_text(encoding="utf-8"))
+    assert (line["benchmark"], line["a"]) == ("codec", 1)

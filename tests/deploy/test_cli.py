@@ -1,0 +1,231 @@
+"""The command: help, exit codes, errors in two lines without a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from palpate.deploy import training
+from palpate.deploy.cli import app
+from palpate.deploy.failure import exit_code
+from palpate.deploy.ports import check_free, free_endpoint
+from palpate.protos.errors import (
+    BundleError,
+    ConfigError,
+    DeviceLost,
+    LinkError,
+    MissingExtraError,
+    PalpateError,
+    RecordingError,
+)
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+TRAINING = {"train", "data"}  # their commands come from another room, and need its extra
+
+
+def _commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        yield path, command
+        return
+    for name in inner.keys() - TRAINING if not path else inner.keys():
+        sub = inner[name]
+        yield from _commands(sub, (*path, name))
+
+
+COMMANDS = dict(_commands(typer.main.get_command(app)))
+
+
+def _assert_said(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+    assert result.returncode == code, result.stderr
+    assert "Traceback" not in result.stderr
+    problem, fix = result.stderr.splitlines()[-2:]
+    assert problem.startswith("error: ")
+    assert fix.startswith("  fix: ")
+    for word in words:
+        assert word in result.stderr
+
+
+@pytest.mark.parametrize("path", sorted(COMMANDS), ids=" ".join)
+def test_help_has_a_runnable_example(path: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(app, [*path, "--help"])
+    assert result.exit_code == 0
+    assert f"Example: palpate {' '.join(path)}" in " ".join(result.output.split())
+
+
+def test_help_imports_nothing_heavy() -> None:
+    heavy = ("numpy", "zenoh", "pydantic", "onnxruntime", "rerun", "torch", "matplotlib", "mcap")
+    program = (
+        "import sys; from palpate.deploy.cli import app\n"
+        "from typer.testing import CliRunner\n"
+        "assert CliRunner().invoke(app, ['--help']).exit_code == 0\n"
+        f"print([name for name in {heavy!r} if name in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ConfigError("a", remedy="b"), 2),
+        (MissingExtraError("torch", extra="training"), 2),
+        (DeviceLost("a", remedy="b"), 3),
+        (RecordingError("a", remedy="b"), 3),
+        (LinkError("a", remedy="b"), 1),
+        (BundleError("a", remedy="b"), 1),
+    ],
+)
+def test_exit_codes(error: PalpateError, code: int) -> None:
+    assert exit_code(error) == code
+
+
+def test_unknown_option_is_a_usage_error(palpate: Palpate) -> None:
+    assert palpate("up", "--nonsense").returncode == 2
+
+
+def test_unknown_profile(palpate: Palpate) -> None:
+    _assert_said(palpate("up", "--profile", "virtaul"), 2, "virtaul", "'virtual'")
+
+
+def test_unknown_key_in_a_profile(palpate: Palpate, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('[recorder]\nuot = "x"\n', encoding="utf-8")
+    _assert_said(palpate("up", "--profile", path), 2, str(path), "recorder.uot", "'out'")
+
+
+def test_print_config_is_toml_and_starts_nothing(palpate: Palpate, tmp_path: Path) -> None:
+    result = palpate("up", "--profile", "virtual", "--print-config")
+    assert result.returncode == 0
+    assert "[features]" in result.stdout
+    again = tmp_path / "again.toml"
+    again.write_text(result.stdout, encoding="utf-8")
+    assert palpate("up", "--profile", again, "--print-config").stdout == result.stdout
+
+
+def test_port_in_use_is_said_before_anything_starts(palpate: Palpate, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        path = tmp_path / "mine.toml"
+        path.write_text(f'[router]\nlisten = ["tcp/127.0.0.1:{port}"]\n', encoding="utf-8")
+        result = palpate("up", "--profile", path)
+    _assert_said(result, 1, f"127.0.0.1:{port} is in use", "palpate status", "[router] listen")
+    assert not list((Path(os.environ["XDG_STATE_HOME"])).rglob("supervisord.conf"))
+
+
+def test_address_of_another_host_cannot_be_listened_at() -> None:
+    with pytest.raises(LinkError, match="cannot listen"):
+        check_free(["tcp/192.0.2.1:7447"])  # TEST-NET-1: nobody's address
+
+
+def test_no_router() -> None:
+    """Each waits for the router for a while, so they wait together."""
+    endpoint = free_endpoint()
+    commands = (
+        ("status",),
+        ("topic", "list"),
+        ("topic", "hz", "electrodes"),
+        ("topic", "echo", "features"),
+        ("record",),
+        ("tare", "finger"),
+    )
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-m", "palpate.deploy", *command, "--connect", endpoint],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for command in commands
+    ]
+    for process in running:
+        output, errors = process.communicate(timeout=60)
+        done = subprocess.CompletedProcess(process.args, process.returncode, output, errors)
+        _assert_said(done, 1, endpoint, "palpate up")
+
+
+def test_endpoint_that_is_none(palpate: Palpate) -> None:
+    _assert_said(palpate("status", "--connect", "localhost"), 2, "localhost")
+
+
+def test_unknown_topic(palpate: Palpate) -> None:
+    _assert_said(palpate("topic", "hz", "electrode"), 2, "'electrode'", "'electrodes'")
+
+
+def test_unknown_service(palpate: Palpate) -> None:
+    _assert_said(palpate("run", "gatway"), 2, "gatway", "gateway")
+
+
+def test_missing_file(palpate: Palpate) -> None:
+    _assert_said(palpate("replay", "nowhere.btd"), 2, "nowhere.btd")
+
+
+def test_unknown_bundle(palpate: Palpate, text_log: Path) -> None:
+    _assert_said(palpate("replay", text_log, "--bundle", "nonsense"), 2, "nonsense")
+
+
+def test_missing_extra_gives_the_install_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def not_installed(room: str) -> typer.Typer:
+        raise MissingExtraError("torch", extra="training")
+
+    monkeypatch.setattr(training, "_app", not_installed)
+    result = CliRunner().invoke(app, ["train", "--help"])
+    assert result.exit_code == 2
+    assert 'pip install "palpate[training]"' in result.stderr
+
+
+def test_training_commands_are_mounted(palpate: Palpate) -> None:
+    pytest.importorskip("torch", reason="palpate[training] is not installed")
+    result = palpate("train", "--help")
+    assert result.returncode == 0
+    assert "palpate train" in result.stdout
+
+
+def test_doctor_names_what_is_wrong(palpate: Palpate, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('[features]\nbundle = "nonsense"\n', encoding="utf-8")
+    result = palpate("doctor", "--profile", path, "--json")
+    assert result.returncode == 1
+    lines = {line["what"]: line for line in json.loads(result.stdout)}
+    assert lines["bundle"]["grade"] == "fail"
+    assert "nonsense" in lines["bundle"]["found"]
+    assert lines["python"]["grade"] == "ok"
+
+
+def test_json_logs(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        f'[router]\nlisten = ["{endpoint}"]\n[log]\nformat = "json"\n', encoding="utf-8"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-m", "palpate.deploy", "run", "router", "--profile", str(path)],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    first = json.loads(process.stderr.readline())
+    assert first["level"] == "info"
+    assert "router starts" in first["message"]
+    process.send_signal(signal.SIGTERM)
+    _, rest = process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert "router ends" in rest

@@ -1,0 +1,31 @@
+"""``palpate demo``: without a terminal, in short."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from palpate.protos.record import summarise
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.mark.slow
+def test_demo_ends_with_record_view_and_picture(
+    palpate: Palpate, bundle: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "demo"
+    result = palpate("demo", "--seconds", "5", "--out", out, timeout=120)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "truth" in result.stdout
+    assert "median error" in result.stdout
+    (record,) = out.glob("*.mcap")
+    counts = {key.rpartition("/")[2]: n for key, n in summarise(record).counts.items()}
+    assert counts["features"] > 100
+    for path in (record, record.with_suffix(".rrd"), record.with_suffix(".png")):
+        assert path.stat().st_size > 0
+        assert str(path) in result.stdout
+    assert f"rerun {record.with_suffix('.rrd')}" in result.stdout

@@ -1,0 +1,155 @@
+"""Profiles: what is wrong is named with file, key and remedy."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from palpate.deploy.profile import (
+    changed,
+    load_profile,
+    parse_profile,
+    plain_values,
+    profile_names,
+)
+from palpate.deploy.toml_text import toml_text
+from palpate.protos.errors import ConfigError
+
+
+def _write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_shipped_profile_is_valid(name: str) -> None:
+    assert load_profile(name).processes
+
+
+def test_the_four_profiles_ship() -> None:
+    assert {"demo", "virtual", "replay", "bench"} <= set(profile_names())
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "remedy"),
+    [
+        ('statoin = "lab"', "'statoin'", "'station'"),
+        ('[features]\nbundel = "x"', "'features.bundel'", "'bundle'"),
+        ('[[gateway.sensors]]\nnam = "x"', "'gateway.sensors.0.nam'", "'name'"),
+        ('[link]\nzzz = "x"', "'link.zzz'", "known keys: connect"),
+        ('[log]\nlevle = "info"', "'log.levle'", "'level'"),
+    ],
+)
+def test_unknown_key_names_file_key_and_nearest(
+    tmp_path: Path, text: str, key: str, remedy: str
+) -> None:
+    path = _write(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_profile(path)
+    assert str(path) in caught.value.problem
+    assert key in caught.value.problem
+    assert remedy in caught.value.remedy
+
+
+def test_wrong_type_names_key_value_and_what_was_expected(tmp_path: Path) -> None:
+    path = _write(tmp_path, '[features]\ndrain_s = "soon"')
+    with pytest.raises(ConfigError, match=r"features\.drain_s.*'soon'.*number"):
+        load_profile(path)
+
+
+def test_unknown_process_is_named(tmp_path: Path) -> None:
+    path = _write(tmp_path, 'processes = ["router", "gatway"]')
+    with pytest.raises(ConfigError, match=r"processes\.1.*gatway.*'gateway'"):
+        load_profile(path)
+
+
+def test_bad_toml_names_the_line(tmp_path: Path) -> None:
+    path = _write(tmp_path, 'station = "lab"\n[features\n')
+    with pytest.raises(ConfigError, match=r"mine\.toml is not TOML.*line 2"):
+        load_profile(path)
+
+
+def test_missing_file() -> None:
+    with pytest.raises(ConfigError, match="does not exist"):
+        load_profile("./nowhere.toml")
+
+
+def test_unknown_name_gives_the_nearest() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_profile("virtaul")
+    assert "'virtual'" in caught.value.remedy
+
+
+def test_exposed_router_without_tls_is_refused(tmp_path: Path) -> None:
+    path = _write(tmp_path, '[router]\nlisten = ["tcp/0.0.0.0:7447"]')
+    with pytest.raises(ConfigError, match="mutual TLS"):
+        load_profile(path)
+
+
+def test_router_port_is_said_once(tmp_path: Path) -> None:
+    """Who starts the router connects to it, unless told otherwise."""
+    path = _write(tmp_path, '[router]\nlisten = ["tcp/127.0.0.1:9000"]')
+    assert load_profile(path).link.connect == ("tcp/127.0.0.1:9000",)
+
+
+def test_environment_wins_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = _write(tmp_path, '[features]\nbundle = "a"\ndrain_s = 1.0')
+    monkeypatch.setenv("PALPATE_FEATURES__BUNDLE", "b")
+    monkeypatch.setenv("PALPATE_STATION", "left")
+    profile = load_profile(path)
+    assert (profile.features.bundle, profile.features.drain_s, profile.station) == (
+        "b",
+        1.0,
+        "left",
+    )
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("PALPATE_STATOIN", "x", "PALPATE_STATION"),
+        ("PALPATE_FEATURES__BUNDEL", "x", "bundle"),
+        ("PALPATE_FEATURES__DRAIN_S", "soon", "PALPATE_FEATURES__DRAIN_S"),
+    ],
+)
+def test_bad_environment_variable_is_named(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, said: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(ConfigError) as caught:
+        load_profile("virtual")
+    assert variable in caught.value.problem
+    assert said in str(caught.value)
+
+
+def test_name_that_cannot_stand_in_a_key(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="My Lab"):
+        load_profile(_write(tmp_path, 'station = "My Lab"'))
+
+
+def test_changed_profile_is_checked() -> None:
+    profile = load_profile("virtual")
+    assert str(changed(profile, recorder={"out": "elsewhere"}).recorder.out) == "elsewhere"
+    with pytest.raises(ConfigError, match="command line"):
+        changed(profile, recorder={"capacity": -1})
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_profile_survives_toml(name: str) -> None:
+    profile = load_profile(name)
+    text = toml_text(plain_values(profile))
+    assert parse_profile(tomllib.loads(text), where="text") == profile
+
+
+def test_toml_text_of_awkward_values() -> None:
+    values = {
+        "text": 'quote " backslash \\ tab \t umlaut ä \x7f',
+        "nothing": None,
+        "odd key": 1,
+        "table": {"empty": [], "nested": {"flag": True, "list": [{"a": 1.5}, {"a": 2}]}},
+    }
+    expected = {key: value for key, value in values.items() if value is not None}
+    assert tomllib.loads(toml_text(values)) == expected

@@ -1,0 +1,110 @@
+"""``palpate replay``: nothing is lost, everything is accounted for, and it repeats bit for bit."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.protos.record import read_record
+from palpate.protos.topics import FEATURES
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+pytestmark = pytest.mark.slow
+
+BTD_SAMPLES, BTD_FRAMES, BTD_MISSING, BTD_JUMPS = 93_456, 2_124, 530, 154
+"""The vendor's public capture: samples, frames, missing frames, time jumps."""
+
+
+def _replay(palpate: Palpate, file: Path, out: Path, *more: str) -> dict[str, Any]:
+    result = palpate("replay", file, "--out", out, "--no-rrd", "--json", *more)
+    assert result.returncode == 0, result.stderr
+    account: dict[str, Any] = json.loads(result.stdout)
+    assert account["lossless"]
+    assert len(account["records"]) == 1
+    return account
+
+
+def _estimates(account: dict[str, Any]) -> list[bytes]:
+    items = read_record(Path(account["records"][0]))
+    return [item.payload for item in items if item.address.topic == FEATURES.name]
+
+
+def test_text_log_and_its_record_give_identical_estimates(
+    palpate: Palpate, text_log: Path, bundle: str, tmp_path: Path
+) -> None:
+    first = _replay(palpate, text_log, tmp_path / "first")
+    assert (first["frames"], first["missing_frames"]) == (118, 2)
+    assert first["recorded"]["electrodes"] == first["estimates"] == 118
+    again = _replay(palpate, Path(first["records"][0]), tmp_path / "again")
+    assert again["frames"] == 118
+    assert _estimates(first) == _estimates(again)
+
+
+def test_record_of_a_virtual_finger(
+    palpate: Palpate, virtual_record: Path, bundle: str, tmp_path: Path
+) -> None:
+    account = _replay(palpate, virtual_record, tmp_path / "out")
+    recorded = account["recorded"]
+    assert {recorded[name] for name in ("electrodes", "wrench", "pose", "features")} == {300}
+
+
+def test_real_capture(palpate: Palpate, shared_data: Path, bundle: str, tmp_path: Path) -> None:
+    capture = shared_data / "syntouch_btd_raw" / "data.btd.gz"
+    first = _replay(palpate, capture, tmp_path / "first")
+    assert (first["samples"], first["frames"]) == (BTD_SAMPLES, BTD_FRAMES)
+    assert (first["missing_frames"], first["time_jumps"]) == (BTD_MISSING, BTD_JUMPS)
+    assert first["estimates"] == first["recorded"]["electrodes"] == BTD_FRAMES
+    again = _replay(palpate, Path(first["records"][0]), tmp_path / "again")
+    estimates = _estimates(first)
+    assert len(estimates) == BTD_FRAMES
+    assert estimates == _estimates(again)
+
+
+@pytest.mark.parametrize("kind", ["plain", "gzip"])
+def test_truncated_log_is_said_and_what_was_read_is_recorded(
+    palpate: Palpate, text_log: Path, bundle: str, tmp_path: Path, kind: str
+) -> None:
+    whole = text_log.read_bytes()
+    cut = tmp_path / ("cut.btd.gz" if kind == "gzip" else "cut.btd")
+    cut.write_bytes(gzip.compress(whole)[:-100] if kind == "gzip" else whole[:-15])
+    result = palpate("replay", cut, "--out", tmp_path / "out", "--no-rrd", "--json")
+    assert result.returncode == 3
+    assert str(cut) in result.stderr
+    assert "truncated" in result.stderr or "cut" in result.stderr
+    account = json.loads(result.stdout)
+    assert account["frames"] > 50
+    assert account["recorded"]["electrodes"] == account["frames"] == account["estimates"]
+
+
+def test_file_that_is_no_log(palpate: Palpate, bundle: str, tmp_path: Path) -> None:
+    nonsense = tmp_path / "nonsense.btd"
+    nonsense.write_text("hello\n", encoding="ascii")
+    result = palpate("replay", nonsense, "--out", tmp_path / "out", "--no-rrd")
+    assert result.returncode == 3
+    assert "nonsense.btd" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_damaged_record(
+    palpate: Palpate, virtual_record: Path, bundle: str, tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(virtual_record.read_bytes()[:-8000])
+    result = palpate("replay", cut, "--out", tmp_path / "out", "--no-rrd", "--json")
+    assert result.returncode == 3
+    assert "cut.mcap" in result.stderr
+
+
+def test_recorded_pace(palpate: Palpate, text_log: Path, bundle: str, tmp_path: Path) -> None:
+    result = palpate(
+        "replay", text_log, "--pace", "recorded", "--out", tmp_path / "out", "--no-rrd", "--json"
+    )
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["estimates"] > 0
