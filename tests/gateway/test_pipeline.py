@@ -11,7 +11,7 @@ from palpate.gateway.clock_map import FileClock, LiveClock, PacedClock
 from palpate.gateway.device import DeviceIdentity, DeviceInfo
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.readings import ElectrodeReading, Reading
+from palpate.gateway.readings import ElectrodeReading, Reading, RecordedMessage
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.errors import DeviceError
 from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
@@ -200,3 +200,15 @@ def test_real_capture_is_tared_from_its_first_frames(shared_data: Path) -> None:
     assert made.counters["frames_untared"] == 0
     for item in out:
         TOPICS[item.topic].codec.encode(item.message)
+
+
+def test_what_a_record_lost_when_it_was_taken_is_told_again_by_its_replay() -> None:
+    source = pipeline(live=True)
+    recorded = [
+        RecordedMessage("electrodes", ELECTRODE_FRAME.encode(frame), 0.01 * i)
+        for i, frame in enumerate(frames(source.push(readings(4, missed=3), 0)))
+    ]
+    replay = pipeline(live=False)
+    replay.push([*recorded, RecordedMessage("electrodes", b"not a frame", 0.05)], 0)
+    assert replay.counters["missing_frames"] == 12
+    assert replay.counters["frames_published"] == 5

@@ -36,7 +36,7 @@ def virtual(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write; default: the one that ships.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1000, help="Frames of the virtual finger.")] = 100_000,
+    frames: Annotated[int, typer.Option(min=1000, help="Frames of the virtual finger.")] = 160_000,
     seed: Annotated[int, typer.Option(min=0, help="Of the finger, and of training.")] = 1,
 ) -> None:
     """Train the features bundle of the demo on the virtual finger (needs palpate[training])."""

@@ -21,6 +21,7 @@ def write_virtual_record(
     frames: int,
     seed: int,
     unit: int = 1,
+    rate_hz: float = 100.0,
     on_frames: Callable[[int], None] | None = None,
 ) -> int:
     """Record the virtual finger as a gateway would publish it, tare and ground truth included.
@@ -30,6 +31,7 @@ def write_virtual_record(
         frames: How many electrode frames.
         seed: Of trajectories and noise.
         unit: Number of the finger.
+        rate_hz: Frames per second of the finger's time; fewer give more presses for as many frames.
         on_frames: Called with the frames written so far, for a progress bar.
 
     Returns:
@@ -38,7 +40,7 @@ def write_virtual_record(
     Raises:
         RecordingError: The disk refuses.
     """
-    options = {"seed": seed, "unit": unit, "frames": frames, "realtime": False}
+    options = {"seed": seed, "unit": unit, "frames": frames, "realtime": False, "rate_hz": rate_hz}
     keys = {name: sensor_key(_STATION, SENSOR, name) for name in TOPICS}
     written = 0
     facts = {"station": _STATION, "source": f"virtual finger, seed {seed}, unit {unit}"}

@@ -18,6 +18,7 @@ from palpate.protos.config import LinkConfig
 from palpate.protos.errors import PalpateError
 from palpate.protos.health import Health, HealthReporter
 from palpate.protos.messages import ServiceState
+from palpate.protos.pauses import avoid_pauses
 from palpate.protos.session import Presence, Session
 from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
 
@@ -116,6 +117,7 @@ def _serve(
 ) -> None:
     if config.wait_for and not _wait_for(config.wait_for, session, health, stop):
         return
+    avoid_pauses()
     for worker in workers:
         worker.start()
     finished = False

@@ -18,6 +18,7 @@ from palpate.gateway.readings import (
     WrenchReading,
 )
 from palpate.gateway.tare import MAX_SD_COUNTS, TARE_FRAMES, TareCollector, TareLedger
+from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.codec import TARE as TARE_CODEC
 from palpate.protos.errors import DeviceError, PalpateError, WireError
 from palpate.protos.messages import (
@@ -266,6 +267,7 @@ class Pipeline:
         """A recorded message goes out as it is; its tare is kept for those who ask."""
         if reading.topic == ELECTRODES.name:
             self.counters["frames_published"] += 1
+            self._count_recorded_loss(reading.payload)
         elif reading.topic == TARE.name:
             try:
                 self.ledger.enter(TARE_CODEC.decode(reading.payload))
@@ -274,6 +276,14 @@ class Pipeline:
                 self.counters["tares_refused"] += 1
         _, due_ns = self._times(reading.time_s, arrival_ns)
         return Outgoing(reading.topic, reading.payload, due_ns)
+
+    def _count_recorded_loss(self, payload: bytes) -> None:
+        try:
+            frame = ELECTRODE_FRAME.decode(payload)
+        except WireError:  # it still goes out as recorded; whoever needs it will reject it
+            return
+        self.counters["missing_frames"] += frame.stamp.missed_before
+        self.counters["frames_untared"] += frame.tare_id == NO_TARE
 
     def _times(self, time_s: float, arrival_ns: int) -> tuple[HostTime, int]:
         if self._clock is None:

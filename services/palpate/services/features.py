@@ -23,6 +23,7 @@ from palpate.protos.messages import (
     ServiceState,
     Stamp,
 )
+from palpate.protos.pauses import avoid_pauses
 from palpate.protos.session import Delivery, Publisher, Received, Session
 from palpate.protos.tares import TareBook
 from palpate.protos.topics import ELECTRODES, FEATURES
@@ -204,6 +205,7 @@ def run(
         with HealthReporter(session, health, refresh=take_over):
             manifest = runtime.manifest
             health.set_state(ServiceState.READY, f"serving {manifest.name}:{manifest.version}")
+            avoid_pauses()
             presence.ready()
             while not stop.is_set():
                 try:

@@ -11,6 +11,7 @@ from palpate.protos.config import LinkConfig
 from palpate.protos.errors import ConfigError, StreamTimeout
 from palpate.protos.health import Health, HealthReporter
 from palpate.protos.messages import ServiceState
+from palpate.protos.pauses import avoid_pauses
 from palpate.protos.session import Delivery, Session, Tap
 from palpate.protos.topics import TOPICS, Topic
 from palpate.services.config import RecorderConfig
@@ -63,6 +64,7 @@ def run(
         keeper.start()
         with HealthReporter(session, health, refresh=lambda: health.set_counts(tap.counters)):
             try:
+                avoid_pauses()
                 presence.ready()
                 while not stop.wait(_NAP_S):
                     _drain(tap, keeper)

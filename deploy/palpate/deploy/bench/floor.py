@@ -51,7 +51,7 @@ def publisher(opened: Any, key: str, message: str) -> Any:
         encoding=zenoh.Encoding(f"application/protobuf;palpate.v1.{message}"),
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.REAL_TIME,
-        express=True,
+        express=False,
         reliability=zenoh.Reliability.RELIABLE,
     )
 
