@@ -8,8 +8,8 @@ mechanics; the finite-element twin replaces it. Choices, and what they were tune
   1 mm and 15 N at 3 mm for the 14 mm sphere (published forces reach 23-32 N);
 * friction: grows with tangential travel and saturates at Coulomb's limit;
 * film over an electrode: rest gap minus a Gaussian footprint, plus the bulge of the displaced
-  fluid, plus a dipole of the dragged skin (thin ahead, thick behind), closing on a residual film
-  that pressure squeezes out (learning reference 4.4);
+  fluid, plus the skin that friction drags along over the whole pad (or shear could not be told from
+  a footprint that lies elsewhere), closing on a residual film that pressure squeezes out;
 * electrode: ``counts = 4095 R_L / (R_L + Z)`` with ``Z / R_L = (a + b / film) / conductivity``.
   b = 0.07 mm meets the published fall by closing gaps: film 0.3 mm -0.07, 0.1 mm -0.22 of full
   scale; lateral electrodes rise by up to +0.05 (learning reference 4.4).
@@ -45,7 +45,10 @@ _SPREAD_M = 2.5e-3
 """The skin spreads even a point load over this radius [m]."""
 _BULGE_AREA_M2 = 700e-6
 """Skin that takes the displaced fluid [m^2]; the outer area is 1242 mm^2, half of it clamped."""
-_DIPOLE = 0.8
+_DRAG_M = 0.5e-3
+"""Most that friction displaces the skin tangentially [m]."""
+_DRAG_FORCE_N = 4.0
+_DRAG_REACH_M = 8.0e-3
 _ASPERITY_M = 80e-6
 _FILM_FLOOR_M = 5e-6
 _FILM_PRESSURE_PA = 30e3
@@ -138,10 +141,14 @@ def films(episode: Episode, state: Contact, indenter_radius_m: float) -> Array:
     share = np.exp(-distance2 / (2.0 * width2))
     facing = np.maximum(SKIN_NORMALS @ normal, 0.0)
     bulge = 2.0 * np.pi * width2 * depth / _BULGE_AREA_M2
-    ahead = (offset @ episode.direction) / np.sqrt(2.0 * width2)
-    wide = np.exp(-distance2 / (4.0 * width2))
-    dipole = _DIPOLE * depth * state.traction[:, None] * ahead * wide
-    gap = REST_GAPS_M + bulge * (1.0 - share) - depth * share * facing - dipole * facing
+    # Friction drags the skin along, far beyond the footprint: off the core where it faces that way,
+    # onto it on the far side, and under it fluid is pushed from ahead to behind.
+    friction = state.normal_force * state.traction
+    drag = _DRAG_M * np.tanh(friction / _DRAG_FORCE_N)[:, None]
+    reach = np.exp(-distance2 / (2.0 * _DRAG_REACH_M**2))
+    ahead = (offset @ episode.direction) / _DRAG_REACH_M
+    dragged = drag * reach * (SKIN_NORMALS @ episode.direction - ahead * facing)
+    gap = REST_GAPS_M + bulge * (1.0 - share) - depth * share * facing + dragged
 
     patch = np.pi * (relative * depth + 4e-6)
     load = state.normal_force[:, None] * share / patch
