@@ -1,0 +1,142 @@
+"""A bundle is written only if ONNX Runtime gives torch's answers, else nothing is left."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from palpate.protos.bundle import read_bundle
+from palpate.protos.errors import BundleError, DatasetError
+from palpate.training import export
+from palpate.training.dataset import FeatureDataset
+from palpate.training.export import FeaturesGraph, check_parity, export_features, to_onnx
+from palpate.training.models import Mlp
+from palpate.training.schema import write_dataset
+from palpate.training.train import TrainConfig
+from palpate.training.train_features import train_features
+
+MakeData = Callable[..., FeatureDataset]
+QUICK = TrainConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
+
+
+def make_graph(*, location: bool = True) -> FeaturesGraph:
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(0, 300, (200, 19)).astype(np.float32)
+    nets = [Mlp(), Mlp()]
+    nets[0].normalise_from(inputs, rng.normal(0, 3, (200, 3)).astype(np.float32))
+    nets[1].normalise_from(inputs, rng.normal(0, 0.004, (200, 3)).astype(np.float32))
+    sd = np.array([0.1, 0.2, 0.3], dtype=np.float32)
+    return (
+        FeaturesGraph(nets[0], sd, nets[1], np.float32(0.01) * sd)
+        if location
+        else FeaturesGraph(nets[0], sd)
+    )
+
+
+def rows(count: int = 16) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    return np.random.default_rng(1).normal(0, 300, (count, 19)).astype(np.float32)
+
+
+def write(folder: Path, graph: FeaturesGraph) -> bytes:
+    return export_features(
+        folder,
+        graph,
+        rows(),
+        name="test",
+        version=1,
+        contact_threshold_n=0.1,
+        training_data_sha256="0" * 64,
+        trained_on="a test",
+        metrics={"force_magnitude_median_n": 0.1},
+    )
+
+
+@pytest.mark.parametrize("location", [True, False])
+def test_bundle_round_trip(tmp_path: Path, *, location: bool) -> None:
+    digest = write(tmp_path / "b", make_graph(location=location))
+    bundle = read_bundle(tmp_path / "b")
+    assert bundle.sha256 == digest
+    assert bundle.manifest.metrics["parity_max"] < export.PARITY_MAX
+    session = onnxruntime.InferenceSession(bundle.model, providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    assert names == [info.name for info in bundle.manifest.outputs]
+    assert len(names) == (4 if location else 2)
+    for name, values in zip(
+        names, session.run(None, {"electrodes": bundle.golden["electrodes"]}), strict=True
+    ):
+        assert values.dtype == np.float32
+        np.testing.assert_allclose(values, bundle.golden[name], atol=1e-5)
+    assert bundle.golden["force_sd"].shape == (16, 3)
+
+
+def test_export_is_deterministic_and_names_no_machine() -> None:
+    graph = make_graph()
+    first = to_onnx(graph)
+    assert hashlib.sha256(first).digest() == hashlib.sha256(to_onnx(graph)).digest()
+    assert b".py" not in first, "no stack traces of the exporting machine"
+
+
+def test_a_model_that_differs_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = make_graph()
+    other = make_graph()
+    with torch.no_grad():
+        next(iter(other.force.layers.parameters()))[0, 0] += 0.05
+    wrong = to_onnx(other)
+    with pytest.raises(BundleError, match=r"differs from torch by .* in force"):
+        check_parity(graph, wrong, rows())
+    monkeypatch.setattr(export, "to_onnx", lambda _: wrong)
+    with pytest.raises(BundleError):
+        write(tmp_path / "b", graph)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_that_is_not_one_is_refused() -> None:
+    with pytest.raises(BundleError, match="ONNX Runtime refuses"):
+        check_parity(make_graph(), b"not a model", rows())
+
+
+def test_nan_is_refused() -> None:
+    graph = make_graph()
+    model = to_onnx(graph)
+    bad = rows()
+    bad[3, 3] = np.nan
+    with pytest.raises(BundleError, match="differs"):
+        check_parity(graph, model, bad)
+
+
+def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data(presses=20)
+    write_dataset(tmp_path / "presses.h5", data)
+    seen: dict[str, int] = {}
+    report = train_features(
+        tmp_path / "presses.h5",
+        tmp_path / "bundle",
+        name="tiny",
+        config=QUICK,
+        on_epoch=lambda quantity, done, total: seen.__setitem__(quantity, done),
+    )
+    bundle = read_bundle(tmp_path / "bundle")
+    metrics = bundle.manifest.metrics
+    assert bundle.sha256 == report.digest
+    assert set(seen) == {"force", "contact location"}
+    assert bundle.manifest.training_data_sha256 == data.content_sha256()
+    assert metrics["force_magnitude_median_n"] < metrics["constant_force_magnitude_median_n"]
+    assert metrics["location_distance_median_m"] < metrics["constant_location_distance_median_m"]
+    assert metrics["contact_found_share"] > 0.8
+    assert 0.05 <= bundle.manifest.contact_threshold_n < 1.0
+    with pytest.raises(BundleError, match="immutable"):
+        train_features(tmp_path / "presses.h5", tmp_path / "bundle", config=QUICK)
+
+
+def test_too_few_presses_are_named(press_data: MakeData, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "two.h5", press_data(presses=2))
+    with pytest.raises(DatasetError, match="2 groups"):
+        train_features(tmp_path / "two.h5", tmp_path / "bundle", config=QUICK)
+    assert not (tmp_path / "bundle").exists()

@@ -1,0 +1,220 @@
+"""Recordings -> data sets: axes, tares, alignment by time, presses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.protos.errors import DatasetError, RecordingError
+from palpate.protos.messages import (
+    ElectrodeFrame,
+    IndenterPoseFrame,
+    Origin,
+    SensorType,
+    Stamp,
+    Tare,
+    WrenchFrame,
+)
+from palpate.protos.record import RecordWriter
+from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH, Topic, sensor_key
+from palpate.training.ingest_lasa import ingest_lasa
+from palpate.training.ingest_record import ingest_record, number_presses
+
+PERIOD_NS = 10_000_000
+
+
+@pytest.fixture
+def lasa_archive(tmp_path: Path) -> Path:
+    """An invented archive with the keys of the real one."""
+    rng = np.random.default_rng(0)
+    arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {}
+    for finger, rows in ((1, 100), (2, 120)):
+        arrays[f"finger{finger}_electrodes_raw"] = rng.integers(
+            2000, 3000, (rows, 19), dtype=np.uint16
+        )
+        arrays[f"finger{finger}_baseline_mean"] = np.full(19, 2500 + finger, dtype=np.float32)
+        arrays[f"finger{finger}_force_N"] = np.tile(
+            np.array([0.1, 0.2, -3.0], dtype=np.float32), (rows, 1)
+        )
+    path = tmp_path / "force_calibration.npz"
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    return path
+
+
+def test_lasa(lasa_archive: Path) -> None:
+    data = ingest_lasa(lasa_archive, command="test", lag_rows=0)
+    assert len(data) == 220
+    # lateral, distal, ventral -> distal, lateral, dorsal: pressed from below, pushed upwards
+    np.testing.assert_allclose(data.force, np.tile([0.2, 0.1, 3.0], (220, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(data.baseline[[0, -1], 0], [2501, 2502])
+    np.testing.assert_array_equal(np.bincount(data.sensor), [100, 120])
+    assert len(np.unique(data.block)) == 40
+    assert "do not redistribute" in data.provenance.licence
+    assert len(data.provenance.input_sha256) == 64
+
+
+def test_lasa_pairs_electrodes_with_the_force_before(lasa_archive: Path) -> None:
+    stored = ingest_lasa(lasa_archive, lag_rows=0)
+    paired = ingest_lasa(lasa_archive, lag_rows=2)
+    assert len(paired) == len(stored) - 4
+    np.testing.assert_array_equal(paired.electrodes[:98], stored.electrodes[2:100])
+    np.testing.assert_array_equal(paired.electrodes[98:], stored.electrodes[102:])
+    np.testing.assert_array_equal(np.bincount(paired.sensor), [98, 118])
+    assert "2 rows before" in paired.provenance.notes
+
+
+def test_lasa_names_what_is_missing(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(DatasetError, match="finger1_electrodes_raw"):
+        ingest_lasa(tmp_path / "other.npz")
+    (tmp_path / "text.npz").write_text("not an archive")
+    with pytest.raises(DatasetError, match="not a readable NumPy archive"):
+        ingest_lasa(tmp_path / "text.npz")
+
+
+def stamp(sequence: int, *, offset_ns: int = 0) -> Stamp:
+    time_ns = 1_000_000_000 + sequence * PERIOD_NS + offset_ns
+    return Stamp(sequence, sequence, time_ns, 10**18 + time_ns, 7, Origin.SIMULATED)
+
+
+def tare(tare_id: int, level: float) -> Tare:
+    return Tare(
+        tare_id=tare_id,
+        stamp=stamp(1),
+        sensor_serial="s1",
+        electrodes=np.full(19, level, dtype=np.float32),
+        electrodes_sd=np.ones(19, dtype=np.float32),
+        pdc=2000.0,
+        pac=2000.0,
+        tac=2000.0,
+        tdc=2000.0,
+        frames_averaged=10,
+    )
+
+
+def frame(sequence: int, tare_id: int = 1) -> ElectrodeFrame:
+    return ElectrodeFrame(
+        stamp=stamp(sequence),
+        sensor_serial="s1",
+        sensor_type=SensorType.BIOTAC,
+        electrodes=np.full(19, 2000 + sequence, dtype=np.uint16),
+        pdc=2000,
+        pac=np.full(22, 2000, dtype=np.uint16),
+        tac=2000,
+        tdc=2000,
+        validity=(1 << SensorType.BIOTAC.validity_bits) - 1,
+        slot_period_ns=227_000,
+        tare_id=tare_id,
+    )
+
+
+def wrench(sequence: int, offset_ns: int = 0) -> WrenchFrame:
+    """Force grows by 1 N a frame, so that its time can be read off."""
+    at = stamp(sequence, offset_ns=offset_ns)
+    force = np.array([0, 0, sequence + offset_ns / PERIOD_NS], dtype=np.float32)
+    return WrenchFrame(at, "ft", force, np.zeros(3, dtype=np.float32))
+
+
+def pose(sequence: int, *, touches: bool) -> IndenterPoseFrame:
+    position = np.array([0.001 * sequence, 0, -0.008])
+    return IndenterPoseFrame(
+        stamp(sequence), "sphere_3-5mm", position, np.array([1.0, 0, 0, 0]), in_contact=touches
+    )
+
+
+class Record:
+    """Writes messages of one sensor to a record."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.messages: list[tuple[Topic, object]] = []  # type: ignore[type-arg]
+
+    def add(self, topic: Topic, *messages: object) -> Record:  # type: ignore[type-arg]
+        self.messages += [(topic, message) for message in messages]
+        return self
+
+    def write(self) -> Path:
+        with RecordWriter(self.path) as writer:
+            for i, (topic, message) in enumerate(self.messages):
+                writer.write(
+                    sensor_key("lab", "finger", topic.name),
+                    topic.codec.schema,
+                    topic.codec.encode(message),
+                    log_time_ns=i,
+                )
+        return self.path
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Record:
+    return Record(tmp_path / "r.mcap")
+
+
+def test_record_aligns_and_numbers_presses(record: Record) -> None:
+    touches = [20 <= i < 40 or 60 <= i < 80 for i in range(100)]
+    record.add(TARE, tare(1, 2000.0))
+    record.add(ELECTRODES, *(frame(i + 1) for i in range(100)))
+    record.add(WRENCH, *(wrench(i + 1, offset_ns=-4_000_000) for i in range(101)))
+    record.add(POSE, *(pose(i + 1, touches=touches[i]) for i in range(100)))
+    data = ingest_record(record.write())
+    assert len(data) == 100
+    # wrenches come 4 ms before the frames: the value between two of them is the frame's own
+    np.testing.assert_allclose(data.force[:, 2], np.arange(1, 101), atol=1e-4)
+    np.testing.assert_allclose(data.tared_counts[:, 0], np.arange(1, 101))
+    assert data.in_contact is not None
+    assert data.contact_location is not None
+    np.testing.assert_array_equal(data.in_contact, touches)
+    assert np.isnan(data.contact_location[~data.in_contact]).all()
+    np.testing.assert_allclose(data.contact_location[30], [0.031, 0, -0.008], atol=1e-6)
+    np.testing.assert_array_equal(np.unique(data.group), [0, 1])
+    assert data.group[49] == 0
+    assert data.group[50] == 1
+    assert data.sensor_names == ("finger",)
+
+
+def test_record_drops_what_cannot_be_used(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0), tare(2, 1990.0))
+    record.add(ELECTRODES, frame(6, tare_id=0))  # before any tare
+    record.add(ELECTRODES, replace(frame(1), validity=1))  # bad channels
+    record.add(ELECTRODES, frame(2), frame(3, tare_id=2), frame(4, tare_id=9))  # 9: unknown
+    record.add(ELECTRODES, frame(50))  # no wrench near
+    record.add(WRENCH, *(wrench(i) for i in range(1, 7)))
+    data = ingest_record(record.write())
+    np.testing.assert_array_equal(data.electrodes[:, 0], [2002, 2003])
+    np.testing.assert_array_equal(data.tared_counts[:, 0], [2, 13])
+    assert data.contact_location is None
+    assert data.in_contact is not None, "without poses, contact is a force above a threshold"
+
+
+def test_record_lacks_something(record: Record, tmp_path: Path) -> None:
+    record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, frame(1))
+    with pytest.raises(DatasetError, match="no wrench stream"):
+        ingest_record(record.write())
+    no_tare = Record(tmp_path / "no_tare.mcap").add(ELECTRODES, frame(1, 0)).add(WRENCH, wrench(1))
+    with pytest.raises(DatasetError, match="tare before recording"):
+        ingest_record(no_tare.write())
+    far = Record(tmp_path / "far.mcap").add(TARE, tare(1, 2000.0)).add(ELECTRODES, frame(9))
+    with pytest.raises(DatasetError, match="within"):
+        ingest_record(far.add(WRENCH, wrench(1)).write())
+    only_wrench = Record(tmp_path / "only.mcap").add(WRENCH, wrench(1))
+    with pytest.raises(DatasetError, match="no electrode frames"):
+        ingest_record(only_wrench.write())
+
+
+def test_a_truncated_record_is_named(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, *(frame(i) for i in range(1, 51)))
+    path = record.write()
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(RecordingError):
+        ingest_record(path)
+
+
+def test_presses_end_halfway() -> None:
+    touching = np.array([0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 1], dtype=np.bool_)
+    np.testing.assert_array_equal(number_presses(touching), [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2])
+    np.testing.assert_array_equal(number_presses(np.zeros(4, np.bool_)), [0, 0, 0, 0])
+    np.testing.assert_array_equal(number_presses(np.ones(4, np.bool_)), [0, 0, 0, 0])

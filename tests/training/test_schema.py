@@ -1,0 +1,127 @@
+"""Data sets on disk: what goes in comes out, and what breaks the schema is named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from palpate.protos.errors import DatasetError
+from palpate.training.dataset import FeatureDataset
+from palpate.training.schema import open_dataset, write_dataset
+
+MakeData = Callable[..., FeatureDataset]
+
+
+@pytest.fixture
+def data(press_data: MakeData) -> FeatureDataset:
+    return press_data(presses=3, rows=20)
+
+
+@pytest.fixture
+def path(data: FeatureDataset, tmp_path: Path) -> Path:
+    path = tmp_path / "presses.h5"
+    write_dataset(path, data)
+    return path
+
+
+def test_round_trip(path: Path, data: FeatureDataset) -> None:
+    read = open_dataset(path)
+    assert read.arrays().keys() == data.arrays().keys()
+    for name, array in data.arrays().items():
+        np.testing.assert_array_equal(read.arrays()[name], array, err_msg=name)
+        assert read.arrays()[name].dtype == array.dtype
+    assert read.provenance == data.provenance
+    assert read.sensor_names == data.sensor_names
+    assert not list(path.parent.glob(".*")), "no partial file is left"
+
+
+def test_content_hash_does_not_depend_on_the_layout(path: Path, data: FeatureDataset) -> None:
+    relaid = path.with_name("relaid.h5")
+    with h5py.File(path) as source, h5py.File(relaid, "w") as target:
+        for key, value in source.attrs.items():
+            target.attrs[key] = value
+        for name in source:
+            copy = target.create_dataset(name, data=source[name][()])  # contiguous, plain
+            copy.attrs["unit"] = source[name].attrs["unit"]
+    assert relaid.read_bytes() != path.read_bytes()
+    assert open_dataset(relaid).content_sha256() == data.content_sha256()
+
+
+def test_content_hash_sees_every_value(data: FeatureDataset) -> None:
+    force = data.force.copy()
+    force[7, 2] += np.float32(1e-3)
+    assert replace(data, force=force).content_sha256() != data.content_sha256()
+
+
+def _damage(path: Path, change: Callable[[Any], None]) -> None:
+    with h5py.File(path, "r+") as file:
+        change(file)
+
+
+def _replace(name: str, values: Any, unit: str) -> Callable[[Any], None]:
+    def change(file: Any) -> None:
+        del file[name]
+        file.create_dataset(name, data=values).attrs["unit"] = unit
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.attrs.__setitem__("schema", "something.else"), "something.else"),
+        (lambda f: f.attrs.__setitem__("schema_version", 2), "version 2.*update palpate"),
+        (lambda f: f.attrs.__setitem__("frame", "world"), "frame is 'world'"),
+        (lambda f: f.__delitem__("group"), "'group' is missing"),
+        (lambda f: f["force"].attrs.__setitem__("unit", "mN"), "force is in 'mN'.*'N'"),
+        (lambda f: f["force"].__setitem__((11, 1), np.nan), "force is not finite in row 11"),
+        (lambda f: f["force"].__setitem__((3, 0), 9.0), "content_sha256"),
+        (lambda f: f["electrodes"].__setitem__((5, 0), 5000), "4095 counts in row 5"),
+        (
+            _replace("electrodes", np.zeros((60, 18), np.uint16), "counts"),
+            "electrodes has 18 columns, a BioTac has 19",
+        ),
+        (_replace("force", np.zeros((59, 3), np.float32), "N"), r"force has shape \(59, 3\)"),
+        (_replace("force", np.zeros((60, 3), np.float64), "N"), "force is float64"),
+        (_replace("block", np.zeros(60, np.int32), "1"), "block 0 spans groups"),
+    ],
+)
+def test_a_broken_file_is_named(path: Path, change: Callable[[Any], None], words: str) -> None:
+    _damage(path, change)
+    with pytest.raises(DatasetError, match=words) as caught:
+        open_dataset(path)
+    assert str(path) in str(caught.value)
+    assert caught.value.remedy
+
+
+def test_location_must_be_known_in_contact_only(path: Path, data: FeatureDataset) -> None:
+    assert data.in_contact is not None
+    row = int(np.flatnonzero(data.in_contact)[0])
+    _damage(path, lambda f: f["contact_location"].__setitem__((row, 0), np.nan))
+    with pytest.raises(DatasetError, match=f"contact_location is not finite in row {row}"):
+        open_dataset(path)
+
+
+def test_a_truncated_file_is_named(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DatasetError, match="truncated or damaged"):
+        open_dataset(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no such file"):
+        open_dataset(tmp_path / "none.h5")
+
+
+def test_a_failed_write_leaves_nothing(data: FeatureDataset, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file where a folder should be")
+    with pytest.raises(DatasetError, match="cannot write"):
+        write_dataset(tmp_path / "taken" / "x.h5", data)
+    assert [p.name for p in tmp_path.iterdir()] == ["taken"]

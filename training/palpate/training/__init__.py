@@ -1,0 +1,1 @@
+"""Recordings and simulations -> data sets -> networks -> bundles; the only room with torch."""

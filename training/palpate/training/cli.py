@@ -1,0 +1,170 @@
+"""Commands of this room: ``palpate train ...`` and ``palpate data ...``, mounted by deploy."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from palpate.training.dataset import FeatureDataset
+from palpate.training.ingest_lasa import BLOCKS_PER_RECORDING, ELECTRODE_LAG_ROWS, ingest_lasa
+from palpate.training.ingest_record import ingest_record
+from palpate.training.schema import UNITS, open_dataset, write_dataset
+
+train_app = typer.Typer(no_args_is_help=True, help="Train networks and write model bundles.")
+data_app = typer.Typer(no_args_is_help=True, help="Make data sets and look into them.")
+
+console = Console()
+
+
+def _command() -> str:
+    """The command line as typed, for provenance; without the folder of the program."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+    )
+
+
+@data_app.command("ingest-lasa")
+def data_ingest_lasa(
+    source: Annotated[Path, typer.Argument(help="force_calibration.npz")],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    blocks: Annotated[
+        int, typer.Option(min=10, help="Contiguous blocks that each recording is cut into.")
+    ] = BLOCKS_PER_RECORDING,
+    lag_rows: Annotated[
+        int, typer.Option(min=0, help="Rows by which electrodes lag the force; 0 = as stored.")
+    ] = ELECTRODE_LAG_ROWS,
+) -> None:
+    """LASA force calibration (two real BioTacs) -> data set. Its rows may not be redistributed.
+
+    palpate data ingest-lasa force_calibration.npz lasa.h5
+    """
+    data = ingest_lasa(source, command=_command(), blocks_per_recording=blocks, lag_rows=lag_rows)
+    write_dataset(out, data)
+    console.print(contents(data, str(out)))
+
+
+@data_app.command("ingest-record")
+def data_ingest_record(
+    source: Annotated[Path, typer.Argument(help="Record (.mcap) with electrodes, tare, wrench.")],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    licence: Annotated[
+        str, typer.Option(help="What may be done with the rows; kept with them.")
+    ] = "own record",
+) -> None:
+    """Record of a sensor with its force/torque sensor and indenter -> data set.
+
+    palpate data ingest-record presses.mcap presses.h5
+    """
+    with console.status(f"reading {source.name}"):
+        data = ingest_record(source, command=_command(), licence=licence)
+        write_dataset(out, data)
+    console.print(contents(data, str(out)))
+
+
+@data_app.command("inspect")
+def data_inspect(
+    path: Annotated[Path, typer.Argument(help="Data set (.h5).")],
+) -> None:
+    """Check a data set and show what is in it.
+
+    palpate data inspect presses.h5
+    """
+    console.print(contents(open_dataset(path), str(path)))
+
+
+def contents(data: FeatureDataset, title: str) -> Table:
+    """What a data set holds: arrays, units, ranges, provenance."""
+    groups, blocks = len(np.unique(data.group)), len(np.unique(data.block))
+    table = Table(
+        title=title,
+        caption=f"{len(data)} rows, {groups} groups, {blocks} blocks,"
+        f" sensors {', '.join(data.sensor_names)}\n"
+        f"source: {data.provenance.source}\nlicence: {data.provenance.licence}\n"
+        f"made by: {data.provenance.command or '-'} (palpate {data.provenance.palpate_version})\n"
+        f"notes: {data.provenance.notes or '-'}\ncontent sha256: {data.content_sha256()}",
+        caption_justify="left",
+    )
+    for heading in ("dataset", "type", "shape", "unit"):
+        table.add_column(heading)
+    for heading in ("min", "median", "max"):
+        table.add_column(heading, justify="right")
+    for name, array in data.arrays().items():
+        values = array.astype(np.float64)
+        low, middle, high = np.nanpercentile(values, [0, 50, 100])
+        table.add_row(
+            name,
+            str(array.dtype),
+            str(array.shape),
+            UNITS[name],
+            *(f"{value:.6g}" for value in (low, middle, high)),
+        )
+    return table
+
+
+@train_app.command("force-real")
+def train_force_real(
+    data: Annotated[Path, typer.Option(help="Data set from `palpate data ingest-lasa`.")],
+    out: Annotated[Path, typer.Option(help="Folder for force-real.md, .json and .png.")],
+    seeds: Annotated[int, typer.Option(min=1, help="Networks for each fold.")] = 5,
+) -> None:
+    """Force on real BioTacs: blocks held out and a BioTac never seen, beside the baselines.
+
+    palpate train force-real --data lasa.h5 --out docs/results
+    """
+    from palpate.training.evaluate import rich_table
+    from palpate.training.force_real import experiment_count, run_force_real, write_report
+
+    dataset = open_dataset(data)
+    with _progress() as progress:
+        task = progress.add_task("networks", total=experiment_count(dataset, seeds))
+        report = run_force_real(dataset, seeds=seeds, on_network=lambda: progress.advance(task))
+    write_report(out, report, command=_command())
+    console.print(rich_table(report.results, "Force on real BioTacs"))
+    console.print(f"wrote {out}/force-real.md, .json, .png")
+
+
+@train_app.command("features")
+def train_features_command(
+    data: Annotated[Path, typer.Option(help="Data set (.h5).")],
+    out: Annotated[Path, typer.Option(help="Folder of the bundle; must not exist.")],
+    name: Annotated[str, typer.Option(help="Name of the bundle.")] = "features",
+    version: Annotated[int, typer.Option(min=1, help="Its version.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of split and weights.")] = 0,
+) -> None:
+    """Train force and contact location, test on unseen presses, write the bundle.
+
+    palpate train features --data presses.h5 --out models/features-virtual/1 --name features-virtual
+    """
+    from palpate.training.train_features import train_features
+
+    with _progress() as progress:
+        tasks = {}
+
+        def on_epoch(quantity: str, done: int, total: int) -> None:
+            if quantity not in tasks:
+                tasks[quantity] = progress.add_task(quantity, total=total)
+            progress.update(tasks[quantity], completed=done)
+
+        report = train_features(data, out, name=name, version=version, seed=seed, on_epoch=on_epoch)
+    table = Table(title=f"{name} {version}: unseen presses", caption=f"wrote {out}")
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    for key, value in report.metrics.items():
+        table.add_row(key, f"{value:.5g}")
+    console.print(table)

@@ -1,0 +1,226 @@
+"""Ingest of a record: electrodes, wrench and indenter pose of each sensor, aligned by time."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.protos.errors import DatasetError
+from palpate.protos.messages import (
+    NO_TARE,
+    ElectrodeFrame,
+    IndenterPoseFrame,
+    SensorType,
+    Stamp,
+    Tare,
+    WrenchFrame,
+)
+from palpate.protos.record import read_record
+from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+from palpate.training.dataset import FeatureDataset, Provenance
+from palpate.training.schema import palpate_version
+
+logger = logging.getLogger(__name__)
+
+TOLERANCE_S = 0.005
+"""Half a frame at 100 Hz: a reading farther away belongs to another frame."""
+
+TOUCH_N = 0.2
+"""Without a pose, a force above this counts as contact [N]; above the noise of a 6-axis sensor."""
+
+Times = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class _Streams:
+    """What a record holds of one sensor."""
+
+    frames: list[ElectrodeFrame] = field(default_factory=list)
+    wrenches: list[WrenchFrame] = field(default_factory=list)
+    poses: list[IndenterPoseFrame] = field(default_factory=list)
+    tares: dict[int, Tare] = field(default_factory=dict)
+
+
+def ingest_record(path: Path, *, command: str = "", licence: str = "own record") -> FeatureDataset:
+    """Read an MCAP record.
+
+    A row is a valid, tared electrode frame that has a wrench within 5 ms (and a pose, where the
+    record has poses of that sensor). A group is a press: it ends halfway between two contacts.
+
+    Args:
+        path: ``NAME.mcap``.
+        command: The command line, for provenance.
+        licence: What may be done with the rows.
+
+    Raises:
+        RecordingError: Not a whole record.
+        DatasetError: The record lacks a stream, or no row could be aligned.
+    """
+    sensors = _read(path)
+    parts: list[dict[str, npt.NDArray[Any]]] = []
+    names: list[str] = []
+    for name, streams in sorted(sensors.items()):
+        if not streams.frames:
+            continue
+        part = _align(path, name, streams)
+        part["sensor"] = np.full(len(part["group"]), len(names), dtype=np.int32)
+        if parts:
+            part["group"] = part["group"] + np.int32(parts[-1]["group"].max() + 1)
+        parts.append(part)
+        names.append(name)
+    if not parts:
+        raise DatasetError(
+            f"{path}: no electrode frames", remedy="record the stream electrodes of a sensor"
+        )
+    if any("contact_location" not in part for part in parts):
+        for part in parts:
+            part.pop("contact_location", None)
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return FeatureDataset(
+        **columns,
+        block=columns["group"].copy(),
+        sensor_names=tuple(names),
+        provenance=Provenance(
+            source=f"record of {', '.join(names)}",
+            command=command,
+            input_sha256=digest,
+            licence=licence,
+            palpate_version=palpate_version(),
+            notes=f"aligned within {TOLERANCE_S * 1e3:g} ms; group = press",
+        ),
+        name=str(path),
+    )
+
+
+def _read(path: Path) -> dict[str, _Streams]:
+    sensors: dict[str, _Streams] = {}
+    for item in read_record(path):
+        sensor = item.address.sensor
+        topic = item.address.topic
+        if topic not in (ELECTRODES.name, WRENCH.name, POSE.name, TARE.name):
+            continue
+        streams = sensors.setdefault(sensor, _Streams())
+        if topic == ELECTRODES.name:
+            streams.frames.append(ELECTRODES.codec.decode(item.payload))
+        elif topic == WRENCH.name:
+            streams.wrenches.append(WRENCH.codec.decode(item.payload))
+        elif topic == POSE.name:
+            streams.poses.append(POSE.codec.decode(item.payload))
+        else:
+            tare = TARE.codec.decode(item.payload)
+            streams.tares[tare.tare_id] = tare
+    return sensors
+
+
+def _align(path: Path, name: str, streams: _Streams) -> dict[str, npt.NDArray[Any]]:
+    if not streams.wrenches:
+        raise DatasetError(
+            f"{path}: sensor {name!r} has no wrench stream",
+            remedy="record the force/torque sensor under the same sensor name",
+        )
+    frames = [
+        frame
+        for frame in streams.frames
+        if frame.sensor_type is SensorType.BIOTAC
+        and frame.electrodes_valid
+        and frame.tare_id != NO_TARE
+        and frame.tare_id in streams.tares
+    ]
+    if not frames:
+        raise DatasetError(
+            f"{path}: none of {len(streams.frames)} frames of {name!r} is a valid, tared BioTac"
+            " frame",
+            remedy="tare before recording, and record the stream tare",
+        )
+    frames.sort(key=lambda frame: _time(frame.stamp, streams))
+    times = np.array([_time(frame.stamp, streams) for frame in frames], dtype=np.int64)
+
+    force, has_force = _interpolate(
+        times,
+        np.array([_time(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
+        np.array([w.force for w in streams.wrenches], dtype=np.float64),
+    )
+    kept = has_force
+    location = touching = None
+    if streams.poses:
+        pose_times = np.array([_time(p.stamp, streams) for p in streams.poses], dtype=np.int64)
+        positions = np.array([p.position for p in streams.poses], dtype=np.float64)
+        contact = np.array([[p.in_contact] for p in streams.poses], dtype=np.float64)
+        both, has_pose = _interpolate(times, pose_times, np.hstack([positions, contact]))
+        location, touching = both[:, :3], both[:, 3] >= 0.5
+        kept = kept & has_pose
+    if not kept.any():
+        raise DatasetError(
+            f"{path}: no frame of {name!r} has a wrench (and pose) within {TOLERANCE_S} s",
+            remedy="check that all streams were stamped by the same clock",
+        )
+    logger.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
+    if touching is None:
+        touching = np.linalg.norm(force, axis=1) > TOUCH_N
+
+    baseline = np.array([streams.tares[frame.tare_id].electrodes for frame in frames])
+    columns: dict[str, npt.NDArray[Any]] = {
+        "electrodes": np.array([frame.electrodes for frame in frames], dtype=np.uint16)[kept],
+        "baseline": baseline.astype(np.float32)[kept],
+        "force": force.astype(np.float32)[kept],
+        "group": number_presses(touching[kept]),
+        "in_contact": touching[kept],
+        "time_ns": times[kept],
+    }
+    if location is not None:
+        seen = np.where(touching[:, None], location, np.nan).astype(np.float32)
+        columns["contact_location"] = seen[kept]
+    return columns
+
+
+def _time(stamp: Stamp, streams: _Streams) -> int:
+    """Monotonic time where the first frame and this stamp share the clock, else wall time."""
+    shared = all(
+        stamps[0].stamp.clock_id == streams.frames[0].stamp.clock_id
+        for stamps in (streams.wrenches, streams.poses)
+        if stamps
+    )
+    return stamp.monotonic_ns if shared else stamp.wall_ns
+
+
+def _interpolate(at: Times, times: Times, values: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
+    """Values at other times, linear between neighbours, and where that is allowed.
+
+    Allowed is a time whose nearest reading is within the tolerance. Across a gap of more than
+    twice the tolerance the nearest reading is taken instead of a line through the gap.
+    """
+    order = np.argsort(times, kind="stable")
+    times, values = times[order], values[order]
+    origin = times[0]  # float64 holds ns exactly only for small numbers
+    after = np.clip(np.searchsorted(times, at), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    tolerance = round(TOLERANCE_S * 1e9)
+    nearer = np.where(np.abs(at - times[before]) <= np.abs(times[after] - at), before, after)
+    allowed = np.abs(times[nearer] - at) <= tolerance
+    seconds = (times - origin) * 1e-9
+    line = np.stack([np.interp((at - origin) * 1e-9, seconds, column) for column in values.T], 1)
+    gap = (times[after] - times[before] > 2 * tolerance)[:, None]
+    return np.where(gap, values[nearer], line), allowed
+
+
+def number_presses(touching: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    """Press of every row, from 0; a press ends halfway between two contacts.
+
+    Args:
+        touching: Whether the indenter touches, shape ``(N,)``, in order of time.
+    """
+    edges = np.diff(touching.astype(np.int8), prepend=0, append=0)
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    press = np.zeros(len(touching), dtype=np.int32)
+    for end, start in zip(ends[:-1], starts[1:], strict=True):
+        press[(end + start) // 2 :] += 1
+    return press
