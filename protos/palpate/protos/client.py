@@ -14,9 +14,9 @@ Every failure is a ``PalpateError``: nothing hangs, nothing old is returned as f
 from __future__ import annotations
 
 import time
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
+from palpate.protos.closing import Closing
 from palpate.protos.codec import (
     MODEL_METADATA,
     SERVICE_REQUEST,
@@ -47,7 +47,7 @@ from palpate.protos.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
 M = TypeVar("M")
 
 
-class Client:
+class Client(Closing):
     """A robot's view of a station.
 
     Args:
@@ -168,17 +168,6 @@ class Client:
     def close(self) -> None:
         """Leave the bus."""
         self.session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _subscriber(self, topic: Topic[M], sensor: str) -> Subscriber[M]:
         key = (topic.name, sensor)

@@ -8,10 +8,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
-from types import TracebackType
-from typing import Self
 
 from palpate.protos import clock
+from palpate.protos.closing import Closing
 from palpate.protos.codec import SERVICE_REQUEST, STATUS
 from palpate.protos.errors import PalpateError
 from palpate.protos.messages import ErrorReply, ServiceState, Status
@@ -120,7 +119,7 @@ class Health:
             )
 
 
-class HealthReporter:
+class HealthReporter(Closing):
     """Publishes ``Status`` once a second and on each change of state, and answers when asked.
 
     Args:
@@ -180,14 +179,3 @@ class HealthReporter:
             self._publisher.put(self._status())
         except PalpateError as error:
             _log.warning("last status not published: %s", error)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

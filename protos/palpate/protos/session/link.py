@@ -6,11 +6,11 @@ import re
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 import zenoh
 
+from palpate.protos.closing import Closing
 from palpate.protos.codec import Codec
 from palpate.protos.config import LinkConfig
 from palpate.protos.errors import LinkError, PalpateError
@@ -36,7 +36,7 @@ K = TypeVar("K", bound=_Closable)
 _IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
 
 
-class Session:
+class Session(Closing):
     """A process's place on the bus. Always used as a context manager.
 
     A process that ends with an open Zenoh session may hang in its thread shutdown; ``with`` closes
@@ -226,17 +226,6 @@ class Session:
                 continue
         self._closing.clear()
         self._raw.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _keep(self, thing: K) -> K:
         self._closing.append(thing.close)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
 
 import zenoh
 
+from palpate.protos.closing import Closing
 from palpate.protos.topics import live_key
 
 
@@ -21,7 +20,7 @@ class Alive:
     ready: bool
 
 
-class Presence:
+class Presence(Closing):
     """Declares that this process is alive, and when it says so, ready.
 
     Both vanish for others within milliseconds when the process dies, and within the link's lease
@@ -49,17 +48,6 @@ class Presence:
         """Withdraw both."""
         self.not_ready()
         self._alive.undeclare()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> list[Alive]:

@@ -6,12 +6,12 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, TypeVar
 
 import zenoh
 
 from palpate.protos import clock
+from palpate.protos.closing import Closing
 from palpate.protos.errors import StaleError, StreamTimeout, WireError
 from palpate.protos.messages import Origin
 from palpate.protos.session.queues import Delivery, Waiting, waiting_for
@@ -58,7 +58,7 @@ class Sample:
         return self.encoding.partition(";")[2]
 
 
-class Subscriber(Generic[M]):
+class Subscriber(Generic[M], Closing):
     """Receives one topic. Made by ``Session.subscriber``; use it from one thread.
 
     ``counters``: ``received``, ``delivered``, ``dropped`` (newest wins), ``overflow``,
@@ -210,19 +210,8 @@ class Subscriber(Generic[M]):
         self._waiting.close()
         self._subscriber.undeclare()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-
-class Tap:
+class Tap(Closing):
     """Receives undecoded samples of several topics in order of arrival. Made by ``Session.tap``."""
 
     def __init__(
@@ -285,14 +274,3 @@ class Tap:
         self._waiting.close()
         for subscriber in self._subscribers:
             subscriber.undeclare()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
