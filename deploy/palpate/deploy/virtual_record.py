@@ -11,7 +11,7 @@ from palpate.gateway.pipeline import Outgoing, Pipeline
 from palpate.protos.record import RecordWriter
 from palpate.protos.topics import ELECTRODES, TOPICS, sensor_key
 
-SENSOR = "finger"
+SENSOR = "virtual-finger"
 _STATION = "virtual"
 
 
