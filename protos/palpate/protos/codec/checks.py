@@ -74,17 +74,21 @@ def stamp_to_wire(stamp: Stamp, msg: common_pb2.Stamp) -> None:
         reject("stamp", f"stamp times {stamp.monotonic_ns}, {stamp.wall_ns} ns exceed int64")
 
 
-def vector3_from_wire(msg: common_pb2.Vector3, what: str) -> FloatArray:
-    """Check and convert three floats, shape ``(3,)``."""
+def vector3_from_wire(msg: common_pb2.Vector3, what: str, *, deviation: bool = False) -> FloatArray:
+    """Check and convert three floats, shape ``(3,)``; a standard deviation is not negative."""
     x, y, z = msg.x, msg.y, msg.z
     # The sum of three float32 cannot overflow a double, and NaN or inf in any of them survives it.
     if not isfinite(x + y + z):
         reject("non_finite", f"{what} = ({x}, {y}, {z}) is not finite")
+    if deviation and (x < 0 or y < 0 or z < 0):
+        reject("negative_sd", f"{what} = ({x}, {y}, {z}) is negative")
     return np.array((x, y, z), np.float32)
 
 
-def vector3_to_wire(value: FloatArray, msg: common_pb2.Vector3, what: str) -> None:
-    """Check and fill three floats."""
+def vector3_to_wire(
+    value: FloatArray, msg: common_pb2.Vector3, what: str, *, deviation: bool = False
+) -> None:
+    """Check and fill three floats; a standard deviation is not negative."""
     try:
         x, y, z = value.tolist()
     except (AttributeError, ValueError, TypeError) as error:
@@ -94,11 +98,13 @@ def vector3_to_wire(value: FloatArray, msg: common_pb2.Vector3, what: str) -> No
         ) from error
     if not isfinite(x + y + z):
         reject("non_finite", f"{what} = ({x}, {y}, {z}) is not finite")
+    if deviation and (x < 0 or y < 0 or z < 0):
+        reject("negative_sd", f"{what} = ({x}, {y}, {z}) is negative")
     msg.x = x
     msg.y = y
     msg.z = z
     # A float32 field stores an out-of-range double as infinity.
-    if not isfinite(msg.x + msg.y + msg.z):
+    if value.dtype != np.float32 and not isfinite(msg.x + msg.y + msg.z):
         reject("non_finite", f"{what} = ({x}, {y}, {z}) exceeds float32")
 
 

@@ -34,12 +34,12 @@ def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
         if not msg.in_contact:
             reject("location", "contact_location comes although in_contact is false")
         location = vector3_from_wire(msg.contact_location, "contact_location")
-        location_sd = vector3_from_wire(msg.contact_location_sd, "contact_location_sd")
-        _check_sd(location_sd, "contact_location_sd")
+        location_sd = vector3_from_wire(
+            msg.contact_location_sd, "contact_location_sd", deviation=True
+        )
     if not msg.HasField("force") or not msg.HasField("force_sd"):
         reject("force", "force or force_sd is missing")
-    force_sd = vector3_from_wire(msg.force_sd, "force_sd")
-    _check_sd(force_sd, "force_sd")
+    force_sd = vector3_from_wire(msg.force_sd, "force_sd", deviation=True)
     return FeatureEstimate(
         stamp_from_wire(msg.source),
         check_serial(msg.sensor_serial),
@@ -62,16 +62,17 @@ def _features_encode(estimate: FeatureEstimate) -> bytes:
     )
     stamp_to_wire(estimate.source, msg.source)
     vector3_to_wire(estimate.force, msg.force, "force")
-    vector3_to_wire(estimate.force_sd, msg.force_sd, "force_sd")
-    _check_sd(estimate.force_sd, "force_sd")
+    vector3_to_wire(estimate.force_sd, msg.force_sd, "force_sd", deviation=True)
     if estimate.contact_location is not None:
         if estimate.contact_location_sd is None or not estimate.in_contact:
             reject("location", "contact_location needs contact_location_sd and in_contact")
         vector3_to_wire(estimate.contact_location, msg.contact_location, "contact_location")
         vector3_to_wire(
-            estimate.contact_location_sd, msg.contact_location_sd, "contact_location_sd"
+            estimate.contact_location_sd,
+            msg.contact_location_sd,
+            "contact_location_sd",
+            deviation=True,
         )
-        _check_sd(estimate.contact_location_sd, "contact_location_sd")
     return msg.SerializeToString()
 
 
