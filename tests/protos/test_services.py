@@ -176,8 +176,10 @@ def test_presence_comes_and_goes(pair: Any, wait_until: WaitUntil) -> None:
     wait_until(lambda: b.alive() == [])
 
 
-def test_no_router_is_said_and_what_to_do(free_port: int) -> None:
-    link = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port}",), wait_for_router_s=0.3)
+@pytest.mark.parametrize("direct", [True, False])
+def test_no_router_is_said_and_what_to_do(free_port: int, direct: bool) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    link = LinkConfig(connect=(endpoint,), wait_for_router_s=0.3, direct=direct)
     with pytest.raises(LinkError, match=rf"no router at tcp/127.0.0.1:{free_port}.*palpate up"):
         Session.open(link)
 

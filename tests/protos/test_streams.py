@@ -23,7 +23,7 @@ from palpate.protos.messages import (
     Origin,
 )
 from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, sensor_key
+from palpate.protos.topics import ELECTRODES, TARE, sensor_key
 
 FrameOf = Callable[..., ElectrodeFrame]
 WaitUntil = Callable[..., None]
@@ -105,6 +105,46 @@ def test_every_loses_nothing_with_a_slow_consumer(
         assert subscriber.next(timeout_s=5).message.stamp.sequence == sequence
     sender.join()
     assert "overflow" not in subscriber.counters
+
+
+def test_without_direct_links_nothing_is_overtaken(link: LinkConfig, frame_of: FrameOf) -> None:
+    """Frames that are sent while links still come up arrive in order: there is one path."""
+    indirect = link.model_copy(update={"direct": False})
+    count = 2000
+    with Session.open(indirect) as a:
+        subscriber = a.subscriber(ELECTRODES, delivery=Delivery.EVERY, capacity=64)
+        with Session.open(indirect) as b:
+            publisher = b.publisher(ELECTRODES, sensor="finger", lossless=True)
+
+            def send() -> None:
+                for sequence in range(1, count + 1):
+                    publisher.put(frame_of(sequence, origin=Origin.REPLAYED))
+
+            sender = threading.Thread(target=send)
+            sender.start()
+            got = [subscriber.next(timeout_s=5).message.stamp.sequence]
+            while got[-1] < count:
+                got.append(subscriber.next(timeout_s=5).message.stamp.sequence)
+            sender.join()
+    assert got == list(range(got[0], count + 1))
+    assert not {"reordered", "restarts", "lost_on_bus"} & set(subscriber.counters)
+
+
+def test_a_tap_keeps_the_order_across_topics(
+    link: LinkConfig, frame_of: FrameOf, examples: dict[str, Any], wait_until: WaitUntil
+) -> None:
+    """A recorded frame must not stand before the tare that was sent before it."""
+    indirect = link.model_copy(update={"direct": False})
+    with Session.open(indirect) as a, Session.open(indirect) as b:
+        tap = a.tap([ELECTRODES, TARE], delivery=Delivery.EVERY, capacity=4096)
+        tares = b.publisher(TARE, sensor="finger", lossless=True)
+        frames = b.publisher(ELECTRODES, sensor="finger", lossless=True)
+        wait_until(lambda: tares.matched() and frames.matched())
+        for sequence in range(1, 501):
+            tares.put(examples["Tare"])
+            frames.put(frame_of(sequence))
+        topics = [tap.next(timeout_s=5).topic for _ in range(1000)]
+    assert topics == ["tare", "electrodes"] * 500
 
 
 def test_a_full_queue_counts_what_it_refuses(

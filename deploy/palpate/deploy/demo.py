@@ -17,6 +17,7 @@ from palpate.deploy.ports import free_endpoint
 from palpate.deploy.profile import Profile, changed, load_profile
 from palpate.deploy.supervise import Supervisor
 from palpate.deploy.up import stop_on_signals
+from palpate.deploy.viewer import viewer_command
 from palpate.protos.client import Client
 from palpate.protos.errors import LinkError, PalpateError, StreamTimeout
 from palpate.protos.session import Delivery
@@ -183,7 +184,7 @@ def _report(console: Console, comparison: Comparison, records: list[Path]) -> in
     view = record.with_suffix(".rrd")
     if view.is_file():
         print(f"view     {view}")
-        print(f"look at it: rerun {view}")
+        print(f"look at it: {viewer_command(view)}")
     else:
         print(f"view     none; make one: palpate review {record}")
     return 0

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.deploy.status import duration_text
+from palpate.deploy.viewer import viewer_command
 from palpate.protos.record import RecordSummary, check_readable, recover, summarise
 
 
@@ -82,7 +83,7 @@ def review_record(path: Path, view: Path | None, picture: Path | None) -> None:
         for name, value in plot_record(path, picture).items():
             print(f"  {name:24} {value:.4g}")
         print(picture)
-    print(f"look at it: rerun {written}")
+    print(f"look at it: {viewer_command(written)}")
 
 
 def recover_record(part: Path) -> None:

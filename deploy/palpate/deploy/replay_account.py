@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from palpate.deploy.viewer import viewer_command
 from palpate.protos.errors import PalpateError
 from palpate.protos.record import summarise
 from palpate.protos.topics import ELECTRODES, FEATURES
@@ -129,4 +130,4 @@ def print_account(outcome: Outcome) -> None:
     for path in outcome.records:
         print(path)
         if (view := path.with_suffix(".rrd")).is_file():
-            print(f"{view}   look at it: rerun {view}")
+            print(f"{view}   look at it: {viewer_command(view)}")

@@ -37,6 +37,9 @@ class LinkConfig(StrictConfig):
     Attributes:
         connect: Endpoints of routers, e.g. ``tcp/127.0.0.1:7447``.
         listen: Endpoints for direct links from peers; port 0 = any free one.
+        direct: Whether processes link to one another directly (least latency). False = all data
+            through the router: one path, so that nothing is overtaken while a direct link comes
+            up. A lossless replay needs that.
         wait_for_router_s: How long opening waits for a router [s]; negative = for ever (services).
         lease_s: A peer silent for this long is gone [s].
         tls: Certificates; required for any listener that is not loopback.
@@ -44,6 +47,7 @@ class LinkConfig(StrictConfig):
 
     connect: tuple[str, ...] = (DEFAULT_ROUTER,)
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    direct: bool = True
     wait_for_router_s: float = -1.0
     lease_s: float = Field(default=2.0, gt=0.1)
     tls: TlsConfig | None = None

@@ -50,7 +50,7 @@ class Session(Closing):
 
     @classmethod
     def open(cls, link: LinkConfig, *, station: str = "lab") -> Self:
-        """Join the bus as a peer.
+        """Join the bus.
 
         Args:
             link: Where the router is and how long to wait for it.
@@ -59,16 +59,13 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
         """
-        raw = _open(link, "peer")
+        raw = _open(link, "peer" if link.direct else "client")
         if link.wait_for_router_s >= 0 and link.connect:
             deadline = time.monotonic() + link.wait_for_router_s
             while not raw.info.routers_zid() and not raw.info.peers_zid():
                 if time.monotonic() > deadline:
                     raw.close()
-                    raise LinkError(
-                        f"no router at {', '.join(link.connect)}",
-                        remedy="start one with `palpate up`, or name yours with --connect",
-                    )
+                    raise _no_router(link)
                 time.sleep(0.02)
         return cls(raw, station)
 
@@ -252,6 +249,13 @@ class Session(Closing):
         return service_key(self.station, service, instance, endpoint)
 
 
+def _no_router(link: LinkConfig) -> LinkError:
+    return LinkError(
+        f"no router at {', '.join(link.connect)}",
+        remedy="start one with `palpate up`, or name yours with --connect",
+    )
+
+
 def _open(link: LinkConfig, mode: str) -> zenoh.Session:
     try:
         return zenoh.open(zenoh_config(link, mode))
@@ -264,6 +268,8 @@ def _open(link: LinkConfig, mode: str) -> zenoh.Session:
                     "port for the listener"
                 ),
             ) from error
+        if mode == "client":
+            raise _no_router(link) from error
         raise LinkError(
             f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
         ) from error

@@ -12,26 +12,36 @@ from palpate.protos.config import LinkConfig
 MAX_MESSAGE_BYTES = 4 << 20
 """Larger messages are refused on arrival; Zenoh's own limit is 1 GiB."""
 
+INDIRECT_WAIT_S = 60.0
+"""Without direct links opening blocks until the router answers; it gives up after this time [s]."""
+
 LOSSLESS_STALL_S = 60.0
 """How long a lossless (replay) publisher may be blocked before its link is closed."""
 
 
 def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
-    """Settings of a session of ``mode`` ``"peer"`` or ``"router"``."""
+    """Settings of a session of ``mode`` ``"peer"``, ``"client"`` or ``"router"``."""
+    client = mode == "client"
+    wait_s = INDIRECT_WAIT_S if link.wait_for_router_s < 0 else link.wait_for_router_s
     settings: dict[str, Any] = {
         "mode": mode,
-        # Retry for ever in the background; Session.open does the waiting and names what is missing.
+        # A peer retries for ever in the background; Session.open does the waiting and names what is
+        # missing. A client cannot open without its router.
         "connect": {
             "endpoints": list(link.connect),
-            "timeout_ms": -1,
-            "exit_on_failure": False,
+            "timeout_ms": round(wait_s * 1000) if client else -1,
+            "exit_on_failure": client,
             "retry": {
                 "period_init_ms": 200,
                 "period_max_ms": 1000,
                 "period_increase_factor": 1.5,
             },
         },
-        "listen": {"endpoints": list(link.listen), "timeout_ms": 0, "exit_on_failure": True},
+        "listen": {
+            "endpoints": [] if client else list(link.listen),
+            "timeout_ms": 0,
+            "exit_on_failure": True,
+        },
         # The router introduces peers to one another; their data then flows on direct links.
         "scouting": {
             "multicast": {"enabled": False},

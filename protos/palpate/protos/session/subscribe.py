@@ -226,7 +226,10 @@ class Tap(Closing):
         self._waiting: Waiting[tuple[zenoh.Sample, int, int]] = waiting_for(
             delivery, capacity, self._counters
         )
-        self._subscribers = [session.declare_subscriber(key, self._on_sample) for _, key in topics]
+        # By default each subscriber calls back from a thread of its own, and a frame may overtake
+        # the tare that was sent before it. Called from the link's thread, arrival is the order.
+        in_order = zenoh.handlers.Callback(self._on_sample, indirect=False)
+        self._subscribers = [session.declare_subscriber(key, in_order) for _, key in topics]
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         monotonic_ns, wall_ns = clock.now()
