@@ -92,6 +92,21 @@ def test_the_name_tells_an_unfinished_record(tmp_path: Path, payload: bytes) -> 
     assert not writer.part.exists()
 
 
+def test_a_record_that_is_being_written_is_not_recovered(tmp_path: Path, payload: bytes) -> None:
+    """Recovery removes the part: under a living writer that would lose the record."""
+    path = tmp_path / "run.mcap"
+    writer = RecordWriter(path)
+    writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1)
+    writer.flush()
+    with pytest.raises(
+        RecordingError, match=r"run\.mcap\.part is being written.*stop its recorder"
+    ):
+        recover(writer.part)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap.part"]
+    writer.close()
+    assert len(list(read_record(path))) == 1
+
+
 def test_every_truncation_is_noticed_and_whole_messages_are_recovered(
     tmp_path: Path, payload: bytes
 ) -> None:

@@ -102,9 +102,9 @@ def sensors_of(file: Path) -> list[dict[str, Any]]:
             names = recorded_sensors(file)
         except RecordingError:
             names = []  # a damaged record delivers what is before the damage, and then says so
-        if len(names) < 2:
-            name = names[0] if names else "finger"
-            return [{"name": name, "driver": "record", "options": {"path": path}}]
+        if not names:
+            return [{"name": "finger", "driver": "record", "options": {"path": path}}]
+        # Naming the sensor spares the driver a look through the whole record.
         return [
             {"name": name, "driver": "record", "options": {"path": path, "sensor": name}}
             for name in names

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
-import os
 import time
 from collections import Counter
 from datetime import UTC, datetime
@@ -19,7 +17,7 @@ from palpate.protos.session import Sample
 from palpate.protos.topics import TOPICS, Topic
 from palpate.services.config import RecorderConfig
 from palpate.services.disk import DiskError, disk_error, free_bytes
-from palpate.services.recovery import PART, Recovery
+from palpate.services.recovery import Recovery
 from palpate.services.scene import SensorScene
 from palpate.services.viewing import ViewWorker
 
@@ -54,7 +52,6 @@ class RecordKeeper:
         self._health = health
         self._counts: Counter[str] = Counter()
         self._writer: RecordWriter | None = None
-        self._lock_fd: int | None = None
         self._view: ViewWorker | None = None
         self._views: list[ViewWorker] = []  # the present one, and those that still draw the rest
         self._path: Path | None = None
@@ -184,7 +181,6 @@ class RecordKeeper:
             self._fail(error.problem)
             return
         self._path = path
-        self._lock_fd = _lock(path.with_name(path.name + PART))
         self._size = self._unflushed = 0
         self._opened_s = time.monotonic()
         if self._config.rrd:
@@ -276,19 +272,6 @@ class RecordKeeper:
             except RecordingError as error:
                 problem = error.problem
                 writer.abandon()  # the part stays; recovery saves what is whole in it
-        if self._lock_fd is not None:
-            os.close(self._lock_fd)
-            self._lock_fd = None
         if view is not None:
             view.finish()
         return problem
-
-
-def _lock(part: Path) -> int | None:
-    """Mark a growing record as alive for as long as this process lives."""
-    try:
-        fd = os.open(part, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return None
-    fcntl.flock(fd, fcntl.LOCK_EX)  # another recorder that looks at it lets go at once
-    return fd

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
-import os
 import threading
 import time
 from collections.abc import Iterable
@@ -12,7 +10,7 @@ from pathlib import Path
 
 from palpate.protos.errors import RecordingError
 from palpate.protos.health import Health
-from palpate.protos.record import recover
+from palpate.protos.record import is_being_written, recover
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +26,7 @@ NEWBORN_S = 10.0
 def leftovers(folder: Path) -> list[Path]:
     """Records in ``folder`` whose writer is gone, oldest first.
 
-    A recorder holds a lock on the file it writes; the kernel drops it with the process.
+    A writer holds a lock on its part; the kernel drops it with the process.
     """
     return [part for part in sorted(folder.glob(f"*.mcap{PART}")) if not _alive(part)]
 
@@ -96,16 +94,9 @@ class Recovery:
 
 def _alive(part: Path) -> bool:
     try:
-        fd = os.open(part, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return True  # gone or not ours: nothing to recover
-    try:
-        status = os.fstat(fd)
+        status = part.stat()
         if status.st_size < NEWBORN_BYTES and time.time() - status.st_mtime < NEWBORN_S:
             return True
-        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(fd)
-    return False
+        return is_being_written(part)
+    except (OSError, RecordingError):
+        return True  # gone or not ours: nothing to recover

@@ -12,7 +12,7 @@ from palpate.protos.record.reading import (
     read_record,
     summarise,
 )
-from palpate.protos.record.recovery import recover
+from palpate.protos.record.recovery import is_being_written, recover
 from palpate.protos.record.writing import FLUSH_S, RecordWriter, descriptor_set
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "RecordWriter",
     "check_readable",
     "descriptor_set",
+    "is_being_written",
     "read_record",
     "recover",
     "summarise",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
 from collections.abc import Mapping
@@ -65,6 +66,9 @@ class RecordWriter:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: IO[bytes] = open(self.part, "xb")
+            # Alive for as long as this process: the kernel drops the lock with it, and recovery
+            # leaves a locked part alone. Whoever is looking at it lets go at once.
+            fcntl.flock(self._file, fcntl.LOCK_EX)
         except FileExistsError as error:
             raise RecordingError(
                 f"{self.part} exists: a record of this name is being written or was cut off",
