@@ -1,0 +1,1 @@
+"""Rigid indenters as exact distances, and the paths they take."""

@@ -1,0 +1,78 @@
+"""Constants of contact, and an indenter at a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from palpate.fem.contact_kernels import Law
+from palpate.fem.device import scalars
+from palpate.fem.indenter.shape import Indenter
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSettings:
+    """Numbers of the contact laws, per unpressurised area.
+
+    Attributes:
+        stiffness: Penalty of the augmented Lagrangian [Pa/m].
+        softness_m: Distance within which its corner is rounded [m].
+        tangential_stiffness: Of a sticking point [Pa/m].
+        margin_m: Points farther from a surface are not looked at [m].
+    """
+
+    stiffness: float = 2e10
+    softness_m: float = 1e-6
+    tangential_stiffness: float = 5e9
+    margin_m: float = 0.1e-3
+
+    def law(self, friction: float) -> Law:
+        """The same for the kernels."""
+        law = Law()
+        law.stiffness = wp.float64(self.stiffness)
+        law.softness = wp.float64(self.softness_m)
+        law.friction = wp.float64(friction)
+        law.tangential_stiffness = wp.float64(self.tangential_stiffness)
+        return law
+
+
+class Press:
+    """An indenter at a pose (7,): position [m] and quaternion w x y z, sensor frame."""
+
+    def __init__(self, indenter: Indenter, pose: Floats, friction: float) -> None:
+        self.indenter, self.friction = indenter, friction
+        self.primitives = scalars(indenter.packed())
+        self.tip = np.asarray(pose[:3], np.float64)
+        self.rotation = rotation_matrix(pose[3:])
+
+    def at(self, pose: Floats) -> Press:
+        """The same at another pose."""
+        other = object.__new__(Press)
+        other.indenter, other.friction, other.primitives = (
+            self.indenter,
+            self.friction,
+            self.primitives,
+        )
+        other.tip, other.rotation = np.asarray(pose[:3], np.float64), rotation_matrix(pose[3:])
+        return other
+
+    def to_local(self, points: Floats) -> Floats:
+        """Points of the sensor frame in the indenter's."""
+        return np.asarray((points - self.tip) @ self.rotation)
+
+
+def rotation_matrix(quaternion: Floats) -> Floats:
+    """Rotation of a unit quaternion w x y z, (3, 3)."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

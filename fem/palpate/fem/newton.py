@@ -1,0 +1,177 @@
+"""Newton's method for one increment: bordered by the fluid, with friction's unsymmetric share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, gmres
+
+from palpate.fem.laws import Press
+from palpate.fem.linear import Factor
+from palpate.fem.state import State
+from palpate.fem.system import Balance, System
+from palpate.protos.errors import SimulationError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class NewtonSettings:
+    """When to stop, and how far to go.
+
+    Attributes:
+        tolerance: Unbalanced force over the scale of the forces that cancel.
+        volume_tolerance: Relative error of the cavity's volume and of each element's.
+        iterations: Give up after this many.
+        largest_move_m: A longer step of any node is shortened [m].
+        keep_factor: A factor is kept while each iteration shrinks the error at least this much.
+    """
+
+    tolerance: float = 1e-6
+    volume_tolerance: float = 1e-6
+    iterations: int = 20
+    largest_move_m: float = 0.25e-3
+    keep_factor: float = 0.2
+
+
+@dataclass(slots=True)
+class Report:
+    """How an increment went."""
+
+    iterations: int = 0
+    factorisations: int = 0
+    residuals: list[float] = field(default_factory=list)
+    converged: bool = False
+    reason: str = ""
+
+
+class Newton:
+    """Solves increments of one system; keeps its factor between them."""
+
+    def __init__(self, system: System, factor: Factor, settings: NewtonSettings) -> None:
+        self.system, self.factor, self.settings = system, factor, settings
+        # Volume gradient at the factorised state, and the factor's answer to it.
+        self._border: tuple[Floats, Floats] | None = None
+        self.fresh = False
+
+    def solve(
+        self,
+        state: State,
+        press: Press | None,
+        *,
+        volume: float | None,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> tuple[Report, Balance]:
+        """Bring ``state`` into equilibrium, in place.
+
+        Args:
+            state: Start; holds the answer, or the last iterate, afterwards.
+            press: Indenter at its pose.
+            volume: Volume the cavity shall have [m^3]; None = the fluid pressure is given.
+            should_stop: Asked once an iteration; True ends it unconverged.
+        """
+        settings, system, report = self.settings, self.system, Report()
+        balance = system.balance(state, press, tangent=not self.fresh)
+        prepared = not self.fresh
+        error = self._error(balance, volume)
+        report.residuals.append(error)
+        while True:
+            if self._converged(balance, volume):
+                report.converged = True
+                return report, balance
+            if report.iterations >= settings.iterations:
+                report.reason = f"no equilibrium after {report.iterations} iterations"
+                return report, balance
+            if should_stop is not None and should_stop():
+                report.reason = "stopped"
+                return report, balance
+            if not self.fresh:
+                if not prepared:
+                    balance = system.balance(state, press, tangent=True)
+                self.factor.factorise(system.tangent_values())
+                self._border = None
+                report.factorisations += 1
+                self.fresh = True
+            try:
+                balance = self._step(state, press, balance, volume)
+            except SimulationError as failure:
+                report.reason = failure.problem
+                self.fresh = False
+                return report, balance
+            report.iterations += 1
+            before, error = error, self._error(balance, volume)
+            report.residuals.append(error)
+            if not np.isfinite(error):
+                report.reason = "the equations gave no number"
+                self.fresh = False
+                return report, balance
+            self.fresh = error < settings.keep_factor * before
+            prepared = False
+
+    def _error(self, balance: Balance, volume: float | None) -> float:
+        """Largest of the relative errors, each over its tolerance's size."""
+        error = float(np.linalg.norm(balance.unbalanced)) / max(balance.scale, 1e-12)
+        if volume is not None:
+            error = max(error, abs(balance.volume - volume) / volume)
+        return max(error, balance.strain_error)
+
+    def _converged(self, balance: Balance, volume: float | None) -> bool:
+        settings = self.settings
+        force = float(np.linalg.norm(balance.unbalanced))
+        if force > settings.tolerance * max(balance.scale, 1e-12):
+            return False
+        if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
+            return False
+        return balance.strain_error <= settings.volume_tolerance
+
+    def _step(
+        self, state: State, press: Press | None, balance: Balance, volume: float | None
+    ) -> Balance:
+        """One linear solve and the move along it, shortened where needed."""
+        settings, system = self.settings, self.system
+        free = system.pattern.free
+        # The condensed residual: pressures are eliminated, so their misfit loads the nodes.
+        right = -(balance.unbalanced + system.misfit_force(state))
+        change = self._linear_solve(right)
+        pressure_change = 0.0
+        if volume is not None:
+            if self._border is None:
+                gradient = balance.volume_gradient.reshape(-1)[free].copy()
+                self._border = (gradient, self._linear_solve(gradient))
+            gradient, answer = self._border
+            stiffness = float(gradient @ answer)
+            pressure_change = (volume - balance.volume - float(gradient @ change)) / stiffness
+            change = change + pressure_change * answer
+        move = np.zeros_like(state.position)
+        move.reshape(-1)[free] = change
+        if not np.isfinite(change).all():
+            raise SimulationError("the linear solve gave no number", remedy="smaller increments")
+        longest = float(np.sqrt((move * move).sum(axis=1).max()))
+        fraction = min(1.0, settings.largest_move_m / max(longest, 1e-300))
+        target = system.updated_pressure(move)
+        start = state.copy()
+        for _ in range(8):
+            state.position[:] = start.position + fraction * move
+            state.pressure[:] = start.pressure + fraction * (target - start.pressure)
+            state.fluid_pressure = start.fluid_pressure + fraction * pressure_change
+            trial = system.balance(state, press)
+            if trial.smallest_jacobian > 0.0:
+                return trial
+            fraction *= 0.5
+        raise SimulationError("an element turns inside out", remedy="use smaller increments")
+
+    def _linear_solve(self, right: Floats) -> Floats:
+        """Solve with the full tangent: the factor of its symmetric part, GMRES for the rest."""
+        first = self.factor.solve(right)
+        if not self.system.slides:
+            return first
+        operator = LinearOperator(
+            (len(right), len(right)),
+            matvec=lambda v: v + self.factor.solve(self.system.rest_product(v)),
+            dtype=np.float64,
+        )
+        answer, _ = gmres(operator, first, rtol=1e-3, atol=0.0, restart=10, maxiter=1)
+        return np.asarray(answer)

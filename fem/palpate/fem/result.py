@@ -1,0 +1,93 @@
+"""What a simulation says: one `Step` per converged pose, and a `Trajectory` of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Outcome(StrEnum):
+    """How a trajectory ended."""
+
+    COMPLETE = "complete"
+    FORCE_LIMIT = "force limit"  # the skin is pinched on the core
+    DIVERGED = "diverged"
+    DEADLINE = "deadline"
+    CANCELLED = "cancelled"
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """How a step was solved: Newton iterations, cut-backs, factorisations, residual, time."""
+
+    increments: int
+    iterations: int
+    factorisations: int
+    residual: float  # ||unbalanced nodal force|| / force scale
+    volume_error: float  # |V - V target| / V
+    penetration_m: float  # deepest, indenter or core [m]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One converged step; all in the sensor frame, SI.
+
+    Attributes:
+        pose: Indenter: position and quaternion w x y z, shape (7,).
+        displacement: Nodal displacement from the pressurised, untouched state [m], shape (V, 3).
+        fluid_pressure_pa: Above ambient [Pa].
+        force: Net force of the indenter on the skin, friction included [N], shape (3,).
+        torque: Its moment about the origin [N m], shape (3,).
+        indenter_force: Nodal forces of the indenter on the skin [N], shape (V, 3).
+        core_force: Nodal forces of the core on the skin [N], shape (V, 3).
+        contact_area_m2: Area of skin under the indenter [m^2].
+        centre_of_pressure: Of the indenter's normal forces [m], shape (3,); NaN without contact.
+        stress: Cauchy stress per element, mean over it: xx yy zz yz xz xy [Pa], shape (E, 6).
+        convergence: How it was solved.
+    """
+
+    pose: Floats
+    displacement: Floats
+    fluid_pressure_pa: float
+    force: Floats
+    torque: Floats
+    indenter_force: Floats
+    core_force: Floats
+    contact_area_m2: float
+    centre_of_pressure: Floats
+    stress: Floats
+    convergence: Convergence
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """The converged steps of one indentation, and why there are no more.
+
+    Attributes:
+        indenter: Its name.
+        path: Requested poses, shape (K, 7).
+        steps: Converged ones, in order of the path; len(steps) < K only if outcome is not COMPLETE.
+        outcome: How it ended.
+        reason: One sentence where it did not complete: what, where, at which travel.
+        travel_m: Path length of the indenter at the last *converged* increment, which may lie
+            between two poses [m].
+    """
+
+    indenter: str
+    path: Floats
+    steps: tuple[Step, ...]
+    outcome: Outcome
+    reason: str = ""
+    travel_m: float = 0.0
+    seconds: float = field(default=0.0, compare=False)
+
+    @property
+    def forces(self) -> Floats:
+        """Net forces [N], shape (len(steps), 3)."""
+        return np.array([step.force for step in self.steps], np.float64).reshape(-1, 3)
