@@ -1,13 +1,24 @@
-"""Kernels of contact, at the quadrature points of the surface faces.
+# mypy: ignore-errors
+"""Kernels of contact, at the corners of the surface faces (Lobatto points).
 
-Normal law, with gap g, multiplier lambda, stiffness e and softness d (all per *reference* area, so
-that frictionless contact has an energy)::
+Normal law, with gap g and stiffness e per *reference* area, so that frictionless contact has an energy::
 
-    p(g) = e d log(1 + exp((lambda / e - g) / d))
+    p = e max(0, -g)
 
-an augmented Lagrangian whose corner is rounded within d, which stops the cycling of a hard active set.
-Friction: return mapping. A point sticks to an anchor on the indenter by a spring of stiffness k; the
-spring's traction is capped at mu p, and what is beyond moves the anchor at the end of the increment.
+so stiff that nothing is deeper than a few micrometres. Coulomb friction by return mapping: a point
+sticks to an anchor on the indenter by a spring of stiffness k; the spring's traction is capped at
+mu p, and what is beyond moves the anchor at the end of the increment.
+
+Pressures and tractions are states of their own, as in the elements: an iterate's values come from
+the linear solve, not from gap and slip, because so stiff laws would turn each micrometre of
+curvature into a megapascal. Whether a point touches, sticks or slides is decided from both
+(primal-dual active set; Hueber and Wohlmuth 2005, Gitterle et al. 2010)::
+
+    touches: g < 0 or p > 0            slides: |t + c (d - t / k)| > mu p
+
+with d the tangential way from the anchor. Points lie in the corners, where the nodes are: as many
+conditions as unknowns. With 2 x 2 inner points there are four times as many; they contradict one
+another by the facet's sagitta, and the sets cycle (tried, not kept).
 
 NumPy twins: ``contact.py``.
 """
@@ -26,22 +37,70 @@ class Law:
     """Constants of the contact laws; SI."""
 
     stiffness: wp.float64
-    softness: wp.float64
     friction: wp.float64
     tangential_stiffness: wp.float64
+    complement: wp.float64
+
+
+@wp.struct
+class Friction:
+    """Linearised friction at a point: status 1 sticks, 2 slides; traction, and its derivatives."""
+
+    status: int
+    wanted: wp.vec3d
+    by_position: wp.mat33d
+    by_pressure: wp.vec3d
 
 
 @wp.func
-def normal_law(law: Law, multiplier: wp.float64, gap: wp.float64) -> wp.vec2d:
-    """Pressure p [Pa] and -dp/dg [Pa/m]."""
-    z = (multiplier / law.stiffness - gap) / law.softness
-    if z > wp.float64(30.0):
-        return wp.vec2d(law.stiffness * law.softness * z, law.stiffness)
-    if z < wp.float64(-40.0):
-        return wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-    grown = wp.exp(z)
-    pressure = law.stiffness * law.softness * wp.log(wp.float64(1.0) + grown)
-    return wp.vec2d(pressure, law.stiffness * grown / (wp.float64(1.0) + grown))
+def normal_law(law: Law, pressure: wp.float64, gap: wp.float64) -> wp.vec2d:
+    """Linearised law at a pressure and a gap: what p should be [Pa], and -dp/dg [Pa/m]."""
+    if gap < wp.float64(0.0) or pressure > wp.float64(0.0):
+        return wp.vec2d(-law.stiffness * gap, law.stiffness)
+    return wp.vec2d(wp.float64(0.0), wp.float64(0.0))
+
+
+@wp.func
+def friction_law(
+    law: Law,
+    pressure: wp.float64,
+    wanted: wp.float64,
+    slope: wp.float64,
+    traction: wp.vec3d,
+    normal: wp.vec3d,
+    curvature: wp.mat33d,
+    arm: wp.vec3d,
+) -> Friction:
+    """Linearised friction of a touching point whose way from its anchor is ``arm``."""
+    answer = Friction()
+    k = law.tangential_stiffness
+    along = wp.dot(normal, arm)
+    way = arm - along * normal
+    # d way / d x, from way = P(n) arm and d n / d x = curvature
+    turn = (
+        wp.identity(n=3, dtype=wp.float64)
+        - wp.outer(normal, normal)
+        - along * curvature
+        - wp.outer(normal, curvature * arm)
+    )
+    now = traction - wp.dot(normal, traction) * normal
+    trial = now + law.complement * (way - now / k)
+    size = wp.length(trial)
+    limit = law.friction * pressure
+    if size <= limit:
+        answer.status = 1
+        answer.wanted = k * way
+        answer.by_position = k * turn
+        return answer
+    answer.status = 2
+    t = trial / size
+    share = limit / size
+    across = now - wp.dot(t, now) * t
+    left = wp.float64(1.0) - share * (wp.float64(1.0) - law.complement / k)
+    answer.wanted = (law.friction * wanted) * t + across - across / left
+    answer.by_position = (share * law.complement / left) * (turn - wp.outer(t, wp.transpose(turn) * t))
+    answer.by_pressure = law.friction * t
+    return answer
 
 
 @wp.func
@@ -83,11 +142,14 @@ def core_contact(
     margin: wp.float64,
     # State in:
     position_in: wp.array(dtype=wp.vec3d),
-    multiplier_in: wp.array2d(dtype=wp.float64),
+    pressure_in: wp.array2d(dtype=wp.float64),
     with_tangent: int,
     # Out:
+    status_out: wp.array2d(dtype=wp.int32),
     gap_out: wp.array2d(dtype=wp.float64),
-    pressure_out: wp.array2d(dtype=wp.float64),
+    wanted_out: wp.array2d(dtype=wp.float64),
+    slope_out: wp.array2d(dtype=wp.vec3d),
+    misfit_out: wp.array2d(dtype=wp.vec3d),
     force_out: wp.array(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
@@ -107,8 +169,12 @@ def core_contact(
         j = wp.clamp(int(wp.floor(u[1])), 1, coefficients.shape[1] - 3)
         l = wp.clamp(int(wp.floor(u[2])), 1, coefficients.shape[2] - 3)
         gap_out[f, q] = coefficients[i, j, l]
-        pressure_out[f, q] = wp.float64(0.0)
-        if coefficients[i, j, l] < margin:
+        status_out[f, q] = 0
+        wanted_out[f, q] = wp.float64(0.0)
+        slope_out[f, q] = wp.vec3d()
+        misfit_out[f, q] = wp.vec3d()
+        p = pressure_in[f, q]
+        if coefficients[i, j, l] < margin or p > wp.float64(0.0):
             tx = u[0] - wp.float64(i)
             ty = u[1] - wp.float64(j)
             tz = u[2] - wp.float64(l)
@@ -153,17 +219,20 @@ def core_contact(
                     hxy += x1[r] * y1[s] * row0
             normal = wp.vec3d(gx, gy, gz) / spacing
             gap_out[f, q] = value
-            answer = normal_law(law, multiplier_in[f, q], value)
-            pressure_out[f, q] = answer[0]
-            if answer[0] > wp.float64(0.0):
+            answer = normal_law(law, p, value)
+            if answer[1] > wp.float64(0.0):
+                status_out[f, q] = 1
+                wanted_out[f, q] = answer[0]
                 w = area[f, q]
+                slope_out[f, q] = answer[1] * normal
+                misfit_out[f, q] = (w * (answer[0] - p)) * normal
                 for a in range(k):
-                    wp.atomic_sub(force_out, faces[f, a], (w * shape[q, a] * answer[0]) * normal)
+                    wp.atomic_sub(force_out, faces[f, a], (w * shape[q, a] * p) * normal)
                 if with_tangent == 1:
                     curvature = wp.mat33d(
                         hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz
                     ) / (spacing * spacing)  # fmt: skip
-                    d = w * (answer[1] * wp.outer(normal, normal) - answer[0] * curvature)
+                    d = w * (answer[1] * wp.outer(normal, normal) - p * curvature)
                     for a in range(k):
                         for b in range(k):
                             if pair[f, a, b] >= 0:
@@ -186,14 +255,18 @@ def indenter_contact(
     tip: wp.vec3d,
     rotation: wp.mat33d,
     position_in: wp.array(dtype=wp.vec3d),
-    multiplier_in: wp.array2d(dtype=wp.float64),
+    pressure_in: wp.array2d(dtype=wp.float64),
+    traction_in: wp.array2d(dtype=wp.vec3d),
     anchor_in: wp.array2d(dtype=wp.vec3d),
     with_tangent: int,
     # Out:
+    status_out: wp.array2d(dtype=wp.int32),
     gap_out: wp.array2d(dtype=wp.float64),
-    pressure_out: wp.array2d(dtype=wp.float64),
-    normal_out: wp.array2d(dtype=wp.vec3d),
-    friction_out: wp.array2d(dtype=wp.vec3d),
+    wanted_out: wp.array2d(dtype=wp.float64),
+    slope_out: wp.array2d(dtype=wp.vec3d),
+    misfit_out: wp.array2d(dtype=wp.vec3d),
+    wanted_traction_out: wp.array2d(dtype=wp.vec3d),
+    traction_slope_out: wp.array2d(dtype=wp.mat33d),
     rest_out: wp.array2d(dtype=wp.mat33d),
     force_out: wp.array(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
@@ -213,53 +286,48 @@ def indenter_contact(
             x += shape[q, a] * position_in[faces[f, a]]
         local = wp.transpose(rotation) * (x - tip)
         near = indenter_distance(primitives, local, margin)
-        gap = near.gap
-        gap_out[f, q] = gap
-        pressure_out[f, q] = wp.float64(0.0)
-        friction_out[f, q] = wp.vec3d()
+        gap_out[f, q] = near.gap
+        status_out[f, q] = 0
+        wanted_out[f, q] = wp.float64(0.0)
+        slope_out[f, q] = wp.vec3d()
+        misfit_out[f, q] = wp.vec3d()
+        wanted_traction_out[f, q] = wp.vec3d()
+        traction_slope_out[f, q] = wp.mat33d()
         if with_tangent == 1:
             rest_out[f, q] = wp.mat33d()
-        if gap < margin:
+        p = pressure_in[f, q]
+        # Far points have none of these: their pressure was taken away when they left.
+        if near.gap < margin:
             normal = rotation * near.normal
-            normal_out[f, q] = normal
-            answer = normal_law(law, multiplier_in[f, q], gap)
-            p = answer[0]
-            pressure_out[f, q] = p
-            if p > wp.float64(0.0):
+            answer = normal_law(law, p, near.gap)
+            if answer[1] > wp.float64(0.0):
+                status_out[f, q] = 1
                 w = area[f, q]
                 curvature = rotation * near.hessian * wp.transpose(rotation)
-                arm = x - (tip + rotation * anchor_in[f, q])
-                along = wp.dot(normal, arm)
-                trial = law.tangential_stiffness * (arm - along * normal)
-                size = wp.length(trial)
-                limit = law.friction * p
-                slips = size > limit
-                friction = trial
-                if slips:
-                    friction = (limit / size) * trial
-                friction_out[f, q] = friction
+                slope = answer[1] * normal
+                wanted_out[f, q] = answer[0]
+                slope_out[f, q] = slope
+                residual = p * normal
+                misfit = (answer[0] - p) * normal
+                d = wp.outer(slope, normal) - p * curvature
+                rest = wp.mat33d()
+                if law.friction > wp.float64(0.0):
+                    t = traction_in[f, q]
+                    arm = x - (tip + rotation * anchor_in[f, q])
+                    rub = friction_law(law, p, answer[0], answer[1], t, normal, curvature, arm)
+                    status_out[f, q] = 1 + rub.status
+                    wanted_traction_out[f, q] = rub.wanted
+                    coupled = wp.outer(rub.by_pressure, slope)
+                    traction_slope_out[f, q] = rub.by_position - coupled
+                    residual -= t
+                    misfit -= rub.wanted - t
+                    symmetric = wp.float64(0.5) * (rub.by_position + wp.transpose(rub.by_position))
+                    d += symmetric
+                    rest = rub.by_position - symmetric - coupled
+                misfit_out[f, q] = w * misfit
                 for a in range(k):
-                    wp.atomic_sub(
-                        force_out, faces[f, a], (w * shape[q, a]) * (p * normal - friction)
-                    )
+                    wp.atomic_sub(force_out, faces[f, a], (w * shape[q, a]) * residual)
                 if with_tangent == 1:
-                    d = answer[1] * wp.outer(normal, normal) - p * curvature
-                    rest = wp.mat33d()
-                    if law.friction > wp.float64(0.0):
-                        # d trial / d x, from trial = k P(n) arm and d n / d x = curvature
-                        turn = law.tangential_stiffness * (
-                            wp.identity(n=3, dtype=wp.float64)
-                            - wp.outer(normal, normal)
-                            - along * curvature
-                            - wp.outer(normal, curvature * arm)
-                        )
-                        if slips:
-                            t = trial / size
-                            turn = (limit / size) * (turn - wp.outer(t, wp.transpose(turn) * t))
-                            rest = wp.outer((-law.friction * answer[1]) * t, normal)
-                        symmetric = wp.float64(0.5) * (turn + wp.transpose(turn))
-                        rest += turn - symmetric
-                        d += symmetric
                     rest_out[f, q] = w * rest
                     d = w * d
                     for a in range(k):
@@ -292,3 +360,57 @@ def rest_product(
         moved = rest_in[f, q] * v
         for a in range(k):
             wp.atomic_add(product_out, faces[f, a], shape[q, a] * moved)
+
+
+@wp.kernel
+def misfit_force(
+    # Model:
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    # State in:
+    misfit_in: wp.array2d(dtype=wp.vec3d),
+    # Out:
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Add the load (a residual) that condensing the contact pressures puts on the nodes."""
+    f = wp.tid()
+    for q in range(shape.shape[0]):
+        m = misfit_in[f, q]
+        if wp.length_sq(m) > wp.float64(0.0):
+            for a in range(faces.shape[1]):
+                wp.atomic_sub(force_out, faces[f, a], shape[q, a] * m)
+
+
+@wp.kernel
+def pressure_update(
+    # Model:
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    # State in:
+    status_in: wp.array2d(dtype=wp.int32),
+    wanted_in: wp.array2d(dtype=wp.float64),
+    slope_in: wp.array2d(dtype=wp.vec3d),
+    wanted_traction_in: wp.array2d(dtype=wp.vec3d),
+    traction_slope_in: wp.array2d(dtype=wp.mat33d),
+    change_in: wp.array(dtype=wp.vec3d),
+    # Out:
+    pressure_out: wp.array2d(dtype=wp.float64),
+    traction_out: wp.array2d(dtype=wp.vec3d),
+):
+    """Pressures, none negative, and tractions that go with a change of the nodes, to first order.
+
+    The slopes are those of the factorised tangent.
+    """
+    f = wp.tid()
+    for q in range(shape.shape[0]):
+        p = wp.float64(0.0)
+        t = wp.vec3d()
+        if status_in[f, q] > 0:
+            moved = wp.vec3d()
+            for a in range(faces.shape[1]):
+                moved += shape[q, a] * change_in[faces[f, a]]
+            p = wp.max(wanted_in[f, q] - wp.dot(slope_in[f, q], moved), wp.float64(0.0))
+            if p > wp.float64(0.0):
+                t = wanted_traction_in[f, q] + traction_slope_in[f, q] * moved
+        pressure_out[f, q] = p
+        traction_out[f, q] = t

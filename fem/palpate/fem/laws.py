@@ -20,24 +20,25 @@ class ContactSettings:
     """Numbers of the contact laws, per unpressurised area.
 
     Attributes:
-        stiffness: Penalty of the augmented Lagrangian [Pa/m].
-        softness_m: Distance within which its corner is rounded [m].
-        tangential_stiffness: Of a sticking point [Pa/m].
+        stiffness: Of the normal law [Pa/m]; 1 MPa, a hard pinch, is 0.5 um deep.
+        tangential_stiffness: Of a sticking point [Pa/m]; 0.1 MPa moves it by 2 um.
+        complement: c that decides between sticking and sliding [Pa/m]; of the size of the skin's
+            own stiffness (mu over an element). It does not touch the answer.
         margin_m: Points farther from a surface are not looked at [m].
     """
 
-    stiffness: float = 2e10
-    softness_m: float = 1e-6
-    tangential_stiffness: float = 5e9
-    margin_m: float = 0.1e-3
+    stiffness: float = 2e12
+    tangential_stiffness: float = 5e10
+    complement: float = 1e9
+    margin_m: float = 0.5e-3
 
     def law(self, friction: float) -> Law:
         """The same for the kernels."""
         law = Law()
         law.stiffness = wp.float64(self.stiffness)
-        law.softness = wp.float64(self.softness_m)
         law.friction = wp.float64(friction)
         law.tangential_stiffness = wp.float64(self.tangential_stiffness)
+        law.complement = wp.float64(self.complement)
         return law
 
 

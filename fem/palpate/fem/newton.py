@@ -25,6 +25,7 @@ class NewtonSettings:
     Attributes:
         tolerance: Unbalanced force over the scale of the forces that cancel.
         volume_tolerance: Relative error of the cavity's volume and of each element's.
+        gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
         iterations: Give up after this many.
         largest_move_m: A longer step of any node is shortened [m].
         keep_factor: A factor is kept while each iteration shrinks the error at least this much.
@@ -32,6 +33,7 @@ class NewtonSettings:
 
     tolerance: float = 1e-6
     volume_tolerance: float = 1e-6
+    gap_tolerance_m: float = 0.1e-6
     iterations: int = 20
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.2
@@ -74,8 +76,8 @@ class Newton:
             should_stop: Asked once an iteration; True ends it unconverged.
         """
         settings, system, report = self.settings, self.system, Report()
-        balance = system.balance(state, press, tangent=not self.fresh)
-        prepared = not self.fresh
+        balance = system.balance(state, press, tangent=True)
+        prepared, self.fresh = True, False
         error = self._error(balance, volume)
         report.residuals.append(error)
         while True:
@@ -108,7 +110,7 @@ class Newton:
                 report.reason = "the equations gave no number"
                 self.fresh = False
                 return report, balance
-            self.fresh = error < settings.keep_factor * before
+            self.fresh = error < settings.keep_factor * before and not system.sets_changed
             prepared = False
 
     def _error(self, balance: Balance, volume: float | None) -> float:
@@ -116,7 +118,8 @@ class Newton:
         error = float(np.linalg.norm(balance.unbalanced)) / max(balance.scale, 1e-12)
         if volume is not None:
             error = max(error, abs(balance.volume - volume) / volume)
-        return max(error, balance.strain_error)
+        # A micrometre of gap counts as much as a hundredth of the force.
+        return max(error, balance.strain_error, balance.gap_error_m * 1e4)
 
     def _converged(self, balance: Balance, volume: float | None) -> bool:
         settings = self.settings
@@ -124,6 +127,8 @@ class Newton:
         if force > settings.tolerance * max(balance.scale, 1e-12):
             return False
         if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
+            return False
+        if balance.gap_error_m > settings.gap_tolerance_m:
             return False
         return balance.strain_error <= settings.volume_tolerance
 
@@ -151,12 +156,18 @@ class Newton:
             raise SimulationError("the linear solve gave no number", remedy="smaller increments")
         longest = float(np.sqrt((move * move).sum(axis=1).max()))
         fraction = min(1.0, settings.largest_move_m / max(longest, 1e-300))
-        target = system.updated_pressure(move)
+        targets = system.updated_pressures(move)
         start = state.copy()
         for _ in range(8):
             state.position[:] = start.position + fraction * move
-            state.pressure[:] = start.pressure + fraction * (target - start.pressure)
             state.fluid_pressure = start.fluid_pressure + fraction * pressure_change
+            for now, before, target in zip(
+                (state.pressure, state.core_pressure, state.indenter_pressure, state.traction),
+                (start.pressure, start.core_pressure, start.indenter_pressure, start.traction),
+                targets,
+                strict=True,
+            ):
+                now[:] = before + fraction * (target - before)
             trial = system.balance(state, press)
             if trial.smallest_jacobian > 0.0:
                 return trial

@@ -27,10 +27,10 @@ def make_step(
     """Quantities of a converged state; see `Step`."""
     surface = tip.system.outer
     on_skin = -balance.indenter
-    weight = surface.pressure * surface.area_values
+    weight = state.indenter_pressure * surface.area_values
     faces = tip.geometry.mesh.outer_faces
     points = np.einsum("qa,fai->fqi", surface.shape_values, state.position[faces])
-    touching = surface.pressure > CONTACT_SHARE * max(float(surface.pressure.max()), 1.0)
+    touching = state.indenter_pressure > CONTACT_SHARE * max(float(state.indenter_pressure.max()), 1.0)
     centre = np.full(3, np.nan)
     if touching.any():
         centre = (weight[..., None] * points).sum(axis=(0, 1)) / weight.sum()

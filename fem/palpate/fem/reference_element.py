@@ -95,3 +95,12 @@ def volume_form(nodes: int) -> Floats:
         - raw.transpose(1, 0, 2) + raw.transpose(2, 0, 1) - raw.transpose(2, 1, 0)
     )  # fmt: skip
     return np.asarray(signs / 6)
+
+
+@cache
+def corner_element(nodes: int) -> ReferenceElement:
+    """Face with its corners as quadrature points (Lobatto 2 x 2; vertex rule of the triangle)."""
+    if nodes == 4:
+        return ReferenceElement(*quadrilateral_at(_HEXAHEDRON), np.ones(4))
+    points = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+    return ReferenceElement(*triangle_at(points), np.full(3, 1 / 6))

@@ -26,7 +26,7 @@ from palpate.protos.errors import SimulationError
 Floats = NDArray[np.float64]
 
 STEPS_TO_PRESSURISE = 4
-THICKNESS_TOLERANCE_M = 1e-9
+THICKNESS_TOLERANCE_M = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,6 @@ class Settings:
     Attributes:
         newton: Tolerances of one increment.
         contact: Constants of the contact laws.
-        penetration_m: Increments that end deeper in a body are augmented again [m].
-        augmentations: At most this often.
         force_limit_n: A trajectory ends where the indenter's force exceeds this [N]; the paper saw
             23-32 N at most.
         smallest_increment: Fraction of a step below which it is given up.
@@ -47,8 +45,6 @@ class Settings:
 
     newton: NewtonSettings = field(default_factory=NewtonSettings)
     contact: ContactSettings = field(default_factory=ContactSettings)
-    penetration_m: float = 5e-6
-    augmentations: int = 5
     force_limit_n: float = 32.0
     smallest_increment: float = 1 / 64
     predict: bool = True
@@ -80,7 +76,7 @@ class Fingertip:
         self.geometry, self.parameters, self.settings = geometry, parameters, settings
         self.system = System(
             geometry.mesh,
-            geometry.core.distance if geometry.core else None,
+            geometry.core.grid if geometry.core else None,
             shear_modulus_pa=parameters.shear_modulus_pa,
             bulk_ratio=parameters.bulk_ratio,
             contact=settings.contact,
@@ -204,37 +200,8 @@ class Fingertip:
         volume: float | None,
         should_stop: Callable[[], bool] | None,
     ) -> tuple[Report, Balance]:
-        """One increment: Newton, then augmentation of the contact pressures until none is deep."""
-        settings = self.settings
-        total = Report()
-        for _ in range(settings.augmentations + 1):
-            report, balance = self.newton.solve(
-                state, press, volume=volume, should_stop=should_stop
-            )
-            total.iterations += report.iterations
-            total.factorisations += report.factorisations
-            total.residuals += report.residuals
-            total.converged, total.reason = report.converged, report.reason
-            if not report.converged:
-                return total, balance
-            deepest = self._augment(state, press)
-            if deepest <= settings.penetration_m:
-                return total, balance
-        total.converged = False
-        total.reason = f"{deepest * 1e6:.1f} um of penetration remain"
-        return total, balance
-
-    def _augment(self, state: State, press: Press | None) -> float:
-        """Carry the contact pressures over; the deepest penetration [m]."""
-        inner, outer = self.system.inner, self.system.outer
-        deepest = 0.0
-        if inner.count and self.geometry.core:
-            state.core_multiplier[:] = inner.pressure
-            deepest = max(deepest, -float(inner.gap.min()))
-        if press is not None:
-            state.indenter_multiplier[:] = outer.pressure
-            deepest = max(deepest, -float(outer.gap.min()))
-        return deepest
+        """One increment."""
+        return self.newton.solve(state, press, volume=volume, should_stop=should_stop)
 
     def indent(
         self,
@@ -285,7 +252,7 @@ class _Indentation:
         surface = self.tip.system.outer
         corners = self.state.position[self.tip.geometry.mesh.outer_faces]
         points = np.einsum("qa,fai->fqi", surface.shape_values, corners)
-        stretch = surface.friction / self.tip.settings.contact.tangential_stiffness
+        stretch = self.state.traction / self.tip.settings.contact.tangential_stiffness
         self.state.anchor[:] = press.to_local(points - stretch)
 
     def run(self) -> Trajectory:
@@ -365,6 +332,13 @@ class _Indentation:
             trial.position += ratio * (self.state.position - self.before.position)
             trial.pressure += ratio * (self.state.pressure - self.before.pressure)
             trial.fluid_pressure += ratio * (self.state.fluid_pressure - self.before.fluid_pressure)
+            trial.traction += ratio * (self.state.traction - self.before.traction)
+            for now, before in (
+                (trial.core_pressure, self.before.core_pressure),
+                (trial.indenter_pressure, self.before.indenter_pressure),
+            ):
+                now += ratio * (now - before)
+                np.maximum(now, 0.0, out=now)
         return trial
 
     def _stop(self) -> bool:

@@ -20,16 +20,18 @@ class State:
         position: Nodal positions [m], (V, 3).
         pressure: Element pressures, positive in tension [Pa], (E,).
         fluid_pressure: Above ambient [Pa].
-        core_multiplier: Contact pressure on the core carried over [Pa], (inner faces, points).
-        indenter_multiplier: The same for the indenter, (outer faces, points).
+        core_pressure: Contact pressure on the core [Pa], (inner faces, points).
+        indenter_pressure: The same on the indenter, (outer faces, points).
+        traction: Friction of each point on the indenter [Pa], (outer faces, points, 3).
         anchor: Where each point sticks to the indenter, in its frame [m], (outer faces, points, 3).
     """
 
     position: Floats
     pressure: Floats
     fluid_pressure: float
-    core_multiplier: Floats
-    indenter_multiplier: Floats
+    core_pressure: Floats
+    indenter_pressure: Floats
+    traction: Floats
     anchor: Floats
 
     @classmethod
@@ -41,8 +43,9 @@ class State:
             position=mesh.nodes.copy(),
             pressure=np.zeros(len(mesh.elements)),
             fluid_pressure=0.0,
-            core_multiplier=np.zeros(inner),
-            indenter_multiplier=np.zeros(outer),
+            core_pressure=np.zeros(inner),
+            indenter_pressure=np.zeros(outer),
+            traction=np.zeros((*outer, 3)),
             anchor=np.zeros((*outer, 3)),
         )
 
@@ -52,12 +55,13 @@ class State:
             self.position.copy(),
             self.pressure.copy(),
             self.fluid_pressure,
-            self.core_multiplier.copy(),
-            self.indenter_multiplier.copy(),
+            self.core_pressure.copy(),
+            self.indenter_pressure.copy(),
+            self.traction.copy(),
             self.anchor.copy(),
         )
 
 
 def _points(faces: NDArray[np.int32]) -> int:
-    """Quadrature points of a face: 2 x 2 or 3."""
+    """Contact points of a face: its corners."""
     return int(faces.shape[1]) if faces.ndim == 2 else 0

@@ -16,7 +16,7 @@ from palpate.fem.laws import ContactSettings, Press
 from palpate.fem.mesh.core import DistanceGrid
 from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.pattern import make_pattern
-from palpate.fem.reference_element import face_element, solid_element, volume_form
+from palpate.fem.reference_element import corner_element, solid_element, volume_form
 from palpate.fem.state import State
 
 Floats = NDArray[np.float64]
@@ -37,6 +37,7 @@ class Balance:
         unbalanced: The sum over the free unknowns, fluid pressure included [N], (n,).
         scale: Norm of the nodal forces that have to cancel [N].
         strain_error: Largest |v - v0 - v0 p / kappa| / v0.
+        gap_error_m: By how much gap or way the worst contact point misses its law [m].
         smallest_jacobian: Of all quadrature points.
     """
 
@@ -48,6 +49,7 @@ class Balance:
     unbalanced: Floats
     scale: float
     strain_error: float
+    gap_error_m: float
     smallest_jacobian: float
 
 
@@ -150,6 +152,8 @@ class System:
         """
         self._blocks[0] += self._blocks[1]
         wp.copy(self._frozen_gradient, self._volume_gradient)
+        for surface in (self.outer, self.inner):
+            surface.freeze()
         rest = self.outer.rest.numpy().reshape(self.outer.count, -1)
         sliding = np.flatnonzero(np.any(rest != 0.0, axis=1)).astype(np.int32)
         self._sliding = wp.array(sliding, dtype=wp.int32, device=DEVICE)
@@ -174,28 +178,43 @@ class System:
         )
         return product.reshape(-1)[self.pattern.free]
 
-    def updated_pressure(self, change: Floats) -> Floats:
-        """Element pressures that go with a change (V, 3) from the last evaluated state, (E,)."""
+    @property
+    def sets_changed(self) -> bool:
+        """Whether a point touches, sticks or slides that did not when the tangent was made."""
+        return self.outer.changed or self.inner.changed
+
+    def updated_pressures(self, change: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Pressures that go with a change (V, 3) from the last evaluated state, to first order.
+
+        Returns:
+            Those of the elements (E,), on the core and on the indenter (faces, points), and the
+            tractions on the indenter (faces, points, 3).
+        """
         pressure = np.zeros(len(self.mesh.elements))
+        moved = vec3s(change)
         wp.launch(
             element_kernels.pressure_update,
             dim=len(pressure),
-            inputs=[*self._condensed, vec3s(change)],
+            inputs=[*self._condensed, moved],
             outputs=[scalars(pressure)],
             device=DEVICE,
         )
-        return pressure
+        core, _ = self.inner.updated_pressure(moved)
+        return pressure, core, *self.outer.updated_pressure(moved)
 
     def misfit_force(self, state: State) -> Floats:
-        """Load of the condensed element pressures on the free unknowns [N], (n,)."""
+        """Load that condensing the pressures puts on the free unknowns [N], (n,)."""
         force = np.zeros_like(self.mesh.nodes)
+        array = vec3s(force)
         wp.launch(
             element_kernels.pressure_misfit,
             dim=len(self.mesh.elements),
             inputs=[*self._condensed, scalars(state.pressure)],
-            outputs=[vec3s(force)],
+            outputs=[array],
             device=DEVICE,
         )
+        for surface in (self.inner, self.outer):
+            surface.add_misfit(array)
         return force.reshape(-1)[self.pattern.free]
 
     @property
@@ -258,9 +277,8 @@ class System:
 
     def _indenter(self, state: State, press: Press | None, position: wp.array, tangent: bool) -> None:
         surface = self.outer
-        surface.pressure[:] = 0.0
-        surface.gap[:] = np.inf
         if press is None or not surface.count:
+            surface.forget()
             return
         wp.launch(
             contact_kernels.indenter_contact,
@@ -276,15 +294,19 @@ class System:
                 wp.vec3d(*press.tip),
                 wp.mat33d(*press.rotation.ravel()),
                 position,
-                scalars(state.indenter_multiplier),
+                scalars(state.indenter_pressure),
+                vec3s(state.traction),
                 vec3s(state.anchor),
                 int(tangent),
             ],
             outputs=[
+                surface.status,
                 surface.gap_array,
-                surface.pressure_array,
-                surface.normal_array,
-                surface.friction_array,
+                surface.wanted_array,
+                surface.slope,
+                surface.misfit,
+                surface.wanted_traction_array,
+                surface.traction_slope,
                 surface.rest,
                 self._force_arrays[THREADS],
                 self._block_arrays[0],
@@ -334,12 +356,15 @@ class System:
                 self.contact.law(0.0),
                 wp.float64(self.contact.margin_m + 2 * self.core.spacing),
                 position,
-                scalars(state.core_multiplier),
+                scalars(state.core_pressure),
                 int(tangent),
             ],
             outputs=[
+                surface.status,
                 surface.gap_array,
-                surface.pressure_array,
+                surface.wanted_array,
+                surface.slope,
+                surface.misfit,
                 self._force_arrays[THREADS + 1],
                 self._block_arrays[1],
             ],
@@ -370,6 +395,11 @@ class System:
                 + np.linalg.norm(self.load)
             ),
             strain_error=float(np.max(np.abs(strain) / self.rest_volume)),
+            gap_error_m=max(
+                self.inner.misfit_of(state.core_pressure) / self.contact.stiffness,
+                self.outer.misfit_of(state.indenter_pressure) / self.contact.stiffness,
+                self.outer.traction_misfit(state.traction) / self.contact.tangential_stiffness,
+            ),
             smallest_jacobian=float(self._jacobian.numpy().min()),
         )
 
@@ -380,21 +410,88 @@ class Surface:
     def __init__(self, nodes: Floats, faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> None:
         self.count = len(faces)
         corners = faces.shape[1] if self.count else 3
-        element = face_element(corners)
+        element = corner_element(corners)
         self.shape_values = element.shape
         edges = np.einsum("qad,fai->fqdi", element.gradient, nodes[faces.reshape(-1, corners)])
         normal = np.cross(edges[:, :, 0], edges[:, :, 1])
         self.area_values = element.weight * np.linalg.norm(normal, axis=2)
         size = self.area_values.shape
-        self.gap, self.pressure = np.full(size, np.inf), np.zeros(size)
-        self.normal, self.friction = np.zeros((*size, 3)), np.zeros((*size, 3))
+        self._corners, self._element = faces, element
+        self.gap, self._wanted = np.full(size, np.inf), np.zeros(size)
+        self._wanted_traction = np.zeros((*size, 3))
         self.faces = wp.array(faces.reshape(-1, corners), dtype=wp.int32, device=DEVICE)
         self.pairs = wp.array(pairs.reshape(-1, corners, corners), dtype=wp.int32, device=DEVICE)
         self.shape, self.area = scalars(element.shape), scalars(self.area_values)
-        self.gap_array, self.pressure_array = scalars(self.gap), scalars(self.pressure)
-        self.normal_array, self.friction_array = vec3s(self.normal), vec3s(self.friction)
+        self.status = wp.zeros(size, dtype=wp.int32, device=DEVICE)
+        self.gap_array, self.wanted_array = scalars(self.gap), scalars(self._wanted)
+        self.wanted_traction_array = vec3s(self._wanted_traction)
+        self.slope = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
+        self.traction_slope = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
+        self.misfit = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
         self.rest = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
-        self._corners, self._element = faces, element
+        self._frozen = [wp.clone(a) for a in (self.slope, self.traction_slope, self.status)]
+
+    def freeze(self) -> None:
+        """Keep what belongs to the tangent that is being factorised."""
+        for kept, now in zip(
+            self._frozen, (self.slope, self.traction_slope, self.status), strict=True
+        ):
+            wp.copy(kept, now)
+
+    @property
+    def changed(self) -> bool:
+        """Whether any point's status differs from the frozen one."""
+        return not np.array_equal(self._frozen[2].numpy(), self.status.numpy())
+
+    def forget(self) -> None:
+        """Nothing is near."""
+        self.gap[:] = np.inf
+        self._wanted[:] = 0.0
+        self._wanted_traction[:] = 0.0
+        for array in (self.status, self.slope, self.traction_slope, self.misfit, self.rest):
+            array.zero_()
+
+    def misfit_of(self, pressure: Floats) -> float:
+        """Largest difference of pressures from what the law wants [Pa]."""
+        return float(np.abs(self._wanted - pressure).max()) if self.count else 0.0
+
+    def traction_misfit(self, traction: Floats) -> float:
+        """Largest difference of tractions from what friction wants [Pa]."""
+        return float(np.abs(self._wanted_traction - traction).max()) if self.count else 0.0
+
+    def updated_pressure(self, moved: wp.array) -> tuple[Floats, Floats]:
+        """Pressures (F, Q) and tractions (F, Q, 3) after a change of the nodal positions [Pa]."""
+        pressure = np.zeros(self.area_values.shape)
+        traction = np.zeros((*pressure.shape, 3))
+        if self.count:
+            wp.launch(
+                contact_kernels.pressure_update,
+                dim=self.count,
+                inputs=[
+                    self.faces,
+                    self.shape,
+                    self.status,
+                    self.wanted_array,
+                    self._frozen[0],
+                    self.wanted_traction_array,
+                    self._frozen[1],
+                    moved,
+                ],
+                outputs=[scalars(pressure), vec3s(traction)],
+                device=DEVICE,
+            )
+        return pressure, traction
+
+    def add_misfit(self, force: wp.array) -> None:
+        """Add the load of the condensed contact pressures to nodal forces."""
+        if self.count:
+            wp.launch(
+                contact_kernels.misfit_force,
+                dim=self.count,
+                inputs=[self.faces, self.shape, self.misfit],
+                outputs=[force],
+                device=DEVICE,
+            )
 
     def current_area(self, position: Floats) -> Floats:
         """Area that belongs to each point now [m^2], (F, Q)."""

@@ -20,7 +20,8 @@ class Kind(IntEnum):
 class Primitive:
     """A box or a solid of revolution, grown by a rounding radius.
 
-    A sphere is REVOLVED with all sizes 0 and rounding R; a rounded cylinder has a = 0; a ring a > 0.
+    A sphere is REVOLVED with all sizes 0 and rounding R; a rounded cylinder has a = 0; a ring
+    a > 0, and a rounding below a.
 
     Attributes:
         kind: Which.
@@ -50,7 +51,7 @@ class Indenter:
     primitives: tuple[Primitive, ...]
 
     def packed(self) -> NDArray[np.float64]:
-        """Primitives as rows for the kernels: kind, axis, centre (3), sizes (4), rounding; (P, 10)."""
+        """Rows for the kernels: kind, axis, centre (3), sizes (4), rounding; shape (P, 10)."""
         return np.array(
             [
                 [float(p.kind), float(p.axis), *p.centre, *p.sizes, p.rounding]

@@ -24,7 +24,7 @@ class SolidMesh:
     Attributes:
         nodes: Positions [m], shape (V, 3), sensor frame, unpressurised.
         elements: Node ids, shape (E, 8) hexahedra or (E, 6) wedges.
-        outer_faces: Faces of the outer surface, shape (F, 4) or (F, 3), normals away from the solid.
+        outer_faces: Faces of the outer surface, (F, 4) or (F, 3), normals away from the solid.
         outer_elements: Element that owns each outer face, shape (F,).
         inner_faces: Faces of the inner surface, normals out of the cavity *into* the solid, so that
             the volume they enclose is positive; empty for a solid without a cavity.
