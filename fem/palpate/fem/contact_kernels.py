@@ -64,8 +64,6 @@ def normal_law(law: Law, pressure: wp.float64, gap: wp.float64) -> wp.vec2d:
 def friction_law(
     law: Law,
     pressure: wp.float64,
-    wanted: wp.float64,
-    slope: wp.float64,
     traction: wp.vec3d,
     normal: wp.vec3d,
     curvature: wp.mat33d,
@@ -97,7 +95,7 @@ def friction_law(
     share = limit / size
     across = now - wp.dot(t, now) * t
     left = wp.float64(1.0) - share * (wp.float64(1.0) - law.complement / k)
-    answer.wanted = (law.friction * wanted) * t + across - across / left
+    answer.wanted = limit * t + across - across / left
     answer.by_position = (share * law.complement / left) * (turn - wp.outer(t, wp.transpose(turn) * t))
     answer.by_pressure = law.friction * t
     return answer
@@ -267,6 +265,7 @@ def indenter_contact(
     misfit_out: wp.array2d(dtype=wp.vec3d),
     wanted_traction_out: wp.array2d(dtype=wp.vec3d),
     traction_slope_out: wp.array2d(dtype=wp.mat33d),
+    coupled_out: wp.array2d(dtype=wp.vec3d),
     rest_out: wp.array2d(dtype=wp.mat33d),
     force_out: wp.array(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
@@ -293,6 +292,7 @@ def indenter_contact(
         misfit_out[f, q] = wp.vec3d()
         wanted_traction_out[f, q] = wp.vec3d()
         traction_slope_out[f, q] = wp.mat33d()
+        coupled_out[f, q] = wp.vec3d()
         if with_tangent == 1:
             rest_out[f, q] = wp.mat33d()
         p = pressure_in[f, q]
@@ -314,9 +314,11 @@ def indenter_contact(
                 if law.friction > wp.float64(0.0):
                     t = traction_in[f, q]
                     arm = x - (tip + rotation * anchor_in[f, q])
-                    rub = friction_law(law, p, answer[0], answer[1], t, normal, curvature, arm)
+                    rub = friction_law(law, p, t, normal, curvature, arm)
                     status_out[f, q] = 1 + rub.status
-                    wanted_traction_out[f, q] = rub.wanted
+                    grown = (answer[0] - p) * rub.by_pressure
+                    wanted_traction_out[f, q] = rub.wanted + grown
+                    coupled_out[f, q] = -w * grown
                     coupled = wp.outer(rub.by_pressure, slope)
                     traction_slope_out[f, q] = rub.by_position - coupled
                     residual -= t

@@ -140,12 +140,12 @@ class Newton:
         free = system.pattern.free
         # The condensed residual: pressures are eliminated, so their misfit loads the nodes.
         right = -(balance.unbalanced + system.misfit_force(state))
-        change = self._linear_solve(right)
+        change = self._linear_solve(right, -system.coupled_force())
         pressure_change = 0.0
         if volume is not None:
             if self._border is None:
                 gradient = balance.volume_gradient.reshape(-1)[free].copy()
-                self._border = (gradient, self._linear_solve(gradient))
+                self._border = (gradient, self._linear_solve(gradient, None))
             gradient, answer = self._border
             stiffness = float(gradient @ answer)
             pressure_change = (volume - balance.volume - float(gradient @ change)) / stiffness
@@ -174,15 +174,25 @@ class Newton:
             fraction *= 0.5
         raise SimulationError("an element turns inside out", remedy="use smaller increments")
 
-    def _linear_solve(self, right: Floats) -> Floats:
-        """Solve with the full tangent: the factor of its symmetric part, GMRES for the rest."""
+    def _linear_solve(self, right: Floats, coupled: Floats | None) -> Floats:
+        """Solve with the full tangent: the factor of its symmetric part, GMRES for the rest.
+
+        Args:
+            right: Right-hand side.
+            coupled: More of it, that `System.rest_product` of the answer nearly cancels.
+        """
         first = self.factor.solve(right)
         if not self.system.slides:
             return first
+        left_over = -self.system.rest_product(first)
+        if coupled is not None:
+            left_over += coupled
         operator = LinearOperator(
             (len(right), len(right)),
             matvec=lambda v: v + self.factor.solve(self.system.rest_product(v)),
             dtype=np.float64,
         )
-        answer, _ = gmres(operator, first, rtol=1e-3, atol=0.0, restart=10, maxiter=1)
-        return np.asarray(answer)
+        more, _ = gmres(
+            operator, self.factor.solve(left_over), rtol=1e-2, atol=0.0, restart=8, maxiter=1
+        )
+        return first + np.asarray(more)

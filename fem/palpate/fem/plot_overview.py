@@ -91,6 +91,7 @@ def _draw_range(axes: Any, names: list[str], groups: dict[str, list[TrajectorySu
         axes.scatter(peaks, row + spread, s=14, c=colours, zorder=2)
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
     label(axes, "largest |F| of a trajectory [N]", "", "force: range, median, each trajectory")
     axes.grid(visible=True, axis="x", color="#e4e4e8", lw=0.7)
 
@@ -122,6 +123,6 @@ def _draw_seconds(axes: Any, summaries: Sequence[TrajectorySummary]) -> None:
         return
     axes.hist(seconds, bins=30, color="#7aa6c2")
     axes.set_title(
-        f"median {np.median(seconds):.2g} s, longest {seconds.max():.2g} s", color=INK, fontsize=10
+        f"median {np.median(seconds):.1f} s, longest {seconds.max():.1f} s", color=INK, fontsize=10
     )
     grid(axes)

@@ -54,7 +54,7 @@ class FemConfig(StrictConfig):
     workers: int = Field(default=2, ge=1, le=64)
     threads: int = Field(default=0, ge=0, le=256)
     waiting: int = Field(default=8, ge=0, le=1000)
-    max_steps: int = Field(default=200, ge=1, le=10_000)
+    max_steps: int = Field(default=200, ge=1, lt=10_000)
     max_deadline_s: float = Field(default=600.0, gt=0, le=86_400)
     grace_s: float = Field(default=5.0, ge=0.1, le=60)
     keep: int = Field(default=2, ge=1, le=32)

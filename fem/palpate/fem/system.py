@@ -214,7 +214,17 @@ class System:
             device=DEVICE,
         )
         for surface in (self.inner, self.outer):
-            surface.add_misfit(array)
+            surface.add_load(surface.misfit, array)
+        return force.reshape(-1)[self.pattern.free]
+
+    def coupled_force(self) -> Floats:
+        """Part of `misfit_force` that comes with the friction of grown pressures, (n,).
+
+        Kept apart: a new point's pressure is its depth times an enormous stiffness until the linear
+        solve has answered, and friction must follow the answer, not the question.
+        """
+        force = np.zeros_like(self.mesh.nodes)
+        self.outer.add_load(self.outer.coupled, vec3s(force))
         return force.reshape(-1)[self.pattern.free]
 
     @property
@@ -307,6 +317,7 @@ class System:
                 surface.misfit,
                 surface.wanted_traction_array,
                 surface.traction_slope,
+                surface.coupled,
                 surface.rest,
                 self._force_arrays[THREADS],
                 self._block_arrays[0],
@@ -428,6 +439,7 @@ class Surface:
         self.slope = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
         self.traction_slope = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
         self.misfit = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
+        self.coupled = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
         self.rest = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
         self._frozen = [wp.clone(a) for a in (self.slope, self.traction_slope, self.status)]
 
@@ -448,7 +460,7 @@ class Surface:
         self.gap[:] = np.inf
         self._wanted[:] = 0.0
         self._wanted_traction[:] = 0.0
-        for array in (self.status, self.slope, self.traction_slope, self.misfit, self.rest):
+        for array in (self.status, self.slope, self.traction_slope, self.misfit, self.coupled, self.rest):
             array.zero_()
 
     def misfit_of(self, pressure: Floats) -> float:
@@ -482,13 +494,13 @@ class Surface:
             )
         return pressure, traction
 
-    def add_misfit(self, force: wp.array) -> None:
-        """Add the load of the condensed contact pressures to nodal forces."""
+    def add_load(self, load: wp.array, force: wp.array) -> None:
+        """Subtract a load at the points (F, Q) from nodal forces."""
         if self.count:
             wp.launch(
                 contact_kernels.misfit_force,
                 dim=self.count,
-                inputs=[self.faces, self.shape, self.misfit],
+                inputs=[self.faces, self.shape, load],
                 outputs=[force],
                 device=DEVICE,
             )
