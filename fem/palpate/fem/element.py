@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.material import NeoHooke
 from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.system import rest_gradients
+from palpate.fem.reference_element import rest_gradients
 
 Floats = NDArray[np.float64]
 
@@ -63,8 +63,6 @@ def elements(
     )
     moduli = material.hessian(f) + pressure[:, None, None, None, None, None] * second
     tangent = np.einsum("eq,eqijkl,eqaj,eqbl->eaibk", weight, moduli, gradient, gradient)
-    tangent += np.einsum(
-        "e,eai,ebk->eaibk", bulk / rest_volume, volume_gradient, volume_gradient
-    )
+    tangent += np.einsum("e,eai,ebk->eaibk", bulk / rest_volume, volume_gradient, volume_gradient)
     energy = float((weight * material.function(f)).sum())
     return Elements(energy, volume, volume_gradient, force, tangent)

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernels of the skin: incompressible neo-Hooke with one pressure an element (Q1-P0).
 
 Energy of an element, with v its volume and p its pressure (Simo, Taylor and Pister 1985)::
@@ -166,8 +167,8 @@ def pressure_update(
 ):
     """Element pressures that belong to a change of the nodal positions, to first order.
 
-    The gradients are those of the factorised tangent: pressures and displacements then solve one and
-    the same linear system, which matters because kappa would magnify any difference.
+    The gradients are those of the factorised tangent: pressures and displacements then solve one
+    and the same linear system, which matters because kappa would magnify any difference.
     """
     e = wp.tid()
     v = volume_in[e] - rest_volume[e]

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernel of the sealed fluid: the volume that a closed surface encloses, and its derivatives."""
 
 from __future__ import annotations

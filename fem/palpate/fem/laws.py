@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from palpate.fem.contact_kernels import Law
+from palpate.fem.contact_laws import Law
 from palpate.fem.device import scalars
 from palpate.fem.indenter.shape import Indenter
 

@@ -105,7 +105,10 @@ class Pardiso:
     def statistics(self) -> dict[str, int]:
         """Entries of the factor and memory [KiB] at the peak of the factorisation."""
         iparm = self._library.iparm
-        return {"factor_entries": int(iparm[17]), "peak_kib": int(max(iparm[14], iparm[15] + iparm[16]))}
+        return {
+            "factor_entries": int(iparm[17]),
+            "peak_kib": int(max(iparm[14], iparm[15] + iparm[16])),
+        }
 
     def _call(self, phase: int, right: Floats) -> Floats:
         library, answer = self._library, np.zeros_like(right)

@@ -49,4 +49,5 @@ class NeoHooke:
     def _parts(self, f: Floats) -> tuple[Floats, Floats, Floats]:
         j = np.linalg.det(f)[..., None, None]
         trace = np.sum(f * f, axis=(-2, -1))[..., None, None]
-        return self.mu * j ** (-2 / 3), trace, np.linalg.inv(f).swapaxes(-1, -2)
+        inverse_t = np.asarray(np.linalg.inv(f).swapaxes(-1, -2), np.float64)
+        return np.asarray(self.mu * j ** (-2 / 3)), np.asarray(trace), inverse_t

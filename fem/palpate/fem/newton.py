@@ -181,7 +181,7 @@ class Newton:
             right: Right-hand side.
             coupled: More of it, that `System.rest_product` of the answer nearly cancels.
         """
-        first = self.factor.solve(right)
+        first = np.asarray(self.factor.solve(right))
         if not self.system.slides:
             return first
         left_over = -self.system.rest_product(first)
@@ -195,4 +195,4 @@ class Newton:
         more, _ = gmres(
             operator, self.factor.solve(left_over), rtol=1e-2, atol=0.0, restart=8, maxiter=1
         )
-        return first + np.asarray(more)
+        return np.asarray(first + more)

@@ -30,7 +30,9 @@ def make_step(
     weight = state.indenter_pressure * surface.area_values
     faces = tip.geometry.mesh.outer_faces
     points = np.einsum("qa,fai->fqi", surface.shape_values, state.position[faces])
-    touching = state.indenter_pressure > CONTACT_SHARE * max(float(state.indenter_pressure.max()), 1.0)
+    touching = state.indenter_pressure > CONTACT_SHARE * max(
+        float(state.indenter_pressure.max()), 1.0
+    )
     centre = np.full(3, np.nan)
     if touching.any():
         centre = (weight[..., None] * points).sum(axis=(0, 1)) / weight.sum()
@@ -52,13 +54,14 @@ def make_step(
 def cauchy_stress(tip: Fingertip, state: State) -> Floats:
     """Cauchy stress, mean over each element: xx yy zz yz xz xy [Pa], (E, 6)."""
     mesh = tip.geometry.mesh
-    gradient, weight = tip.system.rest_gradient_values
+    skin = tip.system.skin
+    gradient, weight = skin.gradient_values, skin.weight_values
     f = np.einsum("eai,eqaj->eqij", state.position[mesh.elements], gradient)
     j = np.linalg.det(f)
     b = np.einsum("eqij,eqkj->eqik", f, f)
     trace = np.trace(b, axis1=2, axis2=3)
     deviator = b - trace[..., None, None] / 3 * np.eye(3)
-    isochoric = tip.system.mu * (j ** (-5 / 3))[..., None, None] * deviator
+    isochoric = skin.mu * (j ** (-5 / 3))[..., None, None] * deviator
     current = weight * j
     mean = np.einsum("eq,eqij->eij", current, isochoric) / current.sum(axis=1)[:, None, None]
     mean += state.pressure[:, None, None] * np.eye(3)

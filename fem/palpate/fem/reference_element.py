@@ -9,6 +9,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.fem.mesh.solid import SolidMesh
+
 Floats = NDArray[np.float64]
 
 _GAUSS = 1.0 / np.sqrt(3.0)
@@ -75,9 +77,7 @@ def solid_element(nodes: int) -> ReferenceElement:
         across = np.concatenate([face.gradient * below, face.gradient * above], axis=1)
         gradient.append(np.concatenate([across, along[:, :, None]], axis=2))
         weight.append(face.weight)
-    return ReferenceElement(
-        np.concatenate(shape), np.concatenate(gradient), np.concatenate(weight)
-    )
+    return ReferenceElement(np.concatenate(shape), np.concatenate(gradient), np.concatenate(weight))
 
 
 @cache
@@ -104,3 +104,13 @@ def corner_element(nodes: int) -> ReferenceElement:
         return ReferenceElement(*quadrilateral_at(_HEXAHEDRON), np.ones(4))
     points = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
     return ReferenceElement(*triangle_at(points), np.full(3, 1 / 6))
+
+
+def rest_gradients(mesh: SolidMesh) -> tuple[Floats, Floats]:
+    """Gradients of the shape functions on the undeformed mesh, (E, Q, n, 3), and w detJ, (E, Q)."""
+    element = solid_element(mesh.elements.shape[1])
+    corners = mesh.nodes[mesh.elements]
+    jacobian = np.einsum("eai,qad->eqid", corners, element.gradient)
+    determinant = np.linalg.det(jacobian)
+    gradient = np.einsum("qad,eqdi->eqai", element.gradient, np.linalg.inv(jacobian))
+    return np.ascontiguousarray(gradient), element.weight * determinant

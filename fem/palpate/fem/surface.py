@@ -1,0 +1,117 @@
+"""One surface of the mesh, with what contact leaves at its points."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from palpate.fem import contact_kernels
+from palpate.fem.device import DEVICE, scalars, vec3s
+from palpate.fem.reference_element import corner_element
+
+Floats = NDArray[np.float64]
+
+
+class Surface:
+    """One surface of the mesh, with what contact leaves at its quadrature points."""
+
+    def __init__(self, nodes: Floats, faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> None:
+        self.count = len(faces)
+        corners = faces.shape[1] if self.count else 3
+        element = corner_element(corners)
+        self.shape_values = element.shape
+        edges = np.einsum("qad,fai->fqdi", element.gradient, nodes[faces.reshape(-1, corners)])
+        normal = np.cross(edges[:, :, 0], edges[:, :, 1])
+        self.area_values = element.weight * np.linalg.norm(normal, axis=2)
+        size = self.area_values.shape
+        self._corners, self._element = faces, element
+        self.gap, self._wanted = np.full(size, np.inf), np.zeros(size)
+        self._wanted_traction = np.zeros((*size, 3))
+        self.faces = wp.array(faces.reshape(-1, corners), dtype=wp.int32, device=DEVICE)
+        self.pairs = wp.array(pairs.reshape(-1, corners, corners), dtype=wp.int32, device=DEVICE)
+        self.shape, self.area = scalars(element.shape), scalars(self.area_values)
+        self.status = wp.zeros(size, dtype=wp.int32, device=DEVICE)
+        self.gap_array, self.wanted_array = scalars(self.gap), scalars(self._wanted)
+        self.wanted_traction_array = vec3s(self._wanted_traction)
+        self.slope = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
+        self.traction_slope = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
+        self.misfit = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
+        self.coupled = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
+        self.rest = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
+        self._frozen = [wp.clone(a) for a in (self.slope, self.traction_slope, self.status)]
+
+    def freeze(self) -> None:
+        """Keep what belongs to the tangent that is being factorised."""
+        for kept, now in zip(
+            self._frozen, (self.slope, self.traction_slope, self.status), strict=True
+        ):
+            wp.copy(kept, now)
+
+    @property
+    def changed(self) -> bool:
+        """Whether any point's status differs from the frozen one."""
+        return not np.array_equal(self._frozen[2].numpy(), self.status.numpy())
+
+    def forget(self) -> None:
+        """Nothing is near."""
+        self.gap[:] = np.inf
+        self._wanted[:] = 0.0
+        self._wanted_traction[:] = 0.0
+        for array in (
+            self.status,
+            self.slope,
+            self.traction_slope,
+            self.misfit,
+            self.coupled,
+            self.rest,
+        ):
+            array.zero_()
+
+    def misfit_of(self, pressure: Floats) -> float:
+        """Largest difference of pressures from what the law wants [Pa]."""
+        return float(np.abs(self._wanted - pressure).max()) if self.count else 0.0
+
+    def traction_misfit(self, traction: Floats) -> float:
+        """Largest difference of tractions from what friction wants [Pa]."""
+        return float(np.abs(self._wanted_traction - traction).max()) if self.count else 0.0
+
+    def updated_pressure(self, moved: wp.array) -> tuple[Floats, Floats]:
+        """Pressures (F, Q) and tractions (F, Q, 3) after a change of the nodal positions [Pa]."""
+        pressure = np.zeros(self.area_values.shape)
+        traction = np.zeros((*pressure.shape, 3))
+        if self.count:
+            wp.launch(
+                contact_kernels.pressure_update,
+                dim=self.count,
+                inputs=[
+                    self.faces,
+                    self.shape,
+                    self.status,
+                    self.wanted_array,
+                    self._frozen[0],
+                    self.wanted_traction_array,
+                    self._frozen[1],
+                    moved,
+                ],
+                outputs=[scalars(pressure), vec3s(traction)],
+                device=DEVICE,
+            )
+        return pressure, traction
+
+    def add_load(self, load: wp.array, force: wp.array) -> None:
+        """Subtract a load at the points (F, Q) from nodal forces."""
+        if self.count:
+            wp.launch(
+                contact_kernels.misfit_force,
+                dim=self.count,
+                inputs=[self.faces, self.shape, load],
+                outputs=[force],
+                device=DEVICE,
+            )
+
+    def current_area(self, position: Floats) -> Floats:
+        """Area that belongs to each point now [m^2], (F, Q)."""
+        edges = np.einsum("qad,fai->fqdi", self._element.gradient, position[self._corners])
+        normal = np.cross(edges[:, :, 0], edges[:, :, 1])
+        return np.asarray(self._element.weight * np.linalg.norm(normal, axis=2))
