@@ -1,5 +1,10 @@
-"""Finite elements of the fingertip: reserved, no solver yet (fem/README.md).
+"""Finite elements of the fingertip: skin, sealed fluid, core and indenter (fem/README.md).
 
-Its contract on the wire exists: ``SimulationRequest``, ``SimulationProgress`` and
-``SimulationReply`` in ``palpate.protos.messages``.
+::
+
+    from palpate.fem.mesh.parametric import biotac
+    from palpate.fem.solver import Fingertip
+
+    tip = Fingertip.pressurised(biotac())
+    trajectory = tip.indent(indenter, path)
 """

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.contact_laws import Law
 from palpate.fem.device import scalars
+from palpate.fem.indenter.pose import rotation_matrix
 from palpate.fem.indenter.shape import Indenter
 
 Floats = NDArray[np.float64]
@@ -65,15 +66,3 @@ class Press:
     def to_local(self, points: Floats) -> Floats:
         """Points of the sensor frame in the indenter's."""
         return np.asarray((points - self.tip) @ self.rotation)
-
-
-def rotation_matrix(quaternion: Floats) -> Floats:
-    """Rotation of a unit quaternion w x y z, (3, 3)."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -23,7 +23,6 @@ from palpate.protos.closing import Closing
 from palpate.protos.errors import RemoteError
 
 log = logging.getLogger(__name__)
-
 _TICK_S = 0.05
 _STARTS_BEFORE_GIVING_UP = 3
 _PAUSE_S = 0.25  # after a worker that did not start; doubled each time
@@ -44,7 +43,7 @@ class Pool(Closing):
         on_fingertip: Called with every fingertip that a worker has at hand.
 
     Attributes:
-        broken: Why there are no workers, when they do not even start; then nothing ever runs.
+        broken: Why there are no workers, when they do not even start.
         restarts: Workers that were started again.
     """
 
@@ -95,11 +94,6 @@ class Pool(Closing):
         """Jobs that wait."""
         with self._lock:
             return len(self._waiting)
-
-    def pids(self) -> list[int]:
-        """Process ids of the workers."""
-        with self._lock:
-            return [worker.pid for worker in self._workers]
 
     def submit(self, job: Job, on_event: OnEvent) -> None:
         """Run a job as soon as a worker is free.

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from palpate.fem.config import FingertipParameters
 from palpate.fem.indentation import Indentation
+from palpate.fem.indenter.approach import Surface, check_clear
+from palpate.fem.indenter.path import check_path
 from palpate.fem.indenter.shape import Indenter
 from palpate.fem.laws import ContactSettings, Press
 from palpate.fem.linear import make_factor
+from palpate.fem.mesh.check import check_mesh
 from palpate.fem.mesh.geometry import Geometry
 from palpate.fem.newton import Newton, NewtonSettings, Report
 from palpate.fem.result import Outcome, Step, Trajectory
@@ -93,6 +96,7 @@ class Fingertip:
             SimulationError: No equilibrium, or the fluid volume does not fit the cavity.
         """
         parameters = parameters or FingertipParameters()
+        check_mesh(geometry.mesh)
         tip = cls(geometry, parameters, settings or Settings())
         tip._pressurise(progress or (lambda _: None))
         return tip
@@ -204,5 +208,12 @@ class Fingertip:
 
         Returns:
             The converged steps; if not all, why, and how far it came.
+
+        Raises:
+            ConfigError: The path is no path.
+            SimulationError: The indenter starts inside the skin.
         """
+        path = check_path(path)
+        surface = Surface(self.nodes, self.geometry.mesh.outer_faces)
+        check_clear(indenter, path[0], surface)
         return Indentation(self, indenter, path, on_step, should_stop).run()
