@@ -25,7 +25,12 @@ from palpate.protos.messages import (
     SensorType,
     ServiceRequest,
     ServiceState,
+    SimulationCancelReply,
+    SimulationCancelRequest,
+    SimulationConvergence,
+    SimulationOutcome,
     SimulationParameters,
+    SimulationPhase,
     SimulationProgress,
     SimulationReply,
     SimulationRequest,
@@ -61,8 +66,17 @@ def examples() -> dict[str, Any]:
     nodes = np.linspace(-0.001, 0.002, 12, dtype=np.float32).reshape(4, 3)
     pose = Pose((0.001, -0.002, -0.0093), (1.0, 0.0, 0.0, 0.0))
     step = SimulationStep(
-        pose, _floats(0.1, -0.2, 3.0), _floats(0.01, 0.02, 0.03), 1750.5, nodes, nodes * 10
+        pose,
+        np.array([0.1, -0.2, 3.0]),
+        np.array([0.01, 0.02, 0.03]),
+        1750.5,
+        nodes,
+        nodes * 10,
+        4.5e-6,
+        np.array([0.001, -0.002, -0.0093]),
+        SimulationConvergence(2, 9, 11, 1e-9, 2e-12, 3e-6, 0.25),
     )
+    progress = SimulationProgress("r-1", 3, 20, 1.25, SimulationPhase.INDENTING, 2)
     return {
         "ElectrodeFrame": ElectrodeFrame(
             stamp,
@@ -166,8 +180,21 @@ def examples() -> dict[str, Any]:
             True,
             False,
         ),
-        "SimulationProgress": SimulationProgress("r-1", 3, 20, 1.25),
-        "SimulationReply": SimulationReply("r-1", mesh, (step, step), "diverged at step 3", 4.5),
+        "SimulationProgress": progress,
+        "SimulationReply": SimulationReply(
+            "r-1",
+            mesh,
+            (step, step),
+            "diverged at step 3",
+            4.5,
+            True,
+            1,
+            progress,
+            SimulationOutcome.DIVERGED,
+            0.00125,
+        ),
+        "SimulationCancelRequest": SimulationCancelRequest("r-1"),
+        "SimulationCancelReply": SimulationCancelReply(True),
     }
 
 

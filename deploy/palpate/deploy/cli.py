@@ -24,6 +24,7 @@ from palpate.deploy.options import (
     client_link,
     example,
 )
+from palpate.fem.cli import fem_app
 
 app = typer.Typer(
     cls=PalpateGroup,
@@ -38,6 +39,7 @@ app.add_typer(cli_bundle.model_app, name="model")
 app.add_typer(cli_bundle.bundle_app, name="bundle")
 app.add_typer(cli_bench.app, name="bench")
 cli_files.register(app)
+app.add_typer(fem_app, name="fem")
 app.add_typer(training.train, name="train")
 app.add_typer(training.data, name="data")
 
@@ -89,7 +91,7 @@ def up(
 
 @app.command(epilog=example("palpate run features --profile virtual"))
 def run(
-    service: Annotated[str, typer.Argument(help="router, gateway, features or recorder")],
+    service: Annotated[str, typer.Argument(help="router, gateway, features, recorder or fem")],
     profile: ProfileOption = DEFAULT_PROFILE,
 ) -> None:
     """Be one process of a station, unsupervised (what `palpate up` starts)."""

@@ -68,16 +68,31 @@ def replay(
 
 
 def review(
-    file: RecordArgument,
+    path: Annotated[
+        Path, typer.Argument(metavar="FILE.mcap|STORE.sim", help="A record, or simulations.")
+    ],
     out: Annotated[Path | None, typer.Option(help="The .rrd to write; default: beside.")] = None,
     png: Annotated[
-        Path | None, typer.Option(help="Also draw truth against estimate into this PNG.")
+        Path | None,
+        typer.Option(
+            help="Also draw a PNG: truth against estimate of a record; the overview of a store, or "
+            "the last step of the one trajectory that is named."
+        ),
     ] = None,
+    trajectory: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trajectory", metavar="ID", help="Of a store: only this, e.g. 'cube/*'; repeatable."
+        ),
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=1, help="Of a store: at most so many trajectories, evenly picked.")
+    ] = 8,
 ) -> None:
-    """Make a Rerun view of a record."""
-    from palpate.deploy.files import review_record
+    """Make a Rerun view of a record, or of a store of simulations."""
+    from palpate.deploy.files import review_path
 
-    review_record(existing_file(file), out, png)
+    review_path(path, out, png, trajectories=tuple(trajectory or ()), most=most)
 
 
 def info(file: RecordArgument, json_: JsonOption = False) -> None:
@@ -101,7 +116,7 @@ def register(app: typer.Typer) -> None:
     for command, lines in (
         (record, ("palpate record --out runs --duration-s 60",)),
         (replay, ("palpate replay data.btd.gz", "palpate replay runs/lab.mcap --pace recorded")),
-        (review, ("palpate review runs/lab.mcap",)),
+        (review, ("palpate review runs/lab.mcap", "palpate review sweep.sim --most 4")),
         (info, ("palpate info runs/lab.mcap",)),
         (recover, ("palpate recover runs/lab.mcap.part",)),
     ):

@@ -1,8 +1,9 @@
-"""``palpate info``, ``review`` and ``recover``: records on disk."""
+"""``palpate info``, ``review`` and ``recover``: records and simulations on disk."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from palpate.deploy.status import duration_text
 from palpate.deploy.viewer import viewer_command
+from palpate.protos.errors import ConfigError
 from palpate.protos.record import RecordSummary, check_readable, recover, summarise
 
 
@@ -66,6 +68,43 @@ def print_contents(path: Path) -> RecordSummary:
     return summary
 
 
+def review_path(
+    path: Path,
+    view: Path | None,
+    picture: Path | None,
+    *,
+    trajectories: Sequence[str] = (),
+    most: int = 8,
+) -> None:
+    """Write the Rerun view of a record or of a store of simulations, and on request the picture.
+
+    Args:
+        path: What to look at.
+        view: The ``.rrd`` to write; None = beside it.
+        picture: The PNG to write; None = none.
+        trajectories: Of a store: which, by id or pattern; none = a choice from all.
+        most: Of a store: how many trajectories at most.
+
+    Raises:
+        ConfigError: There is no such path.
+        RecordingError: The record is damaged or not palpate's.
+        DatasetError: The store is damaged, or has none of these trajectories.
+        MissingExtraError: Rerun, h5py or matplotlib is not installed.
+    """
+    if not path.exists():
+        raise ConfigError(f"{path} does not exist", remedy="check the path")
+    from palpate.services.simulation_view_file import is_simulations
+
+    if is_simulations(path):
+        _review_store(path, view, picture, trajectories, most)
+    elif trajectories:
+        raise ConfigError(
+            f"{path} is a record, which has no trajectories", remedy="leave out --trajectory"
+        )
+    else:
+        review_record(path, view, picture)
+
+
 def review_record(path: Path, view: Path | None, picture: Path | None) -> None:
     """Write the Rerun view of a record, and on request the picture.
 
@@ -84,6 +123,52 @@ def review_record(path: Path, view: Path | None, picture: Path | None) -> None:
             print(f"  {name:24} {value:.4g}")
         print(picture)
     print(f"look at it: {viewer_command(written)}")
+
+
+def _review_store(
+    path: Path, view: Path | None, picture: Path | None, trajectories: Sequence[str], most: int
+) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from palpate.services.simulation_view import review_simulations
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    console = Console(stderr=True)
+    silent = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=silent) as bar:
+        task = bar.add_task("drawing", total=None)
+        written = review_simulations(
+            path,
+            view,
+            trajectories=trajectories,
+            most=most,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
+    if picture is not None:
+        _draw_store(path, picture, trajectories)
+        print(picture)
+    print(f"look at it: {viewer_command(written)}")
+
+
+def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
+    """The overview of a store, or the last step of the one trajectory that is asked for."""
+    from palpate.fem.plot import plot_overview, plot_step
+    from palpate.fem.store import SimulationStore
+    from palpate.services.simulation_view_file import choose
+
+    store = SimulationStore.open(path)
+    names = store.ids()
+    if trajectories:
+        names = choose(names, trajectories, len(names))
+    if trajectories and len(names) == 1:
+        (name,) = names
+        press, outline = store.trajectory(name), store.outline(name)
+        plot_step(store.fingertip(), press, picture, indenter=outline, title=name)
+        return
+    outcomes = plot_overview([store.summary(name) for name in names], picture, title=path.name)
+    for outcome, count in sorted(outcomes.items()):
+        print(f"  {outcome.value:24} {count}")
 
 
 def recover_record(part: Path) -> None:

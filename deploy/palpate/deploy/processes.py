@@ -17,7 +17,7 @@ from palpate.protos.errors import ConfigError
 
 _log = logging.getLogger(__name__)
 
-START_ORDER: tuple[Service, ...] = ("router", "recorder", "features", "gateway")
+START_ORDER: tuple[Service, ...] = ("router", "recorder", "features", "fem", "gateway")
 """Listeners first; stopped in reverse, so that what the gateway last sent is still recorded."""
 
 
@@ -75,11 +75,18 @@ def _run_recorder(profile: Profile, stop: threading.Event) -> None:
     recorder.run(profile.recorder, profile.link, profile.station, stop)
 
 
+def _run_fem(profile: Profile, stop: threading.Event) -> None:
+    from palpate.fem import node
+
+    node.run(profile.fem, profile.link, profile.station, stop)
+
+
 _RUN: dict[Service, Callable[[Profile, threading.Event], None]] = {
     "router": _run_router,
     "gateway": _run_gateway,
     "features": _run_features,
     "recorder": _run_recorder,
+    "fem": _run_fem,
 }
 
 

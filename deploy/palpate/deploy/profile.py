@@ -22,6 +22,7 @@ from pydantic_settings import (
 )
 
 from palpate.deploy.logs import LogFormat, LogLevel
+from palpate.fem.service_config import FemConfig
 from palpate.gateway.config import GatewayConfig
 from palpate.protos.config import (
     DEFAULT_ROUTER,
@@ -41,8 +42,9 @@ PROFILES = Path(__file__).parent / "profiles"
 ENV_PREFIX = "PALPATE_"
 ENV_NESTED = "__"
 
-Service = Literal["router", "gateway", "features", "recorder"]
+Service = Literal["router", "gateway", "features", "recorder", "fem"]
 SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
+"""What a station runs by default; ``fem`` is named where it is wanted."""
 
 
 class RouterConfig(StrictConfig):
@@ -85,6 +87,7 @@ class Profile(StrictConfig):
         gateway: The sensors.
         features: Electrodes to features.
         recorder: What is recorded, and where.
+        fem: How simulations are served, where ``processes`` names ``fem``.
         log: What the processes write into their logs.
     """
 
@@ -95,6 +98,7 @@ class Profile(StrictConfig):
     gateway: GatewayConfig = Field(default_factory=GatewayConfig)
     features: FeaturesConfig = FeaturesConfig()
     recorder: RecorderConfig = RecorderConfig()
+    fem: FemConfig = FemConfig()
     log: LogConfig = LogConfig()
 
     @field_validator("processes")

@@ -34,8 +34,11 @@ TELLING_COUNTERS = (
     "estimates_published",
     "recorded_electrodes",
     "recorded_features",
+    "simulations_complete",
 )
-_TROUBLE = ("lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown")
+_TROUBLE = (
+    "lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown", "failed",
+)  # fmt: skip
 
 
 def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status]:

@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-wp.config.quiet = True
+# Warp announces itself, its devices and each kernel it loads on standard output; errors still come.
+wp.config.log_level = wp.LOG_ERROR
 
 DEVICE = "cpu"
 

@@ -69,10 +69,13 @@ class Step:
 class Trajectory:
     """The converged steps of one indentation, and why there are no more.
 
+    The first pose is where it starts, untouched; each further one makes a step, so a complete
+    trajectory of K poses has K - 1 steps.
+
     Attributes:
         indenter: Its name.
         path: Requested poses, shape (K, 7).
-        steps: Converged ones, in order of the path; len(steps) < K only if outcome is not COMPLETE.
+        steps: Converged ones, in order of the path; fewer than K - 1 only if outcome is not COMPLETE.
         outcome: How it ended.
         reason: One sentence where it did not complete: what, where, at which travel.
         travel_m: Path length of the indenter at the last *converged* increment, which may lie

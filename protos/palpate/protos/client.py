@@ -20,8 +20,8 @@ from palpate.protos.closing import Closing
 from palpate.protos.codec import (
     MODEL_METADATA,
     SERVICE_REQUEST,
-    SIMULATION_REPLY,
-    SIMULATION_REQUEST,
+    SIMULATION_CANCEL_REPLY,
+    SIMULATION_CANCEL_REQUEST,
     STATUS,
     TARE,
     TARE_REQUEST,
@@ -34,6 +34,7 @@ from palpate.protos.messages import (
     FieldEstimate,
     ModelMetadata,
     ServiceRequest,
+    SimulationCancelRequest,
     SimulationReply,
     SimulationRequest,
     Status,
@@ -42,6 +43,7 @@ from palpate.protos.messages import (
     TareRequest,
 )
 from palpate.protos.session import Alive, Delivery, Received, Session, Subscriber
+from palpate.protos.simulations import OnProgress, OnStep, ask_simulation
 from palpate.protos.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
 
 M = TypeVar("M")
@@ -122,22 +124,54 @@ class Client(Closing):
         )
 
     def simulate(
-        self, request: SimulationRequest, *, sensor: str = "twin", timeout_s: float = 60.0
+        self,
+        request: SimulationRequest,
+        *,
+        sensor: str = "twin",
+        timeout_s: float = 60.0,
+        on_progress: OnProgress | None = None,
+        on_step: OnStep | None = None,
     ) -> SimulationReply:
         """Indent the finite-element fingertip.
 
+        Args:
+            request: What to simulate; ``palpate.protos.simulations.straight_path`` makes paths.
+            sensor: Name under which the service serves.
+            timeout_s: How long it may take, time in the queue included [s]. What has converged by
+                then is returned, and ``outcome`` says that it is not all.
+            on_progress: Called, in this thread, whenever the service says how far it is.
+            on_step: Called, in this thread, with number and values of each step as it converges.
+
         Raises:
             LinkError: No finite-element service runs.
-            RemoteError: It refuses the request.
+            RemoteError: It refuses (``retry_after_s`` says when to ask again), or cannot go on.
+                Steps that had converged were given to ``on_step``.
+        """
+        return ask_simulation(
+            self.session,
+            request,
+            sensor=sensor,
+            timeout_s=timeout_s,
+            on_progress=on_progress,
+            on_step=on_step,
+        )
+
+    def cancel_simulation(
+        self, request_id: str, *, sensor: str = "twin", timeout_s: float = 5.0
+    ) -> bool:
+        """Stop a simulation; whoever asked for it gets what has converged.
+
+        Returns:
+            Whether it was waiting or running.
         """
         return self.session.query(
-            "simulate",
+            "simulate_cancel",
             sensor=sensor,
-            request=request,
-            request_codec=SIMULATION_REQUEST,
-            reply_codec=SIMULATION_REPLY,
+            request=SimulationCancelRequest(request_id),
+            request_codec=SIMULATION_CANCEL_REQUEST,
+            reply_codec=SIMULATION_CANCEL_REPLY,
             timeout_s=timeout_s,
-        )
+        ).found
 
     def model(self, *, service: str = "features") -> ModelMetadata:
         """What the served bundle says of itself."""

@@ -5,6 +5,7 @@ Keys (docs/adr/0004-keys-and-qos.md)::
     palpate/@v1/<station>/<sensor>/<stream>                          sensor streams
     palpate/@v1/<station>/@service/<service>/<instance>/<endpoint>   what a process says and answers
     palpate/@v1/@live/<station>/<service>/<instance>/<alive|ready>   presence (liveliness tokens)
+    palpate/@v1/@asking/<station>/<digest of a request's id>          a caller still waits (token)
 
 ``@v1`` is a verbatim chunk: ``*`` and ``**`` never match it, so a future contract cannot be taken
 for this one by accident.
@@ -12,6 +13,7 @@ for this one by accident.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Generic, TypeVar
@@ -24,6 +26,7 @@ from palpate.protos.messages import (
     FeatureEstimate,
     FieldEstimate,
     IndenterPoseFrame,
+    SimulationProgress,
     Stamp,
     Status,
     SynthesisEstimate,
@@ -39,6 +42,7 @@ CONTRACT_VERSION = 1
 
 ROOT = f"palpate/@v{CONTRACT_VERSION}"
 LIVE_ROOT = f"{ROOT}/@live"
+ASKING_ROOT = f"{ROOT}/@asking"
 ENCODING_PREFIX = "application/protobuf;"
 
 
@@ -116,6 +120,15 @@ FIELD: Topic[FieldEstimate] = Topic(
 SYNTHESIS: Topic[SynthesisEstimate] = Topic(
     "synthesis", codec.SYNTHESIS_ESTIMATE, 100, _RT, True, False, "tared counts from a field"
 )
+SIMULATION_PROGRESS: Topic[SimulationProgress] = Topic(
+    "simulation_progress",
+    codec.SIMULATION_PROGRESS,
+    0,
+    Priority.DATA,
+    False,
+    False,
+    "how far a finite-element simulation is",
+)
 STATUS: Topic[Status] = Topic(
     "status",
     codec.STATUS,
@@ -129,7 +142,17 @@ STATUS: Topic[Status] = Topic(
 
 TOPICS: dict[str, Topic[Any]] = {
     topic.name: topic
-    for topic in (ELECTRODES, WRENCH, POSE, TARE, FEATURES, FIELD, SYNTHESIS, STATUS)
+    for topic in (
+        ELECTRODES,
+        WRENCH,
+        POSE,
+        TARE,
+        FEATURES,
+        FIELD,
+        SYNTHESIS,
+        SIMULATION_PROGRESS,
+        STATUS,
+    )
 }
 """All streams by name."""
 
@@ -156,6 +179,15 @@ def live_key(station: str, service: str, instance: str, what: str) -> str:
         f"{LIVE_ROOT}/{_chunk(station, 'station')}/"
         f"{_chunk(service, 'service')}/{_chunk(instance, 'instance')}/{what}"
     )
+
+
+def asking_key(station: str, request_id: str) -> str:
+    """Key of the token of a caller that waits for the answer to ``request_id``; ``"*"`` for any.
+
+    The id may be any text, so its digest stands in the key.
+    """
+    digest = "*" if request_id == "*" else hashlib.sha256(request_id.encode()).hexdigest()[:32]
+    return f"{ASKING_ROOT}/{_chunk(station, 'station')}/{digest}"
 
 
 def _chunk(name: str, what: str) -> str:

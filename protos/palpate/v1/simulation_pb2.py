@@ -25,21 +25,31 @@ _sym_db = _symbol_database.Default()
 from palpate.v1 import common_pb2 as palpate_dot_v1_dot_common__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bpalpate/v1/simulation.proto\x12\npalpate.v1\x1a\x17palpate/v1/common.proto\"\xda\x01\n\x11SimulationRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x10\n\x08indenter\x18\x02 \x01(\t\x12\x1e\n\x04path\x18\x03 \x03(\x0b\x32\x10.palpate.v1.Pose\x12\x34\n\nparameters\x18\x04 \x01(\x0b\x32 .palpate.v1.SimulationParameters\x12\x12\n\ndeadline_s\x18\x05 \x01(\x01\x12\x19\n\x11want_displacement\x18\x06 \x01(\x08\x12\x1a\n\x12want_contact_force\x18\x07 \x01(\x08\"\xec\x01\n\x14SimulationParameters\x12\x1d\n\x10skin_thickness_m\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x1d\n\x10shear_modulus_pa\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12!\n\x14\x66riction_coefficient\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x1c\n\x0f\x66luid_volume_m3\x18\x04 \x01(\x01H\x03\x88\x01\x01\x42\x13\n\x11_skin_thickness_mB\x13\n\x11_shear_modulus_paB\x17\n\x15_friction_coefficientB\x12\n\x10_fluid_volume_m3\"d\n\x12SimulationProgress\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x12\n\nsteps_done\x18\x02 \x01(\r\x12\x13\n\x0bsteps_total\x18\x03 \x01(\r\x12\x11\n\telapsed_s\x18\x04 \x01(\x01\"\xd1\x01\n\x0eSimulationStep\x12.\n\x14pose_sensor_indenter\x18\x01 \x01(\x0b\x32\x10.palpate.v1.Pose\x12\"\n\x05\x66orce\x18\x02 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12#\n\x06torque\x18\x03 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12\x19\n\x11\x66luid_pressure_pa\x18\x04 \x01(\x01\x12\x14\n\x0c\x64isplacement\x18\x05 \x03(\x02\x12\x15\n\rcontact_force\x18\x06 \x03(\x02\"\x91\x01\n\x0fSimulationReply\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x13\n\x0bmesh_sha256\x18\x02 \x01(\x0c\x12)\n\x05steps\x18\x03 \x03(\x0b\x32\x1a.palpate.v1.SimulationStep\x12\x17\n\x0fstopped_because\x18\x04 \x01(\t\x12\x11\n\telapsed_s\x18\x05 \x01(\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bpalpate/v1/simulation.proto\x12\npalpate.v1\x1a\x17palpate/v1/common.proto\"\xda\x01\n\x11SimulationRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x10\n\x08indenter\x18\x02 \x01(\t\x12\x1e\n\x04path\x18\x03 \x03(\x0b\x32\x10.palpate.v1.Pose\x12\x34\n\nparameters\x18\x04 \x01(\x0b\x32 .palpate.v1.SimulationParameters\x12\x12\n\ndeadline_s\x18\x05 \x01(\x01\x12\x19\n\x11want_displacement\x18\x06 \x01(\x08\x12\x1a\n\x12want_contact_force\x18\x07 \x01(\x08\"\xec\x01\n\x14SimulationParameters\x12\x1d\n\x10skin_thickness_m\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x1d\n\x10shear_modulus_pa\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12!\n\x14\x66riction_coefficient\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x1c\n\x0f\x66luid_volume_m3\x18\x04 \x01(\x01H\x03\x88\x01\x01\x42\x13\n\x11_skin_thickness_mB\x13\n\x11_shear_modulus_paB\x17\n\x15_friction_coefficientB\x12\n\x10_fluid_volume_m3\"\xa8\x01\n\x12SimulationProgress\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x12\n\nsteps_done\x18\x02 \x01(\r\x12\x13\n\x0bsteps_total\x18\x03 \x01(\r\x12\x11\n\telapsed_s\x18\x04 \x01(\x01\x12*\n\x05phase\x18\x05 \x01(\x0e\x32\x1b.palpate.v1.SimulationPhase\x12\x16\n\x0ewaiting_before\x18\x06 \x01(\r\"\xa7\x01\n\x15SimulationConvergence\x12\x12\n\nincrements\x18\x01 \x01(\r\x12\x12\n\niterations\x18\x02 \x01(\r\x12\x16\n\x0e\x66\x61\x63torisations\x18\x03 \x01(\r\x12\x10\n\x08residual\x18\x04 \x01(\x01\x12\x14\n\x0cvolume_error\x18\x05 \x01(\x01\x12\x15\n\rpenetration_m\x18\x06 \x01(\x01\x12\x0f\n\x07seconds\x18\x07 \x01(\x01\"\xce\x02\n\x0eSimulationStep\x12.\n\x14pose_sensor_indenter\x18\x01 \x01(\x0b\x32\x10.palpate.v1.Pose\x12\"\n\x05\x66orce\x18\x02 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12#\n\x06torque\x18\x03 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12\x19\n\x11\x66luid_pressure_pa\x18\x04 \x01(\x01\x12\x14\n\x0c\x64isplacement\x18\x05 \x03(\x02\x12\x15\n\rcontact_force\x18\x06 \x03(\x02\x12\x0e\n\x06wrench\x18\x07 \x03(\x01\x12\x17\n\x0f\x63ontact_area_m2\x18\x08 \x01(\x01\x12\x1a\n\x12\x63\x65ntre_of_pressure\x18\t \x03(\x01\x12\x36\n\x0b\x63onvergence\x18\n \x01(\x0b\x32!.palpate.v1.SimulationConvergence\"\xa7\x02\n\x0fSimulationReply\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x13\n\x0bmesh_sha256\x18\x02 \x01(\x0c\x12)\n\x05steps\x18\x03 \x03(\x0b\x32\x1a.palpate.v1.SimulationStep\x12\x17\n\x0fstopped_because\x18\x04 \x01(\t\x12\x11\n\telapsed_s\x18\x05 \x01(\x01\x12\x0c\n\x04more\x18\x06 \x01(\x08\x12\x12\n\nfirst_step\x18\x07 \x01(\r\x12\x30\n\x08progress\x18\x08 \x01(\x0b\x32\x1e.palpate.v1.SimulationProgress\x12.\n\x07outcome\x18\t \x01(\x0e\x32\x1d.palpate.v1.SimulationOutcome\x12\x10\n\x08travel_m\x18\n \x01(\x01\"-\n\x17SimulationCancelRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\"&\n\x15SimulationCancelReply\x12\r\n\x05\x66ound\x18\x01 \x01(\x08*\x94\x01\n\x0fSimulationPhase\x12 \n\x1cSIMULATION_PHASE_UNSPECIFIED\x10\x00\x12\x1c\n\x18SIMULATION_PHASE_WAITING\x10\x01\x12!\n\x1dSIMULATION_PHASE_PRESSURISING\x10\x02\x12\x1e\n\x1aSIMULATION_PHASE_INDENTING\x10\x03*\xe0\x01\n\x11SimulationOutcome\x12\"\n\x1eSIMULATION_OUTCOME_UNSPECIFIED\x10\x00\x12\x1f\n\x1bSIMULATION_OUTCOME_COMPLETE\x10\x01\x12\"\n\x1eSIMULATION_OUTCOME_FORCE_LIMIT\x10\x02\x12\x1f\n\x1bSIMULATION_OUTCOME_DIVERGED\x10\x03\x12\x1f\n\x1bSIMULATION_OUTCOME_DEADLINE\x10\x04\x12 \n\x1cSIMULATION_OUTCOME_CANCELLED\x10\x05\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'palpate.v1.simulation_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
+  _globals['_SIMULATIONPHASE']._serialized_start=1592
+  _globals['_SIMULATIONPHASE']._serialized_end=1740
+  _globals['_SIMULATIONOUTCOME']._serialized_start=1743
+  _globals['_SIMULATIONOUTCOME']._serialized_end=1967
   _globals['_SIMULATIONREQUEST']._serialized_start=69
   _globals['_SIMULATIONREQUEST']._serialized_end=287
   _globals['_SIMULATIONPARAMETERS']._serialized_start=290
   _globals['_SIMULATIONPARAMETERS']._serialized_end=526
-  _globals['_SIMULATIONPROGRESS']._serialized_start=528
-  _globals['_SIMULATIONPROGRESS']._serialized_end=628
-  _globals['_SIMULATIONSTEP']._serialized_start=631
-  _globals['_SIMULATIONSTEP']._serialized_end=840
-  _globals['_SIMULATIONREPLY']._serialized_start=843
-  _globals['_SIMULATIONREPLY']._serialized_end=988
+  _globals['_SIMULATIONPROGRESS']._serialized_start=529
+  _globals['_SIMULATIONPROGRESS']._serialized_end=697
+  _globals['_SIMULATIONCONVERGENCE']._serialized_start=700
+  _globals['_SIMULATIONCONVERGENCE']._serialized_end=867
+  _globals['_SIMULATIONSTEP']._serialized_start=870
+  _globals['_SIMULATIONSTEP']._serialized_end=1204
+  _globals['_SIMULATIONREPLY']._serialized_start=1207
+  _globals['_SIMULATIONREPLY']._serialized_end=1502
+  _globals['_SIMULATIONCANCELREQUEST']._serialized_start=1504
+  _globals['_SIMULATIONCANCELREQUEST']._serialized_end=1549
+  _globals['_SIMULATIONCANCELREPLY']._serialized_start=1551
+  _globals['_SIMULATIONCANCELREPLY']._serialized_end=1589
 # @@protoc_insertion_point(module_scope)

@@ -12,10 +12,12 @@ from palpate.protos.codec.service import (
     TARE_REQUEST,
 )
 from palpate.protos.codec.simulation import (
+    SIMULATION_CANCEL_REPLY,
+    SIMULATION_CANCEL_REQUEST,
     SIMULATION_PROGRESS,
-    SIMULATION_REPLY,
     SIMULATION_REQUEST,
 )
+from palpate.protos.codec.simulation_reply import SIMULATION_REPLY
 
 CODECS = (
     ELECTRODE_FRAME,
@@ -33,6 +35,8 @@ CODECS = (
     SIMULATION_REQUEST,
     SIMULATION_PROGRESS,
     SIMULATION_REPLY,
+    SIMULATION_CANCEL_REQUEST,
+    SIMULATION_CANCEL_REPLY,
 )
 """All codecs of the contract."""
 
@@ -45,6 +49,8 @@ __all__ = [
     "INDENTER_POSE_FRAME",
     "MODEL_METADATA",
     "SERVICE_REQUEST",
+    "SIMULATION_CANCEL_REPLY",
+    "SIMULATION_CANCEL_REQUEST",
     "SIMULATION_PROGRESS",
     "SIMULATION_REPLY",
     "SIMULATION_REQUEST",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
-import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, Self, TypeVar
 
 import zenoh
@@ -13,14 +11,15 @@ import zenoh
 from palpate.protos.closing import Closing
 from palpate.protos.codec import Codec
 from palpate.protos.config import LinkConfig
-from palpate.protos.errors import LinkError, PalpateError
-from palpate.protos.session.presence import Alive, Presence, alive
+from palpate.protos.errors import PalpateError
+from palpate.protos.session.opening import no_router, open_zenoh
+from palpate.protos.session.presence import Alive, Asking, Departures, Presence, alive
 from palpate.protos.session.publish import Publisher
 from palpate.protos.session.query import Queryable, ask_all, ask_one
 from palpate.protos.session.queues import Delivery
-from palpate.protos.session.settings import zenoh_config
+from palpate.protos.session.streams import Answer, StreamQueryable, ask_stream
 from palpate.protos.session.subscribe import Subscriber, Tap
-from palpate.protos.topics import Topic, sensor_key, service_key
+from palpate.protos.topics import Topic, asking_key, sensor_key, service_key
 
 M = TypeVar("M")
 Q = TypeVar("Q")
@@ -32,8 +31,6 @@ class _Closable(Protocol):
 
 
 K = TypeVar("K", bound=_Closable)
-
-_IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
 
 
 class Session(Closing):
@@ -59,13 +56,13 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
         """
-        raw = _open(link, "peer" if link.direct else "client")
+        raw = open_zenoh(link, "peer" if link.direct else "client")
         if link.wait_for_router_s >= 0 and link.connect:
             deadline = time.monotonic() + link.wait_for_router_s
             while not raw.info.routers_zid() and not raw.info.peers_zid():
                 if time.monotonic() > deadline:
                     raw.close()
-                    raise _no_router(link)
+                    raise no_router(link)
                 time.sleep(0.02)
         return cls(raw, station)
 
@@ -202,6 +199,42 @@ class Session(Closing):
         key = self._endpoint(endpoint, sensor, service, instance)
         return ask_all(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
 
+    def stream_queryable(
+        self,
+        endpoint: str,
+        *,
+        sensor: str,
+        request: Codec[Q],
+        reply: Codec[R],
+        handler: Callable[[Q, Answer[R]], None],
+        capacity: int = 16,
+    ) -> StreamQueryable:
+        """Answer questions about a sensor with several replies each, from any thread."""
+        key = sensor_key(self.station, sensor, endpoint)
+        return self._keep(StreamQueryable(self._raw, key, request, reply, handler, capacity))
+
+    def ask_stream(
+        self,
+        endpoint: str,
+        *,
+        sensor: str,
+        request: Q,
+        request_codec: Codec[Q],
+        reply_codec: Codec[R],
+        timeout_s: float,
+    ) -> Iterator[R]:
+        """The replies of a sensor's endpoint as they come; the errors of ``query``."""
+        key = sensor_key(self.station, sensor, endpoint)
+        return ask_stream(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
+
+    def asking(self, request_id: str) -> Asking:
+        """Show that this process waits for an answer, until it is closed or this process dies."""
+        return Asking(self._raw, asking_key(self.station, request_id))
+
+    def watch_askers(self, on_gone: Callable[[str], None]) -> None:
+        """Call ``on_gone`` with the ``asking_key`` of every caller that waits no longer."""
+        self._keep(Departures(self._raw, asking_key(self.station, "*"), on_gone))
+
     def presence(self, service: str, *, instance: str) -> Presence:
         """Declare this process alive; call ``ready`` on the result when it serves."""
         return self._keep(Presence(self._raw, self.station, service, instance))
@@ -247,51 +280,3 @@ class Session(Closing):
         if sensor is not None:
             return sensor_key(self.station, sensor, endpoint)
         return service_key(self.station, service, instance, endpoint)
-
-
-def _no_router(link: LinkConfig) -> LinkError:
-    return LinkError(
-        f"no router at {', '.join(link.connect)}",
-        remedy="start one with `palpate up`, or name yours with --connect",
-    )
-
-
-def _open(link: LinkConfig, mode: str) -> zenoh.Session:
-    try:
-        return zenoh.open(zenoh_config(link, mode))
-    except zenoh.ZError as error:
-        if _IN_USE.search(str(error)):
-            raise LinkError(
-                f"port in use: {', '.join(link.listen)}",
-                remedy=(
-                    "another palpate runs there (palpate status); stop it or choose another "
-                    "port for the listener"
-                ),
-            ) from error
-        if mode == "client":
-            raise _no_router(link) from error
-        raise LinkError(
-            f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
-        ) from error
-
-
-def run_router(
-    listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
-) -> None:
-    """Be the router until ``stop`` is set.
-
-    Args:
-        listen: Endpoints, e.g. ``("tcp/127.0.0.1:7447",)``.
-        stop: Set it to end.
-        link: Lease and certificates; None = defaults.
-
-    Raises:
-        LinkError: A port is in use.
-    """
-    base = link or LinkConfig()
-    config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
-    raw = _open(config, "router")
-    try:
-        stop.wait()
-    finally:
-        raw.close()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import queue
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import zenoh
 
 from palpate.protos.closing import Closing
 from palpate.protos.topics import live_key
+
+_LOOK_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,3 +66,58 @@ def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> li
         name = (where, service, instance)
         found[name] = found.get(name, False) or what == "ready"
     return [Alive(*name, ready) for name, ready in sorted(found.items())]
+
+
+class Asking(Closing):
+    """A caller's token: while it is there, somebody waits for the answer."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._token = session.liveliness().declare_token(key)
+
+    def close(self) -> None:
+        """Withdraw it."""
+        try:
+            self._token.undeclare()
+        except zenoh.ZError:  # the session is gone, and the token with it
+            return
+
+
+class Departures(Closing):
+    """Calls ``on_gone``, in a thread of its own, with the key of every token that is gone for good.
+
+    A token of the same key that is there again, from a caller that asked a second time, is none
+    that has gone.
+
+    Args:
+        session: The bus.
+        key: Which tokens, with a ``"*"``.
+        on_gone: What to call.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, on_gone: Callable[[str], None]) -> None:
+        self._session = session
+        self._on_gone = on_gone
+        self._vanished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._worker = threading.Thread(target=self._run, name=f"departures {key}", daemon=True)
+        self._worker.start()
+        self._subscriber = session.liveliness().declare_subscriber(
+            key, self._on_sample, history=True
+        )
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._vanished.put(str(sample.key_expr))
+
+    def _run(self) -> None:
+        while (key := self._vanished.get()) is not None:
+            try:
+                if not any(self._session.liveliness().get(key, timeout=_LOOK_S)):
+                    self._on_gone(key)
+            except zenoh.ZError:  # the session is closing
+                return
+
+    def close(self) -> None:
+        """Watch no longer."""
+        self._subscriber.undeclare()
+        self._vanished.put(None)
+        self._worker.join(timeout=2)

@@ -160,11 +160,12 @@ def ask_all(
             except WireError as error:
                 answers.append(error)
         elif item.err is not None:
-            answers.append(_remote_error(item.err, key, timeout_s))
+            answers.append(remote_error(item.err, key, timeout_s))
     return answers
 
 
-def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> PalpateError:
+def remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> PalpateError:
+    """The exception that an error reply stands for."""
     payload = error.payload.to_bytes()
     if str(error.encoding) == ENCODING_PREFIX + ERROR.schema:
         try:
@@ -208,13 +209,18 @@ def ask_one(
     """
     answers = ask_all(session, key, request, reply, value, timeout_s=timeout_s)
     if not answers:
-        raise LinkError(
-            f"nobody answers on {key}",
-            remedy="start the service: palpate up; see what runs: palpate status",
-        )
+        raise nobody_answers(key)
     for answer in answers:
         if not isinstance(answer, PalpateError):
             return answer
     error = answers[0]
     assert isinstance(error, PalpateError)
     raise error
+
+
+def nobody_answers(key: str) -> LinkError:
+    """The error that says that a question had no reply at all."""
+    return LinkError(
+        f"nobody answers on {key}",
+        remedy="start the service: palpate up; see what runs: palpate status",
+    )

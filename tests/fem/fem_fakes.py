@@ -1,0 +1,214 @@
+"""Fingertips that solve nothing: quick, slow, stubborn, dying. Imported by worker processes.
+
+The friction coefficient of a job says how its run behaves.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from palpate.fem.config import FingertipParameters
+from palpate.fem.fingertips import OnFraction
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.result import Convergence, Floats, Outcome, Step, Trajectory
+from palpate.fem.store_content import StoredFingertip
+from palpate.fem.store_sample import sample_fingertip
+from palpate.protos.errors import SimulationError
+
+if TYPE_CHECKING:
+    from palpate.protos.messages import SimulationRequest
+
+QUICK, SLOW, STUBBORN, DIES, SEGFAULTS, DIVERGES, REFUSES, DEFECTIVE, PINCHES, NAN = (
+    round(0.01 * k, 2) for k in range(10, 20)
+)
+SLOW_STEP_S = 0.12
+HALF = 0.007  # the finger is a cube of 14 mm
+
+
+def cube(nodes: int) -> SolidMesh:
+    """One element; more nodes than its eight lie at its corner, to make fields large."""
+    corners = np.array(
+        [[x, y, z] for z in (-HALF, HALF) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    )
+    corners[:, :2] *= HALF
+    faces = np.array(
+        [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    ).astype(np.int32)
+    none = np.empty((0, 4), np.int32)
+    return SolidMesh(
+        np.concatenate([corners, np.repeat(corners[:1], nodes - 8, axis=0)]),
+        np.arange(8, dtype=np.int32)[None],
+        faces,
+        np.zeros(6, np.int32),
+        none,
+        none[:, 0],
+        none[:, 0],
+        none[:, 0],
+        name="cube",
+    )
+
+
+class FakeTip:
+    """A fingertip whose answer is a formula."""
+
+    def __init__(self, parameters: FingertipParameters, nodes: int) -> None:
+        self.parameters = parameters
+        self.mesh = cube(nodes)
+        self.fingertip = StoredFingertip(
+            self.mesh,
+            self.parameters,
+            {"fake": True},
+            self.mesh.nodes,
+            29e3,
+            1.8e-6,
+            2 * HALF,
+            np.empty((0, 3)),
+            np.empty((0, 3), np.int32),
+        )
+
+    def describe(self) -> StoredFingertip:
+        return self.fingertip
+
+    def indent(
+        self,
+        indenter: str,
+        path: Floats,
+        *,
+        friction_coefficient: float,
+        on_step: Callable[[Step], None] | None = None,
+        should_stop: Callable[[], Outcome | None] | None = None,
+    ) -> Trajectory:
+        began = time.monotonic()
+        steps: list[Step] = []
+        outcome, reason = Outcome.COMPLETE, ""
+        kind = friction_coefficient
+        for k in range(1, len(path)):
+            if kind == SLOW:
+                time.sleep(SLOW_STEP_S)
+            stopped = None if should_stop is None else should_stop()
+            if stopped is not None:
+                outcome, reason = stopped, f"stopped at step {k}"
+                break
+            if k == 3:
+                misbehave(kind)
+            if k == 3 and kind in (DIVERGES, PINCHES):
+                outcome = Outcome.DIVERGED if kind == DIVERGES else Outcome.FORCE_LIMIT
+                reason = "by design, 2.5 mm along the path"
+                break
+            steps.append(self.step(path[k], kind))
+            if on_step is not None:
+                on_step(steps[-1])
+        return Trajectory(
+            indenter,
+            path,
+            tuple(steps),
+            outcome,
+            reason,
+            travel_m=float(np.linalg.norm(np.diff(path[: len(steps) + 1, :3], axis=0))),
+            seconds=time.monotonic() - began,
+        )
+
+    def step(self, pose: Floats, kind: float) -> Step:
+        """Numbers that no float32 holds, so that rounding would show."""
+        nodes = self.mesh.nodes
+        field = nodes * (1.0 / 3.0) + pose[:3] / 7.0
+        depth = pose[2] / 3.0
+        force = np.array([depth, -depth / 7.0, depth * np.pi])
+        return Step(
+            pose=pose,
+            displacement=field if kind != NAN else field * np.nan,
+            fluid_pressure_pa=29e3 + depth / 11.0,
+            force=force,
+            torque=force / 13.0,
+            indenter_force=field * 17.0,
+            core_force=field * 0.0,
+            contact_area_m2=abs(depth) / 19.0,
+            centre_of_pressure=pose[:3] / 23.0 if depth > 0 else np.full(3, np.nan),
+            stress=np.zeros((1, 6)),
+            convergence=Convergence(1, 4, 4, 1e-9 / 3.0, 1e-12, 1e-6 / 3.0, 0.01),
+        )
+
+
+def misbehave(kind: float) -> None:
+    """What a solver must not do."""
+    if kind == STUBBORN:
+        time.sleep(3600)
+    elif kind == DIES:
+        os._exit(7)
+    elif kind == SEGFAULTS:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    elif kind == REFUSES:
+        raise SimulationError("the mesh is folded", remedy="make the skin thicker")
+    elif kind == DEFECTIVE:
+        raise ZeroDivisionError("a defect")
+
+
+class RoundTip(FakeTip):
+    """A finger with a pad, whose forces depend on its parameters as one would think."""
+
+    def __init__(self, parameters: FingertipParameters) -> None:
+        self.parameters = parameters
+        thinner = 1.57e-3 / parameters.skin_thickness_m
+        self.fingertip = replace(
+            sample_fingertip(), parameters=parameters, fluid_volume_m3=4.7e-7 * thinner
+        )
+        self.mesh = self.fingertip.mesh
+
+    def step(self, pose: Floats, kind: float) -> Step:
+        step = super().step(pose, kind)
+        return replace(step, force=self.force(pose, kind), centre_of_pressure=pose[:3])
+
+    def force(self, pose: Floats, friction: float) -> Floats:
+        """Hertz on a pad at z = -7.8 mm over a hard core, and friction where it comes askew."""
+        p = self.parameters
+        w, x, y, z = pose[3:]
+        askew = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 0.0])
+        depth = max(0.0, pose[2] + 7.8e-3)
+        normal = 2.0 * p.shear_modulus_pa * 3.5e-3**0.5 * depth**1.5
+        normal *= 1.0 + (depth / p.skin_thickness_m) ** 2
+        length = np.linalg.norm(askew)
+        aside = friction * normal * askew / length if length > 1e-9 else askew
+        force: Floats = np.array([0.0, 0.0, normal]) + aside
+        return force
+
+
+def round_finger(**options: object) -> Callable[[FingertipParameters, OnFraction], FakeTip]:
+    """The factory of the commands' tests; takes the options of the real one."""
+    return lambda parameters, on_fraction: RoundTip(parameters)
+
+
+def make(
+    *, nodes: int = 40, fill_s: float = 0.0, broken: str = ""
+) -> Callable[[FingertipParameters, OnFraction], FakeTip]:
+    """The factory of these tests; says on stdout what libraries say there."""
+    sys.stdout.write("a library prints what must not reach stdout\n")
+
+    def build(parameters: FingertipParameters, on_fraction: OnFraction) -> FakeTip:
+        if broken == "dies":
+            os._exit(9)
+        if broken:
+            raise SimulationError(broken, remedy="mend it")
+        for k in range(20):
+            time.sleep(fill_s / 20)
+            on_fraction(k / 20)
+        return FakeTip(parameters, nodes)
+
+    return build
+
+
+def request(name: str, kind: float = QUICK, *, steps: int = 5, **more: Any) -> SimulationRequest:
+    """A straight press whose run behaves as ``kind`` says."""
+    from palpate.protos.messages import SimulationParameters, SimulationRequest
+    from palpate.protos.simulations import straight_path  # which would load Zenoh in workers
+
+    path = straight_path((0.0, 0.0, -0.009), (0.0, 0.0, -0.005), steps)
+    parameters = SimulationParameters(friction_coefficient=kind)
+    return SimulationRequest(name, "sphere_medium", path, parameters, **more)

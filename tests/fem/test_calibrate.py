@@ -1,0 +1,332 @@
+"""Calibration on a finger that is a formula: what was planted is found, what fails is told."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.fem.align import Floats
+from palpate.fem.calibrate import calibrate
+from palpate.fem.calibrate_recover import Planned, recover
+from palpate.fem.calibrate_result import Evaluation, read_parameters, write_calibration
+from palpate.fem.calibrate_runs import Runs, Simulated
+from palpate.fem.calibrate_settings import (
+    FRICTION,
+    MODULUS,
+    PAPER_BOUNDS,
+    THICKNESS,
+    VOLUME,
+    CalibrationSettings,
+)
+from palpate.fem.config import FingertipParameters
+from palpate.fem.measured import Indentation
+from palpate.fem.path import path_lengths
+from palpate.fem.plot_validation import plot_calibration
+from palpate.fem.result import Outcome
+from palpate.protos.errors import ConfigError, DatasetError, SimulationError
+
+RADII_M = {"sphere_small": 1.75e-3, "sphere_medium": 3.5e-3, "sphere_large": 7e-3}
+
+
+def bulge_m(parameters: FingertipParameters) -> float:
+    """How far the skin is blown up: 1.46 mm in 474 mm^3, as measured on the public mesh."""
+    if parameters.fluid_volume_m3 is not None:
+        return (parameters.fluid_volume_m3 - 366e-9) / 474e-9 * 1.46e-3
+    return parameters.total_thickness_m - 13.64e-3 - (parameters.skin_thickness_m - 1.57e-3)
+
+
+@dataclass
+class Formula:
+    """A dome on a core: a membrane, then a pinch; Coulomb friction behind a spring.
+
+    Attributes:
+        stop_m: Travel at which runs of ``stops`` end by divergence.
+        stops: Name of the indenter whose runs do.
+        refuses: Name of an indenter that it does not know.
+        limit_n: Force at which runs end.
+    """
+
+    stop_m: float = math.inf
+    stops: str = ""
+    refuses: str = ""
+    limit_n: float = 32.0
+
+    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+        if indenter == self.refuses:
+            raise SimulationError("the mesh is folded", remedy="none")
+        mu, friction = parameters.shear_modulus_pa, parameters.friction_coefficient
+        skin, bulge = parameters.skin_thickness_m, bulge_m(parameters)
+        root = math.sqrt(RADII_M[indenter])
+        way = path_lengths(path)
+        move = (path[-1, :3] - path[0, :3]) / way[-1]
+        total = 13.64e-3 + (skin - 1.57e-3) + bulge
+        depth = np.maximum(way - 3e-3 + 0.5 * (total - 15.1e-3), 0.0)
+        deep, aside = depth * move[2], depth * math.hypot(move[0], move[1])
+        stretch = skin / 1.57e-3 * (0.6 + 0.4 * bulge / 1.46e-3)
+        membrane = 5.6 * stretch * root * deep**1.5 * (1 + (deep / 2.5e-3) ** 2)
+        gap = 0.73e-3 + bulge
+        squeeze = np.logaddexp(0.0, (deep - gap) / 1e-4) * 1e-4
+        normal = mu * (membrane + 3.2 * root * squeeze**1.5 * 1.57e-3 / skin)
+        spring = 16 * mu * root * np.sqrt(deep) * aside
+        slip = np.maximum(friction * normal, 1e-12)
+        tangent = slip * np.tanh(spring / slip) * (normal > 0)
+        along = np.array([move[0], move[1], 0.0]) / max(math.hypot(move[0], move[1]), 1e-9)
+        force = normal[:, None] * [0.0, 0.0, 1.0] + tangent[:, None] * along
+        outcome, count = Outcome.COMPLETE, len(way)
+        for end, at in (
+            (Outcome.FORCE_LIMIT, np.linalg.norm(force, axis=1) > self.limit_n),
+            (Outcome.DIVERGED, (way > self.stop_m) & (indenter == self.stops)),
+        ):
+            if at[:count].any():
+                outcome, count = end, int(at.argmax())
+        volume = 366e-9 + 474e-9 * bulge / 1.46e-3
+        reason = "" if outcome is Outcome.COMPLETE else "by design"
+        return Simulated(force[:count], way[:count], total, volume, outcome, reason)
+
+
+def press(
+    angle_deg: float = 0.0, azimuth_deg: float = 0.0, *, depth_m: float = 3e-3, samples: int = 46
+) -> Floats:
+    """A straight path that begins 3 mm above the skin."""
+    angle, azimuth = np.radians([angle_deg, azimuth_deg])
+    move = np.array(
+        [np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)]
+    )
+    path = np.zeros((samples, 7))
+    path[:, :3] = np.linspace(0.0, 3e-3 + depth_m, samples)[:, None] * move + [0.0, 0.0, -12e-3]
+    path[:, 3] = 1.0
+    return path
+
+
+ANGLED = Planned("sphere_medium/00/angled-0", "sphere_medium", press(30.0))
+NORMAL = Planned("sphere_medium/00/normal", "sphere_medium", press())
+PLANS = (
+    ANGLED,
+    NORMAL,
+    Planned("sphere_large/01/angled-1", "sphere_large", press(30.0, 90.0)),
+    Planned("sphere_small/02/normal", "sphere_small", press()),
+)
+TRUTH = FingertipParameters(
+    skin_thickness_m=1.42e-3, shear_modulus_pa=3.4e5, friction_coefficient=0.25
+)
+
+
+def measure(
+    plans: Sequence[Planned] = PLANS, truth: FingertipParameters = TRUTH
+) -> list[Indentation]:
+    """Perfect records of the formula."""
+    return [
+        Indentation(
+            plan.name,
+            plan.indenter,
+            "biotac1",
+            plan.path,
+            Formula(limit_n=math.inf).simulate(truth, plan.indenter, plan.path).forces,
+        )
+        for plan in plans
+    ]
+
+
+@pytest.mark.parametrize(
+    ("truth", "noise_n", "sensors"),
+    [
+        (TRUTH, 0.02, 1),
+        (TRUTH, 0.05, 3),
+        (FingertipParameters(1.8e-3, 1.5e5, 0.12), 0.03, 1),
+    ],
+)
+def test_planted_parameters_are_found_in_noise(
+    truth: FingertipParameters, noise_n: float, sensors: int
+) -> None:
+    found = recover(Formula(), truth, PLANS, noise_n, seed=1, sensors=sensors)
+    assert found.passed, found.rows()
+    assert found.calibration.converged
+    assert found.calibration.self_test
+    for name, error in found.errors.items():
+        assert abs(error) < 4 * found.sd[name] / found.found[name], (name, found.rows())
+    # residuals are the noise, but for the shift that was fitted
+    np.testing.assert_allclose(found.calibration.axis_rms_n, noise_n, rtol=0.3)
+    assert sum(found.calibration.paper_axis_rms_n) > sum(found.calibration.axis_rms_n)
+
+
+def test_exact_forces_give_exact_parameters() -> None:
+    found = calibrate(Formula(), measure())
+    assert found.converged
+    assert found.parameters.skin_thickness_m == pytest.approx(TRUTH.skin_thickness_m, rel=2e-3)
+    assert found.parameters.shear_modulus_pa == pytest.approx(TRUTH.shear_modulus_pa, rel=2e-3)
+    assert found.parameters.friction_coefficient == pytest.approx(0.25, rel=2e-3)
+    assert found.parameters.fluid_volume_m3 is None, "the solver is to fill to the thickness"
+    assert found.cost < 0.01
+
+
+def test_free_volume_is_held_by_the_thickness_term() -> None:
+    """The same optimum, found over four parameters with the paper's penalty."""
+    bounds = PAPER_BOUNDS | {VOLUME: (5e-7, 1.2e-6)}
+    found = calibrate(Formula(), measure(), CalibrationSettings(bounds=bounds))
+    truth = Formula().simulate(TRUTH, "sphere_medium", press())
+    assert found.fluid_volume_m3 == pytest.approx(truth.fluid_volume_m3, rel=1e-2)
+    assert found.parameters.fluid_volume_m3 == found.fluid_volume_m3
+    assert found.thickness_m == pytest.approx(15.1e-3, abs=1e-6)
+    assert found.parameters.skin_thickness_m == pytest.approx(TRUTH.skin_thickness_m, rel=1e-2)
+    assert {estimate.name for estimate in found.estimates} == {
+        THICKNESS, MODULUS, FRICTION, VOLUME,
+    }  # fmt: skip
+
+
+def test_the_modulus_needs_no_runs_and_sensors_share_them() -> None:
+    """Runs = points x paths: those of the scan, of the steps, and two beside each step's end."""
+    events: list[Evaluation] = []
+    one = recover(Formula(), TRUTH, PLANS[:2], 0.02, 5, on_evaluation=events.append)
+    points = len(events)
+    beside = one.calibration.simulations / len(PLANS[:2]) - points
+    assert beside == 2 * round(beside / 2)
+    assert one.calibration.simulations <= 2 * (points + 2 * (points - 6 + 1))
+    runs = Runs(Formula())
+    items = measure(PLANS[:1])
+    twin = replace(items[0], name="twin", sensor="biotac2", force=items[0].force + 0.01)
+    runs.run((TRUTH, item) for item in (*items, twin))
+    assert runs.count == 1
+    runs.run([(replace(TRUTH, friction_coefficient=0.3), twin)])
+    assert runs.count == 2
+
+
+def test_progress_is_told_in_order() -> None:
+    events: list[Evaluation] = []
+    batches: list[tuple[int, int]] = []
+    found = calibrate(
+        Formula(),
+        measure(),
+        CalibrationSettings(scan=(2, 2)),
+        on_evaluation=events.append,
+        on_run=lambda done, total: batches.append((done, total)),
+    )
+    assert [event.stage for event in events][:5] == ["scan"] * 4 + ["step"]
+    assert events == list(found.history)
+    assert len(batches) == found.simulations
+    assert batches[:16] == [(done, 16) for done in range(1, 17)]
+    steps = [event.cost for event in events if event.stage == "step"]
+    assert steps == sorted(steps, reverse=True), "each step that counts is lower"
+
+
+def test_without_slip_friction_is_not_determined() -> None:
+    found = calibrate(Formula(), measure([NORMAL, PLANS[3]]))
+    friction = next(item for item in found.estimates if item.name == FRICTION)
+    assert math.isinf(friction.sd)
+    assert friction.sensitivity_n == pytest.approx(0.0, abs=1e-9)
+    assert any("not determined" in row[-1] for row in found.rows())
+    assert found.parameters.skin_thickness_m == pytest.approx(TRUTH.skin_thickness_m, rel=1e-2)
+
+
+def test_a_bound_that_is_reached_is_told() -> None:
+    bounds = PAPER_BOUNDS | {FRICTION: (0.3, 0.9)}
+    found = calibrate(Formula(), measure(), CalibrationSettings(bounds=bounds))
+    friction = next(item for item in found.estimates if item.name == FRICTION)
+    assert friction.at_bound
+    assert math.isnan(friction.sd)
+    assert friction.value == pytest.approx(0.3, rel=1e-3)
+
+
+def test_stated_deviation_grows_with_the_noise() -> None:
+    sds = []
+    for noise_n in (0.01, 0.03):
+        found = recover(Formula(), TRUTH, PLANS[:2], noise_n, seed=8)
+        sds.append([found.sd[name] for name in (THICKNESS, MODULUS, FRICTION)])
+    np.testing.assert_allclose(np.divide(sds[1], sds[0]), 3.0, rtol=0.35)
+
+
+def test_runs_that_end_early_are_compared_as_far_as_they_go_and_noted() -> None:
+    simulator = Formula(stops="sphere_small", stop_m=5.2e-3)
+    found = calibrate(simulator, measure())
+    fit = {fit.name: fit for fit in found.trajectories}["sphere_small/02/normal"]
+    assert 0.5 < fit.coverage < 1.0
+    assert any("sphere_small" in note and "diverged (by design)" in note for note in found.notes)
+    assert found.parameters.skin_thickness_m == pytest.approx(TRUTH.skin_thickness_m, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("simulator", "why"),
+    [
+        (Formula(refuses="sphere_small"), "fewer than two samples"),
+        (Formula(stops="sphere_small", stop_m=4.3e-3), "covers"),
+        (Formula(stops="sphere_small", stop_m=3.05e-3), "never reaches"),
+    ],
+)
+def test_a_trajectory_that_cannot_be_simulated_is_left_out_in_the_open(
+    simulator: Formula, why: str
+) -> None:
+    found = calibrate(simulator, measure())
+    assert list(found.excluded) == ["sphere_small/02/normal"]
+    assert why in found.excluded["sphere_small/02/normal"]
+    assert len(found.trajectories) == 3
+    assert found.parameters.skin_thickness_m == pytest.approx(TRUTH.skin_thickness_m, rel=5e-3)
+
+
+def test_nothing_to_compare_is_an_error() -> None:
+    soft = [replace(item, force=item.force * 0.001) for item in measure(PLANS[:1])]
+    with pytest.raises(DatasetError, match="never reaches the threshold"):
+        calibrate(Formula(), soft)
+    with pytest.raises(DatasetError, match="none given"):
+        calibrate(Formula(), [])
+    with pytest.raises(SimulationError, match="sphere_medium/00/angled-0"):
+        calibrate(Formula(refuses="sphere_medium"), measure(PLANS[:1]))
+
+
+@pytest.mark.parametrize(
+    ("bounds", "says"),
+    [
+        ({THICKNESS: (1e-3, 2e-3)}, "no bounds for"),
+        (PAPER_BOUNDS | {THICKNESS: (2e-3, 1e-3)}, "bounds of skin_thickness_m"),
+        (PAPER_BOUNDS | {FRICTION: (0.0, 1.0)}, "bounds of friction_coefficient"),
+        (PAPER_BOUNDS | {THICKNESS: (1.0, 2.0)}, "bounds of skin_thickness_m"),
+        (PAPER_BOUNDS | {"temperature": (25.0, 35.0)}, "cannot be calibrated"),
+    ],
+)
+def test_impossible_bounds_are_refused(bounds: dict[str, tuple[float, float]], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        CalibrationSettings(bounds=bounds)
+
+
+def test_result_is_a_file_that_gives_the_parameters_back(tmp_path: Path) -> None:
+    found = calibrate(Formula(), measure([NORMAL, PLANS[3]]))  # has an infinite deviation
+    path, picture = tmp_path / "fits" / "fit.json", tmp_path / "fit.png"
+    write_calibration(path, found)
+    assert read_parameters(path) == found.parameters
+    content = json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert content["simulations"] == found.simulations
+    assert len(content["history"]) == len(found.history)
+    plot_calibration(found, picture)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    path.write_text(path.read_text().replace("palpate.calibration", "other"))
+    for bad in (path, tmp_path / "nothing.json", picture):
+        with pytest.raises(ConfigError, match="no calibration"):
+            read_parameters(bad)
+
+
+def test_an_executor_changes_nothing() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        parallel = calibrate(Formula(), measure(PLANS[:2]), executor=executor)
+    alone = calibrate(Formula(), measure(PLANS[:2]))
+    assert parallel.parameters == alone.parameters
+    assert parallel.simulations == alone.simulations
+
+
+class Dying(Executor):
+    """An executor whose process dies."""
+
+    def submit(self, *_: object, **__: object) -> Future[Simulated]:  # type: ignore[override]
+        future: Future[Simulated] = Future()
+        future.set_exception(BrokenProcessPool("killed"))
+        return future
+
+
+def test_a_dying_process_is_named() -> None:
+    with pytest.raises(SimulationError, match="ended by itself: killed"):
+        calibrate(Formula(), measure(PLANS[:1]), executor=Dying())

@@ -1,0 +1,296 @@
+"""``palpate fem``: what its commands say, write and return, on a finger that solves a formula."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from palpate.fem import cli_model
+from palpate.fem.calibrate_result import read_parameters
+from palpate.fem.cli import fem_app
+from palpate.fem.config import FingertipParameters
+from palpate.fem.indenter.path import write_path
+from palpate.fem.measured import SIMULATED, Indentation, write_indentations
+from palpate.fem.store import SimulationStore
+from palpate.protos.client import Client
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import ConfigError, LinkError, MissingExtraError, PalpateError
+from palpate.protos.messages import SimulationOutcome, SimulationParameters, SimulationRequest
+from palpate.protos.simulations import straight_path
+
+fakes: Any = importlib.import_module("fem_fakes")
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture(autouse=True)
+def _a_finger_of_formulas(monkeypatch: pytest.MonkeyPatch, workers_find_fakes: None) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(cli_model, "DEFAULT_FACTORY", "fem_fakes:round_finger")
+
+
+def fem(*words: object, friction: float = fakes.QUICK) -> Result:
+    """Run a command; what it raises is raised here."""
+    more = ["--friction", str(friction)] if words[0] == "run" else []
+    return CliRunner().invoke(fem_app, [*map(str, words), *more], catch_exceptions=False)
+
+
+def test_one_press_is_shown_and_drawn(tmp_path: Path) -> None:
+    png = tmp_path / "press.png"
+    done = fem("run", "--indenter", "sphere_7mm", "--steps", 4, "--workers", 1, "--png", png)
+    assert done.exit_code == 0
+    assert "sphere_medium: complete" in done.stdout
+    assert "1 of 1 run: 1 complete" in done.stdout
+    assert png.stat().st_size > 10_000
+
+
+def test_json_is_json(tmp_path: Path) -> None:
+    done = fem("run", "--steps", 3, "--angle-deg", 30, "--depth-mm", 1.5, "--json")
+    content = json.loads(done.stdout)
+    (trajectory,) = content["trajectories"]
+    assert len(trajectory["steps"]) == 3
+    assert content["outcomes"] == {"complete": 1}
+    start = fem("run", "--steps", 3, "--json")  # straight in: along the normal
+    tilt = np.array(json.loads(start.stdout)["trajectories"][0]["steps"][0]["pose"][3:])
+    cosine = 2 * float(tilt @ trajectory["steps"][0]["pose"][3:]) ** 2 - 1
+    assert np.degrees(np.arccos(cosine)) == pytest.approx(30, abs=1e-6)
+
+
+def test_a_path_from_a_file(tmp_path: Path) -> None:
+    path = np.zeros((5, 7))
+    path[:, 2], path[:, 3] = np.linspace(-0.010, -0.006, 5), 1.0
+    write_path(tmp_path / "poses.csv", path)
+    done = fem("run", "--path", tmp_path / "poses.csv", "--json")
+    steps = json.loads(done.stdout)["trajectories"][0]["steps"]
+    assert [step["pose"][2] for step in steps] == path[1:, 2].tolist()
+    path[:, 2] += 0.005
+    write_path(tmp_path / "inside.csv", path)
+    with pytest.raises(ConfigError, match="inside"):
+        fem("run", "--path", tmp_path / "inside.csv")
+
+
+def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
+    store, png = tmp_path / "a.sim", tmp_path / "a.png"
+    words = ("run", "--sweep", "--points", 1, "--steps", 3, "--store", store, "--workers", 2)
+    done = fem(*words, "--indenter", "cube", "--indenter", "ring")
+    assert done.exit_code == 0
+    assert "10 of 10 run: 10 complete" in done.stdout
+    done = fem(*words, "--indenter", "cube", "--indenter", "sphere_7mm", "--png", png)
+    assert "5 of 5 run: 5 complete; 5 were there already" in done.stdout
+    assert len(SimulationStore.open(store).done()) == 15
+    assert png.stat().st_size > 10_000
+
+
+def test_one_press_into_a_store_is_run_once(tmp_path: Path) -> None:
+    words = ("run", "--steps", 3, "--store", tmp_path / "a.sim")
+    assert "1 of 1 run" in fem(*words).stdout
+    again = fem(*words)
+    assert "1 were there already" in again.stdout
+    assert "complete" in again.stdout
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "said"),
+    [
+        ("PINCHES", 0, "force limit"),
+        ("DIVERGES", 1, "2.5 mm along the path"),
+        ("REFUSES", 1, "folded"),
+        ("DIES", 1, "exit status 7"),
+    ],
+)
+def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
+    done = fem("run", "--steps", 6, friction=getattr(fakes, kind))
+    assert done.exit_code == code
+    assert "did not complete" in done.stdout
+    assert said in " ".join(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--indenter", "spere_7mm"), "sphere_7mm"),
+        (("--sweep",), "--store"),
+        (("--angle-deg", 90), "angle-deg"),
+        (("--indenter", "cube", "--indenter", "ring"), "several"),
+        (("--shear-modulus-kpa", 280_000), "shear_modulus_pa"),
+        (("--mesh", "nowhere"), "nowhere"),
+        (("--path", "nowhere.csv"), "nowhere.csv"),
+        (("--parameters", "nowhere.json"), "nowhere.json"),
+        (("--at-mm", 40, 0), "no pad"),
+        (("--store", "store.h5"), ".sim"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        fem("run", *words)
+
+
+TRUTH = FingertipParameters(
+    skin_thickness_m=1.4e-3, shear_modulus_pa=3.2e5, friction_coefficient=0.35
+)
+
+
+@pytest.fixture
+def measured(tmp_path: Path) -> Path:
+    """Two indentations of a finger with other parameters than the default."""
+    items = []
+    for k, angle in enumerate((0.0, 0.5)):
+        path = np.zeros((22, 7))
+        path[:, 3], path[:, 5] = np.cos(angle / 2), np.sin(angle / 2)
+        inward = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        start = np.array([0.0, 0.0, -9.5e-3 - 2e-3 * k])
+        path[:, :3] = start + np.linspace(0.0, 5e-3 + 2e-3 * k, 22)[:, None] * inward
+        tip = fakes.RoundTip(TRUTH)
+        force = np.array([tip.force(pose, TRUTH.friction_coefficient) for pose in path])
+        items.append(Indentation(f"cube/{k:02}/press", "cube", "virtual", path, force, SIMULATED))
+    write_indentations(tmp_path / "measured.h5", items, source="a formula")
+    return tmp_path / "measured.h5"
+
+
+def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
+    fit, png, out = tmp_path / "fit.json", tmp_path / "fit.png", tmp_path / "validation"
+    done = fem("calibrate", measured, "--out", fit, "--png", png, "--workers", 2)
+    assert done.exit_code == 0, done.stdout
+    assert "this tests the method" in done.stderr
+    found = read_parameters(fit)
+    for name in ("skin_thickness_m", "shear_modulus_pa", "friction_coefficient"):
+        assert getattr(found, name) == pytest.approx(getattr(TRUTH, name), rel=0.05), name
+    assert png.stat().st_size > 10_000
+    done = fem("validate", measured, "--parameters", fit, "--out", out, "--workers", 2)
+    assert done.exit_code == 0
+    assert "SELF-TEST" in done.stdout
+    assert {file.name for file in out.iterdir()} >= {"validation.json", "examples.png"}
+    assert json.loads((out / "validation.json").read_text())["median_n"] < 0.05
+    with pytest.raises(ConfigError, match="begins with ring"):
+        fem("validate", measured, "--only", "ring")
+
+
+def test_verify_tells_every_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*, only: str, slow: bool, on_check: Any) -> None:
+        names = [name for name in ("hertz", "patch test") if only in name]
+        for done, name in enumerate(names, start=1):
+            passed = name != "hertz"
+            check = SimpleNamespace(
+                name=name, value=1.01, reference=1.0, tolerance=1e-3, passed=passed, seconds=0.1,
+                note="",
+            )  # fmt: skip
+            on_check(check, done, len(names))
+
+    monkeypatch.setitem(sys.modules, "palpate.fem.verify", SimpleNamespace(run=run))
+    failed = fem("verify")
+    assert failed.exit_code == 1
+    assert "1 of 2 passed" in failed.stdout
+    assert fem("verify", "--only", "patch").exit_code == 0
+    assert [check["passed"] for check in json.loads(fem("verify", "--json").stdout)] == [
+        False,
+        True,
+    ]
+    with pytest.raises(ConfigError, match="nonsense"):
+        fem("verify", "--only", "nonsense")
+
+
+def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "palpate.fem.cli_run", None)
+    monkeypatch.setattr("palpate.fem.cli.EXTRA_MODULES", ("palpate",))
+    with pytest.raises(MissingExtraError, match=r'pip install "palpate\[fem\]"'):
+        fem("run")
+
+
+PROGRAM = """
+import sys
+from palpate.fem import cli_model
+cli_model.DEFAULT_FACTORY = "fem_fakes:round_finger"
+from palpate.fem.calibrate_result import read_parameters
+from palpate.fem.cli import fem_app
+from palpate.fem.config import FingertipParameters
+fem_app({words!r})
+"""
+
+
+def spawn(*words: object) -> subprocess.Popen[str]:
+    """A command in a process of its own, for signals."""
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM.format(words=[str(word) for word in words])],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def test_ctrl_c_keeps_what_has_ended(tmp_path: Path) -> None:
+    store = tmp_path / "a.sim"
+    process = spawn(
+        "run", "--sweep", "--indenter", "cube", "--steps", 5, "--store", store, "--friction",
+        fakes.SLOW, "--workers", 2,
+    )  # fmt: skip
+    deadline = time.monotonic() + PATIENCE_S
+    while len(list(store.rglob("normal.h5"))) < 1:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers, too
+    output, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert "the same command goes on" in output
+    assert "Traceback" not in errors
+    assert SimulationStore.open(store).check() >= 1
+
+
+def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
+    process = spawn("serve", "--connect", link.connect[0], "--workers", 1)
+    try:
+        with Client(link.connect[0], timeout_s=5) as robot:
+            deadline = time.monotonic() + PATIENCE_S
+            while not any(process.ready for process in robot.alive()):
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            path = straight_path((0, 0, -0.010), (0, 0, -0.006), 4)
+            request = SimulationRequest(
+                "r", "cube", path, SimulationParameters(friction_coefficient=fakes.QUICK)
+            )
+            assert robot.simulate(request).outcome is SimulationOutcome.COMPLETE
+            errors: list[PalpateError] = []
+
+            def ask_slowly() -> None:
+                try:
+                    robot.simulate(
+                        SimulationRequest(
+                            "slow",
+                            "cube",
+                            straight_path((0, 0, -0.010), (0, 0, -0.006), 100),
+                            SimulationParameters(friction_coefficient=fakes.SLOW),
+                        ),
+                        on_step=lambda *_: process.terminate(),
+                    )
+                except PalpateError as error:
+                    errors.append(error)
+
+            asker = threading.Thread(target=ask_slowly)
+            asker.start()
+            asker.join(PATIENCE_S)
+            assert errors[0].code.name == "UNAVAILABLE"
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0
+        assert "Traceback" not in said
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("palpate.fem.cli_serve._ROUTER_WAIT_S", 0.2)
+    with pytest.raises(LinkError, match="no router"):
+        fem("serve", "--connect", f"tcp/127.0.0.1:{free_port}")

@@ -1,0 +1,289 @@
+"""The finite-element service: answers to the last bit, refusals, deadlines, cancelling."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from palpate.fem import node
+from palpate.fem.config import FingertipParameters
+from palpate.fem.reply import as_reply
+from palpate.fem.request import path_of
+from palpate.fem.service_config import FemConfig
+from palpate.protos.client import Client
+from palpate.protos.codec import ERROR, SIMULATION_REQUEST
+from palpate.protos.config import LinkConfig, parse_config
+from palpate.protos.errors import ConfigError, ErrorCode, RemoteError
+from palpate.protos.messages import (
+    SimulationOutcome,
+    SimulationParameters,
+    SimulationPhase,
+    SimulationProgress,
+    SimulationReply,
+)
+from palpate.protos.session import MAX_REPLY_BYTES, Delivery
+from palpate.protos.simulations import straight_path
+from palpate.protos.topics import ENCODING_PREFIX, SIMULATION_PROGRESS, sensor_key
+from palpate.v1 import simulation_pb2
+
+fakes: Any = importlib.import_module("fem_fakes")
+
+PATIENCE_S = 20.0
+
+
+def same(a: SimulationReply, b: SimulationReply) -> bool:
+    """Equal to the last bit, but for the time it took."""
+    first, second = (dataclasses.replace(reply, elapsed_s=0.0, steps=()) for reply in (a, b))
+    return first == second and all(
+        np.array_equal(getattr(x, field.name), getattr(y, field.name))
+        if isinstance(getattr(x, field.name), np.ndarray)
+        else getattr(x, field.name) == getattr(y, field.name)
+        for x, y in zip(a.steps, b.steps, strict=True)
+        for field in dataclasses.fields(x)
+    )
+
+
+def test_the_wire_changes_no_bit(service: Any) -> None:
+    asked = fakes.request("bits", want_displacement=True, want_contact_force=True)
+    told: list[SimulationProgress] = []
+    seen: list[int] = []
+    over_the_wire = service.robot.simulate(
+        asked, on_progress=told.append, on_step=lambda index, _: seen.append(index)
+    )
+    tip = fakes.FakeTip(FingertipParameters(), 40)
+    here = as_reply(
+        tip.indent("sphere_medium", path_of(asked, max_steps=9), friction_coefficient=fakes.QUICK),
+        asked,
+        tip.mesh.sha256,
+    )
+    assert over_the_wire.outcome is SimulationOutcome.COMPLETE
+    assert over_the_wire.steps[-1].displacement is not None
+    assert same(over_the_wire, here)
+    assert seen == [0, 1, 2, 3, 4]
+    assert told[-1].phase is SimulationPhase.INDENTING
+    assert (told[-1].steps_done, told[-1].steps_total) == (5, 5)
+
+
+def test_others_can_follow(service: Any) -> None:
+    progress = service.robot.session.subscriber(
+        SIMULATION_PROGRESS, sensor="twin", delivery=Delivery.QUEUE
+    )
+    time.sleep(0.3)
+    service.robot.simulate(fakes.request("followed"))
+    seen = progress.next(timeout_s=PATIENCE_S).message
+    while seen.steps_done < 5:
+        seen = progress.next(timeout_s=PATIENCE_S).message
+    assert seen.request_id == "followed"
+
+
+BAD: list[tuple[str, dict[str, Any], str]] = [
+    ("unknown indenter", {"indenter": "sphere_medum"}, "'sphere_medium'"),
+    ("no step", {"path": straight_path((0, 0, -0.009), (0, 0, -0.005), 1)[:1]}, "no step"),
+    ("many steps", {"path": straight_path((0, 0, -0.009), (0, 0, -0.005), 201)}, "at most 200"),
+    ("millimetres", {"path": straight_path((0, 0, -9), (0, 0, -5), 4)}, "metres"),
+    ("inside", {"path": straight_path((0.007, 0.007, -0.006), (0, 0, 0), 4)}, "inside the skin"),
+    ("within", {"path": straight_path((0, 0, 0.003), (0, 0, 0.004), 4)}, "inside"),
+    (
+        "absurd material",
+        {"parameters": SimulationParameters(shear_modulus_pa=0.28)},
+        "shear_modulus_pa",
+    ),
+    (
+        "negative friction",
+        {"parameters": SimulationParameters(friction_coefficient=-1)},
+        "friction",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "said"), BAD, ids=[bad[0] for bad in BAD])
+def test_a_request_out_of_range_is_refused(
+    service: Any, name: str, changes: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(RemoteError, match=said) as caught:
+        service.robot.simulate(dataclasses.replace(fakes.request("bad"), **changes), timeout_s=5)
+    assert caught.value.code is ErrorCode.INVALID_REQUEST
+
+
+def _nan(message: simulation_pb2.SimulationRequest) -> None:
+    message.path[1].px = float("nan")
+
+
+def _long_quaternion(message: simulation_pb2.SimulationRequest) -> None:
+    message.path[2].qw = 2.0
+
+
+def _nowhere(message: simulation_pb2.SimulationRequest) -> None:
+    del message.path[:]
+
+
+def _endless(message: simulation_pb2.SimulationRequest) -> None:
+    del message.path[3:]
+    for _ in range(30_000):
+        message.path.add(pz=-0.009, qw=1.0)
+
+
+def _past(message: simulation_pb2.SimulationRequest) -> None:
+    message.deadline_s = -1.0
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (_nan, "path[1]"),
+        (_long_quaternion, "path[2]"),
+        (_nowhere, "path is empty"),
+        (_endless, "30003 poses"),
+        (_past, "deadline_s"),
+    ],
+)
+def test_a_request_that_means_nothing_is_refused(
+    service: Any, damage: Callable[[simulation_pb2.SimulationRequest], None], said: str
+) -> None:
+    """Another client's: ours would not send it."""
+    message = simulation_pb2.SimulationRequest.FromString(
+        SIMULATION_REQUEST.encode(fakes.request("x"))
+    )
+    damage(message)
+    (reply,) = service.robot.session._raw.get(
+        sensor_key("lab", "twin", "simulate"),
+        payload=message.SerializeToString(),
+        encoding=zenoh.Encoding(ENCODING_PREFIX + SIMULATION_REQUEST.schema),
+        timeout=5,
+    )
+    assert reply.err is not None
+    error = ERROR.decode(reply.err.payload.to_bytes())
+    assert error.code is ErrorCode.INVALID_REQUEST
+    assert said in error.message
+
+
+@pytest.mark.parametrize(
+    ("kind", "outcome"),
+    [
+        (fakes.DIVERGES, SimulationOutcome.DIVERGED),
+        (fakes.PINCHES, SimulationOutcome.FORCE_LIMIT),
+    ],
+)
+def test_an_early_end_keeps_what_converged(
+    service: Any, kind: float, outcome: SimulationOutcome
+) -> None:
+    reply = service.robot.simulate(fakes.request("early", kind))
+    assert (reply.outcome, len(reply.steps)) == (outcome, 2)
+    assert "2.5 mm" in reply.stopped_because
+    assert reply.travel_m > 0
+
+
+def test_a_deadline_keeps_what_converged(service: Any) -> None:
+    reply = service.robot.simulate(fakes.request("late", fakes.SLOW, steps=100), timeout_s=1.0)
+    assert reply.outcome is SimulationOutcome.DEADLINE
+    assert 1 <= len(reply.steps) < 100
+
+
+def test_a_deadline_before_any_step_is_an_error(service: Any) -> None:
+    with pytest.raises(RemoteError, match="no step converged") as caught:
+        service.robot.simulate(fakes.request("too late", fakes.SLOW, deadline_s=0.01))
+    assert caught.value.code is ErrorCode.DEADLINE_EXCEEDED
+
+
+def test_a_cancelled_simulation_keeps_what_converged(service: Any) -> None:
+    first = threading.Event()
+    thread, out = service.in_thread(
+        fakes.request("cancelled", fakes.SLOW, steps=50), on_step=lambda *_: first.set()
+    )
+    assert first.wait(PATIENCE_S)
+    assert service.robot.cancel_simulation("cancelled")
+    thread.join(PATIENCE_S)
+    assert out[0].outcome is SimulationOutcome.CANCELLED
+    assert 1 <= len(out[0].steps) < 50
+    assert not service.robot.cancel_simulation("cancelled")
+
+
+def occupied(service: Any, count: int) -> list[tuple[threading.Thread, list[Any]]]:
+    """So many simulations that run or wait, named ``many <k>``."""
+    asked = [
+        service.in_thread(fakes.request(f"many {k}", fakes.SLOW, steps=100)) for k in range(count)
+    ]
+
+    def all_there() -> bool:
+        gauges = service.robot.status()[0].gauges
+        return bool(gauges["busy_workers"] + gauges["waiting_requests"] == count)
+
+    service.until(all_there)
+    return asked
+
+
+def test_too_many_are_refused_and_told_when_to_come_back(service: Any) -> None:
+    asked = occupied(service, 4)
+    with pytest.raises(RemoteError, match="2 wait") as caught:
+        service.robot.simulate(fakes.request("one more"))
+    assert caught.value.code is ErrorCode.RESOURCE_EXHAUSTED
+    assert caught.value.retry_after_s > 0
+    with pytest.raises(RemoteError, match="in use"):
+        service.robot.simulate(fakes.request("many 0"))
+    for k, (thread, out) in reversed(list(enumerate(asked))):
+        assert service.robot.cancel_simulation(f"many {k}")
+        thread.join(PATIENCE_S)
+        assert out[0].outcome is SimulationOutcome.CANCELLED
+
+
+def test_time_in_the_queue_counts(service: Any) -> None:
+    asked = occupied(service, 2)
+    told: list[SimulationProgress] = []
+    with pytest.raises(RemoteError, match="while it waited") as caught:
+        service.robot.simulate(fakes.request("waits"), timeout_s=0.2, on_progress=told.append)
+    assert caught.value.code is ErrorCode.DEADLINE_EXCEEDED
+    assert told[0].phase is SimulationPhase.WAITING
+    for k, (thread, _) in enumerate(asked):
+        assert service.robot.cancel_simulation(f"many {k}")
+        thread.join(PATIENCE_S)
+
+
+def test_nobody_waits_for_it_any_more(service: Any) -> None:
+    """A client that goes away, for whatever reason, takes its simulation with it."""
+    before = service.counters().get("callers_gone", 0)
+    leaving = Client(service.link.connect[0], timeout_s=5)
+    first = threading.Event()
+
+    def ask() -> None:
+        def interrupt(index: int, step: object) -> None:
+            first.set()
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            leaving.simulate(fakes.request("left alone", fakes.SLOW, steps=200), on_step=interrupt)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    assert first.wait(PATIENCE_S)
+    thread.join(PATIENCE_S)
+    service.until(lambda: service.counters().get("callers_gone", 0) == before + 1)
+    leaving.close()
+    service.until(lambda: service.robot.status()[0].gauges["busy_workers"] == 0)
+
+
+def test_large_fields(serving: Any) -> None:
+    """All fields of one step fit a message; those of all steps need not."""
+    with serving(workers=1, options={"nodes": 60_000}) as served:
+        asked = fakes.request("large", steps=6, want_displacement=True, want_contact_force=True)
+        reply = served.robot.simulate(asked)
+        sizes = [step.displacement.nbytes for step in reply.steps if step.displacement is not None]
+        assert 2 * sum(sizes) > MAX_REPLY_BYTES > 2 * sizes[0]
+        assert len(sizes) == 6
+    with serving(workers=1, options={"nodes": 180_000}) as served:
+        with pytest.raises(RemoteError, match="MiB") as caught:
+            served.robot.simulate(asked)
+        assert caught.value.code is ErrorCode.INVALID_REQUEST
+
+
+def test_an_absurd_profile_is_told_before_the_bus_is_joined() -> None:
+    config = parse_config(FemConfig, {"fingertip": {"skin_thickness_m": 1.57}}, where="test")
+    with pytest.raises(ConfigError, match="skin_thickness_m"):
+        node.run(config, LinkConfig(), "lab", threading.Event())

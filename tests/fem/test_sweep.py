@@ -1,0 +1,176 @@
+"""Sweeps over worker processes into a store: resumed, stopped, with workers that die."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.fem.batch import Batch, BatchReport, Press
+from palpate.fem.config import FingertipParameters
+from palpate.fem.jobs import Setup
+from palpate.fem.result import Outcome, Trajectory
+from palpate.fem.store import SimulationStore
+from palpate.fem.sweep import sweep_into_store
+from palpate.protos.errors import DatasetError, RemoteError
+
+fakes: Any = importlib.import_module("fem_fakes")
+
+STEPS = 4
+
+
+def plans(count: int, name: str = "sphere_medium") -> list[Press]:
+    path = np.zeros((STEPS + 1, 7))
+    path[:, 3] = 1.0
+    path[:, 2] = np.linspace(-0.009, -0.005, STEPS + 1)
+    return [Press(f"{name}/{k:02}/normal", name, path) for k in range(count)]
+
+
+def batch_of(kind: float, **more: Any) -> Batch:
+    parameters = FingertipParameters(friction_coefficient=kind)
+    setup = Setup("fem_fakes:make", more.pop("options", {}), parameters, 1)
+    return Batch(setup, **{"workers": 1, "threads": 1, "grace_s": 0.3, **more})
+
+
+pytestmark = pytest.mark.usefixtures("workers_find_fakes")
+
+
+def run(kind: float, count: int, **more: Any) -> tuple[BatchReport, list[Trajectory]]:
+    kept: list[Trajectory] = []
+    batch = batch_of(kind, **more)
+    try:
+        report = batch.run(
+            plans(count),
+            count,
+            stop=threading.Event(),
+            on_trajectory=lambda _, trajectory: kept.append(trajectory),
+        )
+    finally:
+        batch.close()
+    return report, kept
+
+
+def test_all_are_run() -> None:
+    report, kept = run(fakes.QUICK, 7, workers=2)
+    assert (report.done, report.outcomes["complete"], report.early) == (7, 7, [])
+    assert all(len(trajectory.steps) == STEPS for trajectory in kept)
+
+
+@pytest.mark.parametrize(
+    ("kind", "how", "steps"),
+    [("DIVERGES", "diverged", 2), ("PINCHES", "force limit", 2), ("STUBBORN", "deadline", 2)],
+)
+def test_every_early_end_is_told_and_kept(kind: str, how: str, steps: int) -> None:
+    report, kept = run(getattr(fakes, kind), 2, limit_s=0.5)
+    assert report.outcomes[how] == 2
+    assert [(early.how, early.steps, early.steps_total) for early in report.early] == [
+        (how, steps, STEPS)
+    ] * 2
+    assert all(early.reason for early in report.early)
+    assert [len(trajectory.steps) for trajectory in kept] == [steps, steps]
+
+
+@pytest.mark.parametrize(("kind", "said"), [("DIES", "exit status 7"), ("REFUSES", "folded")])
+def test_what_fails_does_not_stop_the_others(kind: str, said: str) -> None:
+    report, kept = run(getattr(fakes, kind), 3)
+    assert (report.failed, kept) == (3, [])
+    assert all(said in early.reason for early in report.early)
+
+
+def test_a_solver_that_does_not_start_ends_the_sweep() -> None:
+    with pytest.raises(RemoteError, match="no such mesh"):
+        run(fakes.QUICK, 2, options={"broken": "no such mesh"})
+
+
+def into_store(path: Path, kind: float, count: int, stop: threading.Event) -> Any:
+    batch = batch_of(kind, workers=2)
+    try:
+        return sweep_into_store(batch, plans(count), path, stop=stop)
+    finally:
+        batch.close()
+
+
+def test_a_store_is_filled_and_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "a.sim"
+    report, there = into_store(path, fakes.QUICK, 3, threading.Event())
+    assert (report.done, there) == (3, 0)
+    report, there = into_store(path, fakes.QUICK, 5, threading.Event())
+    assert (report.done, there) == (2, 3)
+    store = SimulationStore.open(path)
+    assert len(store.ids()) == 5
+    assert store.trajectory(store.ids()[0]).outcome is Outcome.COMPLETE
+    with pytest.raises(DatasetError, match="friction_coefficient"):
+        into_store(path, fakes.SLOW, 5, threading.Event())
+
+
+def test_stopping_keeps_what_has_ended(tmp_path: Path) -> None:
+    path = tmp_path / "a.sim"
+    stop = threading.Event()
+    batch = batch_of(fakes.SLOW)
+    try:
+        report, _ = sweep_into_store(
+            batch,
+            plans(20),
+            path,
+            stop=stop,
+            on_report=lambda report: stop.set() if report.done >= 2 else None,
+        )
+    finally:
+        batch.close()
+    assert report.stopped
+    assert 2 <= report.done < 20
+    assert len(SimulationStore.open(path).done()) == report.done
+    again, there = into_store(path, fakes.SLOW, report.done + 1, threading.Event())
+    assert (again.done, there) == (1, report.done)
+
+
+KILLED = """
+import threading, sys
+sys.path.insert(0, {folder!r})
+from test_sweep import into_store, fakes
+from pathlib import Path
+into_store(Path({store!r}), fakes.SLOW, 40, threading.Event())
+"""
+
+
+def test_a_killed_sweep_leaves_no_process_and_a_good_store(tmp_path: Path) -> None:
+    """Written without a guard for the main module, as a robot programmer would."""
+    store = tmp_path / "a.sim"
+    script = tmp_path / "script.py"
+    script.write_text(KILLED.format(folder=str(Path(__file__).parent), store=str(store)))
+    process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
+    deadline = time.monotonic() + 20
+    while len(list(store.rglob("*normal.h5"))) < 2:
+        assert time.monotonic() < deadline, "nothing was written"
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    while _members(process.pid):
+        assert time.monotonic() < deadline, "workers outlive the one who started them"
+        time.sleep(0.02)
+    done = len(SimulationStore.open(store).done())
+    assert done >= 2
+    report, there = into_store(store, fakes.SLOW, done + 1, threading.Event())
+    assert (report.done, there) == (1, done)
+
+
+def _members(group: int) -> list[int]:
+    """Processes of a group that still run."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[2]) == group and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
