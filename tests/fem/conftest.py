@@ -1,4 +1,4 @@
-"""The finite-element service on a bus of its own, its workers solving a formula (``fem_fakes``)."""
+"""Small meshes and a small finger; the service on its own bus, its workers solving a formula."""
 
 from __future__ import annotations
 
@@ -8,13 +8,22 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate.fem import node
+from palpate.fem.config import FingertipParameters
+from palpate.fem.mesh.core import Core, DistanceGrid
+from palpate.fem.mesh.geometry import Geometry
+from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.service_config import FemConfig
+from palpate.fem.solver import Fingertip, Settings
 from palpate.protos.client import Client
 from palpate.protos.config import LinkConfig, parse_config
 from palpate.protos.errors import PalpateError
@@ -23,6 +32,11 @@ from palpate.protos.session import run_router
 FOLDER = str(Path(__file__).parent)
 sys.path.append(FOLDER)  # tests import the fakes by name, as worker processes do
 PATIENCE_S = 20.0
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+Shell = Callable[..., SolidMesh]
+Fill = Callable[..., Fingertip]
+
 FAKES = {"factory": "fem_fakes:make", "workers": 2, "waiting": 2, "grace_s": 0.3, "threads": 1}
 
 
@@ -143,3 +157,123 @@ def starting(own_bus: LinkConfig) -> Iterator[Callable[..., Served]]:
 def workers_find_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that start worker processes themselves."""
     monkeypatch.setenv("PYTHONPATH", FOLDER)
+
+
+def _solid(
+    nodes: Floats, quads: NDArray[np.int64], layers: int, corners: int, *, cavity: bool
+) -> SolidMesh:
+    """Layers upon quads: node n of layer l has the number n (layers + 1) + l."""
+    halves = [quads] if corners == 8 else [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
+    faces = (np.concatenate(halves) * (layers + 1)).astype(np.int32)
+    count = len(faces)
+    elements = [np.concatenate([faces + k, faces + k + 1], axis=1) for k in range(layers)]
+    everyone = np.arange(count * layers, dtype=np.int32)
+    return SolidMesh(
+        nodes=nodes,
+        elements=np.concatenate(elements),
+        outer_faces=faces + np.int32(layers),
+        outer_elements=everyone[-count:],
+        inner_faces=faces if cavity else np.zeros((0, faces.shape[1]), np.int32),
+        inner_elements=everyone[: count if cavity else 0],
+        fixed=np.zeros(0, np.int32),
+        mirror=np.zeros(0, np.int32),
+    )
+
+
+def make_block(
+    counts: tuple[int, int, int], size_m: float = 1e-3, *, corners: int = 8
+) -> SolidMesh:
+    """Cubes of one size, or halves of them; the outer surface is the top, there is no cavity."""
+    x, y, z = (size_m * np.arange(n + 1) for n in counts)
+    nodes = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = np.arange(len(x) * len(y)).reshape(len(x), len(y))
+    quads = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=-1)
+    return _solid(nodes, quads.reshape(-1, 4), counts[2], corners, cavity=False)
+
+
+def make_shell(
+    around: int, layers: int, inner_m: float, outer_m: float, *, corners: int = 8
+) -> SolidMesh:
+    """Thick sphere: the squares of a cube, blown up."""
+    part = np.tan(np.linspace(-np.pi / 4, np.pi / 4, around + 1))
+    part = (part - part[::-1]) / 2  # symmetric to the last bit
+    side = np.stack(np.meshgrid([1.0], part, part, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = np.arange(len(side)).reshape(around + 1, around + 1)
+    quads = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=-1)
+    quads = quads.reshape(-1, 4)
+    points = np.concatenate([sign * np.roll(side, k, axis=1) for k in range(3) for sign in (1, -1)])
+    turned = (quads, quads[:, ::-1])  # seen from outside, a point reflection turns them round
+    cells = np.concatenate([turned[k % 2] + k * len(side) for k in range(6)])
+    rounded = np.round(points, 9) + 0.0
+    _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    direction = points[first]
+    # Sorted, so that nodes that mirror one another get the same length.
+    length = np.sqrt(np.sum(np.sort(direction**2, axis=1), axis=1))
+    direction /= length[:, None]
+    radii = np.linspace(inner_m, outer_m, layers + 1)
+    nodes = (direction[:, None] * radii[:, None]).reshape(-1, 3)
+    quads = np.asarray(number.reshape(-1)[cells], np.int64)
+    solid = _solid(nodes, quads, layers, corners, cavity=True)
+    if corners == 6:
+        return solid
+    away, mirror = cKDTree(nodes).query(nodes * (1.0, -1.0, 1.0))
+    assert away.max() < 1e-12 * outer_m
+    return replace(solid, mirror=mirror.astype(np.int32))
+
+
+def make_ball(radius_m: float, spacing_m: float = 0.25e-3, reach_m: float = 4e-3) -> Core:
+    """A ball about the origin as a core."""
+    count = 2 * round(reach_m / spacing_m) + 1
+    axis = spacing_m * (np.arange(count) - count // 2)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = np.linalg.norm(points, axis=-1) - radius_m
+    return Core(
+        DistanceGrid.sampled(np.full(3, axis[0]), spacing_m, values),
+        np.zeros((0, 3)),
+        np.zeros((0, 3), np.int32),
+        4 / 3 * np.pi * radius_m**3,
+        "ball",
+    )
+
+
+@pytest.fixture(scope="session")
+def block() -> Shell:
+    """`make_block`."""
+    return make_block
+
+
+@pytest.fixture(scope="session")
+def shell() -> Shell:
+    """`make_shell`."""
+    return make_shell
+
+
+@pytest.fixture(scope="session")
+def ball() -> Callable[..., Core]:
+    """`make_ball`."""
+    return make_ball
+
+
+@pytest.fixture(scope="session")
+def finger_geometry() -> Geometry:
+    """Half a sphere of skin, the other half held, about a ball: 1,900 unknowns."""
+    mesh = make_shell(8, 2, 3e-3, 4.5e-3)
+    held = np.flatnonzero(mesh.nodes[:, 2] > 0.2e-3).astype(np.int32)
+    return Geometry(replace(mesh, fixed=held, name="half sphere"), make_ball(2.5e-3))
+
+
+@pytest.fixture(scope="session")
+def fill(finger_geometry: Geometry) -> Fill:
+    """The same finger, filled, with other settings and parameters."""
+
+    def make(settings: Settings | None = None, **parameters: float) -> Fingertip:
+        parameters = {"fluid_volume_m3": 61e-9, **parameters}
+        return Fingertip.pressurised(finger_geometry, FingertipParameters(**parameters), settings)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def finger(fill: Fill) -> Fingertip:
+    """The small finger for all tests that leave it as it was."""
+    return fill()

@@ -19,10 +19,10 @@ import numpy as np
 
 from palpate.fem.align import Floats, Unalignable
 from palpate.fem.calibrate_errors import estimates
+from palpate.fem.calibrate_local import LocalModel
 from palpate.fem.calibrate_model import (
     Case,
     Fit,
-    LocalModel,
     State,
     compare,
     failures_at,

@@ -2,8 +2,9 @@
 
 Noise reaches the cost not only sample by sample: where the measured curve crosses the threshold is
 noisy too, and moves the whole curve. So the noise is carried from the raw samples through the
-alignment (by differences), and then through the stationarity of the cost. What no repetition shows,
-such as a wrong model or a wrong registration, is not in it.
+alignment (by differences), and then through the stationarity of the cost. First order only: in 65
+repetitions on a formula in place of the solver the spread was 1.2 to 1.3 times the stated one. What
+no repetition shows, such as a wrong model or a wrong registration, is not in it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from scipy.linalg import null_space
 
 from palpate.fem.align import Curve, Floats, Unalignable
-from palpate.fem.calibrate_model import Case, LocalModel, compare, curvature
+from palpate.fem.calibrate_local import LocalModel, curvature
+from palpate.fem.calibrate_model import Case, compare
 from palpate.fem.calibrate_settings import MODULUS, CalibrationSettings
 
 _FORCE_STEP_N = 1e-4

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from palpate.fem.align import Floats, Unalignable
-from palpate.fem.calibrate_model import LocalModel, curvature
+from palpate.fem.calibrate_local import LocalModel, curvature
 from palpate.fem.calibrate_settings import MODULUS
 
 _ROUNDS = 6

@@ -1,4 +1,4 @@
-"""NumPy twin of the contact kernels: the laws at points, as short as they can be said."""
+"""NumPy twin of the contact laws and of the kernels that use them, at points."""
 
 from __future__ import annotations
 
@@ -8,52 +8,205 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)
 class ContactLaw:
-    """Softened augmented Lagrangian, and Coulomb friction by return mapping.
+    """Constants of the contact laws; see ``contact_laws``.
 
     Attributes:
-        stiffness: Penalty e [Pa/m].
-        softness_m: Rounding d of its corner [m].
+        stiffness: e of the normal law [Pa/m].
         friction: Coulomb coefficient.
-        tangential_stiffness: Of a sticking point k [Pa/m].
+        tangential_stiffness: k of a sticking point [Pa/m].
+        complement: c that decides between sticking and sliding [Pa/m].
     """
 
     stiffness: float
-    softness_m: float
     friction: float
     tangential_stiffness: float
+    complement: float
 
-    def energy(self, multiplier: Floats, gap: Floats) -> Floats:
-        """Potential of the pressure per area [J/m^2]: its derivative by the gap is -p."""
-        from scipy.special import spence
 
-        z = (multiplier / self.stiffness - gap) / self.softness_m
-        # Integral of log(1 + e^z) is -Li2(-e^z); Li2(x) = spence(1 - x). For large z by reflection.
-        small = np.minimum(z, 0.0)
-        large = np.maximum(z, 0.0)
-        tail = -spence(1 + np.exp(-np.abs(z)))
-        value = np.where(z > 0, large**2 / 2 + np.pi**2 / 6 - tail, tail) + 0.0 * small
-        return np.asarray(self.stiffness * self.softness_m**2 * value)
+@dataclass(frozen=True, slots=True)
+class Friction:
+    """Linearised friction.
 
-    def pressure(self, multiplier: Floats, gap: Floats) -> Floats:
-        """Contact pressure p [Pa]."""
-        z = (multiplier / self.stiffness - gap) / self.softness_m
-        return np.asarray(self.stiffness * self.softness_m * np.logaddexp(0.0, z))
+    Attributes:
+        sticks: Whether a point sticks, (N,).
+        wanted: Traction on the indenter by the linearised law [Pa], (N, 3).
+        by_position: Its derivative by the point's position [Pa/m], (N, 3, 3).
+        by_pressure: Its derivative by the pressure, (N, 3).
+    """
 
-    def traction(self, pressure: Floats, normal: Floats, arm: Floats) -> Floats:
-        """Friction that the skin exerts on the indenter per area [Pa].
+    sticks: NDArray[np.bool_]
+    wanted: Floats
+    by_position: Floats
+    by_pressure: Floats
 
-        Args:
-            pressure: Contact pressure [Pa], (N,).
-            normal: Unit normals out of the indenter, (N, 3).
-            arm: Way of the points from their anchors [m], (N, 3).
-        """
-        along = np.sum(normal * arm, axis=1, keepdims=True)
-        trial = self.tangential_stiffness * (arm - along * normal)
-        size = np.linalg.norm(trial, axis=1)
-        limit = self.friction * pressure
-        factor = np.where(size > limit, limit / np.where(size > 0, size, 1.0), 1.0)
-        return np.asarray(factor[:, None] * trial)
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """What points contribute, per reference area.
+
+    Attributes:
+        status: 0 apart, 1 touches without friction, 2 sticks, 3 slides, (N,).
+        wanted: Pressure by the linearised law [Pa], (N,).
+        slope: Minus its derivative by the point's position [Pa/m], (N, 3).
+        wanted_traction: Friction by the linearised law at the wanted pressure [Pa], (N, 3).
+        traction_slope: Its derivative by the point's position [Pa/m], (N, 3, 3).
+        force: On the skin at the state's own pressure and traction [Pa], (N, 3).
+        misfit: What the force lacks to that by the law, but ``coupled`` [Pa], (N, 3).
+        coupled: What it lacks because friction follows the wanted pressure, negative [Pa], (N, 3).
+        tangent: Symmetric approximation of minus the derivative of the law's force, (N, 3, 3).
+        rest: What ``tangent`` lacks, (N, 3, 3).
+    """
+
+    status: Ints
+    wanted: Floats
+    slope: Floats
+    wanted_traction: Floats
+    traction_slope: Floats
+    force: Floats
+    misfit: Floats
+    coupled: Floats
+    tangent: Floats
+    rest: Floats
+
+
+def normal_law(law: ContactLaw, pressure: Floats, gap: Floats) -> tuple[Floats, Floats]:
+    """Wanted pressure [Pa] and minus its derivative by the gap [Pa/m], each (N,).
+
+    Args:
+        law: Constants.
+        pressure: Of the state [Pa], (N,).
+        gap: [m], (N,).
+    """
+    touches = (gap < 0.0) | (pressure > 0.0)
+    return np.where(touches, -law.stiffness * gap, 0.0), np.where(touches, law.stiffness, 0.0)
+
+
+def friction_law(
+    law: ContactLaw,
+    pressure: Floats,
+    traction: Floats,
+    normal: Floats,
+    curvature: Floats,
+    arm: Floats,
+) -> Friction:
+    """Linearised friction of touching points.
+
+    Args:
+        law: Constants.
+        pressure: Of the state [Pa], (N,).
+        traction: Of the state, on the indenter [Pa], (N, 3).
+        normal: Unit normals out of the indenter, (N, 3).
+        curvature: Their derivative by the position [1/m], (N, 3, 3).
+        arm: Way of the points from their anchors [m], (N, 3).
+    """
+    k, c = law.tangential_stiffness, law.complement
+    along = _dot(normal, arm)
+    way = arm - along * normal
+    turn = (
+        np.eye(3)
+        - _outer(normal, normal)
+        - along[..., None] * curvature
+        - _outer(normal, np.einsum("nij,nj->ni", curvature, arm))
+    )
+    now = traction - _dot(normal, traction) * normal
+    trial = now + c * (way - now / k)
+    size = np.linalg.norm(trial, axis=1, keepdims=True)
+    limit = law.friction * pressure[:, None]
+    sticks = size <= limit
+
+    size = np.where(sticks, 1.0, size)  # not needed there, and may be zero
+    t, share = trial / size, limit / size
+    across = now - _dot(t, now) * t
+    left = 1.0 - share * (1.0 - c / k)
+    wanted = limit * t + across - across / left
+    rolled = turn - _outer(t, np.einsum("nji,nj->ni", turn, t))
+    by_position = (share * c / left)[..., None] * rolled
+    return Friction(
+        sticks[:, 0],
+        np.where(sticks, k * way, wanted),
+        np.where(sticks[..., None], k * turn, by_position),
+        np.where(sticks, 0.0, law.friction * t),
+    )
+
+
+def return_map(law: ContactLaw, pressure: Floats, normal: Floats, arm: Floats) -> Floats:
+    """Friction that `friction_law` iterates to: a spring, capped at the Coulomb limit [Pa], (N, 3).
+
+    The arguments are those of `friction_law`.
+    """
+    trial = law.tangential_stiffness * (arm - _dot(normal, arm) * normal)
+    size = np.linalg.norm(trial, axis=1, keepdims=True)
+    limit = law.friction * pressure[:, None]
+    return np.asarray(np.where(size > limit, limit / np.where(size > 0.0, size, 1.0), 1.0) * trial)
+
+
+def contact(
+    law: ContactLaw,
+    gap: Floats,
+    normal: Floats,
+    curvature: Floats,
+    pressure: Floats,
+    traction: Floats,
+    arm: Floats,
+) -> Contact:
+    """Twin of the kernels' loop bodies; the core is a body without friction.
+
+    Args:
+        law: Constants.
+        gap: Distance to the body [m], (N,).
+        normal: Its derivative by the position, (N, 3).
+        curvature: Its second derivative [1/m], (N, 3, 3).
+        pressure: Of the state [Pa], (N,).
+        traction: Of the state, on the body [Pa], (N, 3).
+        arm: Way of the points from their anchors [m], (N, 3).
+    """
+    wanted, stiffness = normal_law(law, pressure, gap)
+    touches = stiffness > 0.0
+    slope = stiffness[:, None] * normal
+    grown = np.zeros_like(normal)
+    traction_slope, rest = np.zeros_like(curvature), np.zeros_like(curvature)
+    status = touches.astype(np.int32)
+    force, misfit = pressure[:, None] * normal, (wanted - pressure)[:, None] * normal
+    tangent = _outer(slope, normal) - pressure[:, None, None] * curvature
+    wanted_traction = np.zeros_like(normal)
+    if law.friction > 0.0:
+        rub = friction_law(law, pressure, traction, normal, curvature, arm)
+        status += np.where(touches, np.where(rub.sticks, 1, 2), 0).astype(np.int32)
+        grown = (wanted - pressure)[:, None] * rub.by_pressure
+        wanted_traction = rub.wanted + grown
+        follows = _outer(rub.by_pressure, slope)
+        traction_slope = rub.by_position - follows
+        force = force - traction
+        misfit = misfit - (rub.wanted - traction)
+        symmetric = (rub.by_position + rub.by_position.swapaxes(1, 2)) / 2
+        tangent = tangent + symmetric
+        rest = traction_slope - symmetric
+
+    def there(array: Floats) -> Floats:
+        return np.asarray(np.where(touches.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0))
+
+    return Contact(
+        status=status,
+        wanted=wanted,
+        slope=slope,
+        wanted_traction=there(wanted_traction),
+        traction_slope=there(traction_slope),
+        force=there(force),
+        misfit=there(misfit),
+        coupled=there(-grown),
+        tangent=there(tangent),
+        rest=there(rest),
+    )
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(np.sum(a * b, axis=1, keepdims=True))
+
+
+def _outer(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[:, :, None] * b[:, None, :])

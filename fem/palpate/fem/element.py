@@ -20,16 +20,20 @@ class Elements:
 
     Attributes:
         energy: Stored energy of the isochoric part [J].
+        rest_volume: Of each element, undeformed [m^3], (E,).
         volume: Of each element [m^3], (E,).
         volume_gradient: Its derivative by the element's nodes, (E, n, 3).
         force: Derivative of energy + sum p (v - v0) by the nodes [N], (V, 3).
+        smallest_jacobian: Of all quadrature points.
         tangent: Condensed tangent of each element, (E, n, 3, n, 3).
     """
 
     energy: float
+    rest_volume: Floats
     volume: Floats
     volume_gradient: Floats
     force: Floats
+    smallest_jacobian: float
     tangent: Floats
 
 
@@ -65,4 +69,4 @@ def elements(
     tangent = np.einsum("eq,eqijkl,eqaj,eqbl->eaibk", weight, moduli, gradient, gradient)
     tangent += np.einsum("e,eai,ebk->eaibk", bulk / rest_volume, volume_gradient, volume_gradient)
     energy = float((weight * material.function(f)).sum())
-    return Elements(energy, volume, volume_gradient, force, tangent)
+    return Elements(energy, rest_volume, volume, volume_gradient, force, float(j.min()), tangent)

@@ -18,6 +18,10 @@ from palpate.protos.errors import SimulationError
 Floats = NDArray[np.float64]
 
 
+DAMP_FROM = 6
+"""Iterations after which an error that does not fall is taken for a cycle."""
+
+
 @dataclass(frozen=True, slots=True)
 class NewtonSettings:
     """When to stop, and how far to go.
@@ -98,7 +102,7 @@ class Newton:
                 report.factorisations += 1
                 self.fresh = True
             try:
-                balance = self._step(state, press, balance, volume)
+                balance = self._step(state, press, balance, volume, self._damping(report))
             except SimulationError as failure:
                 report.reason = failure.problem
                 self.fresh = False
@@ -112,6 +116,16 @@ class Newton:
                 return report, balance
             self.fresh = error < settings.keep_factor * before and not system.sets_changed
             prepared = False
+
+    def _damping(self, report: Report) -> float:
+        """Fraction of the next step: half where the error goes round in circles.
+
+        Sets of sticking and sliding points may alternate between two, which a full step jumps over.
+        """
+        past = report.residuals
+        if report.iterations < DAMP_FROM or past[-1] < 0.3 * min(past[-4:-1]):
+            return 1.0
+        return 0.5 if report.iterations % 2 else 0.75
 
     def _error(self, balance: Balance, volume: float | None) -> float:
         """Largest of the relative errors, each over its tolerance's size."""
@@ -133,7 +147,12 @@ class Newton:
         return balance.strain_error <= settings.volume_tolerance
 
     def _step(
-        self, state: State, press: Press | None, balance: Balance, volume: float | None
+        self,
+        state: State,
+        press: Press | None,
+        balance: Balance,
+        volume: float | None,
+        damping: float,
     ) -> Balance:
         """One linear solve and the move along it, shortened where needed."""
         settings, system = self.settings, self.system
@@ -157,7 +176,7 @@ class Newton:
         if not np.isfinite(change).all():
             raise SimulationError("the linear solve gave no number", remedy="smaller increments")
         longest = float(np.sqrt((move * move).sum(axis=1).max()))
-        fraction = min(1.0, settings.largest_move_m / max(longest, 1e-300))
+        fraction = min(damping, settings.largest_move_m / max(longest, 1e-300))
         targets = system.updated_pressures(move)
         start = state.copy()
         for _ in range(8):

@@ -1,0 +1,109 @@
+"""What a calibration is asked and how it runs its simulations: once each, some at a time."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.fem.align import Floats
+from palpate.fem.calibrate_runs import Runs, Simulated
+from palpate.fem.calibrate_settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
+from palpate.fem.config import FingertipParameters
+from palpate.fem.measured import Indentation
+from palpate.fem.path import path_lengths
+from palpate.fem.result import Outcome, Trajectory
+from palpate.protos.errors import ConfigError, SimulationError
+
+TRUTH = FingertipParameters()
+
+
+class Spring:
+    """Force = depth times modulus."""
+
+    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+        if indenter == "unknown":
+            raise ConfigError("no such indenter", remedy="none")
+        way = path_lengths(path)
+        force = np.outer(way * parameters.shear_modulus_pa, np.array([0.0, 0.0, 1.0]))
+        return Simulated(force, way, 0.0151, 8e-7, Outcome.COMPLETE)
+
+
+def press(
+    name: str = "cube/00/normal", sensor: str = "biotac1", depth_m: float = 1e-3
+) -> Indentation:
+    pose = np.zeros((5, 7))
+    pose[:, 2], pose[:, 3] = np.linspace(0.0, depth_m, 5), 1.0
+    return Indentation(f"{name}/{sensor}", "cube", sensor, pose, np.ones((5, 3)))
+
+
+def test_each_run_is_made_once_whatever_the_sensor() -> None:
+    runs = Runs(Spring())
+    twin = replace(press(sensor="biotac2"), force=np.zeros((5, 3)))
+    first, second = runs.run([(TRUTH, press()), (TRUTH, twin)])
+    assert first is second
+    assert runs.count == 1
+    runs.run([(TRUTH, press()), (replace(TRUTH, friction_coefficient=0.3), press())])
+    assert runs.count == 2
+    runs.run([(TRUTH, press(depth_m=1.1e-3)), (TRUTH, replace(press(), indenter="ring"))])
+    assert runs.count == 4
+
+
+def test_a_refused_run_is_that_runs_trouble_only() -> None:
+    bad, good = Runs(Spring()).run(
+        [(TRUTH, replace(press(), indenter="unknown")), (TRUTH, press())]
+    )
+    assert (len(bad.forces), bad.outcome) == (0, Outcome.DIVERGED)
+    assert "no such indenter" in bad.reason
+    assert len(good.forces) == 5
+
+
+def test_a_solvers_steps_begin_at_the_second_pose() -> None:
+    path = press().pose
+    stopped = Trajectory("cube", path, (), Outcome.DIVERGED, "at once")
+    run = Simulated.of(stopped, thickness_m=0.0151, fluid_volume_m3=8e-7)
+    np.testing.assert_array_equal(run.forces, np.zeros((1, 3)))
+    np.testing.assert_array_equal(run.travel, [0.0])
+    assert run.reason == "at once"
+
+
+def test_an_executor_changes_nothing_but_the_order_of_reports() -> None:
+    jobs = [(TRUTH, press(depth_m=depth)) for depth in (1e-3, 2e-3, 3e-3)]
+    told: list[tuple[int, int]] = []
+    with ThreadPoolExecutor(2) as executor:
+        parallel = Runs(Spring(), executor, lambda *now: told.append(now)).run(jobs)
+    for one, other in zip(parallel, Runs(Spring()).run(jobs), strict=True):
+        np.testing.assert_array_equal(one.forces, other.forces)
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+class Dying(Executor):
+    """An executor whose process dies."""
+
+    def submit(self, *_: object, **__: object) -> Future[Simulated]:  # type: ignore[override]
+        future: Future[Simulated] = Future()
+        future.set_exception(BrokenProcessPool("killed"))
+        return future
+
+
+def test_a_dying_process_is_named() -> None:
+    with pytest.raises(SimulationError, match="ended by itself: killed"):
+        Runs(Spring(), Dying()).run([(TRUTH, press())])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "says"),
+    [
+        ({THICKNESS: (1e-3, 2e-3)}, "no bounds for"),
+        (PAPER_BOUNDS | {THICKNESS: (2e-3, 1e-3)}, "bounds of skin_thickness_m"),
+        (PAPER_BOUNDS | {FRICTION: (0.0, 1.0)}, "bounds of friction_coefficient"),
+        (PAPER_BOUNDS | {THICKNESS: (1.0, 2.0)}, "bounds of skin_thickness_m"),
+        (PAPER_BOUNDS | {"temperature": (25.0, 35.0)}, "cannot be calibrated"),
+    ],
+)
+def test_impossible_bounds_are_refused(bounds: dict[str, tuple[float, float]], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        CalibrationSettings(bounds=bounds)

@@ -1,0 +1,153 @@
+"""The sealed fluid: known volumes, exact derivatives, and kernels that equal their twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from palpate.fem.fluid import cavity
+from palpate.fem.laws import ContactSettings
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.state import State
+from palpate.fem.system import System
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+Mesh = Callable[..., SolidMesh]
+Sphere = Callable[[int, int], SolidMesh]
+
+SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
+BOTH = pytest.mark.parametrize("corners", [8, 6])
+
+CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+SQUARES = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32
+)
+TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+
+
+@pytest.fixture
+def sphere(shell: Mesh) -> Sphere:
+    """A mesh by elements around and their corners; the cavity's radius is 3 mm."""
+    return lambda around, corners: shell(around, 1, 3e-3, 4e-3, corners=corners)
+
+
+def uneven(mesh: SolidMesh, seed: int) -> Floats:
+    """Positions with no symmetry; quadrilaterals are warped."""
+    random = np.random.default_rng(seed)
+    gradient = np.eye(3) + random.uniform(-0.2, 0.2, (3, 3))
+    return np.asarray(mesh.nodes @ gradient.T + random.normal(0.0, 1e-4, mesh.nodes.shape))
+
+
+def hessian(faces: Ints, position: Floats) -> Floats:
+    """Second derivative of the volume by all nodes, dense."""
+    unknowns = (3 * faces[:, :, None] + np.arange(3)).reshape(len(faces), -1)
+    matrix = np.zeros((position.size, position.size))
+    blocks = cavity(faces, position).hessian.reshape(*unknowns.shape, -1)
+    for rows, block in zip(unknowns, blocks, strict=True):
+        matrix[np.ix_(rows, rows)] += block
+    return matrix
+
+
+def test_volume_of_bodies_whose_volume_is_known() -> None:
+    shear = np.array([[2.0, 0.3, -0.7], [0.1, 1.5, 0.4], [0.0, -0.2, 3.0]])
+    squares = cavity(SQUARES, CUBE @ shear.T + (5.0, -3.0, 2.0))
+    assert squares.volume.sum() == pytest.approx(np.linalg.det(shear), rel=1e-13)
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.2, 2.0, 0.0], [0.3, 0.4, 3.0]])
+    assert cavity(TETRAHEDRON, corners + 7.0).volume.sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_volume_under_a_saddle() -> None:
+    """A bilinear face is no two triangles: one corner of the cube's top raised by h adds h / 4."""
+    raised = CUBE.copy()
+    raised[7, 2] += 0.6
+    assert cavity(SQUARES, raised).volume.sum() == pytest.approx(1.0 + 0.6 / 4, rel=1e-13)
+
+
+@BOTH
+def test_volume_of_a_sphere_converges(sphere: Sphere, corners: int) -> None:
+    errors = []
+    for around in (4, 8):
+        mesh = sphere(around, corners)
+        volume = cavity(mesh.inner_faces, mesh.nodes).volume.sum()
+        errors.append(1.0 - volume / (4 / 3 * np.pi * 3e-3**3))
+    assert 0.0 < errors[1] < 0.03
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
+
+
+@BOTH
+def test_derivatives_are_those_of_the_volume(sphere: Sphere, corners: int) -> None:
+    mesh = sphere(3, corners)
+    faces, position = mesh.inner_faces, uneven(mesh, 0)
+    move = np.random.default_rng(1).normal(size=position.shape)
+    step = 1e-6
+    up, down = cavity(faces, position + step * move), cavity(faces, position - step * move)
+    here = cavity(faces, position)
+    slope = (up.volume.sum() - down.volume.sum()) / (2 * step)
+    assert float((here.gradient * move).sum()) == pytest.approx(slope, rel=1e-6)
+    turned = (hessian(faces, position) @ move.ravel()).reshape(-1, 3)
+    difference = (up.gradient - down.gradient) / (2 * step)
+    np.testing.assert_allclose(turned, difference, atol=1e-9 * np.abs(turned).max())
+
+
+@BOTH
+def test_a_closed_surface_feels_no_net_force_and_no_net_moment(
+    sphere: Sphere, corners: int
+) -> None:
+    mesh = sphere(3, corners)
+    position = uneven(mesh, 2)
+    gradient = cavity(mesh.inner_faces, position).gradient
+    largest = np.abs(gradient).max()
+    assert np.abs(gradient.sum(axis=0)).max() < SAME * largest
+    moment = np.cross(position, gradient).sum(axis=0)
+    assert np.abs(moment).max() < SAME * largest * np.abs(position).max()
+    matrix = hessian(mesh.inner_faces, position)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-18)
+
+
+@BOTH
+@pytest.mark.parametrize("pressure", [3e4, -2e3])
+def test_kernels_equal_the_twin(sphere: Sphere, corners: int, pressure: float) -> None:
+    mesh = sphere(4, corners)
+    random = np.random.default_rng(3)
+    held = random.random(mesh.nodes.shape) < 0.2
+    system = System(
+        mesh, None, shear_modulus_pa=1.0, bulk_ratio=10.0, contact=ContactSettings(), held=held
+    )
+    state = State.at_rest(mesh)
+    state.position[:], state.fluid_pressure = uneven(mesh, 4), pressure
+    expected = cavity(mesh.inner_faces, state.position)
+    balance = system.balance(state, None, tangent=True)
+    assert balance.volume == pytest.approx(expected.volume.sum(), rel=SAME)
+    assert (
+        np.abs(balance.volume_gradient - expected.gradient).max()
+        < SAME * np.abs(expected.gradient).max()
+    )
+    with_fluid = system.tangent_values()
+    free = system.pattern.free
+    outside = (balance.internal - pressure * expected.gradient).reshape(-1)[free]
+    assert np.abs(balance.unbalanced - outside).max() < SAME * np.abs(outside).max()
+
+    state.fluid_pressure = 0.0
+    system.balance(state, None, tangent=True)
+    share = with_fluid - system.tangent_values()
+    matrix = -pressure * hessian(mesh.inner_faces, state.position)[np.ix_(free, free)]
+    rows = np.repeat(np.arange(len(free)), np.diff(system.pattern.indptr))
+    found = np.zeros_like(matrix)
+    found[rows, system.pattern.indices] = share
+    # A difference of tangents, so the elements' rounding is in it.
+    assert np.abs(found - np.triu(matrix)).max() < 1e-12 * np.abs(with_fluid).max()
+    assert np.abs(found - np.triu(matrix)).max() < 1e-8 * np.abs(matrix).max()
+
+
+def test_a_solid_without_a_cavity_has_no_volume(block: Mesh) -> None:
+    mesh = block((2, 1, 1))
+    mesh = replace(mesh, fixed=np.array([0, 1, 2], np.int32))
+    system = System(mesh, None, shear_modulus_pa=1.0, bulk_ratio=10.0, contact=ContactSettings())
+    balance = system.balance(State.at_rest(mesh), None, tangent=True)
+    assert balance.volume == 0.0
+    assert not balance.volume_gradient.any()
