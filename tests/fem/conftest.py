@@ -24,6 +24,7 @@ from palpate.fem.mesh.geometry import Geometry
 from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.service_config import FemConfig
 from palpate.fem.solver import Fingertip, Settings
+from palpate.fem.system import System
 from palpate.protos.client import Client
 from palpate.protos.config import LinkConfig, parse_config
 from palpate.protos.errors import PalpateError
@@ -252,6 +253,34 @@ def shell() -> Shell:
 def ball() -> Callable[..., Core]:
     """`make_ball`."""
     return make_ball
+
+
+@pytest.fixture(scope="session")
+def assembled() -> Callable[..., Floats]:
+    """Dense matrix of all unknowns from blocks (C, k, 3, k, 3) of cells (C, k)."""
+
+    def assemble(cells: Ints, blocks: Floats, nodes: int) -> Floats:
+        unknowns = (3 * cells[:, :, None] + np.arange(3)).reshape(len(cells), -1)
+        matrix = np.zeros((3 * nodes, 3 * nodes))
+        for rows, block in zip(unknowns, blocks.reshape(*unknowns.shape, -1), strict=True):
+            matrix[np.ix_(rows, rows)] += block
+        return matrix
+
+    return assemble
+
+
+@pytest.fixture(scope="session")
+def dense() -> Callable[[System], Floats]:
+    """The symmetric tangent of a system's last balance, over its free unknowns."""
+
+    def tangent(system: System) -> Floats:
+        pattern, size = system.pattern, len(system.pattern.free)
+        upper = np.zeros((size, size))
+        rows = np.repeat(np.arange(size), np.diff(pattern.indptr))
+        upper[rows, pattern.indices] = system.tangent_values()
+        return np.asarray(upper + np.triu(upper, 1).T)
+
+    return tangent
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Contact: the laws have Coulomb's answer, kernels equal their twin, tangents are derivatives."""
+"""Contact of skin with indenter and core: kernels equal their twin, tangents are derivatives."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.contact import Contact, ContactLaw, contact, friction_law, normal_law, return_map
+from palpate.fem.contact import Contact, ContactLaw, contact, return_map
 from palpate.fem.element import elements
 from palpate.fem.indenter.catalogue import make_indenter
 from palpate.fem.indenter.distance import distance
@@ -25,12 +23,12 @@ from palpate.fem.system import System
 
 Floats = NDArray[np.float64]
 Mesh = Callable[..., SolidMesh]
+Dense = Callable[[System], Floats]
 
 SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
 MU, BULK_RATIO, OUTER_M = 2.8e5, 10.0, 4e-3
 # As soft as the skin, so that no part of a tangent hides behind another.
 SOFT = ContactSettings(stiffness=2e9, tangential_stiffness=8e8, complement=1e8, margin_m=0.5e-3)
-LAW = ContactLaw(2e9, 0.3, 8e8, 1e8)
 
 
 def difference(found: Floats, wanted: Floats) -> float:
@@ -44,68 +42,6 @@ def directions(random: np.random.Generator, count: int) -> Floats:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def test_normal_law_pushes_and_never_pulls() -> None:
-    gap = np.array([-2e-6, -2e-6, 1e-6, 1e-6])
-    pressure = np.array([0.0, 5e3, 0.0, 5e3])
-    wanted, stiffness = normal_law(LAW, pressure, gap)
-    # The last one still has a pressure, so the linear solve may see it part.
-    np.testing.assert_allclose(wanted, [4e3, 4e3, 0.0, -2e3])
-    np.testing.assert_allclose(stiffness, [2e9, 2e9, 0.0, 2e9])
-
-
-@given(
-    pressure=st.floats(0.0, 1e6),
-    arm=st.tuples(*[st.floats(-1e-3, 1e-3)] * 3),
-    start=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
-    complement=st.floats(1e7, 8e8),
-)
-@settings(max_examples=200, deadline=None)
-def test_friction_iterates_to_a_spring_capped_by_coulomb(
-    pressure: float,
-    arm: tuple[float, float, float],
-    start: tuple[float, float, float],
-    complement: float,
-) -> None:
-    law = ContactLaw(LAW.stiffness, LAW.friction, LAW.tangential_stiffness, complement)
-    normal = np.array([[0.6, 0.0, 0.8]])
-    p, t, way = np.array([pressure]), np.array([start]), np.array([arm])
-    for _ in range(60):
-        t = friction_law(law, p, t, normal, np.zeros((1, 3, 3)), way).wanted
-    wanted = return_map(law, p, normal, way)
-    np.testing.assert_allclose(t, wanted, atol=1e-6 + 1e-9 * pressure)
-    assert np.linalg.norm(wanted) <= law.friction * pressure * (1 + 1e-12)
-    assert abs(normal[0] @ wanted[0]) < 1e-9 * (1.0 + pressure)
-
-
-def test_friction_has_the_derivatives_of_the_capped_spring() -> None:
-    """On a ball, whose normal turns as the point moves; sticking and sliding."""
-    random = np.random.default_rng(0)
-    count, radius = 60, 3.5e-3
-    position = directions(random, count) * radius
-    anchor = (
-        position + random.normal(0.0, 2e-5, (count, 3)) * np.repeat([1.0, 9.0], count // 2)[:, None]
-    )
-    pressure = random.uniform(2e4, 1e5, count)
-
-    def traction(x: Floats, p: Floats) -> Floats:
-        normal = x / np.linalg.norm(x, axis=1, keepdims=True)
-        return return_map(LAW, p, normal, x - anchor)
-
-    normal = position / radius
-    curvature = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / radius
-    law = friction_law(
-        LAW, pressure, traction(position, pressure), normal, curvature, position - anchor
-    )
-    assert law.sticks.any()
-    assert not law.sticks.all()
-    move, step = random.normal(size=(count, 3)), 1e-9
-    up, down = (traction(position + sign * step * move, pressure) for sign in (1, -1))
-    slope = np.einsum("nij,nj->ni", law.by_position, move)
-    assert difference(slope, (up - down) / (2 * step)) < 1e-6
-    more, less = (traction(position, pressure + sign) for sign in (1.0, -1.0))
-    assert difference(law.by_pressure, (more - less) / 2) < 1e-6
-
-
 @dataclass
 class Pressed:
     """A shell between an indenter and a ball inside, at a state that solves nothing."""
@@ -114,6 +50,7 @@ class Pressed:
     core: Core
     state: State
     press: Press
+    assembled: Callable[..., Floats]
 
     @property
     def law(self) -> ContactLaw:
@@ -123,7 +60,8 @@ class Pressed:
 
     def points(self, surface: Surface, faces: NDArray[np.int32]) -> Floats:
         corners = self.state.position[faces]
-        return np.einsum("qa,fai->fqi", surface.shape_values, corners).reshape(-1, 3)
+        at = np.einsum("qa,fai->fqi", surface.shape_values, corners)
+        return np.asarray(at.reshape(-1, 3))
 
     def outside(self) -> tuple[Contact, NDArray[np.bool_]]:
         """Twin at the outer points, and which of them are near."""
@@ -177,29 +115,17 @@ class Pressed:
 
     def matrix(self, surface: Surface, faces: NDArray[np.int32], stiffness: Floats) -> Floats:
         """Dense matrix of stiffnesses per point."""
-        matrix = np.zeros((self.state.position.size,) * 2)
         shape, area = surface.shape_values, surface.area_values
         blocks = stiffness.reshape(*area.shape, 3, 3)
         local = np.einsum("fq,qa,qb,fqij->faibj", area, shape, shape, blocks)
-        unknowns = (3 * faces[:, :, None] + np.arange(3)).reshape(len(faces), -1)
-        for rows, block in zip(unknowns, local.reshape(*unknowns.shape, -1), strict=True):
-            matrix[np.ix_(rows, rows)] += block
-        return matrix
-
-    def tangent(self) -> Floats:
-        """Symmetric tangent of the last balance, dense."""
-        pattern, size = self.system.pattern, len(self.system.pattern.free)
-        upper = np.zeros((size, size))
-        rows = np.repeat(np.arange(size), np.diff(pattern.indptr))
-        upper[rows, pattern.indices] = self.system.tangent_values()
-        return upper + np.triu(upper, 1).T
+        return self.assembled(faces, local, len(self.state.position))
 
 
 Squeeze = Callable[..., Pressed]
 
 
 @pytest.fixture
-def squeeze(shell: Mesh, ball: Callable[..., Core]) -> Squeeze:
+def squeeze(shell: Mesh, ball: Callable[..., Core], assembled: Callable[..., Floats]) -> Squeeze:
     """Makes a `Pressed`: indenter, friction, drag of the anchors [m], element corners."""
 
     def make(
@@ -222,7 +148,7 @@ def squeeze(shell: Mesh, ball: Callable[..., Core]) -> Squeeze:
         turn = np.array([1.0, 0.1, 0.2, -0.3])
         pose = np.array([1e-4, 2e-4, 0.3e-3 - OUTER_M, *turn / np.linalg.norm(turn)])
         press = Press(make_indenter(indenter), pose, friction)
-        pressed = Pressed(system, core, state, press)
+        pressed = Pressed(system, core, state, press, assembled)
         points = pressed.points(system.outer, mesh.outer_faces)
         away = directions(random, len(points)) * drag_m
         state.anchor = press.to_local(points + away).reshape(state.anchor.shape)
@@ -244,14 +170,14 @@ def at_random(pressed: Pressed) -> None:
     ("indenter", "friction"), [("sphere_medium", 0.3), ("cube", 0.3), ("ring", 0.0)]
 )
 def test_kernels_equal_the_twin(
-    squeeze: Squeeze, indenter: str, friction: float, corners: int
+    squeeze: Squeeze, dense: Dense, indenter: str, friction: float, corners: int
 ) -> None:
     pressed = squeeze(indenter, friction, drag_m=5e-5, corners=corners)
     at_random(pressed)
     system, state, mesh = pressed.system, pressed.state, pressed.system.mesh
     outer, inner = system.outer, system.inner
     balance = system.balance(state, pressed.press, tangent=True)
-    with_contact = pressed.tangent()
+    with_contact = dense(system)
     (out, near), core = pressed.outside(), pressed.inside()
     area = outer.area_values.ravel()
 
@@ -294,7 +220,7 @@ def test_kernels_equal_the_twin(
         held=np.zeros(mesh.nodes.shape, bool),
     )  # fmt: skip
     apart.balance(state, None, tangent=True)
-    alone = Pressed(apart, pressed.core, state, pressed.press).tangent()
+    alone = dense(apart)
     assert np.abs(with_contact - alone - expected).max() < SAME * np.abs(with_contact).max()
 
 
@@ -351,6 +277,7 @@ def test_condensed_loads_and_updates_equal_the_twin(squeeze: Squeeze) -> None:
 @pytest.mark.parametrize("corners", [8, 6])
 def test_assembled_tangent_is_the_derivative_of_the_forces(
     squeeze: Squeeze,
+    dense: Dense,
     indenter: str,
     friction: float,
     drag_m: float,
@@ -364,20 +291,16 @@ def test_assembled_tangent_is_the_derivative_of_the_forces(
     system.balance(state, pressed.press, tangent=True)
     assert set(system.outer.status.numpy().ravel()) == statuses
     assert 1 in system.inner.status.numpy()
-    matrix = pressed.tangent()
-    random = np.random.default_rng(5)
+    matrix = dense(system)
     here, step = state.position.copy(), 1e-10
-    for _ in range(3):
-        move = random.normal(size=here.shape)
-        forces = []
-        for sign in (1.0, -1.0):
-            state.position = here + sign * step * move
-            pressed.settle()
-            forces.append(system.balance(state, pressed.press).unbalanced)
-        state.position = here
-        wanted = (forces[0] - forces[1]) / (2 * step)
-        found = matrix @ move.ravel() + system.rest_product(move.ravel())
-        assert difference(found, wanted) < 1e-6
+    move = np.random.default_rng(5).normal(size=here.shape)
+    forces = []
+    for sign in (1.0, -1.0):
+        state.position = here + sign * step * move
+        pressed.settle()
+        forces.append(system.balance(state, pressed.press).unbalanced)
+    found = matrix @ move.ravel() + system.rest_product(move.ravel())
+    assert difference(found, (forces[0] - forces[1]) / (2 * step)) < 1e-6
 
 
 def test_only_the_symmetric_part_is_without_sliding_on_a_flat(squeeze: Squeeze) -> None:
@@ -385,7 +308,7 @@ def test_only_the_symmetric_part_is_without_sliding_on_a_flat(squeeze: Squeeze) 
     pressed = squeeze("cube", 5.0, drag_m=1e-6)
     pressed.settle()
     pressed.system.balance(pressed.state, pressed.press, tangent=True)
-    pressed.tangent()
+    pressed.system.tangent_values()
     rest = pressed.system.outer.rest.numpy()
     assert 2 in pressed.system.outer.status.numpy()
     assert np.abs(rest).max() < 1e-9 * SOFT.tangential_stiffness * 1e-6

@@ -66,7 +66,9 @@ def elements(
         "eqil,eqkj->eqijkl", cofactor, inverse_t
     )
     moduli = material.hessian(f) + pressure[:, None, None, None, None, None] * second
-    tangent = np.einsum("eq,eqijkl,eqaj,eqbl->eaibk", weight, moduli, gradient, gradient)
+    tangent = np.einsum(
+        "eq,eqijkl,eqaj,eqbl->eaibk", weight, moduli, gradient, gradient, optimize=True
+    )
     tangent += np.einsum("e,eai,ebk->eaibk", bulk / rest_volume, volume_gradient, volume_gradient)
     energy = float((weight * material.function(f)).sum())
     return Elements(energy, rest_volume, volume, volume_gradient, force, float(j.min()), tangent)

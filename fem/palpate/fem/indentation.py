@@ -68,7 +68,7 @@ class Indentation:
         surface = self.tip.system.outer
         corners = self.state.position[self.tip.geometry.mesh.outer_faces]
         points = np.einsum("qa,fai->fqi", surface.shape_values, corners)
-        stretch = self.state.traction / self.tip.settings.contact.tangential_stiffness
+        stretch = self.state.traction / self.tip.system.contact.tangential_stiffness
         self.state.anchor[:] = press.to_local(points - stretch)
 
     def run(self) -> Trajectory:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -23,15 +23,25 @@ class ContactSettings:
     Attributes:
         stiffness: Of the normal law [Pa/m]; 1 MPa, a hard pinch, is 0.5 um deep.
         tangential_stiffness: Of a sticking point [Pa/m]; 0.1 MPa moves it by 2 um.
-        complement: c that decides between sticking and sliding [Pa/m]; of the size of the skin's
-            own stiffness (mu over an element). It does not touch the answer.
+        complement: c that decides between sticking and sliding [Pa/m]; it does not touch the
+            answer. At most the skin's own stiffness (mu over an element): with more, a point whose
+            way changes sign from iteration to iteration slides for ever.
         margin_m: Points farther from a surface are not looked at [m].
     """
 
     stiffness: float = 2e12
     tangential_stiffness: float = 5e10
-    complement: float = 1e9
+    complement: float = 3e8
     margin_m: float = 0.5e-3
+
+    def scaled(self, factor: float) -> ContactSettings:
+        """The same relative to a skin that is stiffer by a factor."""
+        return replace(
+            self,
+            stiffness=factor * self.stiffness,
+            tangential_stiffness=factor * self.tangential_stiffness,
+            complement=factor * self.complement,
+        )
 
     def law(self, friction: float) -> Law:
         """The same for the kernels."""

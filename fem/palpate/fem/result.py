@@ -75,7 +75,7 @@ class Trajectory:
     Attributes:
         indenter: Its name.
         path: Requested poses, shape (K, 7).
-        steps: Converged ones, in order of the path; fewer than K - 1 only if outcome is not COMPLETE.
+        steps: Converged ones, in order of the path; K - 1 of them if the outcome is COMPLETE.
         outcome: How it ended.
         reason: One sentence where it did not complete: what, where, at which travel.
         travel_m: Path length of the indenter at the last *converged* increment, which may lie

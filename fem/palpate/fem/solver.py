@@ -27,6 +27,7 @@ from palpate.protos.errors import SimulationError
 Floats = NDArray[np.float64]
 
 STEPS_TO_PRESSURISE = 4
+REFERENCE_MODULUS_PA = 2.8e5
 THICKNESS_TOLERANCE_M = 1e-8
 
 
@@ -36,7 +37,8 @@ class Settings:
 
     Attributes:
         newton: Tolerances of one increment.
-        contact: Constants of the contact laws.
+        contact: Constants of the contact laws for a modulus of ``REFERENCE_MODULUS_PA``; a fingertip
+            scales them with its own, so that forces scale exactly with the modulus.
         force_limit_n: A trajectory ends where the indenter's force exceeds this [N]; the paper saw
             23-32 N at most.
         smallest_increment: Fraction of a step below which it is given up.
@@ -65,7 +67,7 @@ class Fingertip:
             geometry.core.grid if geometry.core else None,
             shear_modulus_pa=parameters.shear_modulus_pa,
             bulk_ratio=parameters.bulk_ratio,
-            contact=settings.contact,
+            contact=settings.contact.scaled(parameters.shear_modulus_pa / REFERENCE_MODULUS_PA),
         )
         pattern = self.system.pattern
         self.newton = Newton(

@@ -1,0 +1,215 @@
+"""Direct solvers: both give the answer, again and again, and say so where there is none."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from palpate.fem import linear
+from palpate.fem.laws import ContactSettings
+from palpate.fem.linear import Factor, make_factor
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.state import State
+from palpate.fem.system import System
+from palpate.protos.errors import ConfigError, SimulationError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+SIZE = 80
+SAME = 1e-10  # of two eliminations of matrices with a condition of 1e3
+
+
+@cache
+def has_pardiso() -> bool:
+    try:
+        make_factor(*pattern_of(np.eye(2)), solver="pardiso")
+    except ConfigError:
+        return False
+    return True
+
+
+def pattern_of(matrix: Floats) -> tuple[Ints, Ints]:
+    upper = sp.triu(sp.csr_matrix(matrix), format="csr")
+    upper.sort_indices()
+    return upper.indptr.astype(np.int32), upper.indices.astype(np.int32)
+
+
+def values_of(matrix: Floats, indptr: Ints, indices: Ints) -> Floats:
+    rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    return np.asarray(matrix[rows, indices])
+
+
+def indefinite(seed: int) -> Floats:
+    """Sparse and symmetric, with eigenvalues of both signs; all seeds share a pattern."""
+    places = sp.random(SIZE, SIZE, 0.06, random_state=7, format="csr")
+    random = np.random.default_rng(seed)
+    places.data = random.normal(size=places.nnz)
+    sign = np.where(np.arange(SIZE) % 3 == 0, -1.0, 1.0)
+    matrix = (places + places.T).toarray() + np.diag(sign * random.uniform(3.0, 6.0, SIZE))
+    return np.asarray(matrix)
+
+
+@pytest.fixture(params=["pardiso", "superlu"])
+def solver(request: pytest.FixtureRequest) -> str:
+    if request.param == "pardiso" and not has_pardiso():
+        pytest.skip("no MKL on this machine")
+    return str(request.param)
+
+
+@pytest.fixture
+def factor(solver: str) -> Factor:
+    return make_factor(*pattern_of(indefinite(0)), solver=solver)
+
+
+def test_solves_an_indefinite_matrix(factor: Factor, solver: str) -> None:
+    assert factor.name == solver
+    matrix = indefinite(0)
+    assert np.linalg.eigvalsh(matrix)[[0, -1]].prod() < 0.0
+    factor.factorise(values_of(matrix, *pattern_of(matrix)))
+    right = np.random.default_rng(1).normal(size=SIZE)
+    answer = factor.solve(right)
+    assert answer.shape == (SIZE,)
+    np.testing.assert_allclose(answer, np.linalg.solve(matrix, right), rtol=SAME, atol=SAME)
+
+
+def test_factorises_new_values_and_forgets_the_old(factor: Factor) -> None:
+    right = np.random.default_rng(2).normal(size=SIZE)
+    for seed in (0, 3, 4, 0):
+        matrix = indefinite(seed)
+        values = values_of(matrix, *pattern_of(indefinite(0)))
+        factor.factorise(values)
+        values[:] = np.nan  # the caller's array is its own
+        wanted = np.linalg.solve(matrix, right)
+        np.testing.assert_allclose(factor.solve(right), wanted, rtol=SAME, atol=SAME)
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_solves_many_right_hand_sides_and_leaves_them_alone(factor: Factor, columns: int) -> None:
+    matrix = indefinite(0)
+    factor.factorise(values_of(matrix, *pattern_of(matrix)))
+    wide = np.random.default_rng(5).normal(size=(SIZE, 2 * columns))
+    for right in (wide[:, :columns].copy(), wide[:, ::2], np.asfortranarray(wide[:, :columns])):
+        before = right.copy()
+        answer = factor.solve(right)
+        np.testing.assert_array_equal(right, before)
+        assert answer.shape == (SIZE, columns)
+        np.testing.assert_allclose(matrix @ answer, right, atol=1e-11)
+
+
+def test_takes_integers_for_numbers(factor: Factor) -> None:
+    matrix = indefinite(0)
+    factor.factorise(values_of(matrix, *pattern_of(matrix)))
+    right = np.arange(SIZE)
+    np.testing.assert_allclose(matrix @ factor.solve(right), right, atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_none_are_refused_and_the_next_matrix_is_not(
+    factor: Factor, bad: float
+) -> None:
+    matrix = indefinite(0)
+    good = values_of(matrix, *pattern_of(matrix))
+    for _ in range(2):
+        broken = good.copy()
+        broken[3] = bad
+        with pytest.raises(SimulationError, match="not numbers"):
+            factor.factorise(broken)
+        factor.factorise(good)
+        np.testing.assert_allclose(matrix @ factor.solve(np.ones(SIZE)), 1.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("singular", ["zero", "empty row", "floating"])
+def test_a_singular_matrix_is_refused_and_the_next_is_not(solver: str, singular: str) -> None:
+    matrix = indefinite(0)
+    indptr, indices = pattern_of(matrix)
+    broken = matrix * (singular != "zero")
+    if singular == "empty row":
+        broken[5], broken[:, 5] = 0.0, 0.0
+    if singular == "floating":  # a chain of springs that is held nowhere
+        matrix = 2.0 * np.eye(SIZE) - np.eye(SIZE, k=1) - np.eye(SIZE, k=-1)
+        broken = matrix.copy()
+        broken[0, 0] = broken[-1, -1] = 1.0
+        indptr, indices = pattern_of(matrix)
+    factor = make_factor(indptr, indices, solver=solver)
+    for _ in range(2):
+        with pytest.raises(SimulationError):
+            factor.factorise(values_of(broken, indptr, indices))
+        factor.factorise(values_of(matrix, indptr, indices))
+        np.testing.assert_allclose(matrix @ factor.solve(np.ones(SIZE)), 1.0, atol=1e-10)
+
+
+def test_a_matrix_that_is_not_there_cannot_be_solved(solver: str) -> None:
+    """In a process of its own: MKL dies of it if asked."""
+    program = (
+        "import numpy as np\n"
+        "from palpate.fem.linear import make_factor\n"
+        "index = np.arange(4, dtype=np.int32)\n"
+        f"factor = make_factor(index, index[:3], solver={solver!r})\n"
+        "try:\n    factor.solve(np.ones(3))\n"
+        "except Exception:\n    print('refused')\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert result.stdout.strip() == "refused", result.stderr[-500:]
+
+
+def test_solvers_agree_on_a_tangent(shell: Callable[..., SolidMesh]) -> None:
+    """Nearly incompressible and with contact's stiffness in it: the worst that there is."""
+    if not has_pardiso():
+        pytest.skip("no MKL on this machine")
+    mesh = shell(4, 2, 3e-3, 4e-3)
+    held = np.zeros(mesh.nodes.shape, bool)
+    held[mesh.nodes[:, 2] > 0.0] = True
+    system = System(
+        mesh, None, shear_modulus_pa=2.8e5, bulk_ratio=1e7, contact=ContactSettings(), held=held
+    )
+    system.balance(State.at_rest(mesh), None, tangent=True)
+    values = system.tangent_values()
+    right = np.random.default_rng(6).normal(size=len(system.pattern.free))
+    answers = []
+    for name in ("pardiso", "superlu"):
+        factor = make_factor(system.pattern.indptr, system.pattern.indices, solver=name)
+        factor.factorise(values)
+        answers.append(factor.solve(right))
+    assert np.abs(answers[0] - answers[1]).max() < 1e-6 * np.abs(answers[0]).max()
+
+
+def test_several_factors_live_side_by_side_and_are_freed(solver: str) -> None:
+    matrices = [indefinite(seed) for seed in range(4)]
+    pattern = pattern_of(matrices[0])
+    factors = [make_factor(*pattern, solver=solver) for _ in matrices]
+    for factor, matrix in zip(factors, matrices, strict=True):
+        factor.factorise(values_of(matrix, *pattern))
+    del factors[1]
+    gc.collect()
+    for factor, matrix in zip(factors, matrices[:1] + matrices[2:], strict=True):
+        np.testing.assert_allclose(matrix @ factor.solve(np.ones(SIZE)), 1.0, atol=1e-11)
+
+
+def test_an_unknown_solver_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no solver 'mumps'"):
+        make_factor(*pattern_of(np.eye(2)), solver="mumps")
+
+
+def test_without_mkl_auto_takes_superlu_and_pardiso_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Missing:
+        def __init__(self, indptr: Ints, indices: Ints) -> None:
+            raise OSError("libmkl_rt.so not found")
+
+    monkeypatch.setattr(linear, "Pardiso", Missing)
+    pattern = pattern_of(np.eye(2))
+    assert make_factor(*pattern).name == "superlu"
+    with pytest.raises(ConfigError, match="libmkl_rt"):
+        make_factor(*pattern, solver="pardiso")

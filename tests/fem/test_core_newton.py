@@ -1,0 +1,296 @@
+"""Newton: quadratic, exact in volume, honest about what it cannot do; and the way between poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from palpate.fem.element import elements
+from palpate.fem.fluid import cavity
+from palpate.fem.indenter.catalogue import make_indenter
+from palpate.fem.indenter.pose import rotation_matrix
+from palpate.fem.laws import ContactSettings, Press
+from palpate.fem.linear import make_factor
+from palpate.fem.material import NeoHooke
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.newton import Newton, NewtonSettings
+from palpate.fem.path import interpolate_pose, path_lengths
+from palpate.fem.state import State
+from palpate.fem.system import System
+from palpate.protos.errors import SimulationError
+
+Floats = NDArray[np.float64]
+Mesh = Callable[..., SolidMesh]
+
+MU, BULK_RATIO = 2.8e5, 1e4
+# Always a fresh factor, whole steps, and on to where rounding rules.
+PURE = NewtonSettings(
+    tolerance=1e-12,
+    volume_tolerance=1e-13,
+    gap_tolerance_m=1e-14,
+    largest_move_m=1.0,
+    keep_factor=0.0,
+    iterations=12,
+)
+
+
+def newton_of(mesh: SolidMesh, settings: NewtonSettings | None = None, **options: object) -> Newton:
+    arguments = {"shear_modulus_pa": MU, "bulk_ratio": BULK_RATIO, "contact": ContactSettings()}
+    system = System(mesh, None, **{**arguments, **options})  # type: ignore[arg-type]
+    factor = make_factor(system.pattern.indptr, system.pattern.indices)
+    return Newton(system, factor, settings or NewtonSettings())
+
+
+@pytest.fixture(scope="module")
+def cup(shell: Mesh) -> SolidMesh:
+    """A sphere whose upper half is held."""
+    mesh = shell(5, 1, 3e-3, 4e-3)
+    return replace(mesh, fixed=np.flatnonzero(mesh.nodes[:, 2] > 0.1e-3).astype(np.int32))
+
+
+def orders(residuals: list[float]) -> list[float]:
+    """Order of convergence of each three errors that are small, but not rounding."""
+    errors = [r for r in residuals if 1e-11 < r < 1e-1]
+    logs = np.log(errors)
+    return list((logs[2:] - logs[1:-1]) / (logs[1:-1] - logs[:-2]))
+
+
+@pytest.mark.parametrize("held_volume", [True, False])
+def test_convergence_is_quadratic(cup: SolidMesh, held_volume: bool) -> None:
+    newton, state = newton_of(cup, PURE), State.at_rest(cup)
+    volume = 1.15 * newton.system.balance(state, None).volume if held_volume else None
+    state.fluid_pressure = 0.0 if held_volume else 3e4
+    report, _ = newton.solve(state, None, volume=volume)
+    assert min(report.residuals) < 1e-11, report.residuals
+    assert report.iterations == report.factorisations
+    assert max(orders(report.residuals)) > 1.8, report.residuals
+
+
+@pytest.mark.parametrize("friction", [0.0, 10.0], ids=["smooth", "sticking"])
+def test_convergence_is_quadratic_in_contact(cup: SolidMesh, friction: float) -> None:
+    """From near the answer, so that the sets do not change."""
+    newton = newton_of(cup, PURE)
+    state = State.at_rest(cup)
+    volume = 1.1 * newton.system.balance(state, None).volume
+    newton.solve(state, None, volume=volume)
+    low = state.position[:, 2].min()
+    pose = np.array([0.1e-3, 0.0, low, 1.0, 0.0, 0.0, 0.0])
+    press = Press(make_indenter("sphere_medium"), pose, friction)
+    points = state.position[cup.outer_faces]
+    state.anchor[:] = press.to_local(points)
+    newton.settings = replace(PURE, largest_move_m=0.25e-3, iterations=30)
+    for depth in (0.3e-3, 0.31e-3):
+        pose[2] = low + depth
+        report, balance = newton.solve(state, press.at(pose), volume=volume)
+    assert min(report.residuals) < 1e-9, report.residuals
+    assert np.linalg.norm(balance.indenter.sum(axis=0)) > 0.05
+    assert max(orders(report.residuals)) > (1.8 if not friction else 1.5), report.residuals
+
+
+def test_volume_is_met_exactly_by_the_border(cup: SolidMesh) -> None:
+    newton, state = newton_of(cup), State.at_rest(cup)
+    rest = newton.system.balance(state, None).volume
+    for ratio in (1.05, 1.1, 1.08):
+        report, balance = newton.solve(state, None, volume=ratio * rest)
+        assert report.converged
+        assert balance.volume == pytest.approx(ratio * rest, rel=1e-6)
+        found = cavity(cup.inner_faces, state.position).volume.sum()
+        assert found == pytest.approx(balance.volume, rel=1e-12)
+
+
+def test_a_given_pressure_and_the_volume_it_makes_are_one_state(cup: SolidMesh) -> None:
+    newton, by_volume = newton_of(cup, PURE), State.at_rest(cup)
+    rest = newton.system.balance(by_volume, None).volume
+    newton.solve(by_volume, None, volume=1.08 * rest)
+    by_pressure = State.at_rest(cup)
+    by_pressure.fluid_pressure = by_volume.fluid_pressure
+    assert by_pressure.fluid_pressure > 1e3
+    _, balance = newton.solve(by_pressure, None, volume=None)
+    assert balance.volume == pytest.approx(1.08 * rest, rel=1e-8)
+    np.testing.assert_allclose(by_pressure.position, by_volume.position, atol=1e-11)
+
+
+def test_kept_and_fresh_factors_agree(cup: SolidMesh) -> None:
+    positions, costs = [], []
+    for keep in (0.0, 0.9):
+        newton = newton_of(cup, NewtonSettings(keep_factor=keep, tolerance=1e-9))
+        state = State.at_rest(cup)
+        volume = 1.1 * newton.system.balance(state, None).volume
+        report, _ = newton.solve(state, None, volume=volume)
+        assert report.converged
+        positions.append(state.position)
+        costs.append(report.factorisations)
+    np.testing.assert_allclose(positions[0], positions[1], atol=1e-10)
+    assert costs[1] < costs[0]
+
+
+def test_a_body_at_rest_is_in_equilibrium(cup: SolidMesh) -> None:
+    """Also without any force to measure the unbalanced ones against."""
+    newton, state = newton_of(cup), State.at_rest(cup)
+    volume = newton.system.balance(state, None).volume
+    for target in (None, volume):
+        report, _ = newton.solve(state, None, volume=target)
+        assert report.converged
+        assert report.iterations == 0
+        np.testing.assert_array_equal(state.position, cup.nodes)
+
+
+def test_prescribed_displacements_alone_stretch_a_block(block: Mesh) -> None:
+    """Uniaxial tension: mu (l^2 - 1/l) times the current area; rollers on three sides."""
+    mesh, stretch = block((2, 2, 3), 1e-3), 1.3
+    held = np.isclose(mesh.nodes, 0.0)
+    top = np.isclose(mesh.nodes[:, 2], 3e-3)
+    held[top, 2] = True
+    newton = newton_of(mesh, held=held, bulk_ratio=1e6)
+    state = State.at_rest(mesh)
+    state.position[top, 2] *= stretch
+    report, balance = newton.solve(state, None, volume=None)
+    assert report.converged, report.reason
+    assert report.iterations < 10
+    load = balance.internal[top, 2].sum()
+    stress = MU * (stretch**2 - 1 / stretch)
+    assert load == pytest.approx(stress * 4e-6 / stretch, rel=1e-5)
+    np.testing.assert_allclose(
+        state.position, mesh.nodes * [stretch**-0.5, stretch**-0.5, stretch], atol=1e-8
+    )
+
+
+def test_dead_loads_are_borne_by_what_is_held(block: Mesh) -> None:
+    mesh = block((2, 2, 2))
+    mesh = replace(mesh, fixed=np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32))
+    newton = newton_of(mesh)
+    newton.system.load[-1] = (0.01, -0.02, 0.03)
+    state = State.at_rest(mesh)
+    report, balance = newton.solve(state, None, volume=None)
+    assert report.converged
+    borne = balance.internal[mesh.fixed].sum(axis=0)
+    np.testing.assert_allclose(borne, (-0.01, 0.02, -0.03), atol=1e-7)
+    twin = elements(mesh, NeoHooke(MU), BULK_RATIO * MU, state.position, state.pressure)
+    np.testing.assert_allclose(twin.force, balance.internal, atol=1e-9)
+
+
+def test_no_node_moves_farther_than_it_may(cup: SolidMesh) -> None:
+    newton = newton_of(cup, NewtonSettings(largest_move_m=1e-5, iterations=1))
+    state = State.at_rest(cup)
+    volume = 1.5 * newton.system.balance(state, None).volume
+    report, _ = newton.solve(state, None, volume=volume)
+    assert not report.converged
+    assert report.reason == "no equilibrium after 1 iterations"
+    moved = np.linalg.norm(state.position - cup.nodes, axis=1).max()
+    assert moved == pytest.approx(1e-5, rel=1e-9)
+
+
+def test_asks_whether_to_stop_once_an_iteration(cup: SolidMesh) -> None:
+    newton, state = newton_of(cup, PURE), State.at_rest(cup)
+    volume = 1.1 * newton.system.balance(state, None).volume
+    asked = 0
+
+    def stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked == 3
+
+    report, _ = newton.solve(state, None, volume=volume, should_stop=stop)
+    assert (asked, report.iterations) == (3, 2)
+    assert (report.converged, report.reason) == (False, "stopped")
+
+
+@pytest.mark.parametrize("culprit", ["factorise", "solve"])
+def test_a_solver_that_fails_ends_the_increment_not_the_program(
+    cup: SolidMesh, monkeypatch: pytest.MonkeyPatch, culprit: str
+) -> None:
+    """So that a smaller increment can be tried; the next one starts afresh."""
+    newton, state = newton_of(cup), State.at_rest(cup)
+    volume = 1.1 * newton.system.balance(state, None).volume
+
+    def fail(_: Floats) -> Floats:
+        raise SimulationError("no memory left", remedy="buy some")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(newton.factor, culprit, fail)
+        report, _ = newton.solve(state, None, volume=volume)
+        assert (report.converged, report.reason) == (False, "no memory left")
+    report, _ = newton.solve(State.at_rest(cup), None, volume=volume)
+    assert report.converged
+
+
+def test_a_body_that_nothing_holds_is_reported(block: Mesh) -> None:
+    mesh = block((2, 2, 1))
+    newton = newton_of(mesh, held=np.zeros(mesh.nodes.shape, bool))
+    newton.system.load[0, 2] = 0.1
+    report, _ = newton.solve(State.at_rest(mesh), None, volume=None)
+    assert not report.converged
+    assert report.reason
+
+
+def test_an_inverted_start_is_reported(cup: SolidMesh) -> None:
+    newton, state = newton_of(cup), State.at_rest(cup)
+    inside = np.setdiff1d(np.arange(len(cup.nodes)), cup.fixed)
+    state.position[inside[0]] = 0.0
+    report, _ = newton.solve(state, None, volume=None)
+    assert not report.converged
+    assert report.reason
+
+
+COORDINATE = st.floats(-0.02, 0.02)
+TURN = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+SHARE = st.floats(0.0, 1.0)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> Floats:
+    turn = np.array(draw(TURN))
+    place = [draw(COORDINATE) for _ in range(3)]
+    return np.array([*place, *turn / np.linalg.norm(turn)])
+
+
+def angle(a: Floats, b: Floats) -> float:
+    """Of the turn between two poses [rad]; exact for small ones too."""
+    first, second = a[3:], b[3:]
+    nearer = min(np.linalg.norm(first - second), np.linalg.norm(first + second))
+    return float(4.0 * np.arcsin(min(1.0, nearer / 2.0)))
+
+
+@given(a=poses(), b=poses(), share=SHARE)
+def test_between_poses_the_tip_goes_straight_and_turns_evenly(
+    a: Floats, b: Floats, share: float
+) -> None:
+    pose = interpolate_pose(a, b, share)
+    np.testing.assert_allclose(pose[:3], a[:3] + share * (b[:3] - a[:3]), atol=1e-17)
+    assert np.linalg.norm(pose[3:]) == pytest.approx(1.0, abs=1e-14)
+    whole = angle(a, b)
+    if whole < np.pi - 1e-3:  # at half a turn there is no shortest way
+        assert angle(a, pose) == pytest.approx(share * whole, abs=1e-6)
+        assert angle(pose, b) == pytest.approx((1 - share) * whole, abs=1e-6)
+
+
+@given(a=poses(), b=poses(), share=SHARE)
+def test_interpolation_begins_ends_reverses_and_knows_both_signs(
+    a: Floats, b: Floats, share: float
+) -> None:
+    assert angle(interpolate_pose(a, b, 0.0), a) < 1e-7
+    assert angle(interpolate_pose(a, b, 1.0), b) < 1e-7
+    np.testing.assert_array_equal(interpolate_pose(a, a, share)[:3], a[:3])
+    if angle(a, b) < np.pi - 1e-3:
+        there, back = interpolate_pose(a, b, share), interpolate_pose(b, a, 1.0 - share)
+        np.testing.assert_allclose(there[:3], back[:3], atol=1e-16)
+        assert angle(there, back) < 1e-6
+        other = np.concatenate([b[:3], -b[3:]])
+        turned = [rotation_matrix(interpolate_pose(a, end, share)[3:]) for end in (b, other)]
+        np.testing.assert_allclose(turned[0], turned[1], atol=1e-9)
+
+
+@given(corners=st.lists(st.tuples(*[COORDINATE] * 3), min_size=2, max_size=8))
+def test_lengths_of_a_path_add_up(corners: list[tuple[float, float, float]]) -> None:
+    path = np.array([[*corner, 1.0, 0.0, 0.0, 0.0] for corner in corners])
+    lengths = path_lengths(path)
+    assert lengths[0] == 0.0
+    for k in range(1, len(path)):
+        step = np.linalg.norm(path[k, :3] - path[k - 1, :3])
+        assert lengths[k] - lengths[k - 1] == pytest.approx(step, abs=1e-15)
