@@ -212,6 +212,6 @@ class Newton:
             dtype=np.float64,
         )
         more, _ = gmres(
-            operator, self.factor.solve(left_over), rtol=1e-2, atol=0.0, restart=8, maxiter=1
+            operator, self.factor.solve(left_over), rtol=1e-1, atol=0.0, restart=8, maxiter=1
         )
         return np.asarray(first + more)
