@@ -105,13 +105,6 @@ def test_solves_many_right_hand_sides_and_leaves_them_alone(factor: Factor, colu
         np.testing.assert_allclose(matrix @ answer, right, atol=1e-11)
 
 
-def test_takes_integers_for_numbers(factor: Factor) -> None:
-    matrix = indefinite(0)
-    factor.factorise(values_of(matrix, *pattern_of(matrix)))
-    right = np.arange(SIZE)
-    np.testing.assert_allclose(matrix @ factor.solve(right), right, atol=1e-9)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_numbers_that_are_none_are_refused_and_the_next_matrix_is_not(
     factor: Factor, bad: float

@@ -65,7 +65,9 @@ def calibrate(
     Args:
         simulator: Runs indentations; the sensor is not part of a run.
         measured: Trajectories, of one or several sensors. Friction shows only where the indenter
-            slips, so angled ones belong to them.
+            slips, so angled ones belong to them. Thickness and modulus replace one another until
+            the skin is pinched on the core: one press of the long cylinder with noise of 0.02 N
+            gives the thickness within 2.2 % up to 6 N, and within 0.13 % up to 12 N.
         settings: Bounds, weights, search; None = the paper's.
         executor: Runs simulations in parallel, e.g. a process pool; None = one after the other.
         on_evaluation: Told of every evaluation of the cost that took runs.

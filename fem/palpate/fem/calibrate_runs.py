@@ -48,7 +48,7 @@ class Simulated:
     @classmethod
     def of(cls, trajectory: Trajectory, *, thickness_m: float, fluid_volume_m3: float) -> Simulated:
         """From a solver's trajectory, whose steps begin at the second pose, and its finger."""
-        forces = np.concatenate([np.zeros((1, 3)), trajectory.forces])
+        forces = from_rest(trajectory.forces)
         return cls(
             forces,
             path_lengths(trajectory.path)[: len(forces)],
@@ -62,6 +62,11 @@ class Simulated:
     def curve(self) -> Curve:
         """Force against travel."""
         return along(self.travel, self.forces)
+
+
+def from_rest(force_n: Floats) -> Floats:
+    """Forces at a solver's steps, and none before them at the untouched first pose [N]."""
+    return np.concatenate([np.zeros((1, 3)), force_n])
 
 
 class Simulator(Protocol):

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from palpate.fem.align import Floats
-from palpate.fem.calibrate_runs import Simulated
+from palpate.fem.calibrate_runs import Simulated, from_rest
 from palpate.fem.measured import MEASURED, SIMULATED, Indentation, is_file_of, read_indentations
-from palpate.fem.result import Trajectory
+from palpate.fem.path import path_lengths
 from palpate.fem.store import SimulationStore
+from palpate.fem.store_content import TrajectorySummary
 from palpate.fem.store_hdf5 import SCHEMA as STORE_SCHEMA
 from palpate.protos.errors import DatasetError
 
@@ -42,8 +42,7 @@ def measured_from(path: Path) -> tuple[tuple[Indentation, ...], dict[str, str]]:
         pose, force = item.pose, item.force
         if not item.sensor and len(pose):
             # a solver's steps begin at the second pose; at the first it does not touch
-            pose = np.concatenate([store.trajectory(name).path[:1], pose])
-            force = np.concatenate([np.zeros((1, 3)), force])
+            pose, force = np.concatenate([item.path[:1], pose]), from_rest(force)
         try:
             found.append(
                 Indentation(
@@ -88,22 +87,25 @@ def simulated_from(
         name = next((name for name in names if name in there), None)
         if name is None:
             continue
-        trajectory = store.trajectory(name)
-        problem = _mismatch(trajectory, item)
+        summary = store.summary(name)
+        problem = _mismatch(summary, item)
         if problem:
             refused[item.name] = problem
             continue
-        run = Simulated.of(
-            trajectory,
-            thickness_m=tip.total_thickness_m,
-            fluid_volume_m3=tip.fluid_volume_m3,
+        force = from_rest(summary.force)
+        ahead = _direction(item.pose) @ (summary.path[0, :3] - item.pose[0, :3])
+        found[item.name] = Simulated(
+            force,
+            path_lengths(summary.path)[: len(force)] + ahead,
+            tip.total_thickness_m,
+            tip.fluid_volume_m3,
+            summary.outcome,
+            summary.reason,
         )
-        ahead = _direction(item.pose) @ (trajectory.path[0, :3] - item.pose[0, :3])
-        found[item.name] = replace(run, travel=run.travel + ahead)
     return found, refused
 
 
-def _mismatch(simulated: Trajectory, item: Indentation) -> str:
+def _mismatch(simulated: TrajectorySummary, item: Indentation) -> str:
     """Why a simulation is not of this trajectory; empty if it is."""
     if simulated.indenter != item.indenter:
         return f"simulated with {simulated.indenter}, measured with {item.indenter}"

@@ -21,8 +21,8 @@ from palpate.fem.verify.rigid import ball, pose
 
 Floats = NDArray[np.float64]
 
-INNER_M, OUTER_M, CORE_M, BALL_M = 3.0e-3, 4.5e-3, 2.5e-3, 2.0e-3
-FILLED = 1.12  # cavity over the unpressurised one
+INNER_M, OUTER_M, CORE_M, BALL_M = 3.0e-3, 4.5e-3, 2.95e-3, 2.0e-3
+FILLED = 1.06  # cavity over the unpressurised one
 ASIDE_M = (0.31e-3, 0.17e-3)  # of the indenter: no symmetry
 EDGE_M = 1.4e-3  # of the coarse BioTac
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from palpate.fem.indenter.distance import distance
 from palpate.fem.laws import Press
-from palpate.fem.mesh.core import DistanceGrid
 from palpate.fem.system import Balance
 from palpate.fem.verify.body import MU, Body
 from palpate.fem.verify.check import Case, Measured
+from palpate.fem.verify.finger import round_core
 from palpate.fem.verify.meshes import hollow_sphere, octant
 from palpate.fem.verify.rigid import ball, pose
 
@@ -29,20 +29,12 @@ TOLERANCE = 1e-6
 TURN = np.array([1.0, 0.1, 0.2, 0.0]) / np.linalg.norm([1.0, 0.1, 0.2, 0.0])
 
 
-@cache
-def _round_core() -> DistanceGrid:
-    spacing, half = 0.5e-3, 14
-    line = spacing * np.arange(-half, half + 1)
-    at = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
-    return DistanceGrid.sampled(at[0, 0, 0], spacing, np.linalg.norm(at, axis=-1) - CORE_M)
-
-
 def _shaken(*, wedges: bool = False, core: bool = False) -> tuple[Body, Floats]:
     """A body whose nodes are moved at random, none held, and a random direction (V, 3)."""
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=True) if wedges else hollow_sphere(
         8, INNER_M, OUTER_M, 1
     )  # fmt: skip
-    body = Body(mesh, bulk_ratio=1e2, core=_round_core() if core else None)
+    body = Body(mesh, bulk_ratio=1e2, core=round_core(CORE_M, 0.5e-3) if core else None)
     random = np.random.default_rng(5)
     body.state.position += random.normal(scale=3e-5, size=mesh.nodes.shape)
     _follow(body, None)

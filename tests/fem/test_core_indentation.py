@@ -1,0 +1,210 @@
+"""How a trajectory goes on and ends: steps, cut-backs, limits, and requests to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from palpate.fem.indenter.catalogue import make_indenter
+from palpate.fem.newton import Newton, NewtonSettings
+from palpate.fem.result import Outcome, Step, Trajectory
+from palpate.fem.solver import Fingertip, Settings
+from palpate.protos.errors import SimulationError
+
+Floats = NDArray[np.float64]
+Fill = Callable[..., Fingertip]
+
+BALL = make_indenter("sphere_medium")
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def press_path(tip: Fingertip, *depths_m: float, side_m: float = 0.0) -> Floats:
+    """From just below the pad to each depth."""
+    low = tip.nodes[:, 2].min()
+    return np.array(
+        [
+            [0.3e-3 + side_m * k / len(depths_m), 0.0, low + depth, *UPRIGHT]
+            for k, depth in enumerate((-2e-6, *depths_m))
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def path(finger: Fingertip) -> Floats:
+    return press_path(finger, 0.2e-3, 0.4e-3, 0.6e-3)
+
+
+@pytest.fixture(scope="module")
+def whole(finger: Fingertip, path: Floats) -> Trajectory:
+    """All of it."""
+    trajectory = finger.indent(BALL, path)
+    assert trajectory.outcome is Outcome.COMPLETE
+    return trajectory
+
+
+def assert_same_steps(found: tuple[Step, ...], wanted: tuple[Step, ...]) -> None:
+    for step, other in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(step.displacement, other.displacement)
+        np.testing.assert_array_equal(step.indenter_force, other.indenter_force)
+
+
+def test_a_start_within_the_skin_is_refused(finger: Fingertip) -> None:
+    path = press_path(finger, 0.4e-3)
+    path[0, 2] += 0.2e-3
+    with pytest.raises(SimulationError, match="inside the skin"):
+        finger.indent(BALL, path)
+
+
+def test_steps_are_told_as_they_come(finger: Fingertip, path: Floats, whole: Trajectory) -> None:
+    told: list[Step] = []
+    trajectory = finger.indent(BALL, path, on_step=told.append)
+    assert_same_steps(tuple(told), whole.steps)
+    assert all(step is other for step, other in zip(told, trajectory.steps, strict=True))
+
+
+def test_without_contact_nothing_happens(finger: Fingertip) -> None:
+    path = press_path(finger, -1e-3, -2e-3, side_m=1e-3)
+    trajectory = finger.indent(BALL, path)
+    assert trajectory.outcome is Outcome.COMPLETE
+    for step in trajectory.steps:
+        assert not step.force.any()
+        assert not step.torque.any()
+        assert not step.displacement.any()
+        assert step.contact_area_m2 == 0.0
+        assert np.isnan(step.centre_of_pressure).all()
+        assert step.fluid_pressure_pa == finger.fluid_pressure_pa
+        assert step.convergence.penetration_m == 0.0
+
+
+def test_pressing_leaves_the_fingertip_as_it_was(finger: Fingertip, path: Floats) -> None:
+    before = finger.state.copy()
+    finger.indent(BALL, path)
+    np.testing.assert_array_equal(finger.state.position, before.position)
+    assert finger.state.fluid_pressure == before.fluid_pressure
+    assert not finger.state.indenter_pressure.any()
+
+
+def test_a_smooth_press_and_return_undoes_itself(fill: Fill) -> None:
+    """Without friction a state depends on the pose alone, not on the way or its increments."""
+    smooth = fill(friction_coefficient=0.0)
+    path = press_path(smooth, 0.3e-3, 0.6e-3, 0.3e-3, -2e-6)
+    steps = smooth.indent(BALL, path).steps
+    assert steps[1].force[2] > 0.3
+    np.testing.assert_allclose(steps[2].force, steps[0].force, atol=1e-6)
+    np.testing.assert_allclose(steps[3].displacement, 0.0, atol=1e-9)
+    at_once = smooth.indent(BALL, path[[0, 2]]).steps[0]
+    np.testing.assert_allclose(at_once.force, steps[1].force, atol=1e-6)
+    np.testing.assert_allclose(at_once.displacement, steps[1].displacement, atol=1e-8)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_the_skin_is_dragged_with_the_indenter(finger: Fingertip, sense: float) -> None:
+    """Along its way, and round with its turn; never by more than friction can."""
+    down, dragged, turned = (press_path(finger, 0.6e-3, 0.6e-3) for _ in range(3))
+    dragged[2, 0] += sense * 0.3e-3
+    half = np.deg2rad(15.0) * sense
+    turned[2, 3:] = (np.cos(half), 0.0, 0.0, np.sin(half))
+    still, along, round_it = (finger.indent(BALL, p).steps[-1] for p in (down, dragged, turned))
+    assert still.force[2] > 0.3
+    share = (along.force[0] - still.force[0]) * sense / along.force[2]
+    assert 0.05 < share < 1.0
+    middle = np.array([0.3e-3, 0.0, 0.0])
+    twist = (round_it.torque - np.cross(middle, round_it.force))[2] * sense
+    assert 0.0 < twist < 0.186 * round_it.force[2] * 1.5e-3
+    assert round_it.force[2] == pytest.approx(still.force[2], rel=0.02)
+
+
+def test_a_force_limit_ends_it_with_the_step_that_passed_it(
+    finger: Fingertip, path: Floats, whole: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forces = np.linalg.norm(whole.forces, axis=1)
+    limit = Settings(force_limit_n=float(forces[1] * 0.9))
+    monkeypatch.setattr(finger, "settings", limit)
+    trajectory = finger.indent(BALL, path)
+    assert trajectory.outcome is Outcome.FORCE_LIMIT
+    assert_same_steps(trajectory.steps, whole.steps[:2])
+    assert trajectory.travel_m == pytest.approx(0.402e-3, rel=1e-9)
+    assert trajectory.reason == f"{forces[1]:.1f} N, 0.402 mm along the path"
+
+
+@pytest.fixture(scope="module")
+def hasty(fill: Fill) -> Fingertip:
+    """Gives up soon."""
+    return fill(Settings(newton=NewtonSettings(iterations=8), smallest_increment=0.6))
+
+
+def test_what_cannot_be_solved_is_reported_with_what_could(hasty: Fingertip) -> None:
+    """Three millimetres at once, onto the core."""
+    path = press_path(hasty, 0.2e-3, 0.4e-3, 3.4e-3, 3.5e-3)
+    trajectory = hasty.indent(BALL, path)
+    assert trajectory.outcome is Outcome.DIVERGED
+    assert_same_steps(trajectory.steps, hasty.indent(BALL, path[:3]).steps)
+    assert len(trajectory.steps) == 2
+    assert trajectory.travel_m == pytest.approx(0.402e-3, rel=1e-9)
+    assert trajectory.reason.endswith(", 0.402 mm along the path")
+    assert len(trajectory.reason) > len(", 0.402 mm along the path")
+    # and it can be used again
+    assert hasty.indent(BALL, path[:3]).outcome is Outcome.COMPLETE
+
+
+def test_a_step_is_cut_until_it_goes(finger: Fingertip, hasty: Fingertip) -> None:
+    path = press_path(finger, 1.4e-3)
+    hasty_settings = replace(hasty.settings, smallest_increment=1 / 64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hasty, "settings", hasty_settings)
+        patch.setattr(hasty.newton, "settings", NewtonSettings(iterations=5))
+        cut = hasty.indent(BALL, path)
+    assert cut.outcome is Outcome.COMPLETE
+    assert cut.steps[0].convergence.increments > 1
+    wanted = finger.indent(BALL, path).steps[0].force[2]
+    assert cut.steps[0].force[2] == pytest.approx(wanted, rel=0.05)  # friction knows the way
+
+
+@pytest.mark.parametrize("outcome", [Outcome.CANCELLED, Outcome.DEADLINE])
+@pytest.mark.parametrize("patience", [1, 2, 4, 9])
+def test_a_request_to_stop_is_honoured_within_an_iteration(
+    finger: Fingertip,
+    path: Floats,
+    whole: Trajectory,
+    monkeypatch: pytest.MonkeyPatch,
+    outcome: Outcome,
+    patience: int,
+) -> None:
+    asked = iterations = 0
+    step = Newton._step
+
+    def should_stop() -> Outcome | None:
+        nonlocal asked
+        asked += 1
+        return outcome if asked == patience else None
+
+    def count(*args: object) -> object:
+        nonlocal iterations
+        iterations += 1
+        assert asked < patience, "goes on after it was told to stop"
+        return step(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Newton, "_step", count)
+    trajectory = finger.indent(BALL, path, should_stop=should_stop)
+    assert asked == patience
+    assert trajectory.outcome is outcome
+    assert iterations < patience
+    assert_same_steps(trajectory.steps, whole.steps[: len(trajectory.steps)])
+    assert len(trajectory.steps) < len(whole.steps)
+
+
+def test_a_request_to_stop_is_honoured_before_the_skin_is_touched(finger: Fingertip) -> None:
+    """Where no increment needs an iteration."""
+    path = press_path(finger, *[-2e-6 - 1e-5 * k for k in range(20)])
+    told: list[Step] = []
+
+    def should_stop() -> Outcome | None:
+        return Outcome.CANCELLED if len(told) == 3 else None
+
+    trajectory = finger.indent(BALL, path, on_step=told.append, should_stop=should_stop)
+    assert trajectory.outcome is Outcome.CANCELLED
+    assert len(trajectory.steps) == 3

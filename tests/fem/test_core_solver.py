@@ -1,0 +1,297 @@
+"""A small finger, filled and pressed: balance, constraints, symmetry, repetition, outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from palpate.fem.config import FingertipParameters
+from palpate.fem.element import elements
+from palpate.fem.fluid import cavity
+from palpate.fem.indentation import Indentation
+from palpate.fem.indenter.catalogue import make_indenter
+from palpate.fem.indenter.distance import signed_distance
+from palpate.fem.linear import make_factor
+from palpate.fem.material import NeoHooke
+from palpate.fem.mesh.core import Core
+from palpate.fem.mesh.geometry import Geometry
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.newton import NewtonSettings
+from palpate.fem.result import Outcome, Step, Trajectory
+from palpate.fem.solver import Fingertip, Settings
+from palpate.protos.errors import SimulationError
+
+Floats = NDArray[np.float64]
+Fill = Callable[..., Fingertip]
+
+BALL = make_indenter("sphere_medium")
+FRICTION = FingertipParameters().friction_coefficient
+STEPS = 5
+BALANCE = 1e-6  # of the force: Newton's tolerance
+COULOMB = 1e-3  # of the limit: a tenth of a micrometre on a sticking point's spring, and some luck
+ACROSS = np.array([1.0, -1.0, 1.0])
+
+
+def press_path(
+    tip: Fingertip, depth_m: float, *, steps: int = STEPS, side_m: float = 0.0, y_m: float = 0.0
+) -> Floats:
+    """Up into the pad, beside its middle; ``side_m`` farther along x at its end."""
+    low = tip.nodes[:, 2].min() - 2e-6
+    share = np.linspace(0.0, 1.0, steps + 1)[:, None]
+    start, way = np.array([[0.3e-3, y_m, low]]), np.array([[side_m, 0.0, depth_m]])
+    return np.hstack([start + share * way, np.tile([1.0, 0.0, 0.0, 0.0], (steps + 1, 1))])
+
+
+@dataclass
+class Pressed:
+    """A finished trajectory and the state that it ended in."""
+
+    tip: Fingertip
+    run: Indentation
+    trajectory: Trajectory
+
+    @property
+    def last(self) -> Step:
+        return self.trajectory.steps[-1]
+
+    @property
+    def position(self) -> Floats:
+        return self.run.state.position
+
+
+@pytest.fixture(scope="module")
+def pressed(finger: Fingertip) -> Pressed:
+    """Pressed to the core and dragged, with friction."""
+    run = Indentation(finger, BALL, press_path(finger, 1.5e-3, side_m=0.2e-3), None, None)
+    return Pressed(finger, run, run.run())
+
+
+def test_fill_makes_the_volume_and_reports_its_progress(
+    finger: Fingertip, shell: Callable[..., SolidMesh], ball: Callable[..., Core]
+) -> None:
+    mesh = finger.geometry.mesh
+    volume = cavity(mesh.inner_faces, finger.nodes).volume.sum()
+    assert volume - finger.core_volume == pytest.approx(61e-9, rel=1e-5)
+    assert finger.fluid_volume_m3 == pytest.approx(61e-9, rel=1e-12)
+    assert 1e4 < finger.fluid_pressure_pa < 2e5
+    np.testing.assert_array_equal(finger.nodes[mesh.fixed], mesh.nodes[mesh.fixed])
+
+    large = shell(4, 1, 5.5e-3, 7.07e-3)
+    large = replace(large, fixed=np.flatnonzero(large.nodes[:, 2] > 0.5e-3).astype(np.int32))
+    geometry, fractions = Geometry(large, ball(3e-3)), list[float]()
+    wanted = FingertipParameters(total_thickness_m=14.6e-3)
+    tip = Fingertip.pressurised(geometry, wanted, progress=fractions.append)
+    assert tip.total_thickness_m == pytest.approx(14.6e-3, abs=1e-8)
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    with pytest.raises(SimulationError, match=r"14\.14 mm thick already"):
+        Fingertip.pressurised(geometry, replace(wanted, total_thickness_m=14.0e-3))
+
+
+@pytest.fixture(scope="module")
+def exact(fill: Fill) -> Pressed:
+    """The same, solved until rounding rules."""
+    newton = NewtonSettings(tolerance=1e-9, gap_tolerance_m=1e-15, iterations=40)
+    tip = fill(Settings(newton=newton))
+    path = press_path(tip, 1.5e-3, side_m=0.2e-3)
+    run = Indentation(tip, BALL, path, None, None)
+    return Pressed(tip, run, run.run())
+
+
+def test_every_step_comes_in_order(pressed: Pressed) -> None:
+    trajectory = pressed.trajectory
+    assert (trajectory.outcome, trajectory.reason) == (Outcome.COMPLETE, "")
+    assert trajectory.indenter == BALL.name
+    np.testing.assert_array_equal([s.pose for s in trajectory.steps], trajectory.path[1:])
+    length = np.linalg.norm(trajectory.path[-1, :3] - trajectory.path[0, :3])
+    assert trajectory.travel_m == pytest.approx(length, rel=1e-9)
+    assert (np.diff(trajectory.forces[:, 2]) > 0.0).all()
+    assert (np.diff([s.fluid_pressure_pa for s in trajectory.steps]) > 0.0).all()
+
+
+def test_all_forces_and_moments_on_the_skin_cancel(pressed: Pressed) -> None:
+    """Indenter, core and supports, whose reactions the twins give."""
+    mesh, state, last = pressed.tip.geometry.mesh, pressed.run.state, pressed.last
+    mu, ratio = pressed.tip.parameters.shear_modulus_pa, pressed.tip.parameters.bulk_ratio
+    skin = elements(mesh, NeoHooke(mu), ratio * mu, state.position, state.pressure)
+    fluid = state.fluid_pressure * cavity(mesh.inner_faces, state.position).gradient
+    left = skin.force - fluid - last.indenter_force - last.core_force
+    support = np.zeros_like(left)
+    support[mesh.fixed] = left[mesh.fixed]
+    size = np.linalg.norm(last.force)
+    assert size > 1.0
+    assert np.linalg.norm(last.core_force.sum(axis=0)) > 0.1
+    net = (last.indenter_force + last.core_force + support).sum(axis=0)
+    assert np.linalg.norm(net) < BALANCE * size
+    moment = np.cross(state.position, last.indenter_force + last.core_force + support)
+    assert np.linalg.norm(moment.sum(axis=0)) < BALANCE * size * 5e-3
+    assert np.abs(left - support).max() < BALANCE * size
+
+
+def test_the_fluid_keeps_its_volume(pressed: Pressed) -> None:
+    tip, mesh = pressed.tip, pressed.tip.geometry.mesh
+    for step in pressed.trajectory.steps:
+        volume = cavity(mesh.inner_faces, tip.nodes + step.displacement).volume.sum()
+        assert volume - tip.core_volume == pytest.approx(tip.fluid_volume_m3, rel=1e-5)
+        assert abs(volume - tip.cavity) <= 1e-6 * tip.cavity
+        assert step.convergence.volume_error <= 1e-6
+
+
+def test_the_skin_keeps_its_volume_in_every_element(pressed: Pressed) -> None:
+    mesh, state = pressed.tip.geometry.mesh, pressed.run.state
+    mu, ratio = pressed.tip.parameters.shear_modulus_pa, pressed.tip.parameters.bulk_ratio
+    skin = elements(mesh, NeoHooke(mu), ratio * mu, state.position, state.pressure)
+    assert skin.smallest_jacobian > 0.5
+    strain = skin.volume / skin.rest_volume - 1.0
+    assert np.abs(strain - state.pressure / (ratio * mu)).max() < 1e-6
+    assert np.abs(strain).max() < 1e-3
+
+
+def test_nothing_is_deeper_than_micrometres(pressed: Pressed) -> None:
+    tip, mesh = pressed.tip, pressed.tip.geometry.mesh
+    for step in pressed.trajectory.steps:
+        position = tip.nodes + step.displacement
+        outside = signed_distance(BALL, position[mesh.outer_nodes] - step.pose[:3])
+        inside = tip.geometry.core.grid.evaluate(position[mesh.inner_nodes])[0]
+        deepest = max(-outside.min(), -inside.min())
+        assert 0.0 < deepest < 5e-6
+        assert step.convergence.penetration_m == pytest.approx(deepest, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("which", "tolerance"), [("pressed", COULOMB), ("exact", 1e-9)], ids=["usual", "exact"]
+)
+def test_friction_obeys_coulomb_at_every_point(
+    request: pytest.FixtureRequest, which: str, tolerance: float
+) -> None:
+    pressed: Pressed = request.getfixturevalue(which)
+    assert pressed.trajectory.outcome is Outcome.COMPLETE
+    state, surface = pressed.run.state, pressed.tip.system.outer
+    traction = np.linalg.norm(state.traction, axis=2)
+    limit = FRICTION * state.indenter_pressure
+    status = surface.status.numpy()
+    assert {2, 3} <= set(status.ravel())
+    assert (state.indenter_pressure >= 0.0).all()
+    assert (traction <= limit * (1 + tolerance)).all()
+    sliding = status == 3
+    np.testing.assert_allclose(traction[sliding], limit[sliding], rtol=tolerance)
+    points = pressed.position[pressed.tip.geometry.mesh.outer_faces]
+    away = points - pressed.run.press.tip - (0.0, 0.0, -3.5e-3)
+    normal = away / np.linalg.norm(away, axis=2, keepdims=True)
+    across = np.abs((normal * state.traction).sum(axis=2))
+    assert across.max() < tolerance * traction.max()
+
+
+def test_nodal_forces_are_those_of_pressure_and_friction(pressed: Pressed) -> None:
+    """Normals point out of the ball; friction drags the skin along with it."""
+    state, surface, last = pressed.run.state, pressed.tip.system.outer, pressed.last
+    faces = pressed.tip.geometry.mesh.outer_faces
+    away = pressed.position[faces] - pressed.run.press.tip - (0.0, 0.0, -3.5e-3)
+    normal = away / np.linalg.norm(away, axis=2, keepdims=True)
+    load = state.indenter_pressure[..., None] * normal - state.traction
+    force = np.zeros_like(state.position)
+    np.add.at(force, faces, surface.area_values[..., None] * load)
+    np.testing.assert_allclose(last.indenter_force, force, atol=1e-9 * last.force[2])
+    dragged = -(surface.area_values[..., None] * state.traction).sum(axis=(0, 1))
+    assert dragged[0] > 0.01 * last.force[2]
+
+
+def test_step_outputs_agree_with_one_another(pressed: Pressed) -> None:
+    tip, mesh = pressed.tip, pressed.tip.geometry.mesh
+    whole = tip.system.outer.current_area(tip.nodes).sum()
+    areas = []
+    for step in pressed.trajectory.steps:
+        np.testing.assert_allclose(step.force, step.indenter_force.sum(axis=0), atol=1e-15)
+        position = tip.nodes + step.displacement
+        moment = np.cross(position, step.indenter_force).sum(axis=0)
+        np.testing.assert_allclose(step.torque, moment, atol=1e-15)
+        touched = np.flatnonzero(np.linalg.norm(step.indenter_force, axis=1) > 0.0)
+        assert np.isin(touched, mesh.outer_nodes).all()
+        assert np.isin(np.flatnonzero(step.core_force.any(axis=1)), mesh.inner_nodes).all()
+        low, high = position[touched].min(axis=0), position[touched].max(axis=0)
+        assert (low <= step.centre_of_pressure).all()
+        assert (step.centre_of_pressure <= high).all()
+        areas.append(step.contact_area_m2)
+        assert step.convergence.residual <= 1e-6
+        assert step.convergence.iterations > 0
+        assert step.convergence.increments > 0
+    assert 0.0 < areas[0] < areas[-1] < whole / 4
+    assert areas == sorted(areas)
+
+
+def test_stress_carries_the_loads(pressed: Pressed) -> None:
+    """The integral of the stress is the sum of position times nodal force; so it is symmetric."""
+    mesh, state = pressed.tip.geometry.mesh, pressed.run.state
+    mu, ratio = pressed.tip.parameters.shear_modulus_pa, pressed.tip.parameters.bulk_ratio
+    skin = elements(mesh, NeoHooke(mu), ratio * mu, state.position, state.pressure)
+    wanted = state.position.T @ skin.force
+    xx, yy, zz, yz, xz, xy = (pressed.last.stress * skin.volume[:, None]).sum(axis=0)
+    found = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
+
+
+def test_the_same_press_gives_the_same_bits(
+    pressed: Pressed, finger: Fingertip, fill: Fill
+) -> None:
+    """On the same finger after other presses, and on a new one."""
+    path = pressed.trajectory.path
+    for tip in (finger, fill()):
+        again = tip.indent(BALL, path)
+        assert len(again.steps) == len(pressed.trajectory.steps)
+        for step, other in zip(again.steps, pressed.trajectory.steps, strict=True):
+            np.testing.assert_array_equal(step.displacement, other.displacement)
+            np.testing.assert_array_equal(step.indenter_force, other.indenter_force)
+            np.testing.assert_array_equal(step.core_force, other.core_force)
+            np.testing.assert_array_equal(step.stress, other.stress)
+            assert step.fluid_pressure_pa == other.fluid_pressure_pa
+
+
+def test_a_mirrored_press_gives_the_mirror_image(finger: Fingertip) -> None:
+    mirror = finger.geometry.mesh.mirror
+    left, right = (
+        finger.indent(BALL, press_path(finger, 0.8e-3, steps=3, y_m=y)).steps
+        for y in (0.4e-3, -0.4e-3)
+    )
+    for step, other in zip(left, right, strict=True):
+        assert abs(step.force[1]) > 1e-4
+        np.testing.assert_allclose(other.force, ACROSS * step.force, atol=2e-6)
+        image = ACROSS * step.displacement[mirror]
+        np.testing.assert_allclose(other.displacement, image, atol=5e-9)
+        np.testing.assert_allclose(other.torque, -ACROSS * step.torque, atol=2e-8)
+
+
+def test_a_press_in_the_plane_of_symmetry_stays_in_it(pressed: Pressed) -> None:
+    for step in pressed.trajectory.steps:
+        assert abs(step.force[1]) < 1e-9
+        assert np.abs(step.torque[[0, 2]]).max() < 1e-12
+
+
+def test_forces_scale_with_the_modulus_and_the_shape_does_not_change(
+    finger: Fingertip, fill: Fill
+) -> None:
+    """So calibration never needs to simulate again for another modulus."""
+    path = press_path(finger, 0.8e-3, steps=2)
+    hard = fill(shear_modulus_pa=2.0 * FingertipParameters().shear_modulus_pa)
+    assert hard.fluid_pressure_pa == pytest.approx(2.0 * finger.fluid_pressure_pa, rel=1e-12)
+    once, twice = finger.indent(BALL, path).steps, hard.indent(BALL, path).steps
+    for step, other in zip(once, twice, strict=True):
+        np.testing.assert_allclose(other.displacement, step.displacement, atol=1e-15)
+        np.testing.assert_allclose(other.indenter_force, 2 * step.indenter_force, atol=1e-12)
+        np.testing.assert_allclose(other.core_force, 2 * step.core_force, atol=1e-12)
+        np.testing.assert_allclose(other.stress, 2 * step.stress, rtol=1e-9, atol=1e-6)
+
+
+def test_superlu_gives_the_same_forces(finger: Fingertip, fill: Fill) -> None:
+    pattern = finger.system.pattern
+    if make_factor(pattern.indptr, pattern.indices).name == "superlu":
+        pytest.skip("there is nothing to compare it with")
+    other = fill(Settings(solver="superlu"))
+    assert (finger.newton.factor.name, other.newton.factor.name) == ("pardiso", "superlu")
+    path = press_path(finger, 0.8e-3, steps=2)
+    first, second = finger.indent(BALL, path), other.indent(BALL, path)
+    np.testing.assert_allclose(second.forces, first.forces, atol=1e-8)
+    np.testing.assert_allclose(other.nodes, finger.nodes, atol=1e-14)
