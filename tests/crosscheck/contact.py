@@ -11,9 +11,9 @@ Load path: in press_steps equal steps the sphere goes down by 0.6 mm, then in sh
 Output: after every step, net force of the sphere *on the block* [N], shape (K, 3): z negative
     (pressed down), x positive in the second part (dragged along).
 
-The steps matter a little: slip is measured over a step, so the first touch of a point counts with
-the slip of that whole step. Press force at friction 0.186 falls as 1 / press_steps, by 0.6 % from 6
-steps to many. Two codes are compared at the same steps.
+The steps matter a little (0.1 % of the press force from 6 to 12): slip is measured over a step, so
+the first touch of a point counts with the slip of that whole step. Codes are compared at the same
+steps.
 """
 
 from __future__ import annotations

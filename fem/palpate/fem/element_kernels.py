@@ -53,7 +53,7 @@ def element_state(
         w = weight[e, q]
         volume += w * j
         inverse_t = wp.transpose(wp.inverse(f))
-        scale = w * mu * wp.pow(wp.abs(j), wp.float64(-2.0 / 3.0))
+        scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
         i1 = wp.ddot(f, f)
         # w P = scale (F - I1/3 F^-T) + w p J F^-T
         stress = scale * f + (w * pressure * j - scale * i1 / wp.float64(3.0)) * inverse_t
@@ -97,13 +97,13 @@ def point_state(
         j = wp.determinant(f)
         w = weight[e, q]
         inverse_t = wp.transpose(wp.inverse(f))
-        c = w * mu * wp.pow(wp.abs(j), wp.float64(-2.0 / 3.0))
+        c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
         ci1 = c * wp.ddot(f, f)
         wpj = w * pressure * j
-        along = ci1 * wp.float64(2.0 / 9.0) + wpj
+        along = ci1 * wp.float64(2.0) / wp.float64(9.0) + wpj
         for a in range(n):
             g = inverse_t * gradient[e, q, a]
-            left = (wp.float64(-2.0 / 3.0) * c) * (f * gradient[e, q, a])
+            left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[e, q, a])
             spatial_out[e, q, a] = g
             left_out[e, q, a] = left
             right_out[e, q, a] = left + along * g

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.indenter.shape import Indenter
 from palpate.fem.laws import Press
-from palpate.fem.newton import Report
+from palpate.fem.newton import FORCE_FLOOR_N, Report
 from palpate.fem.outputs import make_step
 from palpate.fem.path import interpolate_pose, path_lengths
 from palpate.fem.result import Convergence, Outcome, Step, Trajectory
@@ -81,6 +81,8 @@ class Indentation:
         for k in range(1, len(self.path)):
             work, done = _Work(), 0.0
             while done < 1.0 - 1e-9 and self.outcome is None:
+                if self._stop():
+                    break
                 size = min(size, 1.0 - done)
                 goal = done + size
                 if 1.0 - goal < 1e-6:
@@ -188,7 +190,7 @@ def _cost(work: _Work, report: Report, balance: Balance, tip: Fingertip) -> Conv
         increments=work.increments,
         iterations=work.iterations,
         factorisations=work.factorisations,
-        residual=report.residuals[-1],
+        residual=float(np.linalg.norm(balance.unbalanced)) / max(balance.scale, FORCE_FLOOR_N),
         volume_error=abs(balance.volume - tip.cavity) / tip.cavity,
         penetration_m=max(0.0, -float(outer.gap.min()), -float(inner.gap.min())),
         seconds=time.perf_counter() - work.started,

@@ -22,6 +22,10 @@ DAMP_FROM = 6
 """Iterations after which an error that does not fall is taken for a cycle."""
 
 
+FORCE_FLOOR_N = 1e-6
+"""Scale of force where nothing presses [N]: rounding alone is far below."""
+
+
 @dataclass(frozen=True, slots=True)
 class NewtonSettings:
     """When to stop, and how far to go.
@@ -97,11 +101,12 @@ class Newton:
             if not self.fresh:
                 if not prepared:
                     balance = system.balance(state, press, tangent=True)
-                self.factor.factorise(system.tangent_values())
                 self._border = None
-                report.factorisations += 1
-                self.fresh = True
             try:
+                if not self.fresh:
+                    self.factor.factorise(system.tangent_values())
+                    report.factorisations += 1
+                    self.fresh = True
                 balance = self._step(state, press, balance, volume, self._damping(report))
             except SimulationError as failure:
                 report.reason = failure.problem
@@ -129,7 +134,7 @@ class Newton:
 
     def _error(self, balance: Balance, volume: float | None) -> float:
         """Largest of the relative errors, each over its tolerance's size."""
-        error = float(np.linalg.norm(balance.unbalanced)) / max(balance.scale, 1e-12)
+        error = float(np.linalg.norm(balance.unbalanced)) / max(balance.scale, FORCE_FLOOR_N)
         if volume is not None:
             error = max(error, abs(balance.volume - volume) / volume)
         # A micrometre of gap counts as much as a hundredth of the force.
@@ -138,7 +143,7 @@ class Newton:
     def _converged(self, balance: Balance, volume: float | None) -> bool:
         settings = self.settings
         force = float(np.linalg.norm(balance.unbalanced))
-        if force > settings.tolerance * max(balance.scale, 1e-12):
+        if force > settings.tolerance * max(balance.scale, FORCE_FLOOR_N):
             return False
         if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
             return False

@@ -37,7 +37,7 @@ class Settings:
 
     Attributes:
         newton: Tolerances of one increment.
-        contact: Constants of the contact laws for a modulus of ``REFERENCE_MODULUS_PA``; a fingertip
+        contact: Constants of the contact laws for a modulus of ``REFERENCE_MODULUS_PA``. A fingertip
             scales them with its own, so that forces scale exactly with the modulus.
         force_limit_n: A trajectory ends where the indenter's force exceeds this [N]; the paper saw
             23-32 N at most.
@@ -142,7 +142,7 @@ class Fingertip:
             )
         begin = low[1]
         slope = 0.35 / area  # of thickness by volume; measured on the BioTac: 1.45 mm in 474 mm^3
-        previous = low
+        previous, reached = low, 0.0
         for _ in range(40):
             missing = wanted - self.total_thickness_m
             if abs(missing) < THICKNESS_TOLERANCE_M:
@@ -157,7 +157,8 @@ class Fingertip:
             previous = now
             if slope <= 0.0:
                 break
-            progress(min(1.0, max(0.0, (now[1] - begin) / (wanted - begin))))
+            reached = max(reached, min(0.99, (now[1] - begin) / max(wanted - begin, 1e-12)))
+            progress(reached)  # never backwards, though the secant may overshoot
         raise SimulationError(
             f"the skin does not get {wanted * 1e3:.2f} mm thick by filling; it reached "
             f"{self.total_thickness_m * 1e3:.2f} mm",

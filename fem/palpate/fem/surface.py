@@ -18,7 +18,8 @@ class Surface:
 
     def __init__(self, nodes: Floats, faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> None:
         self.count = len(faces)
-        corners = faces.shape[1] if self.count else 3
+        corners = faces.shape[1] if faces.ndim == 2 else 3
+        self.points = corners
         element = corner_element(corners)
         self.shape_values = element.shape
         edges = np.einsum("qad,fai->fqdi", element.gradient, nodes[faces.reshape(-1, corners)])

@@ -87,6 +87,7 @@ class System:
             held = np.zeros(mesh.nodes.shape, bool)
             held[mesh.fixed] = True
         self.pattern = make_pattern(held, mesh.elements, mesh.outer_faces, mesh.inner_faces)
+        self._held = np.flatnonzero(held)
         self.load = np.zeros(mesh.nodes.shape)  # dead nodal forces [N]; tests set them
         self.skin = Skin(
             mesh,
@@ -144,7 +145,7 @@ class System:
         self.skin.freeze()
         for surface in (self.outer, self.inner):
             surface.freeze()
-        rest = self.outer.rest.numpy().reshape(self.outer.count, -1)
+        rest = self.outer.rest.numpy().reshape(self.outer.count, 9 * self.outer.points)
         sliding = np.flatnonzero(np.any(rest != 0.0, axis=1)).astype(np.int32)
         self._sliding = wp.array(sliding, dtype=wp.int32, device=DEVICE)
         return self._blocks[0].reshape(-1)[self.pattern.gather]
@@ -341,6 +342,7 @@ class System:
                 + np.linalg.norm(indenter.reshape(-1)[free])
                 + np.linalg.norm(core.reshape(-1)[free])
                 + np.linalg.norm(self.load)
+                + np.linalg.norm(internal.reshape(-1)[self._held])
             ),
             strain_error=self.skin.strain_error(state.pressure),
             gap_error_m=max(

@@ -119,9 +119,7 @@ def mirror_force() -> Measured:
     return Measured(_pressed_in_the_middle()[1])
 
 
-def _answer(
-    scale: float, mu: float, stiffness: float
-) -> tuple[Floats, Floats]:
+def _answer(scale: float, mu: float, stiffness: float) -> tuple[Floats, Floats]:
     """Displacements over scale, and forces and pressures: of indenter, core, fluid."""
     finger = round_finger(friction=FRICTION, scale=scale, mu=mu, stiffness=stiffness)
     start = finger.body.state.position.copy()
@@ -138,7 +136,7 @@ def scaling(scale: float, modulus: float, stiffness: float) -> Measured:
     """Largest relative deviation of displacements and of forces from those of the original.
 
     Forces go with modulus and with the square of lengths; contact's constants, which are pressures
-    per length, go along or not.
+    per length, go along.
     """
     moved, force = _answer(1.0, MU, 1.0)
     other, other_force = _answer(scale, modulus * MU, stiffness)
@@ -167,6 +165,5 @@ CHECKS = (
     Case("symmetry/force across", mirror_force, 1e-10),
     Case("scaling/modulus x 3", partial(scaling, 1.0, 3.0, 3.0), 1e-8),
     Case("scaling/lengths x 1.7", partial(scaling, 1.7, 1.0, 1 / 1.7), 1e-8),
-    Case("scaling/modulus x 3, contact as it is", partial(scaling, 1.0, 3.0, 1.0), 1e-2),
     Case("newton/order in contact", newton_in_contact, 0.1, at_least=True),
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,20 +63,17 @@ class Body:
         self.system = System(
             mesh, core, shear_modulus_pa=mu, bulk_ratio=bulk_ratio, contact=self.contact, held=held
         )
-        pattern = self.system.pattern
-        self.newton = Newton(self.system, make_factor(pattern.indptr, pattern.indices), settings)
+        self.settings = settings
         self.held = np.ones(mesh.nodes.shape, bool)
-        self.held.reshape(-1)[pattern.free] = False
+        self.held.reshape(-1)[self.system.pattern.free] = False
         self.state = State.at_rest(mesh)
         self.report = Report()
 
-    def scale_by(self, force: float) -> None:
-        """Measure residuals against a force [N], where reactions are the only ones.
-
-        The solver's scale leaves out what held nodes carry; a dead load on one of them counts for
-        the scale and for nothing else.
-        """
-        self.system.load[np.unravel_index(int(self.held.argmax()), self.held.shape)] = force
+    @cached_property
+    def newton(self) -> Newton:
+        """Made when first needed: half of the bodies are only looked at."""
+        pattern = self.system.pattern
+        return Newton(self.system, make_factor(pattern.indptr, pattern.indices), self.settings)
 
     def solve(self, press: Press | None = None, *, volume: float | None = None) -> Balance:
         """Equilibrium from where it is; then anchors follow what slid.
@@ -100,7 +99,7 @@ class Body:
     def contact_points(self) -> Floats:
         """Where the outer surface's contact points are [m], (F, Q, 3)."""
         corners = self.state.position[self.mesh.outer_faces]
-        return np.einsum("qa,fai->fqi", self.system.outer.shape_values, corners)
+        return np.asarray(np.einsum("qa,fai->fqi", self.system.outer.shape_values, corners))
 
     def reactions(self, balance: Balance) -> Floats:
         """Forces of the supports on held components [N], 0 elsewhere, (V, 3)."""

@@ -80,6 +80,9 @@ class Case:
             measured, skipped = Measured(math.nan, math.nan, f"skipped: {reason}"), True
         except PalpateError as error:
             measured = Measured(math.nan, math.nan, error.problem)
+        note = (
+            ", ".join(filter(None, ("at least", measured.note))) if self.at_least else measured.note
+        )
         return Check(
             name=self.name,
             value=float(measured.value),
@@ -88,7 +91,7 @@ class Case:
             unit=self.unit,
             passed=skipped or self._holds(measured),
             seconds=time.perf_counter() - started,
-            note=measured.note,
+            note=note,
             skipped=skipped,
         )
 

@@ -34,7 +34,6 @@ def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measure
     held[end[:, 1], 1] = wide or plane
     goal = mesh.nodes * [stretch, stretch if wide else 1.0, 1.0]
     body = Body(mesh, held=held, bulk_ratio=1e9)
-    body.scale_by(MU * 1e-6)
     for share in np.linspace(0.2, 1.0, 5):
         at = mesh.nodes + share * (goal - mesh.nodes)
         body.state.position[held] = at[held]
@@ -45,16 +44,16 @@ def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measure
 
 
 def thick_sphere(stretch: float, ratio: float) -> float:
-    """p / mu of an incompressible neo-Hookean sphere, by the stretch of its inner radius.
+    """Inflation of an incompressible neo-Hookean sphere by the stretch of its inner radius.
 
-    (2/lb + 1/(2 lb^4)) - (2/la + 1/(2 la^4)) with lb^3 = 1 + (la^3 - 1) / ratio^3.
+    p / mu = (2/lb + 1/(2 lb^4)) - (2/la + 1/(2 la^4)) with lb^3 = 1 + (la^3 - 1) / ratio^3.
     """
     outer = (1 + (stretch**3 - 1) / ratio**3) ** (1 / 3)
-    return (2 / outer + 0.5 / outer**4) - (2 / stretch + 0.5 / stretch**4)
+    return float((2 / outer + 0.5 / outer**4) - (2 / stretch + 0.5 / stretch**4))
 
 
 def thick_tube(stretch: float, ratio: float) -> float:
-    """p / mu of the same as a tube in plane strain: ln(la/lb) + (1/lb^2 - 1/la^2) / 2."""
+    """The same as a tube in plane strain: p / mu = ln(la/lb) + (1/lb^2 - 1/la^2) / 2."""
     outer = (1 + (stretch**2 - 1) / ratio**2) ** 0.5
     return float(np.log(stretch / outer) + (outer**-2 - stretch**-2) / 2)
 
@@ -63,7 +62,7 @@ def thick_tube(stretch: float, ratio: float) -> float:
 def blown(
     edges: int, layers: int, ratio: float, stretches: tuple[float, ...], wedges: bool = False
 ) -> dict[float, float]:
-    """p / mu of an eighth of a sphere at the volume of each stretch, by volume control."""
+    """Find p / mu of an eighth of a sphere at the volume of each stretch, by volume control."""
     mesh = octant(edges, INNER_M, INNER_M * ratio, layers, wedges=wedges)
     body = Body(mesh, held=on_planes(mesh), bulk_ratio=1e6, settings=FEWER_DIGITS)
     rest = body.system.balance(body.state, None).volume
@@ -109,7 +108,7 @@ def balloon(stretch: float) -> Measured:
 
 @cache
 def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[float, float]:
-    """p / mu of a tube, B/A = 1.5, whose inner nodes are moved out."""
+    """Find p / mu of a tube, B/A = 1.5, whose inner nodes are moved out."""
     around = 4 * layers
     mesh = quarter_tube(around, INNER_M, 1.5 * INNER_M, layers)
     held = on_planes(mesh)
@@ -119,7 +118,6 @@ def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[
     body = Body(mesh, held=held, bulk_ratio=bulk_ratio, settings=FEWER_DIGITS)
     found, last = {}, 1.0
     for stretch in stretches:
-        body.scale_by(MU * INNER_M * np.ptp(mesh.nodes[:, 2]) * (stretch - 1))
         for between in np.linspace(last, stretch, 2 + int((stretch - last) / 0.1))[1:]:
             body.state.position[bore, :2] = between * mesh.nodes[bore, :2]
             balance = body.solve()
@@ -141,7 +139,7 @@ SMALL = 1e-4  # strain: what is not linear in it is far below the tolerance
 
 
 def bulk_ratio(nu: float) -> float:
-    """kappa / mu = 2 (1 + nu) / (3 (1 - 2 nu))."""
+    """Linear elasticity: kappa / mu = 2 (1 + nu) / (3 (1 - 2 nu))."""
     return 2 * (1 + nu) / 3 / (1 - 2 * nu)
 
 

@@ -80,23 +80,23 @@ def hertz(radius: float, depth: float) -> tuple[float, float, float]:
 
 
 def hertz_force(radius: float, depth: float) -> Measured:
-    """F = 16/3 mu sqrt(R) d^1.5."""
+    """Hertz: F = 16/3 mu sqrt(R) d^1.5."""
     return Measured(hertz(radius, depth)[0], 16 / 3 * MU * np.sqrt(radius) * depth**1.5)
 
 
 def hertz_radius(radius: float, depth: float) -> Measured:
-    """a = sqrt(R d)."""
+    """Hertz: a = sqrt(R d)."""
     return Measured(hertz(radius, depth)[1] * 1e3, np.sqrt(radius * depth) * 1e3)
 
 
 def hertz_pressure(radius: float, depth: float) -> Measured:
-    """p0 = 3 F / (2 pi a^2), F and a by their formulas."""
+    """Hertz: p0 = 3 F / (2 pi a^2), F and a by their formulas."""
     force, area = 16 / 3 * MU * np.sqrt(radius) * depth**1.5, np.pi * radius * depth
     return Measured(hertz(radius, depth)[2] * 1e-3, 1.5e-3 * force / area)
 
 
 def flat_punch() -> Measured:
-    """F = 8 mu a d under a flat-ended cylinder."""
+    """Sneddon: F = 8 mu a d under a flat-ended cylinder."""
     a, depth = 1e-3, 1e-5
     outside = PUNCH_RINGS[-1] + graded(0.05, 0.05, FAR, GROWTH)[1:]
     radii = a * np.concatenate([PUNCH_RINGS, outside])
@@ -128,13 +128,13 @@ def line_contact() -> tuple[float, float, float, float]:
 
 
 def line_contact_width() -> Measured:
-    """a = sqrt(F R / (pi mu)) at the measured force."""
+    """Johnson: a = sqrt(F R / (pi mu)) at the measured force."""
     force, contact, _, radius = line_contact()
     return Measured(contact * 1e3, np.sqrt(force * radius / np.pi / MU) * 1e3, f"{force:.2f} N/m")
 
 
 def line_contact_pressure() -> Measured:
-    """p0 = 2 F / (pi a), a by its formula."""
+    """Johnson: p0 = 2 F / (pi a), a by its formula."""
     force, _, pressure, radius = line_contact()
     return Measured(pressure * 1e-3, 2e-3 * force / np.pi / np.sqrt(force * radius / np.pi / MU))
 

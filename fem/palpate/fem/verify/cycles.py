@@ -18,7 +18,13 @@ FRICTION = 0.186
 COARSE, FINE, FINEST = 4, 16, 32  # steps a leg
 # Press, drag, drag back, lift [m]: corners of the indenter's way.
 CORNERS_M = np.array(
-    [(0.0, 0.0, 0.0), (0.0, 0.0, 0.5e-3), (0.4e-3, 0.0, 0.5e-3), (0.0, 0.0, 0.5e-3), (0.0, 0.0, 0.0)]
+    [
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.5e-3),
+        (0.4e-3, 0.0, 0.5e-3),
+        (0.0, 0.0, 0.5e-3),
+        (0.0, 0.0, 0.0),
+    ]
 )
 
 
@@ -108,7 +114,12 @@ CHECKS = (
     Case("work/closed cycle without friction", closed_cycle, 1e-8),
     Case("work/shape after it", same_shape, 1.0, "nm"),
     Case(f"work/stored and lost, {FINE} steps a leg", partial(work_balance, FINE), 1e-3),
-    Case(f"work/stored and lost, {FINEST} steps a leg", partial(work_balance, FINEST), 3e-4, slow=True),
+    Case(
+        f"work/stored and lost, {FINEST} steps a leg",
+        partial(work_balance, FINEST),
+        3e-4,
+        slow=True,
+    ),
     Case("work/order in the step", work_order, 1e-12, at_least=True),
     Case("work/friction gives nothing back", dissipation, 1e-12, at_least=True),
 )

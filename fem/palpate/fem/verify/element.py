@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.fem.laws import Press, rotation_matrix
+from palpate.fem.indenter.pose import rotation_matrix
+from palpate.fem.laws import Press
 from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.verify.body import MU, TIGHT, Body
 from palpate.fem.verify.check import Case, Measured
@@ -39,14 +40,17 @@ def _cube(*, wedges: bool) -> SolidMesh:
     return distorted(mesh, 0.25 * line[1], seed=3)
 
 
+def _on_edge(mesh: SolidMesh) -> NDArray[np.bool_]:
+    inside = (mesh.nodes > 1e-9) & (mesh.nodes < SIDE_M - 1e-9)
+    return np.asarray(~inside.all(axis=1))
+
+
 def patch(strain: Floats, *, wedges: bool) -> Measured:
     """Linear motion of the boundary of a distorted cube: the inside follows to the last digits."""
     mesh = _cube(wedges=wedges)
     held = np.zeros(mesh.nodes.shape, bool)
-    edge = (mesh.nodes < 1e-9) | (mesh.nodes > SIDE_M - 1e-9)
-    held[edge.any(axis=1)] = True
+    held[_on_edge(mesh)] = True
     body = Body(mesh, held=held, bulk_ratio=10.0, settings=replace(TIGHT, tolerance=1e-13))
-    body.scale_by(MU * SIDE_M**2)
     exact = mesh.nodes @ (np.eye(3) + strain).T
     body.state.position[held] = exact[held]
     body.solve()
@@ -56,9 +60,9 @@ def patch(strain: Floats, *, wedges: bool) -> Measured:
 def patch_pressure(*, wedges: bool) -> Measured:
     """The same under equal swelling: every element finds the same pressure."""
     mesh = _cube(wedges=wedges)
-    held = ((mesh.nodes < 1e-9) | (mesh.nodes > SIDE_M - 1e-9)).any(axis=1)
-    body = Body(mesh, held=np.repeat(held[:, None], 3, axis=1), bulk_ratio=10.0)
-    body.scale_by(MU * SIDE_M**2)
+    held = np.zeros(mesh.nodes.shape, bool)
+    held[_on_edge(mesh)] = True
+    body = Body(mesh, held=held, bulk_ratio=10.0)
     body.state.position[held] = 1.05 * mesh.nodes[held]
     body.solve()
     return Measured(np.abs(body.state.pressure / (body.bulk * (1.05**3 - 1)) - 1).max())

@@ -70,12 +70,7 @@ def round_finger(
     grid = round_core(CORE_M, 0.25e-3)
     core = DistanceGrid(grid.origin * scale, grid.spacing * scale, grid.coefficients * scale)
     usual = ContactSettings()
-    contact = ContactSettings(
-        stiffness=usual.stiffness * stiffness,
-        tangential_stiffness=usual.tangential_stiffness * stiffness,
-        complement=usual.complement * stiffness,
-        margin_m=usual.margin_m * scale,
-    )
+    contact = replace(usual.scaled(stiffness), margin_m=usual.margin_m * scale)
     body = Body(mesh, core=core, mu=mu, contact=contact)
     rest = body.system.balance(body.state, None).volume
     for share in (0.5, 1.0):

@@ -8,7 +8,8 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.fem.laws import Press, rotation_matrix
+from palpate.fem.indenter.pose import rotation_matrix
+from palpate.fem.laws import Press
 from palpate.fem.newton import NewtonSettings
 from palpate.fem.verify.body import BULK_RATIO, TIGHT, Body
 from palpate.fem.verify.check import Case, Measured

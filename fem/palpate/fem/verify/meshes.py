@@ -70,7 +70,7 @@ def slab(points: Floats, faces: Ints, depths: Floats, *, name: str = "slab") -> 
         Nodes of a column are consecutive, the deepest first; without a cavity.
     """
     flat = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-    deep = flat + [0.0, 0.0, depths[-1]]
+    deep = flat + np.array([0.0, 0.0, depths[-1]])
     mesh = extrude(deep, flat, faces[:, ::-1], layers=len(depths) - 1, name=name)
     nodes = mesh.nodes.copy()
     nodes[:, 2] = np.tile(depths[::-1], len(points))
@@ -124,7 +124,8 @@ def hollow_sphere(edges: int, inner: float, outer: float, layers: int) -> SolidM
     flat, quads = rectangle(side, side)
     ones = np.ones((len(flat), 1))
     patch = np.concatenate([ones, flat], axis=1)
-    points, faces = [], []
+    points: list[Floats] = []
+    faces: list[Ints] = []
     for turn in range(3):
         for sign in (1.0, -1.0):
             faces.append((quads if sign > 0 else quads[:, ::-1]) + len(points) * len(flat))
