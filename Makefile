@@ -46,6 +46,8 @@ bench: $(VENV)/.dev  ## latency and throughput beside their bare floor | 2-5 min
 docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links | 20 s
 	$(BIN)/python docs/make_messages.py
 	$(BIN)/python docs/make_electrode_map.py
+	$(BIN)/python docs/make_fingertip_mesh.py
+	$(BIN)/python docs/make_indenters.py
 	$(BIN)/towncrier build --draft >/dev/null
 	$(BIN)/pytest -q tests/house/test_docs.py
 

@@ -37,7 +37,7 @@ class Settings:
 
     Attributes:
         newton: Tolerances of one increment.
-        contact: Constants of the contact laws for a modulus of ``REFERENCE_MODULUS_PA``. A fingertip
+        contact: Constants of the contact laws for a modulus of ``REFERENCE_MODULUS_PA``; every tip
             scales them with its own, so that forces scale exactly with the modulus.
         force_limit_n: A trajectory ends where the indenter's force exceeds this [N]; the paper saw
             23-32 N at most.
