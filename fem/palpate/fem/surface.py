@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from palpate.fem import contact_kernels
 from palpate.fem.device import DEVICE, scalars, vec3s
-from palpate.fem.reference_element import corner_element
+from palpate.fem.reference_element import corner_element, face_element
 
 Floats = NDArray[np.float64]
 
@@ -22,11 +22,9 @@ class Surface:
         self.points = corners
         element = corner_element(corners)
         self.shape_values = element.shape
-        edges = np.einsum("qad,fai->fqdi", element.gradient, nodes[faces.reshape(-1, corners)])
-        normal = np.cross(edges[:, :, 0], edges[:, :, 1])
-        self.area_values = element.weight * np.linalg.norm(normal, axis=2)
+        self._corners = faces.reshape(-1, corners)
+        self.area_values = self.current_area(nodes)
         size = self.area_values.shape
-        self._corners, self._element = faces, element
         self.gap, self._wanted = np.full(size, np.inf), np.zeros(size)
         self._wanted_traction = np.zeros((*size, 3))
         self.faces = wp.array(faces.reshape(-1, corners), dtype=wp.int32, device=DEVICE)
@@ -112,7 +110,12 @@ class Surface:
             )
 
     def current_area(self, position: Floats) -> Floats:
-        """Area that belongs to each point now [m^2], (F, Q)."""
-        edges = np.einsum("qad,fai->fqdi", self._element.gradient, position[self._corners])
-        normal = np.cross(edges[:, :, 0], edges[:, :, 1])
-        return np.asarray(self._element.weight * np.linalg.norm(normal, axis=2))
+        """Area that belongs to each corner, the integral of its shape function [m^2], (F, Q).
+
+        The Jacobian at the corner itself would do on squares only: on distorted faces it is not the
+        corner's share, and an even pressure would push unevenly.
+        """
+        element = face_element(self.points)
+        edges = np.einsum("qad,fai->fqdi", element.gradient, position[self._corners])
+        size = np.linalg.norm(np.cross(edges[:, :, 0], edges[:, :, 1]), axis=2)
+        return np.asarray(np.einsum("q,fq,qa->fa", element.weight, size, element.shape))

@@ -32,8 +32,13 @@ def _forces(finger: Finger, balance: Balance) -> dict[str, Floats]:
 
 
 @cache
-def _pressed_biotac() -> tuple[float, float, str]:
-    """Imbalance of force and of moment over the indenter's, of a finger rubbed and pinched."""
+def _pressed_biotac() -> tuple[float, float, float, str]:
+    """A finger rubbed and pinched on its core.
+
+    Returns:
+        Imbalance of force and of moment over the indenter's, deepest penetration [m], and the
+        sizes of the forces in words.
+    """
     finger = biotac_finger(friction=FRICTION, aside=ASIDE_M)
     for share in np.linspace(0.0, 1.0, 13)[1:]:
         balance = finger.at(share * np.array([RUB_M, 0.0, DEEP_M]))
@@ -43,21 +48,28 @@ def _pressed_biotac() -> tuple[float, float, str]:
     force = sum(forces.values(), np.zeros((1, 3)))
     turn = np.linalg.norm(np.cross(position, forces["indenter"]).sum(axis=0))
     note = ", ".join(f"{who} {size:.3g} N" for who, size in push.items())
+    system = finger.body.system
     return (
         float(np.linalg.norm(force.sum(axis=0))) / push["indenter"],
         float(np.linalg.norm(np.cross(position, force).sum(axis=0)) / turn),
+        -float(min(system.outer.gap.min(), system.inner.gap.min())),
         note,
     )
 
 
 def force_balance() -> Measured:
     """Indenter, core, fluid and supports: their forces on the skin add up to nothing."""
-    return Measured(_pressed_biotac()[0], note=_pressed_biotac()[2])
+    return Measured(_pressed_biotac()[0], note=_pressed_biotac()[3])
 
 
 def moment_balance() -> Measured:
     """So do their moments about the origin, because the stress is symmetric."""
     return Measured(_pressed_biotac()[1])
+
+
+def penetration() -> Measured:
+    """How deep the worst point is in indenter or core."""
+    return Measured(_pressed_biotac()[2] * 1e6)
 
 
 def potential(finger: Finger, move: Floats) -> float:
@@ -159,6 +171,7 @@ def newton_in_contact() -> Measured:
 CHECKS = (
     Case("balance/forces on a pressed BioTac", force_balance, 1e-8),
     Case("balance/moments on a pressed BioTac", moment_balance, 1e-8),
+    Case("contact/penetration on a pressed BioTac", penetration, 5.0, "um"),
     Case("balance/force is the energy's derivative", energy_derivative, 1e-8),
     Case("symmetry/mesh", mirror_mesh, 1e-10),
     Case("symmetry/displacements", mirror_displacement, 1e-10),
