@@ -169,6 +169,7 @@ def _solid(
     count = len(faces)
     elements = [np.concatenate([faces + k, faces + k + 1], axis=1) for k in range(layers)]
     everyone = np.arange(count * layers, dtype=np.int32)
+    none = np.zeros(0, np.int32)
     return SolidMesh(
         nodes=nodes,
         elements=np.concatenate(elements),
@@ -176,9 +177,14 @@ def _solid(
         outer_elements=everyone[-count:],
         inner_faces=faces if cavity else np.zeros((0, faces.shape[1]), np.int32),
         inner_elements=everyone[: count if cavity else 0],
-        fixed=np.zeros(0, np.int32),
-        mirror=np.zeros(0, np.int32),
+        fixed=none,
+        mirror=none,
     )
+
+
+def _quads(grid: NDArray[np.int64]) -> NDArray[np.int64]:
+    corners = [grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]]
+    return np.stack(corners, axis=-1).reshape(-1, 4)
 
 
 def make_block(
@@ -188,8 +194,7 @@ def make_block(
     x, y, z = (size_m * np.arange(n + 1) for n in counts)
     nodes = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     grid = np.arange(len(x) * len(y)).reshape(len(x), len(y))
-    quads = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=-1)
-    return _solid(nodes, quads.reshape(-1, 4), counts[2], corners, cavity=False)
+    return _solid(nodes, _quads(grid), counts[2], corners, cavity=False)
 
 
 def make_shell(
@@ -199,14 +204,12 @@ def make_shell(
     part = np.tan(np.linspace(-np.pi / 4, np.pi / 4, around + 1))
     part = (part - part[::-1]) / 2  # symmetric to the last bit
     side = np.stack(np.meshgrid([1.0], part, part, indexing="ij"), axis=-1).reshape(-1, 3)
-    grid = np.arange(len(side)).reshape(around + 1, around + 1)
-    quads = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=-1)
-    quads = quads.reshape(-1, 4)
+    quads = _quads(np.arange(len(side)).reshape(around + 1, around + 1))
     points = np.concatenate([sign * np.roll(side, k, axis=1) for k in range(3) for sign in (1, -1)])
     turned = (quads, quads[:, ::-1])  # seen from outside, a point reflection turns them round
     cells = np.concatenate([turned[k % 2] + k * len(side) for k in range(6)])
-    rounded = np.round(points, 9) + 0.0
-    _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    places = np.round(points, 9) + 0.0
+    _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
     direction = points[first]
     # Sorted, so that nodes that mirror one another get the same length.
     length = np.sqrt(np.sum(np.sort(direction**2, axis=1), axis=1))
@@ -214,44 +217,33 @@ def make_shell(
     radii = np.linspace(inner_m, outer_m, layers + 1)
     nodes = (direction[:, None] * radii[:, None]).reshape(-1, 3)
     quads = np.asarray(number.reshape(-1)[cells], np.int64)
+    _, mirror = cKDTree(nodes).query(nodes * (1.0, -1.0, 1.0))
     solid = _solid(nodes, quads, layers, corners, cavity=True)
-    if corners == 6:
-        return solid
-    away, mirror = cKDTree(nodes).query(nodes * (1.0, -1.0, 1.0))
-    assert away.max() < 1e-12 * outer_m
-    return replace(solid, mirror=mirror.astype(np.int32))
+    return replace(solid, mirror=mirror.astype(np.int32)) if corners == 8 else solid
 
 
-def make_ball(radius_m: float, spacing_m: float = 0.25e-3, reach_m: float = 4e-3) -> Core:
+def make_ball(radius_m: float, spacing_m: float = 0.25e-3) -> Core:
     """A ball about the origin as a core."""
-    count = 2 * round(reach_m / spacing_m) + 1
-    axis = spacing_m * (np.arange(count) - count // 2)
+    axis = spacing_m * np.arange(-16.0, 17.0)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     values = np.linalg.norm(points, axis=-1) - radius_m
-    return Core(
-        DistanceGrid.sampled(np.full(3, axis[0]), spacing_m, values),
-        np.zeros((0, 3)),
-        np.zeros((0, 3), np.int32),
-        4 / 3 * np.pi * radius_m**3,
-        "ball",
-    )
+    grid = DistanceGrid.sampled(np.full(3, axis[0]), spacing_m, values)
+    none = np.zeros((0, 3))
+    return Core(grid, none, none.astype(np.int32), 4 / 3 * np.pi * radius_m**3, "ball")
 
 
 @pytest.fixture(scope="session")
 def block() -> Shell:
-    """`make_block`."""
     return make_block
 
 
 @pytest.fixture(scope="session")
 def shell() -> Shell:
-    """`make_shell`."""
     return make_shell
 
 
 @pytest.fixture(scope="session")
 def ball() -> Callable[..., Core]:
-    """`make_ball`."""
     return make_ball
 
 

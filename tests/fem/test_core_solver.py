@@ -10,12 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.fem.config import FingertipParameters
-from palpate.fem.element import elements
+from palpate.fem.element import Elements, elements
 from palpate.fem.fluid import cavity
 from palpate.fem.indentation import Indentation
 from palpate.fem.indenter.catalogue import make_indenter
 from palpate.fem.indenter.distance import signed_distance
-from palpate.fem.linear import make_factor
 from palpate.fem.material import NeoHooke
 from palpate.fem.mesh.core import Core
 from palpate.fem.mesh.geometry import Geometry
@@ -31,14 +30,13 @@ Fill = Callable[..., Fingertip]
 
 BALL = make_indenter("sphere_medium")
 FRICTION = FingertipParameters().friction_coefficient
-STEPS = 5
 BALANCE = 1e-6  # of the force: Newton's tolerance
 COULOMB = 1e-3  # of the limit: a tenth of a micrometre on a sticking point's spring, and some luck
 ACROSS = np.array([1.0, -1.0, 1.0])
 
 
 def press_path(
-    tip: Fingertip, depth_m: float, *, steps: int = STEPS, side_m: float = 0.0, y_m: float = 0.0
+    tip: Fingertip, depth_m: float, *, steps: int = 5, side_m: float = 0.0, y_m: float = 0.0
 ) -> Floats:
     """Up into the pad, beside its middle; ``side_m`` farther along x at its end."""
     low = tip.nodes[:, 2].min() - 2e-6
@@ -62,6 +60,14 @@ class Pressed:
     @property
     def position(self) -> Floats:
         return self.run.state.position
+
+    @property
+    def skin(self) -> Elements:
+        """Its elements by the twin."""
+        mesh, state, parameters = self.tip.geometry.mesh, self.run.state, self.tip.parameters
+        mu = parameters.shear_modulus_pa
+        kappa = parameters.bulk_ratio * mu
+        return elements(mesh, NeoHooke(mu), kappa, state.position, state.pressure)
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +104,7 @@ def exact(fill: Fill) -> Pressed:
     """The same, solved until rounding rules."""
     newton = NewtonSettings(tolerance=1e-9, gap_tolerance_m=1e-15, iterations=40)
     tip = fill(Settings(newton=newton))
-    path = press_path(tip, 1.5e-3, side_m=0.2e-3)
-    run = Indentation(tip, BALL, path, None, None)
+    run = Indentation(tip, BALL, press_path(tip, 1.5e-3, side_m=0.2e-3), None, None)
     return Pressed(tip, run, run.run())
 
 
@@ -117,8 +122,7 @@ def test_every_step_comes_in_order(pressed: Pressed) -> None:
 def test_all_forces_and_moments_on_the_skin_cancel(pressed: Pressed) -> None:
     """Indenter, core and supports, whose reactions the twins give."""
     mesh, state, last = pressed.tip.geometry.mesh, pressed.run.state, pressed.last
-    mu, ratio = pressed.tip.parameters.shear_modulus_pa, pressed.tip.parameters.bulk_ratio
-    skin = elements(mesh, NeoHooke(mu), ratio * mu, state.position, state.pressure)
+    skin = pressed.skin
     fluid = state.fluid_pressure * cavity(mesh.inner_faces, state.position).gradient
     left = skin.force - fluid - last.indenter_force - last.core_force
     support = np.zeros_like(left)
@@ -143,12 +147,12 @@ def test_the_fluid_keeps_its_volume(pressed: Pressed) -> None:
 
 
 def test_the_skin_keeps_its_volume_in_every_element(pressed: Pressed) -> None:
-    mesh, state = pressed.tip.geometry.mesh, pressed.run.state
-    mu, ratio = pressed.tip.parameters.shear_modulus_pa, pressed.tip.parameters.bulk_ratio
-    skin = elements(mesh, NeoHooke(mu), ratio * mu, state.position, state.pressure)
+    skin = pressed.skin
     assert skin.smallest_jacobian > 0.5
     strain = skin.volume / skin.rest_volume - 1.0
-    assert np.abs(strain - state.pressure / (ratio * mu)).max() < 1e-6
+    parameters = pressed.tip.parameters
+    kappa = parameters.bulk_ratio * parameters.shear_modulus_pa
+    assert np.abs(strain - pressed.run.state.pressure / kappa).max() < 1e-6
     assert np.abs(strain).max() < 1e-3
 
 
@@ -206,20 +210,18 @@ def test_step_outputs_agree_with_one_another(pressed: Pressed) -> None:
     whole = tip.system.outer.current_area(tip.nodes).sum()
     areas = []
     for step in pressed.trajectory.steps:
-        np.testing.assert_allclose(step.force, step.indenter_force.sum(axis=0), atol=1e-15)
-        position = tip.nodes + step.displacement
-        moment = np.cross(position, step.indenter_force).sum(axis=0)
+        position, force = tip.nodes + step.displacement, step.indenter_force
+        np.testing.assert_allclose(step.force, force.sum(axis=0), atol=1e-15)
+        moment = np.cross(position, force).sum(axis=0)
         np.testing.assert_allclose(step.torque, moment, atol=1e-15)
-        touched = np.flatnonzero(np.linalg.norm(step.indenter_force, axis=1) > 0.0)
+        touched = np.flatnonzero(force.any(axis=1))
         assert np.isin(touched, mesh.outer_nodes).all()
         assert np.isin(np.flatnonzero(step.core_force.any(axis=1)), mesh.inner_nodes).all()
         low, high = position[touched].min(axis=0), position[touched].max(axis=0)
-        assert (low <= step.centre_of_pressure).all()
-        assert (step.centre_of_pressure <= high).all()
+        assert ((low <= step.centre_of_pressure) & (step.centre_of_pressure <= high)).all()
         areas.append(step.contact_area_m2)
         assert step.convergence.residual <= 1e-6
-        assert step.convergence.iterations > 0
-        assert step.convergence.increments > 0
+        assert min(step.convergence.iterations, step.convergence.increments) > 0
     assert 0.0 < areas[0] < areas[-1] < whole / 4
     assert areas == sorted(areas)
 
@@ -291,15 +293,3 @@ def test_forces_scale_with_the_modulus_and_the_shape_does_not_change(
         np.testing.assert_allclose(other.indenter_force, 2 * step.indenter_force, atol=1e-12)
         np.testing.assert_allclose(other.core_force, 2 * step.core_force, atol=1e-12)
         np.testing.assert_allclose(other.stress, 2 * step.stress, rtol=1e-9, atol=1e-6)
-
-
-def test_superlu_gives_the_same_forces(finger: Fingertip, fill: Fill) -> None:
-    pattern = finger.system.pattern
-    if make_factor(pattern.indptr, pattern.indices).name == "superlu":
-        pytest.skip("there is nothing to compare it with")
-    other = fill(Settings(solver="superlu"))
-    assert (finger.newton.factor.name, other.newton.factor.name) == ("pardiso", "superlu")
-    path = press_path(finger, 0.8e-3, steps=2)
-    first, second = finger.indent(BALL, path), other.indent(BALL, path)
-    np.testing.assert_allclose(second.forces, first.forces, atol=1e-8)
-    np.testing.assert_allclose(other.nodes, finger.nodes, atol=1e-14)

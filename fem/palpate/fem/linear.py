@@ -65,6 +65,10 @@ class Pardiso:
     name = "pardiso"
 
     def __init__(self, indptr: Ints, indices: Ints) -> None:
+        if "torch" in sys.modules:
+            # Torch brings an OpenMP and an MKL of its own; PARDISO then dies of a segmentation
+            # fault (seen with torch 2.13 and MKL 2026.2, whichever threading layer is asked for).
+            raise ImportError("torch is loaded in this process, and its MKL does not bear another")
         from pypardiso import PyPardisoSolver
 
         # pypardiso finds and declares the library; its own call shifts all indices every time,
