@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +18,13 @@ from palpate.fem.indenter.distance import distance
 from palpate.fem.laws import ContactSettings, Press
 from palpate.fem.material import NeoHooke
 from palpate.fem.mesh.core import Core
-from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.state import State
 from palpate.fem.surface import Surface
 from palpate.fem.system import System
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
-Mesh = Callable[..., SolidMesh]
+Make = Callable[..., Any]
 Dense = Callable[[System], Floats]
 
 SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
@@ -32,6 +32,14 @@ MU, BULK_RATIO, OUTER_M = 2.8e5, 10.0, 4e-3
 SKIN = {"shear_modulus_pa": MU, "bulk_ratio": BULK_RATIO}
 # As soft as the skin, so that no part of a tangent hides behind another.
 SOFT = ContactSettings(stiffness=2e9, tangential_stiffness=8e8, complement=1e8, margin_m=0.5e-3)
+
+# Indenter, friction, drag of the anchors [m], and the statuses that come of it.
+CASES: dict[str, tuple[str, float, float, set[int]]] = {
+    "touching": ("sphere_medium", 0.0, 0.0, {0, 1}),
+    "sticking": ("sphere_medium", 5.0, 1e-5, {0, 2}),
+    "sliding": ("sphere_medium", 0.05, 5e-4, {0, 3}),
+    "both": ("cube", 0.4, 1e-4, {0, 2, 3}),
+}
 
 
 def difference(found: Floats, wanted: Floats) -> float:
@@ -122,7 +130,7 @@ Squeeze = Callable[..., Pressed]
 
 
 @pytest.fixture
-def squeeze(shell: Mesh, ball: Callable[..., Core], assembled: Callable[..., Floats]) -> Squeeze:
+def squeeze(shell: Make, ball: Make, assembled: Make) -> Squeeze:
     """Makes a `Pressed`: indenter, friction, drag of the anchors [m], element corners."""
 
     def make(indenter: str, friction: float, *, drag_m: float = 0.0, corners: int = 8) -> Pressed:
@@ -180,15 +188,13 @@ def test_kernels_equal_the_twin(
     balance = system.balance(state, pressed.press, tangent=True)
     with_contact = dense(system)
     (out, near), core = pressed.outside(), pressed.inside()
-    area = outer.area_values.ravel()
-
     assert set(out.status[near]) == ({0, 2, 3} if friction else {0, 1})
     np.testing.assert_array_equal(outer.status.numpy().ravel(), out.status)
     np.testing.assert_array_equal(inner.status.numpy().ravel(), core.status)
     for array, wanted in [
         (outer.wanted_array, out.wanted),
         (outer.slope, out.slope),
-        (outer.misfit, area[:, None] * out.misfit),
+        (outer.misfit, outer.area_values.reshape(-1, 1) * out.misfit),
         (inner.wanted_array, core.wanted),
         (inner.slope, core.slope),
     ] + friction_arrays(outer, out) * (friction > 0.0):
@@ -245,27 +251,13 @@ def test_condensed_loads_and_updates_equal_the_twin(squeeze: Squeeze) -> None:
             assert difference(traction.reshape(-1, 3), wanted) < SAME
 
 
-@pytest.mark.parametrize(
-    ("indenter", "friction", "drag_m", "statuses"),
-    [
-        ("sphere_medium", 0.0, 0.0, {0, 1}),
-        ("sphere_medium", 5.0, 1e-5, {0, 2}),
-        ("sphere_medium", 0.05, 5e-4, {0, 3}),
-        ("cube", 0.4, 1e-4, {0, 2, 3}),
-    ],
-    ids=["touching", "sticking", "sliding", "both"],
-)
 @pytest.mark.parametrize("corners", [8, 6])
+@pytest.mark.parametrize("case", CASES)
 def test_assembled_tangent_is_the_derivative_of_the_forces(
-    squeeze: Squeeze,
-    dense: Dense,
-    indenter: str,
-    friction: float,
-    drag_m: float,
-    statuses: set[int],
-    corners: int,
+    squeeze: Squeeze, dense: Dense, case: str, corners: int
 ) -> None:
     """Of skin, fluid, core and indenter together, pressures following their laws."""
+    indenter, friction, drag_m, statuses = CASES[case]
     pressed = squeeze(indenter, friction, drag_m=drag_m, corners=corners)
     system, state = pressed.system, pressed.state
     pressed.settle()
