@@ -19,9 +19,8 @@ from palpate.fem.system import Balance, System
 UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)  # half a turn about x: the indenter's body points to +z
 NO_FACES = np.zeros((0, 3), np.int32)
 SMALLEST_STEP = 1 / 64
-# Newton's force tolerance is relative to the forces of fluid, contact and dead load. Where supports
-# alone do the work there are none, and it measures against 1e-12 N: this is 1e-9 N.
-TIGHT, TIGHT_WITHOUT_LOADS = 1e-9, 1e3
+# Newton's force tolerance, relative to the forces of fluid, contact, dead load and supports.
+TIGHT = 1e-9
 
 
 def _mesh(
@@ -57,10 +56,7 @@ def deform(problem: Problem) -> Solution:
     mesh = _mesh(problem.nodes, problem.hexes, inner_faces=problem.pressure_faces)
     ratio = problem.bulk_modulus_pa / problem.shear_modulus_pa
     system = _system(mesh, problem.shear_modulus_pa, ratio, problem.held)
-    loaded = bool(len(problem.pressure_faces)) or bool(problem.nodal_force.any())
-    settings = NewtonSettings(
-        tolerance=TIGHT if loaded else TIGHT_WITHOUT_LOADS, volume_tolerance=1e-9, iterations=30
-    )
+    settings = NewtonSettings(tolerance=TIGHT, volume_tolerance=1e-9, iterations=30)
     newton = Newton(system, _factor(system), settings)
     state, done, size = State.at_rest(mesh), 0.0, 1.0 / problem.steps
     while done < 1.0 - 1e-9:
