@@ -103,7 +103,7 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
     start = np.array([0.0, 0.0, contact.height_m, *UPSIDE_DOWN])
     press = Press(Indenter("ball", (ball,)), start, contact.friction)
     state, forces = State.at_rest(mesh), []
-    _settle(system, state, press)
+    system.settle(state, press)
     was = np.zeros(3)
     for to in contact.path():
         done, size = 0.0, 1.0
@@ -115,7 +115,7 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
             report, balance = newton.solve(trial, moved, volume=None)
             if report.converged:
                 state, done = trial, share
-                _settle(system, state, moved)
+                system.settle(state, moved)
                 continue
             newton.fresh = False
             size /= 2
@@ -129,11 +129,3 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
 def _on_block(balance: Balance) -> Floats:
     half = -balance.indenter.sum(axis=0)
     return np.array([2 * half[0], 0.0, 2 * half[2]])
-
-
-def _settle(system: System, state: State, press: Press) -> None:
-    """After a converged increment the anchors of sliding points follow."""
-    corners = state.position[system.mesh.outer_faces]
-    points = np.einsum("qa,fai->fqi", system.outer.shape_values, corners)
-    stretch = state.traction / system.contact.tangential_stiffness
-    state.anchor[:] = press.to_local(points - stretch)

@@ -58,18 +58,10 @@ class Indentation:
         self.state = tip.state.copy()
         self.outcome: Outcome | None = None
         self.reason = ""
-        self.settled(self.press)
+        tip.system.settle(self.state, self.press)
         # Of the last two increments: where they ended and how long they were, for the predictor.
         self.before: State | None = None
         self.before_length = 0.0
-
-    def settled(self, press: Press) -> None:
-        """Move the anchors of points that slid; all start where they are."""
-        surface = self.tip.system.outer
-        corners = self.state.position[self.tip.geometry.mesh.outer_faces]
-        points = np.einsum("qa,fai->fqi", surface.shape_values, corners)
-        stretch = self.state.traction / self.tip.system.contact.tangential_stiffness
-        self.state.anchor[:] = press.to_local(points - stretch)
 
     def run(self) -> Trajectory:
         """Follow the whole path."""
@@ -139,12 +131,7 @@ class Indentation:
         kept, press = self.state.copy(), self.press.at(pose)
         trial = self.predicted(length)
         report, balance = self.tip.equilibrium(trial, press, self.tip.cavity, self._stop)
-        if (
-            not report.converged
-            and trial is not None
-            and self.outcome is None
-            and self.before is not None
-        ):
+        if not report.converged and self.outcome is None and self.before is not None:
             # The extrapolation may have led astray, e.g. at first touch.
             trial = kept.copy()
             second, balance = self.tip.equilibrium(trial, press, self.tip.cavity, self._stop)
@@ -154,7 +141,7 @@ class Indentation:
         if report.converged:
             self.before, self.before_length = kept, length
             self.state, self.press = trial, press
-            self.settled(press)
+            self.tip.system.settle(trial, press)
         else:
             self.before = None
         return report, balance

@@ -28,8 +28,7 @@ def make_step(
     surface = tip.system.outer
     on_skin = -balance.indenter
     weight = state.indenter_pressure * surface.area_values
-    faces = tip.geometry.mesh.outer_faces
-    points = np.einsum("qa,fai->fqi", surface.shape_values, state.position[faces])
+    points = surface.points_at(state.position)
     touching = state.indenter_pressure > CONTACT_SHARE * max(
         float(state.indenter_pressure.max()), 1.0
     )

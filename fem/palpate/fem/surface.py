@@ -109,6 +109,10 @@ class Surface:
                 device=DEVICE,
             )
 
+    def points_at(self, position: Floats) -> Floats:
+        """Where the contact points are [m], (F, Q, 3)."""
+        return np.asarray(np.einsum("qa,fai->fqi", self.shape_values, position[self._corners]))
+
     def current_area(self, position: Floats) -> Floats:
         """Area that belongs to each corner, the integral of its shape function [m^2], (F, Q).
 

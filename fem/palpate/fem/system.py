@@ -204,6 +204,14 @@ class System:
         self.outer.add_load(self.outer.coupled, vec3s(force))
         return force.reshape(-1)[self.pattern.free]
 
+    def settle(self, state: State, press: Press) -> None:
+        """After an increment: anchors such that each point's spring carries its traction.
+
+        Those of points that slid thereby move along; all others stay, or start where they are.
+        """
+        stretch = state.traction / self.contact.tangential_stiffness
+        state.anchor[:] = press.to_local(self.outer.points_at(state.position) - stretch)
+
     def _both(self, first: Callable[[], None], second: Callable[[], None]) -> None:
         """Run two halves at once; Warp launches release the interpreter."""
         other = self._pool.submit(second)

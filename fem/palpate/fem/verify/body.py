@@ -92,14 +92,12 @@ class Body:
         return balance
 
     def settle(self, press: Press) -> None:
-        """Anchors such that each point's spring carries its traction; what slid moves them."""
-        stretch = self.state.traction / self.contact.tangential_stiffness
-        self.state.anchor[:] = press.to_local(self.contact_points() - stretch)
+        """See `System.settle`."""
+        self.system.settle(self.state, press)
 
     def contact_points(self) -> Floats:
-        """Where the outer surface's contact points are [m], (F, Q, 3)."""
-        corners = self.state.position[self.mesh.outer_faces]
-        return np.asarray(np.einsum("qa,fai->fqi", self.system.outer.shape_values, corners))
+        """See `Surface.points_at`."""
+        return self.system.outer.points_at(self.state.position)
 
     def reactions(self, balance: Balance) -> Floats:
         """Forces of the supports on held components [N], 0 elsewhere, (V, 3)."""
