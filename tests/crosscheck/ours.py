@@ -70,7 +70,6 @@ def deform(problem: Problem) -> Solution:
         trial.fluid_pressure = share * problem.pressure_pa
         system.load[:] = share * problem.nodal_force
         report, balance = newton.solve(trial, None, volume=None)
-        newton.fresh = False
         if report.converged:
             state, done = trial, share
             continue
@@ -117,7 +116,6 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
                 state, done = trial, share
                 system.settle(state, moved)
                 continue
-            newton.fresh = False
             size /= 2
             if size < SMALLEST_STEP:
                 raise AssertionError(f"sphere at {to} m: {report.reason}")

@@ -65,7 +65,6 @@ class Newton:
         self.system, self.factor, self.settings = system, factor, settings
         # Volume gradient at the factorised state, and the factor's answer to it.
         self._border: tuple[Floats, Floats] | None = None
-        self.fresh = False
 
     def solve(
         self,
@@ -85,7 +84,7 @@ class Newton:
         """
         settings, system, report = self.settings, self.system, Report()
         balance = system.balance(state, press, tangent=True)
-        prepared, self.fresh = True, False
+        prepared, fresh = True, False
         error = self._error(balance, volume)
         report.residuals.append(error)
         while True:
@@ -98,28 +97,26 @@ class Newton:
             if should_stop is not None and should_stop():
                 report.reason = "stopped"
                 return report, balance
-            if not self.fresh:
+            if not fresh:
                 if not prepared:
                     balance = system.balance(state, press, tangent=True)
                 self._border = None
             try:
-                if not self.fresh:
+                if not fresh:
                     self.factor.factorise(system.tangent_values())
                     report.factorisations += 1
-                    self.fresh = True
+                    fresh = True
                 balance = self._step(state, press, balance, volume, self._damping(report))
             except SimulationError as failure:
                 report.reason = failure.problem
-                self.fresh = False
                 return report, balance
             report.iterations += 1
             before, error = error, self._error(balance, volume)
             report.residuals.append(error)
             if not np.isfinite(error):
                 report.reason = "the equations gave no number"
-                self.fresh = False
                 return report, balance
-            self.fresh = error < settings.keep_factor * before and not system.sets_changed
+            fresh = error < settings.keep_factor * before and not system.sets_changed
             prepared = False
 
     def _damping(self, report: Report) -> float:
