@@ -13,11 +13,11 @@ pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
 from palpate.deploy import cli_files
 from palpate.deploy.options import PalpateGroup
-from palpate.fem import store_hdf5
-from palpate.fem.store import SimulationStore
-from palpate.fem.store_export import export
-from palpate.fem.store_sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store_writer import StoreWriter
+from palpate.fem.store import hdf5 as store_hdf5
+from palpate.fem.store.export import export
+from palpate.fem.store.read import SimulationStore
+from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate.fem.store.writer import StoreWriter
 from palpate.services import simulation_view_file
 from palpate.services.simulation_view_file import Simulations
 

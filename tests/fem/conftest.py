@@ -17,14 +17,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.fem import node
 from palpate.fem.config import FingertipParameters
+from palpate.fem.mechanics.solver import Fingertip, Settings
+from palpate.fem.mechanics.system import System
 from palpate.fem.mesh.core import Core, DistanceGrid
 from palpate.fem.mesh.geometry import Geometry
 from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.service_config import FemConfig
-from palpate.fem.solver import Fingertip, Settings
-from palpate.fem.system import System
+from palpate.fem.service import node
+from palpate.fem.service.config import FemConfig
 from palpate.protos.client import Client
 from palpate.protos.config import LinkConfig, parse_config
 from palpate.protos.errors import PalpateError

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from palpate.fem.config import FingertipParameters
-from palpate.fem.fingertips import OnFraction
 from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.result import Convergence, Floats, Outcome, Step, Trajectory
-from palpate.fem.store_content import StoredFingertip
-from palpate.fem.store_sample import sample_fingertip
+from palpate.fem.service.fingertips import OnFraction
+from palpate.fem.store.content import StoredFingertip
+from palpate.fem.store.sample import sample_fingertip
 from palpate.protos.errors import SimulationError
 
 if TYPE_CHECKING:

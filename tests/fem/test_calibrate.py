@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem.align import Floats
-from palpate.fem.calibrate import calibrate
-from palpate.fem.calibrate_recover import Planned, recover
-from palpate.fem.calibrate_result import Evaluation, read_parameters, write_calibration
-from palpate.fem.calibrate_runs import Simulated
-from palpate.fem.calibrate_settings import (
+from palpate.fem.calibration.align import Floats
+from palpate.fem.calibration.calibrate import calibrate
+from palpate.fem.calibration.measured import Indentation
+from palpate.fem.calibration.recover import Planned, recover
+from palpate.fem.calibration.result import Evaluation, read_parameters, write_calibration
+from palpate.fem.calibration.runs import Simulated
+from palpate.fem.calibration.settings import (
     FRICTION,
     MODULUS,
     PAPER_BOUNDS,
@@ -25,9 +26,8 @@ from palpate.fem.calibrate_settings import (
     CalibrationSettings,
 )
 from palpate.fem.config import FingertipParameters
-from palpate.fem.measured import Indentation
-from palpate.fem.path import path_lengths
-from palpate.fem.plot_validation import plot_calibration
+from palpate.fem.mechanics.path import path_lengths
+from palpate.fem.plot.validation import plot_calibration
 from palpate.fem.result import Outcome
 from palpate.protos.errors import ConfigError, DatasetError, SimulationError
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.fem.align import Floats
-from palpate.fem.calibrate_runs import Runs, Simulated
-from palpate.fem.calibrate_settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
+from palpate.fem.calibration.align import Floats
+from palpate.fem.calibration.measured import Indentation
+from palpate.fem.calibration.runs import Runs, Simulated
+from palpate.fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
 from palpate.fem.config import FingertipParameters
-from palpate.fem.measured import Indentation
-from palpate.fem.path import path_lengths
+from palpate.fem.mechanics.path import path_lengths
 from palpate.fem.result import Outcome, Trajectory
 from palpate.protos.errors import ConfigError, SimulationError
 

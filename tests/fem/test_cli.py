@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.fem import cli_model
-from palpate.fem.calibrate_result import read_parameters
-from palpate.fem.cli import fem_app
+from palpate.fem.calibration.measured import SIMULATED, Indentation, write_indentations
+from palpate.fem.calibration.result import read_parameters
+from palpate.fem.cli import model as cli_model
+from palpate.fem.cli.app import fem_app
 from palpate.fem.config import FingertipParameters
 from palpate.fem.indenter.path import write_path
-from palpate.fem.measured import SIMULATED, Indentation, write_indentations
-from palpate.fem.store import SimulationStore
+from palpate.fem.store.read import SimulationStore
 from palpate.protos.client import Client
 from palpate.protos.config import LinkConfig
 from palpate.protos.errors import ConfigError, LinkError, MissingExtraError, PalpateError
@@ -203,18 +203,18 @@ def test_verify_tells_every_check(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "palpate.fem.cli_run", None)
-    monkeypatch.setattr("palpate.fem.cli.EXTRA_MODULES", ("palpate",))
+    monkeypatch.setitem(sys.modules, "palpate.fem.cli.run", None)
+    monkeypatch.setattr("palpate.fem.cli.app.EXTRA_MODULES", ("palpate",))
     with pytest.raises(MissingExtraError, match=r'pip install "palpate\[fem\]"'):
         fem("run")
 
 
 PROGRAM = """
 import sys
-from palpate.fem import cli_model
+from palpate.fem.cli import model as cli_model
 cli_model.DEFAULT_FACTORY = "fem_fakes:round_finger"
-from palpate.fem.calibrate_result import read_parameters
-from palpate.fem.cli import fem_app
+from palpate.fem.calibration.result import read_parameters
+from palpate.fem.cli.app import fem_app
 from palpate.fem.config import FingertipParameters
 fem_app({words!r})
 """
@@ -291,6 +291,6 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
 
 
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate.fem.cli_serve._ROUTER_WAIT_S", 0.2)
+    monkeypatch.setattr("palpate.fem.cli.serve._ROUTER_WAIT_S", 0.2)
     with pytest.raises(LinkError, match="no router"):
         fem("serve", "--connect", f"tcp/127.0.0.1:{free_port}")

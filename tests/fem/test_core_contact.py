@@ -11,16 +11,16 @@ import pytest
 import warp as wp
 from numpy.typing import NDArray
 
-from palpate.fem.contact import Contact, ContactLaw, contact, return_map
-from palpate.fem.element import elements
 from palpate.fem.indenter.catalogue import make_indenter
 from palpate.fem.indenter.distance import distance
-from palpate.fem.laws import ContactSettings, Press
-from palpate.fem.material import NeoHooke
+from palpate.fem.mechanics.contact import Contact, ContactLaw, contact, return_map
+from palpate.fem.mechanics.element import elements
+from palpate.fem.mechanics.laws import ContactSettings, Press
+from palpate.fem.mechanics.material import NeoHooke
+from palpate.fem.mechanics.state import State
+from palpate.fem.mechanics.surface import Surface
+from palpate.fem.mechanics.system import System
 from palpate.fem.mesh.core import Core
-from palpate.fem.state import State
-from palpate.fem.surface import Surface
-from palpate.fem.system import System
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -185,7 +185,7 @@ def test_kernels_equal_the_twin(
     at_random(pressed)
     system, state, mesh = pressed.system, pressed.state, pressed.system.mesh
     outer, inner = system.outer, system.inner
-    balance = system.balance(state, pressed.press, tangent=True)
+    balance = system.balance(state, pressed.press)
     with_contact = dense(system)
     (out, near), core = pressed.outside(), pressed.inside()
     assert set(out.status[near]) == ({0, 2, 3} if friction else {0, 1})
@@ -215,7 +215,7 @@ def test_kernels_equal_the_twin(
     state.core_pressure[:] = 0.0
     held = np.zeros(mesh.nodes.shape, bool)
     apart = System(mesh, None, **SKIN, contact=SOFT, held=held)
-    apart.balance(state, None, tangent=True)
+    apart.balance(state, None)
     alone = dense(apart)
     assert np.abs(with_contact - alone - expected).max() < SAME * np.abs(with_contact).max()
 
@@ -225,7 +225,7 @@ def test_condensed_loads_and_updates_equal_the_twin(squeeze: Squeeze) -> None:
     at_random(pressed)
     system, state, mesh = pressed.system, pressed.state, pressed.system.mesh
     # The skin's own misfit is tested with the elements.
-    system.balance(state, pressed.press, tangent=True)
+    system.balance(state, pressed.press)
     system.tangent_values()
     skin = elements(mesh, NeoHooke(MU), BULK_RATIO * MU, state.position, state.pressure)
     state.pressure = BULK_RATIO * MU * (skin.volume / skin.rest_volume - 1.0)
@@ -261,7 +261,7 @@ def test_assembled_tangent_is_the_derivative_of_the_forces(
     pressed = squeeze(indenter, friction, drag_m=drag_m, corners=corners)
     system, state = pressed.system, pressed.state
     pressed.settle()
-    system.balance(state, pressed.press, tangent=True)
+    system.balance(state, pressed.press)
     assert set(system.outer.status.numpy().ravel()) == statuses
     assert 1 in system.inner.status.numpy()
     matrix = dense(system)
@@ -279,7 +279,7 @@ def test_sticking_to_a_flat_has_a_symmetric_tangent(squeeze: Squeeze) -> None:
     """So no iterations are spent on its rest."""
     pressed = squeeze("cube", 5.0, drag_m=1e-6)
     pressed.settle()
-    pressed.system.balance(pressed.state, pressed.press, tangent=True)
+    pressed.system.balance(pressed.state, pressed.press)
     surface = pressed.system.outer
     assert 2 in surface.status.numpy()
     assert np.abs(surface.rest.numpy()).max() < 1e-9 * SOFT.tangential_stiffness * 1e-6
@@ -289,10 +289,10 @@ def test_an_indenter_that_is_gone_leaves_nothing(squeeze: Squeeze) -> None:
     pressed = squeeze("sphere_medium", 0.3, drag_m=5e-5)
     at_random(pressed)
     system, state = pressed.system, pressed.state
-    system.balance(state, pressed.press, tangent=True)
+    system.balance(state, pressed.press)
     state.indenter_pressure[:], state.traction[:] = 0.0, 0.0
     for away in (None, pressed.press.at(np.array([0.0, 0.0, -0.1, 1.0, 0.0, 0.0, 0.0]))):
-        balance = system.balance(state, away, tangent=True)
+        balance = system.balance(state, away)
         system.tangent_values()
         assert not balance.indenter.any()
         assert not system.slides

@@ -10,13 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.fem.config import FingertipParameters
-from palpate.fem.indentation import Indentation
 from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.linear import make_factor
-from palpate.fem.newton import Newton, NewtonSettings
+from palpate.fem.mechanics.indentation import Indentation
+from palpate.fem.mechanics.newton import Newton, NewtonSettings
+from palpate.fem.mechanics.solver import Fingertip, Settings
+from palpate.fem.mechanics.state import State
 from palpate.fem.result import Outcome, Step, Trajectory
-from palpate.fem.solver import Fingertip, Settings
-from palpate.fem.state import State
 from palpate.protos.errors import SimulationError
 
 Floats = NDArray[np.float64]
@@ -238,12 +237,9 @@ def test_a_request_to_stop_is_honoured_before_the_skin_is_touched(finger: Finger
 
 
 def test_superlu_gives_the_same_forces(finger: Fingertip, fill: Fill) -> None:
-    pattern = finger.system.pattern
-    if make_factor(pattern.indptr, pattern.indices).name == "superlu":
-        pytest.skip("there is nothing to compare it with")
     other = fill(Settings(solver="superlu"))
-    assert (finger.newton.factor.name, other.newton.factor.name) == ("pardiso", "superlu")
+    assert (finger.newton.factor.name, other.newton.factor.name) == ("fronts", "superlu")
     path = press_path(finger, 0.4e-3, 0.8e-3)
     first, second = finger.indent(BALL, path), other.indent(BALL, path)
-    np.testing.assert_allclose(second.forces, first.forces, atol=1e-8)
-    np.testing.assert_allclose(other.nodes, finger.nodes, atol=1e-14)
+    np.testing.assert_allclose(second.forces, first.forces, atol=1e-6)
+    np.testing.assert_allclose(other.nodes, finger.nodes, atol=1e-10)

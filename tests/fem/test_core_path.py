@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate.fem.indenter.pose import rotation_matrix
-from palpate.fem.path import interpolate_pose, path_lengths
+from palpate.fem.mechanics.path import interpolate_pose, path_lengths
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.fem.measured import (
+from palpate.fem.calibration.measured import (
     MEASURED,
     SIMULATED,
     Indentation,

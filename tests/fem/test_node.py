@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import zenoh
 
-from palpate.fem import node
 from palpate.fem.config import FingertipParameters
-from palpate.fem.reply import as_reply
-from palpate.fem.request import path_of
-from palpate.fem.service_config import FemConfig
+from palpate.fem.service import node
+from palpate.fem.service.config import FemConfig
+from palpate.fem.service.reply import as_reply
+from palpate.fem.service.request import path_of
 from palpate.protos.client import Client
 from palpate.protos.codec import ERROR, SIMULATION_REQUEST
 from palpate.protos.config import LinkConfig, parse_config

@@ -76,7 +76,7 @@ def test_a_killed_worker_is_replaced(service: Any) -> None:
     assert first.wait(PATIENCE_S)
     for path in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
         for pid in map(int, path.read_text().split()):
-            if b"palpate.fem.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            if b"palpate.fem.service.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
                 os.kill(pid, signal.SIGKILL)
     thread.join(PATIENCE_S)
     assert out[0].code is ErrorCode.INTERNAL

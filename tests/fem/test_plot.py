@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem.plot import plot_curves, plot_overview, plot_step, von_mises
-from palpate.fem.plot_curves import travel_m
-from palpate.fem.plot_section import cut_sides, cut_solid, cut_surface, outline
+from palpate.fem.plot.curves import travel_m
+from palpate.fem.plot.section import cut_sides, cut_solid, cut_surface, outline
+from palpate.fem.plot.step import plot_curves, plot_overview, plot_step, von_mises
 from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.store_content import StoredFingertip, TrajectorySummary
-from palpate.fem.store_files import StoreDiskError
-from palpate.fem.store_sample import (
+from palpate.fem.store.content import StoredFingertip, TrajectorySummary
+from palpate.fem.store.files import StoreDiskError
+from palpate.fem.store.sample import (
     INNER_M,
     OUTER_M,
     indenter_outline,

@@ -16,12 +16,12 @@ import pytest
 
 from palpate.fem.config import FingertipParameters
 from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.store import SimulationStore
-from palpate.fem.store_content import StoredFingertip
-from palpate.fem.store_export import export
-from palpate.fem.store_files import StoreMismatchError, StoreTakenError
-from palpate.fem.store_sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store_writer import StoreWriter
+from palpate.fem.store.content import StoredFingertip
+from palpate.fem.store.export import export
+from palpate.fem.store.files import StoreMismatchError, StoreTakenError
+from palpate.fem.store.read import SimulationStore
+from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate.fem.store.writer import StoreWriter
 from palpate.protos.errors import ConfigError, DatasetError
 
 ID = "sphere_medium/03/normal"
@@ -218,9 +218,9 @@ def test_export_onto_a_full_disk(path: Path) -> None:
     program = """
 import resource, signal, sys
 from pathlib import Path
-from palpate.fem.store import SimulationStore
-from palpate.fem.store_export import export
-from palpate.fem.store_files import StoreDiskError
+from palpate.fem.store.read import SimulationStore
+from palpate.fem.store.export import export
+from palpate.fem.store.files import StoreDiskError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
 try:

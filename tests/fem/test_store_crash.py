@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 
 from palpate.fem.result import Trajectory
-from palpate.fem.store import SimulationStore
-from palpate.fem.store_content import StoredFingertip
-from palpate.fem.store_files import StoreDiskError, StoreTakenError
-from palpate.fem.store_sample import sample_fingertip, sample_trajectory
-from palpate.fem.store_writer import StoreWriter
+from palpate.fem.store.content import StoredFingertip
+from palpate.fem.store.files import StoreDiskError, StoreTakenError
+from palpate.fem.store.read import SimulationStore
+from palpate.fem.store.sample import sample_fingertip, sample_trajectory
+from palpate.fem.store.writer import StoreWriter
 
 PRELUDE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
-from palpate.fem.store import FINGERTIP, SimulationStore
-from palpate.fem.store_files import StoreTakenError, StoreDiskError
-from palpate.fem.store_sample import sample_fingertip, sample_trajectory
-from palpate.fem.store_writer import StoreWriter
+from palpate.fem.store.read import FINGERTIP, SimulationStore
+from palpate.fem.store.files import StoreTakenError, StoreDiskError
+from palpate.fem.store.sample import sample_fingertip, sample_trajectory
+from palpate.fem.store.writer import StoreWriter
 path = Path(sys.argv[1])
 tip = sample_fingertip(divisions=4)
 press = sample_trajectory(tip, steps=5)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from palpate.fem.result import Trajectory
-from palpate.fem.store import FINGERTIP, SimulationStore
-from palpate.fem.store_content import StoredFingertip
-from palpate.fem.store_files import StoreDiskError
-from palpate.fem.store_sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store_writer import StoreWriter
+from palpate.fem.store.content import StoredFingertip
+from palpate.fem.store.files import StoreDiskError
+from palpate.fem.store.read import FINGERTIP, SimulationStore
+from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate.fem.store.writer import StoreWriter
 from palpate.protos.errors import ConfigError, DatasetError
 
 ID = "sphere_medium/03/normal"

@@ -8,9 +8,9 @@ from pathlib import Path
 import h5py
 import pytest
 
-from palpate.fem.store_sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store_trajectory import CONVERGENCE
-from palpate.fem.store_writer import StoreWriter
+from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate.fem.store.trajectory import CONVERGENCE
+from palpate.fem.store.writer import StoreWriter
 
 
 @pytest.fixture(scope="module")

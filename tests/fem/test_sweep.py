@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.fem.batch import Batch, BatchReport, Press
 from palpate.fem.config import FingertipParameters
-from palpate.fem.jobs import Setup
 from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.store import SimulationStore
-from palpate.fem.sweep import sweep_into_store
+from palpate.fem.service.batch import Batch, BatchReport, Press
+from palpate.fem.service.jobs import Setup
+from palpate.fem.service.sweep import sweep_into_store
+from palpate.fem.store.read import SimulationStore
 from palpate.protos.errors import DatasetError, RemoteError
 
 fakes: Any = importlib.import_module("fem_fakes")

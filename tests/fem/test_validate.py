@@ -10,19 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem.align import Floats
-from palpate.fem.calibrate_runs import Simulated, simulate_all
+from palpate.fem.calibration.align import Floats
+from palpate.fem.calibration.measured import SIMULATED, Indentation, write_indentations
+from palpate.fem.calibration.runs import Simulated, simulate_all
 from palpate.fem.config import FingertipParameters
-from palpate.fem.measured import SIMULATED, Indentation, write_indentations
-from palpate.fem.path import path_lengths
-from palpate.fem.plot_validation import examples, plot_examples, plot_indenters
+from palpate.fem.mechanics.path import path_lengths
+from palpate.fem.plot.validation import examples, plot_examples, plot_indenters
 from palpate.fem.result import Outcome
-from palpate.fem.store import SimulationStore
-from palpate.fem.store_export import export
-from palpate.fem.store_sample import sample_fingertip, sample_trajectory
-from palpate.fem.store_writer import StoreWriter
-from palpate.fem.validate import Validation, validate
-from palpate.fem.validate_report import (
+from palpate.fem.store.export import export
+from palpate.fem.store.read import SimulationStore
+from palpate.fem.store.sample import sample_fingertip, sample_trajectory
+from palpate.fem.store.writer import StoreWriter
+from palpate.fem.validation.report import (
     INDENTER_HEADINGS,
     TRAJECTORY_HEADINGS,
     indenter_rows,
@@ -30,7 +29,8 @@ from palpate.fem.validate_report import (
     trajectory_rows,
     write_report,
 )
-from palpate.fem.validate_store import measured_from, simulated_from
+from palpate.fem.validation.simulated import measured_from, simulated_from
+from palpate.fem.validation.validate import Validation, validate
 from palpate.protos.errors import DatasetError
 
 TOUCH_M = 1e-3

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from palpate.fem import verify
-from palpate.fem.system import System
+from palpate.fem.mechanics.system import System
 from palpate.fem.verify import closed_forms
 from palpate.fem.verify.check import Absent, Case, Check, Measured
 from palpate.protos.errors import SimulationError

@@ -24,7 +24,7 @@ from palpate.deploy.options import (
     client_link,
     example,
 )
-from palpate.fem.cli import fem_app
+from palpate.fem.cli.app import fem_app
 
 app = typer.Typer(
     cls=PalpateGroup,

@@ -153,8 +153,8 @@ def _review_store(
 
 def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
     """The overview of a store, or the last step of the one trajectory that is asked for."""
-    from palpate.fem.plot import plot_overview, plot_step
-    from palpate.fem.store import SimulationStore
+    from palpate.fem.plot.step import plot_overview, plot_step
+    from palpate.fem.store.read import SimulationStore
     from palpate.services.simulation_view_file import choose
 
     store = SimulationStore.open(path)

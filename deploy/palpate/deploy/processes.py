@@ -76,7 +76,7 @@ def _run_recorder(profile: Profile, stop: threading.Event) -> None:
 
 
 def _run_fem(profile: Profile, stop: threading.Event) -> None:
-    from palpate.fem import node
+    from palpate.fem.service import node
 
     node.run(profile.fem, profile.link, profile.station, stop)
 

@@ -22,7 +22,7 @@ from pydantic_settings import (
 )
 
 from palpate.deploy.logs import LogFormat, LogLevel
-from palpate.fem.service_config import FemConfig
+from palpate.fem.service.config import FemConfig
 from palpate.gateway.config import GatewayConfig
 from palpate.protos.config import (
     DEFAULT_ROUTER,

@@ -3,7 +3,7 @@
 ::
 
     from palpate.fem.mesh.parametric import biotac
-    from palpate.fem.solver import Fingertip
+    from palpate.fem.mechanics.solver import Fingertip
 
     tip = Fingertip.pressurised(biotac())
     trajectory = tip.indent(indenter, path)

@@ -12,10 +12,10 @@ import numpy as np
 
 from palpate.fem.indenter.approach import Surface
 from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.linear import Pardiso
+from palpate.fem.mechanics.solver import Fingertip
 from palpate.fem.mesh.parametric import biotac
 from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.solver import Fingertip
+from palpate.fem.sparse.factor import Multifrontal
 from palpate.fem.trajectory import angled_path, normal_path, sample_targets
 
 Metrics = dict[str, float | str]
@@ -83,7 +83,7 @@ def run(
                 best, parts = trajectory, dict(spent)
         assert best is not None
         metrics |= _of_trajectory(name, best, parts)
-    if isinstance(tip.newton.factor, Pardiso):
+    if isinstance(tip.newton.factor, Multifrontal):
         statistics = tip.newton.factor.statistics
         metrics |= {f"solver.{key}": value for key, value in statistics.items()}
         each = float(metrics["normal.factorise_s"]) / float(metrics["normal.factorisations"])
@@ -118,25 +118,22 @@ def _watch(tip: Fingertip) -> dict[str, float]:
     """Clock the parts of a fingertip's solver; the sums are in the returned dictionary."""
     spent: dict[str, float] = defaultdict(float)
 
-    def clocked(part: Callable[..., str], function: Callable[..., Any]) -> Callable[..., Any]:
+    def clocked(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **options: Any) -> Any:
             started = time.perf_counter()
             try:
                 return function(*args, **options)
             finally:
-                spent[part(*args, **options)] += time.perf_counter() - started
+                spent[part] += time.perf_counter() - started
 
         return call
 
-    def evaluation(*_: object, tangent: bool = False) -> str:
-        return "assemble" if tangent else "residual"
-
     system, factor = tip.system, tip.newton.factor
-    watched: tuple[tuple[Any, str, Callable[..., str]], ...] = (
-        (system, "balance", evaluation),
-        (system, "tangent_values", lambda: "assemble"),
-        (factor, "factorise", lambda _: "factorise"),
-        (factor, "solve", lambda _: "solve"),
+    watched: tuple[tuple[Any, str, str], ...] = (
+        (system, "balance", "residual"),
+        (system, "tangent_values", "assemble"),
+        (factor, "factorise", "factorise"),
+        (factor, "solve", "solve"),
     )
     for owner, method, part in watched:
         setattr(owner, method, clocked(part, getattr(owner, method)))

@@ -57,7 +57,7 @@ CORE_EDGE_M = 0.6e-3  # of the surface for pictures
 def biotac(
     *,
     thickness_m: float = 1.57e-3,
-    edge_m: float = 0.45e-3,
+    edge_m: float = 0.47e-3,
     layers: int = 2,
     cavity: CavityShape | None = None,
     core: CoreShape | None = None,

@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.fem.system import Balance
+from palpate.fem.mechanics.balance import Balance
 from palpate.fem.verify.body import MU
 from palpate.fem.verify.check import Case, Measured
 from palpate.fem.verify.element import order_of

@@ -7,14 +7,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.fem.laws import ContactSettings, Press
-from palpate.fem.linear import make_factor
-from palpate.fem.material import NeoHooke
+from palpate.fem.mechanics.balance import Balance
+from palpate.fem.mechanics.laws import ContactSettings, Press
+from palpate.fem.mechanics.material import NeoHooke
+from palpate.fem.mechanics.newton import Newton, NewtonSettings, Report
+from palpate.fem.mechanics.state import State
+from palpate.fem.mechanics.system import System
 from palpate.fem.mesh.core import DistanceGrid
 from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.newton import Newton, NewtonSettings, Report
-from palpate.fem.state import State
-from palpate.fem.system import Balance, System
+from palpate.fem.sparse.factor import make_factor
 from palpate.protos.errors import SimulationError
 
 Floats = NDArray[np.float64]
@@ -30,6 +31,7 @@ TIGHT = NewtonSettings(
     iterations=40,
     largest_move_m=1.0,
     keep_factor=0.0,
+    keep_elastic=0.0,
 )
 
 
@@ -73,7 +75,13 @@ class Body:
     def newton(self) -> Newton:
         """Made when first needed: half of the bodies are only looked at."""
         pattern = self.system.pattern
-        return Newton(self.system, make_factor(pattern.indptr, pattern.indices), self.settings)
+        return Newton(
+            self.system,
+            make_factor(
+                pattern.indptr, pattern.indices, groups=pattern.free // 3, solver="fronts-double"
+            ),
+            self.settings,
+        )
 
     def solve(self, press: Press | None = None, *, volume: float | None = None) -> Balance:
         """Equilibrium from where it is; then anchors follow what slid.

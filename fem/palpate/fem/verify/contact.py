@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.fem.indenter.shape import Indenter
-from palpate.fem.laws import Press
+from palpate.fem.mechanics.balance import Balance
+from palpate.fem.mechanics.laws import Press
 from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.system import Balance
 from palpate.fem.verify.body import MU, TIGHT, Body
 from palpate.fem.verify.check import Case, Measured
 from palpate.fem.verify.meshes import (

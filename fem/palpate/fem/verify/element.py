@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.fem.indenter.pose import rotation_matrix
-from palpate.fem.laws import Press
+from palpate.fem.mechanics.laws import Press
 from palpate.fem.mesh.solid import SolidMesh
 from palpate.fem.verify.body import MU, TIGHT, Body
 from palpate.fem.verify.check import Case, Measured

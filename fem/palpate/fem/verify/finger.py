@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.fem.indenter.shape import Indenter
-from palpate.fem.laws import ContactSettings, Press
+from palpate.fem.mechanics.balance import Balance
+from palpate.fem.mechanics.laws import ContactSettings, Press
+from palpate.fem.mechanics.solver import Fingertip, Settings
 from palpate.fem.mesh.core import DistanceGrid
 from palpate.fem.mesh.geometry import Geometry
 from palpate.fem.mesh.parametric import biotac
-from palpate.fem.solver import Fingertip, Settings
-from palpate.fem.system import Balance
 from palpate.fem.verify.body import MU, TIGHT, Body
 from palpate.fem.verify.meshes import hollow_sphere
 from palpate.fem.verify.rigid import ball, pose
@@ -81,7 +81,9 @@ def round_finger(
 @cache
 def _coarse() -> tuple[Geometry, Fingertip]:
     geometry = biotac(edge_m=EDGE_M, layers=1)
-    return geometry, Fingertip.pressurised(geometry, settings=Settings(newton=TIGHT))
+    return geometry, Fingertip.pressurised(
+        geometry, settings=Settings(newton=TIGHT, solver="fronts-double")
+    )
 
 
 def biotac_finger(*, friction: float, aside: tuple[float, float]) -> Finger:

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from palpate.fem.laws import Press
+from palpate.fem.mechanics.laws import Press
 from palpate.fem.verify.body import MU, Body
 from palpate.fem.verify.check import Case, Measured
 from palpate.fem.verify.finger import biotac_finger, round_finger

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.fem.indenter.pose import rotation_matrix
-from palpate.fem.laws import Press
-from palpate.fem.newton import NewtonSettings
+from palpate.fem.mechanics.laws import Press
+from palpate.fem.mechanics.newton import NewtonSettings
 from palpate.fem.verify.body import BULK_RATIO, TIGHT, Body
 from palpate.fem.verify.check import Case, Measured
 from palpate.fem.verify.meshes import rectangle, slab

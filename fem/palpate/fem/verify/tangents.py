@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from palpate.fem.indenter.distance import distance
-from palpate.fem.laws import Press
-from palpate.fem.system import Balance
+from palpate.fem.mechanics.balance import Balance
+from palpate.fem.mechanics.laws import Press
 from palpate.fem.verify.body import MU, Body
 from palpate.fem.verify.check import Case, Measured
 from palpate.fem.verify.finger import round_core
@@ -51,11 +51,11 @@ def _follow(body: Body, press: Press | None) -> None:
     f = np.einsum("eai,eqaj->eqij", state.position[body.mesh.elements], skin.gradient_values)
     volume = (skin.weight_values * np.linalg.det(f)).sum(axis=1)
     state.pressure = body.bulk * (volume / skin.rest_volume - 1)
-    if body.system.core is not None:
+    if body.system.on_core.core is not None:
         inside = body.system.inner
         corners = state.position[body.mesh.inner_faces]
         points = np.einsum("qa,fai->fqi", inside.shape_values, corners)
-        gap = body.system.core.evaluate(points)[0].reshape(points.shape[:2])
+        gap = body.system.on_core.core.evaluate(points)[0].reshape(points.shape[:2])
         state.core_pressure = contact.stiffness * np.maximum(-gap, 0.0)
     if press is None:
         return
@@ -78,7 +78,7 @@ def _follow(body: Body, press: Press | None) -> None:
 def _product(body: Body, press: Press | None, direction: Floats) -> Floats:
     """The solver's tangent times a direction (V, 3)."""
     system = body.system
-    system.balance(body.state, press, tangent=True)
+    system.balance(body.state, press)
     pattern = system.pattern
     upper = sp.csr_matrix((system.tangent_values(), pattern.indices, pattern.indptr))
     flat = direction.ravel()
@@ -153,7 +153,7 @@ def core_tangent() -> Measured:
     body, direction = _shaken(core=True)
     expected = _difference(body, None, direction, lambda balance: balance.core)
     with_core = _product(body, None, direction)
-    body.system.core = None
+    body.system.on_core.core = None
     return _off(with_core - _product(body, None, direction), expected)
 
 

@@ -1,0 +1,1 @@
+"""Parameters of a fingertip from measured forces."""

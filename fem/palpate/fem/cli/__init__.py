@@ -1,0 +1,1 @@
+"""``palpate fem`` and its commands."""

@@ -1,0 +1,279 @@
+"""``palpate fem``: signatures and help only; each command's work is in its own module.
+
+Nothing heavy is imported before a command runs: ``palpate --help`` must not wait for NumPy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from palpate.protos.errors import MissingExtraError
+
+EXTRA_MODULES = ("scipy", "warp", "pymetis", "threadpoolctl", "h5py", "matplotlib")
+"""What ``palpate[fem]`` installs and a bare palpate has not."""
+
+
+class _FemGroup(typer.core.TyperGroup):
+    """A group whose commands say which extra is missing."""
+
+    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
+        """Run the command that was given."""
+        try:
+            return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing in EXTRA_MODULES:
+                raise MissingExtraError(missing, extra="fem") from error
+            raise
+
+
+fem_app = typer.Typer(
+    cls=_FemGroup,
+    help="The fingertip in finite elements: simulate, verify, calibrate, serve (palpate[fem]).",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+MeshOption = Annotated[
+    str, typer.Option("--mesh", metavar="biotac|FOLDER", help="Mesh, or folder of the public one.")
+]
+EdgeOption = Annotated[
+    float | None, typer.Option("--edge-mm", help="Edge of the mesh's elements on the pad [mm].")
+]
+LayersOption = Annotated[int, typer.Option("--layers", min=1, help="Elements through the skin.")]
+ParametersOption = Annotated[
+    Path | None,
+    typer.Option("--parameters", metavar="FIT.json", help="Fingertip as `calibrate` found it."),
+]
+ThicknessOption = Annotated[
+    float | None, typer.Option("--skin-thickness-mm", help="Skin thickness [mm].")
+]
+ModulusOption = Annotated[
+    float | None, typer.Option("--shear-modulus-kpa", help="Shear modulus of the skin [kPa].")
+]
+FrictionOption = Annotated[
+    float | None, typer.Option("--friction", help="Friction coefficient of indenter and skin.")
+]
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=0, help="Processes that solve; 0 = one for each core.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+MeasuredArgument = Annotated[
+    Path, typer.Argument(metavar="MEASURED.h5", help="Measured indentations.")
+]
+
+
+def _example(*lines: str) -> str:
+    return "Example: " + "  or  ".join(lines)
+
+
+@fem_app.command(
+    epilog=_example(
+        "palpate fem run --indenter sphere_7mm --depth-mm 2 --png press.png",
+        "palpate fem run --sweep --points 2 --store runs/paper.sim",
+    )
+)
+def run(
+    indenter: Annotated[
+        list[str] | None, typer.Option("--indenter", help="Indenter; --sweep: may be repeated.")
+    ] = None,
+    depth_mm: Annotated[float, typer.Option(help="Travel from first contact on [mm].")] = 3.0,
+    at_mm: Annotated[
+        tuple[float, float], typer.Option(metavar="X Y", help="Point of the pad it aims at [mm].")
+    ] = (-4.0, 0.0),
+    angle_deg: Annotated[float, typer.Option(help="Angle to the inward normal [degrees].")] = 0.0,
+    azimuth_deg: Annotated[
+        float, typer.Option(help="Where an angled one goes: 0 distal, 90 +y [degrees].")
+    ] = 0.0,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a path.")] = 20,
+    path: Annotated[
+        Path | None,
+        typer.Option(metavar="POSES.csv", help="Poses x_m,y_m,z_m,qw,qx,qy,qz instead of a press."),
+    ] = None,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="The paper's set of indentations.")
+    ] = False,
+    points: Annotated[int, typer.Option(min=1, help="--sweep: points for each indenter.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="--sweep: seed of the points.")] = 0,
+    store: Annotated[
+        Path | None,
+        typer.Option(metavar="NAME.sim", help="Store; what it holds already is not run again."),
+    ] = None,
+    stress: Annotated[bool, typer.Option("--stress", help="Keep stress in the store.")] = False,
+    png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the result.")] = None,
+    limit_s: Annotated[
+        float, typer.Option(min=1, help="Longest time for one trajectory [s].")
+    ] = 600.0,
+    workers: WorkersOption = 0,
+    mesh: MeshOption = "biotac",
+    edge_mm: EdgeOption = None,
+    layers: LayersOption = 2,
+    parameters: ParametersOption = None,
+    skin_thickness_mm: ThicknessOption = None,
+    shear_modulus_kpa: ModulusOption = None,
+    friction: FrictionOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Simulate one indentation, or the paper's set of them; Ctrl-C keeps what has ended."""
+    from palpate.fem.cli.model import model_of
+    from palpate.fem.cli.run import Wanted, run_command
+
+    raise typer.Exit(
+        run_command(
+            Wanted(
+                indenters=tuple(indenter or ()),
+                depth_m=depth_mm * 1e-3,
+                at_m=(at_mm[0] * 1e-3, at_mm[1] * 1e-3),
+                angle_deg=angle_deg,
+                azimuth_deg=azimuth_deg,
+                steps=steps,
+                path=path,
+                sweep=sweep,
+                points=points,
+                seed=seed,
+            ),
+            model_of(
+                mesh=mesh,
+                edge_mm=edge_mm,
+                layers=layers,
+                fit=parameters,
+                skin_thickness_mm=skin_thickness_mm,
+                shear_modulus_kpa=shear_modulus_kpa,
+                friction=friction,
+            ),
+            workers=workers,
+            limit_s=limit_s,
+            store=store,
+            stress=stress,
+            png=png,
+            as_json=json_,
+        )
+    )
+
+
+@fem_app.command(epilog=_example("palpate fem verify", "palpate fem verify --only hertz --json"))
+def verify(
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="WORD", help="Tests whose name has this word.")
+    ] = None,
+    slow: Annotated[bool, typer.Option("--slow", help="Also tests that take minutes.")] = False,
+    json_: JsonOption = False,
+) -> None:
+    """Check the solver against closed forms and itself; a line each with value and tolerance."""
+    from palpate.fem.cli.check import verify_command
+
+    raise typer.Exit(verify_command(only=only, slow=slow, as_json=json_))
+
+
+@fem_app.command(epilog=_example("palpate fem bench --json"))
+def bench(
+    edge_mm: EdgeOption = None,
+    layers: LayersOption = 2,
+    json_: JsonOption = False,
+) -> None:
+    """Seconds for a trajectory of 20 steps, with GFlop/s beside the machine's peak."""
+    from palpate.fem.cli.check import bench_command
+
+    raise typer.Exit(bench_command(edge_mm=edge_mm, layers=layers, as_json=json_))
+
+
+@fem_app.command(epilog=_example("palpate fem calibrate measured.h5 --out fit.json"))
+def calibrate(
+    measured: MeasuredArgument,
+    out: Annotated[
+        Path, typer.Option(metavar="FIT.json", help="Result; `run --parameters` takes it.")
+    ] = Path("fit.json"),
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Use trajectories that begin so; repeatable.")
+    ] = None,
+    png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the fit.")] = None,
+    workers: WorkersOption = 0,
+    mesh: MeshOption = "biotac",
+    edge_mm: EdgeOption = None,
+    layers: LayersOption = 2,
+) -> None:
+    """Find skin thickness, modulus, friction and fluid volume from measured forces."""
+    from palpate.fem.cli.calibrate import calibrate_command
+    from palpate.fem.cli.model import model_of
+
+    model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers)
+    raise typer.Exit(calibrate_command(measured, out, only or [], model, png=png, workers=workers))
+
+
+@fem_app.command(
+    epilog=_example("palpate fem validate measured.h5 --parameters fit.json --out runs/validation")
+)
+def validate(
+    measured: MeasuredArgument,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of table and plots.")] = Path(
+        "runs/validation"
+    ),
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Use trajectories that begin so; repeatable.")
+    ] = None,
+    store: Annotated[
+        Path | None,
+        typer.Option(metavar="NAME.sim", help="Take simulations from this store; run none."),
+    ] = None,
+    workers: WorkersOption = 0,
+    mesh: MeshOption = "biotac",
+    edge_mm: EdgeOption = None,
+    layers: LayersOption = 2,
+    parameters: ParametersOption = None,
+) -> None:
+    """Compare simulated with measured forces: the paper's table by indenter, and its plots."""
+    from palpate.fem.cli.calibrate import validate_command
+    from palpate.fem.cli.model import model_of
+
+    model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers, fit=parameters)
+    raise typer.Exit(
+        validate_command(measured, out, only or [], model, store=store, workers=workers)
+    )
+
+
+@fem_app.command(epilog=_example("palpate fem serve --workers 2"))
+def serve(
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
+    ] = "tcp/127.0.0.1:7447",
+    station: Annotated[str, typer.Option("--station", help="Name of the station.")] = "lab",
+    sensor: Annotated[str, typer.Option("--sensor", help="Name to answer under.")] = "twin",
+    workers: WorkersOption = 0,
+    waiting: Annotated[int, typer.Option(min=0, help="Requests that may wait.")] = 8,
+    max_deadline_s: Annotated[
+        float, typer.Option(min=1, help="Longest time for a request [s].")
+    ] = 600.0,
+    mesh: MeshOption = "biotac",
+    edge_mm: EdgeOption = None,
+    layers: LayersOption = 2,
+    parameters: ParametersOption = None,
+    skin_thickness_mm: ThicknessOption = None,
+    shear_modulus_kpa: ModulusOption = None,
+    friction: FrictionOption = None,
+) -> None:
+    """Answer simulation requests of a running station until Ctrl-C."""
+    from palpate.fem.cli.model import model_of
+    from palpate.fem.cli.serve import serve_command
+
+    model = model_of(
+        mesh=mesh,
+        edge_mm=edge_mm,
+        layers=layers,
+        fit=parameters,
+        skin_thickness_mm=skin_thickness_mm,
+        shear_modulus_kpa=shear_modulus_kpa,
+        friction=friction,
+    )
+    serve_command(
+        model,
+        connect=connect,
+        station=station,
+        sensor=sensor,
+        workers=workers,
+        waiting=waiting,
+        max_deadline_s=max_deadline_s,
+    )

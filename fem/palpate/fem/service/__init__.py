@@ -1,0 +1,1 @@
+"""Workers that solve, and the service that asks them."""

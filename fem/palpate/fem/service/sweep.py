@@ -1,0 +1,77 @@
+"""A sweep into a store: what is there already is not run again."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from palpate.fem.result import Trajectory
+from palpate.fem.service.batch import Batch, BatchReport, OnReport, Plan
+from palpate.fem.store.content import Outline
+from palpate.fem.store.files import StoreTakenError
+from palpate.fem.store.writer import Place, StoreWriter
+
+
+def sweep_into_store(
+    batch: Batch,
+    plans: Sequence[Plan],
+    path: Path,
+    *,
+    stop: threading.Event,
+    on_report: OnReport | None = None,
+    outline: Callable[[str], Outline] | None = None,
+    stress: bool = False,
+    command: str = "",
+) -> tuple[BatchReport, int]:
+    """Run what a store does not hold yet; each trajectory is on the disk as soon as it has ended.
+
+    Several sweeps, of one command line or of several, may fill one store at the same time.
+
+    Args:
+        batch: Runs them; closed by whoever made it.
+        plans: All that the store is to hold.
+        path: The store, ``NAME.sim``; made if it is not there.
+        stop: Set it to end early; what runs then is not kept.
+        on_report: Called whenever something has happened.
+        outline: Gives the surface of an indenter by its name, for pictures.
+        stress: Whether to keep stress.
+        command: What runs it, for people.
+
+    Returns:
+        How it went, and how many were there already.
+
+    Raises:
+        DatasetError: The store is another fingertip's, damaged, in use, or the disk refuses.
+        RemoteError: The solver does not start.
+    """
+    fingertip = batch.fingertip(stop)
+    if fingertip is None:
+        return BatchReport(len(plans), stopped=True), 0
+    with StoreWriter(
+        path, fingertip, shared=True, outline=outline, stress=stress, command=command
+    ) as store:
+        done = store.done()
+        left = [plan for plan in plans if plan.name not in done]
+        places: dict[str, Place] = {}
+
+        def claimed() -> Iterator[Plan]:
+            for plan in left:
+                with contextlib.suppress(StoreTakenError):  # another process is at it, or was
+                    places[plan.name] = store.claim(plan.name)
+                    yield plan
+
+        def keep(plan: Plan, trajectory: Trajectory) -> None:
+            with places.pop(plan.name) as place:
+                place.write(trajectory)
+
+        try:
+            report = batch.run(
+                claimed(), len(left), stop=stop, on_trajectory=keep, on_report=on_report
+            )
+        finally:
+            for place in places.values():
+                with place:  # lets go of what was not written
+                    pass
+    return report, len(plans) - len(left)
