@@ -26,9 +26,7 @@ demo: $(VENV)/.demo  ## virtual finger -> features -> recorder: live table and p
 	@$(BIN)/palpate demo
 
 test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 5-10 min after setup
-	@# Two processes: torch, which others import, and MKL's sparse solver do not bear one another.
-	@$(BIN)/pytest tests/fem tests/crosscheck
-	@$(BIN)/pytest --ignore=tests/fem --ignore=tests/crosscheck
+	@$(BIN)/pytest
 
 # The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.
 check: $(VENV)/.dev  ## format, lint, types, borders, wire contract, house tests | 1-2 min

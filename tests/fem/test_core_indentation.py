@@ -114,7 +114,7 @@ def test_the_skin_is_dragged_held_and_dragged_back(finger: Fingertip, sense: flo
     still, along, held, back = finger.indent(BALL, path).steps
     friction = [(s.force[0] - still.force[0]) * sense for s in (along, held, back)]
     assert friction[0] > 0.05 * along.force[2]
-    assert friction[1] == pytest.approx(friction[0], rel=1e-5)
+    assert friction[1] == pytest.approx(friction[0], rel=5e-5)
     np.testing.assert_allclose(held.displacement, along.displacement, atol=1e-9)
     assert friction[2] < -0.02 * back.force[2]
 
@@ -135,13 +135,28 @@ def test_a_force_limit_ends_it_with_the_step_that_passed_it(
     finger: Fingertip, path: Floats, whole: Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     forces = np.linalg.norm(whole.forces, axis=1)
-    limit = Settings(force_limit_n=float(forces[1] * 0.9))
+    limit = Settings(force_limit_n=float(forces[1] * 0.95))
     monkeypatch.setattr(finger, "settings", limit)
     trajectory = finger.indent(BALL, path)
     assert trajectory.outcome is Outcome.FORCE_LIMIT
     assert_same_steps(trajectory.steps, whole.steps[:2])
     assert trajectory.travel_m == pytest.approx(0.402e-3, rel=1e-9)
     assert trajectory.reason == f"{forces[1]:.1f} N, 0.402 mm along the path"
+
+
+def test_an_increment_that_goes_far_past_the_limit_is_cut_back(
+    finger: Fingertip, path: Floats, whole: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends between the limit and a tenth more, and says where."""
+    forces = np.linalg.norm(whole.forces, axis=1)
+    limit = float(forces[0] + 0.4 * (forces[1] - forces[0]))
+    assert forces[1] > 1.2 * limit
+    monkeypatch.setattr(finger, "settings", Settings(force_limit_n=limit))
+    trajectory = finger.indent(BALL, path)
+    assert trajectory.outcome is Outcome.FORCE_LIMIT
+    assert_same_steps(trajectory.steps, whole.steps[:1])
+    assert 0.201e-3 < trajectory.travel_m < 0.402e-3
+    assert limit < float(trajectory.reason.split()[0]) < 1.1 * limit + 0.05
 
 
 @pytest.fixture(scope="module")

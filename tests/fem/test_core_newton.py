@@ -30,6 +30,7 @@ PURE = NewtonSettings(
     tolerance=1e-12,
     volume_tolerance=1e-13,
     gap_tolerance_m=1e-14,
+    traction_tolerance=1e-7,
     largest_move_m=1.0,
     keep_factor=0.0,
     keep_elastic=0.0,

@@ -53,7 +53,7 @@ def calibrate_command(
         ConfigError: No trajectory is left.
     """
     chosen = _chosen(measured, only)
-    with _simulator(model, workers, len(chosen)) as (simulator, executor), progress_bar() as bar:
+    with simulator_for(model, workers, len(chosen)) as (simulator, executor), progress_bar() as bar:
         task = bar.add_task("simulate", total=None, info="")
 
         def on_evaluation(evaluation: Evaluation) -> None:
@@ -119,7 +119,7 @@ def validate_command(
 
 
 def _simulated(chosen: Sequence[Indentation], model: Model, workers: int) -> dict[str, Simulated]:
-    with _simulator(model, workers, len(chosen)) as (simulator, executor), progress_bar() as bar:
+    with simulator_for(model, workers, len(chosen)) as (simulator, executor), progress_bar() as bar:
         task = bar.add_task("simulate", total=None)
         return simulate_all(
             simulator,
@@ -151,7 +151,7 @@ def _chosen(measured: Path, only: Sequence[str]) -> list[Indentation]:
 
 
 @contextmanager
-def _simulator(
+def simulator_for(
     model: Model, workers: int, jobs: int
 ) -> Iterator[tuple[PoolSimulator, ThreadPoolExecutor]]:
     """Worker processes, and as many threads that wait for them."""

@@ -12,6 +12,9 @@ Floats = NDArray[np.float64]
 FORCE_FLOOR_N = 1e-6
 """Scale of force where nothing presses [N]: rounding alone is far below."""
 
+TRACTION_FLOOR_PA = 100.0
+"""Scale of tractions where nothing rubs [Pa]: a thousandth of what a light press makes."""
+
 
 @dataclass(slots=True)
 class Balance:
@@ -26,7 +29,8 @@ class Balance:
         unbalanced: The sum over the free unknowns, fluid pressure included [N], (n,).
         scale: Norm of the nodal forces that have to cancel [N].
         strain_error: Largest |v - v0 - v0 p / kappa| / v0.
-        gap_error_m: By how much gap or way the worst contact point misses its law [m].
+        gap_error_m: By how much the gap of the worst contact point misses its law [m].
+        traction_error: By how much friction's worst traction misses its law, over the largest.
         smallest_jacobian: Of all quadrature points.
     """
 
@@ -39,6 +43,7 @@ class Balance:
     scale: float
     strain_error: float
     gap_error_m: float
+    traction_error: float
     smallest_jacobian: float
 
     @property

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+OVERSHOOT = 0.1
+"""By how much of the force limit its last increment may go beyond it."""
+
 
 @dataclass(slots=True)
 class _Work:
@@ -81,8 +84,13 @@ class Indentation:
                 if 1.0 - goal < 1e-6:
                     goal = 1.0
                 pose = interpolate_pose(self.path[k - 1], self.path[k], goal)
+                origin = (self.state, self.press, self.before, self.before_length)
                 report, balance = self.increment(pose, size)
                 work.add(report)
+                if report.converged and self._overshoots(balance, size):
+                    self.state, self.press, self.before, self.before_length = origin
+                    size *= 0.5
+                    continue
                 if report.converged:
                     done = goal
                     travel = lengths[k - 1] + done * (lengths[k] - lengths[k - 1])
@@ -120,9 +128,17 @@ class Indentation:
             seconds=time.perf_counter() - started,
         )
 
+    def _overshoots(self, balance: Balance, size: float) -> bool:
+        """Whether the skin is pinched so hard at the end of an increment that less is wanted."""
+        settings = self.tip.settings
+        return (
+            _force(balance) > (1.0 + OVERSHOOT) * settings.force_limit_n
+            and 0.5 * size >= settings.smallest_increment
+        )
+
     def check_force(self, balance: Balance, travel: float) -> None:
         """End the trajectory where the skin is pinched."""
-        force = float(np.linalg.norm(balance.indenter.sum(axis=0)))
+        force = _force(balance)
         if force > self.tip.settings.force_limit_n:
             self.outcome = Outcome.FORCE_LIMIT
             self.reason = f"{force:.1f} N, {travel * 1e3:.3f} mm along the path"
@@ -170,6 +186,11 @@ class Indentation:
             if self.outcome is not None:
                 self.reason = str(self.outcome)
         return self.outcome is not None
+
+
+def _force(balance: Balance) -> float:
+    """Size of the net force on the indenter [N]."""
+    return float(np.linalg.norm(balance.indenter.sum(axis=0)))
 
 
 def _cost(work: _Work, report: Report, balance: Balance, tip: Fingertip) -> Convergence:

@@ -36,6 +36,7 @@ class NewtonSettings:
         tolerance: Unbalanced force over the scale of the forces that cancel.
         volume_tolerance: Relative error of the cavity's volume and of each element's.
         gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
+        traction_tolerance: Error of a point's friction over the largest traction.
         iterations: Give up after this many.
         largest_move_m: A longer step of any node is shortened [m].
         keep_factor: A factor is kept while each iteration shrinks the error at least this much
@@ -47,6 +48,7 @@ class NewtonSettings:
     tolerance: float = 1e-6
     volume_tolerance: float = 1e-6
     gap_tolerance_m: float = 0.1e-6
+    traction_tolerance: float = 0.01
     iterations: int = 20
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
@@ -155,8 +157,13 @@ class Newton:
         error = balance.residual
         if volume is not None:
             error = max(error, abs(balance.volume - volume) / volume)
-        # A micrometre of gap counts as much as a hundredth of the force.
-        return max(error, balance.strain_error, balance.gap_error_m * 1e4)
+        # A micrometre of gap counts as much as a hundredth of the force, and as all of friction.
+        return max(
+            error,
+            balance.strain_error,
+            balance.gap_error_m * 1e4,
+            balance.traction_error * 1e-2,
+        )
 
     def _converged(self, balance: Balance, volume: float | None) -> bool:
         settings = self.settings
@@ -165,6 +172,8 @@ class Newton:
         if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
             return False
         if balance.gap_error_m > settings.gap_tolerance_m:
+            return False
+        if balance.traction_error > settings.traction_tolerance:
             return False
         return balance.strain_error <= settings.volume_tolerance
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate.fem.mechanics import contact_kernels, core_kernels, element_kernels, fluid_kernels
-from palpate.fem.mechanics.balance import Balance
+from palpate.fem.mechanics.balance import TRACTION_FLOOR_PA, Balance
 from palpate.fem.mechanics.cavity import Cavity
 from palpate.fem.mechanics.laws import ContactSettings, Press
 from palpate.fem.mechanics.pattern import make_pattern
@@ -230,7 +230,8 @@ class System:
             gap_error_m=max(
                 self.inner.misfit_of(state.core_pressure) / self.contact.stiffness,
                 self.outer.misfit_of(state.indenter_pressure) / self.contact.stiffness,
-                self.outer.traction_misfit(state.traction) / self.contact.tangential_stiffness,
             ),
+            traction_error=self.outer.traction_misfit(state.traction)
+            / max(float(np.abs(state.traction).max(initial=0.0)), TRACTION_FLOOR_PA),
             smallest_jacobian=self.skin.smallest_jacobian(),
         )

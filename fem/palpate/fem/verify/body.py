@@ -28,6 +28,7 @@ TIGHT = NewtonSettings(
     tolerance=1e-11,
     volume_tolerance=1e-11,
     gap_tolerance_m=1e-14,
+    traction_tolerance=1e-7,
     iterations=40,
     largest_move_m=1.0,
     keep_factor=0.0,

@@ -1,0 +1,57 @@
+"""What refinement changes and what it costs: a picture of a study."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from palpate.fem.plot.style import MM, grid, label, new_figure, save
+from palpate.fem.study import DISPLACEMENT_CHANGE_M, FORCE_CHANGE, Row
+
+COLOURS = ("#2f6fb5", "#d1495b", "#2e8b57", "#e09f3e")
+LIMIT = "#9aa0a8"
+
+
+def plot_study(rows: Sequence[Row], path: Path) -> None:
+    """Change of force and displacement by each refinement, and seconds, one line an indenter.
+
+    Args:
+        rows: Of `mesh_study` (drawn over unknowns) or `step_study` (drawn over steps).
+        path: PNG to write.
+
+    Raises:
+        StoreDiskError: The disk is full or refuses.
+    """
+    meshes = len({row.edge_m for row in rows}) > 1
+    figure = new_figure(12.0, 3.6)
+    force, moved, cost = figure.subplots(1, 3)
+    for name, colour in zip(dict.fromkeys(row.indenter for row in rows), COLOURS, strict=False):
+        mine = [row for row in rows if row.indenter == name]
+        across = [row.unknowns if meshes else row.steps for row in mine]
+        style = {"color": colour, "marker": "o", "ms": 4, "lw": 1.5, "label": name}
+        force.plot(across, [100 * abs(row.force_change) for row in mine], **style)
+        moved.plot(across, [MM * row.displacement_change_m for row in mine], **style)
+        cost.plot(across, [row.seconds for row in mine], **style)
+        if meshes:
+            for row, x in zip(mine, across, strict=True):
+                if not math.isnan(row.seconds) and name == rows[0].indenter:
+                    cost.annotate(
+                        f"{row.edge_m * MM:g} mm\n{row.factor_gflop:.1f} GFlop",
+                        (x, row.seconds),
+                        textcoords="offset points",
+                        xytext=(4, -22),
+                        fontsize=7,
+                    )
+    force.axhline(100 * FORCE_CHANGE, color=LIMIT, ls="--", lw=1)
+    moved.axhline(MM * DISPLACEMENT_CHANGE_M, color=LIMIT, ls="--", lw=1)
+    unit = "unknowns" if meshes else "steps of 3 mm"
+    label(force, unit, "change of the force [%]", "force against the coarser one")
+    label(moved, unit, "mean change [mm]", "displacement of the outer skin")
+    label(cost, unit, "seconds a press", "cost")
+    for axes in (force, moved, cost):
+        grid(axes)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+    force.legend(frameon=False, fontsize=8)
+    save(figure, path)
