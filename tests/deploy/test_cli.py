@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -16,10 +17,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from palpate.deploy import training
+from palpate.deploy import doctor, training
 from palpate.deploy.cli import app
 from palpate.deploy.failure import exit_code
 from palpate.deploy.ports import check_free, free_endpoint
+from palpate.fem.cli.group import EXTRA_MODULES
 from palpate.protos.errors import (
     BundleError,
     ConfigError,
@@ -208,6 +210,23 @@ def test_doctor_names_what_is_wrong(palpate: Palpate, tmp_path: Path) -> None:
     assert lines["bundle"]["grade"] == "fail"
     assert "nonsense" in lines["bundle"]["found"]
     assert lines["python"]["grade"] == "ok"
+
+
+def test_doctor_names_what_an_extra_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    lacking = {"warp": "warp-lang", "pymetis": "pymetis"}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in lacking else found(name)
+    )
+    lines = {line.found: line for line in doctor._packages()}
+    for distribution in lacking.values():
+        line = lines[f"{distribution} is not installed"]
+        assert (line.grade, line.fix) == ("warn", 'pip install "palpate[fem]"')
+
+
+def test_doctor_looks_for_all_that_simulations_need() -> None:
+    looked_for = {module for module, _, _ in doctor._PACKAGES}
+    assert set(EXTRA_MODULES) <= looked_for
 
 
 def test_json_logs(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from palpate.fem.calibration.result import read_parameters
 from palpate.fem.cli import model as cli_model
 from palpate.fem.cli.app import fem_app
 from palpate.fem.config import FingertipParameters
+from palpate.fem.indenter.outline import outline_of
 from palpate.fem.indenter.path import write_path
 from palpate.fem.store.read import SimulationStore
 from palpate.protos.client import Client
@@ -55,6 +55,18 @@ def test_one_press_is_shown_and_drawn(tmp_path: Path) -> None:
     assert "sphere_medium: complete" in done.stdout
     assert "1 of 1 run: 1 complete" in done.stdout
     assert png.stat().st_size > 10_000
+
+
+def test_the_picture_of_a_press_shows_its_indenter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(
+        "palpate.fem.plot.step.plot_step", lambda *_, indenter: drawn.append(indenter)
+    )
+    fem("run", "--indenter", "cube_14mm", "--steps", 3, "--png", tmp_path / "press.png")
+    (outline,) = drawn
+    np.testing.assert_array_equal(outline[0], outline_of("cube")[0])
 
 
 def test_json_is_json(tmp_path: Path) -> None:
@@ -178,33 +190,9 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
         fem("validate", measured, "--only", "ring")
 
 
-def test_verify_tells_every_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(*, only: str, slow: bool, on_check: Any) -> None:
-        names = [name for name in ("hertz", "patch test") if only in name]
-        for done, name in enumerate(names, start=1):
-            passed = name != "hertz"
-            check = SimpleNamespace(
-                name=name, value=1.01, reference=1.0, tolerance=1e-3, passed=passed, seconds=0.1,
-                note="",
-            )  # fmt: skip
-            on_check(check, done, len(names))
-
-    monkeypatch.setitem(sys.modules, "palpate.fem.verify", SimpleNamespace(run=run))
-    failed = fem("verify")
-    assert failed.exit_code == 1
-    assert "1 of 2 passed" in failed.stdout
-    assert fem("verify", "--only", "patch").exit_code == 0
-    assert [check["passed"] for check in json.loads(fem("verify", "--json").stdout)] == [
-        False,
-        True,
-    ]
-    with pytest.raises(ConfigError, match="nonsense"):
-        fem("verify", "--only", "nonsense")
-
-
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "palpate.fem.cli.run", None)
-    monkeypatch.setattr("palpate.fem.cli.app.EXTRA_MODULES", ("palpate",))
+    monkeypatch.setattr("palpate.fem.cli.group.EXTRA_MODULES", ("palpate",))
     with pytest.raises(MissingExtraError, match=r'pip install "palpate\[fem\]"'):
         fem("run")
 

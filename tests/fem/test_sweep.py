@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 
 from palpate.fem.config import FingertipParameters
+from palpate.fem.indenter.catalogue import make_indenter
+from palpate.fem.indenter.distance import signed_distance
 from palpate.fem.result import Outcome, Trajectory
 from palpate.fem.service.batch import Batch, BatchReport, Press
 from palpate.fem.service.jobs import Setup
@@ -26,6 +28,8 @@ from palpate.protos.errors import DatasetError, RemoteError
 fakes: Any = importlib.import_module("fem_fakes")
 
 STEPS = 4
+KEPT_M = 2e-9
+"""Outlines are kept as float32, which rounds 18 mm to 1 nm."""
 
 
 def plans(count: int, name: str = "sphere_medium") -> list[Press]:
@@ -108,6 +112,11 @@ def test_a_store_is_filled_and_resumed(tmp_path: Path) -> None:
     store = SimulationStore.open(path)
     assert len(store.ids()) == 5
     assert store.trajectory(store.ids()[0]).outcome is Outcome.COMPLETE
+    for name in store.ids():
+        outline = store.outline(name)
+        assert outline is not None, "pictures show the indenter"
+        gaps = signed_distance(make_indenter("sphere_medium"), np.asarray(outline[0]))
+        np.testing.assert_allclose(gaps, 0.0, atol=KEPT_M)
     with pytest.raises(DatasetError, match="friction_coefficient"):
         into_store(path, fakes.SLOW, 5, threading.Event())
 

@@ -51,6 +51,7 @@ PLANTS = [
     ("services/palpate/services/planted.py", "import serial", "Ports stay in the gateway"),
     ("services/palpate/services/planted.py", "import torch", "Torch stays in training"),
     ("services/palpate/services/planted.py", "import warp", "Warp stays in fem"),
+    ("fem/palpate/fem/indenter/planted.py", "import palpate.fem.store", "only point down"),
 ]
 
 
@@ -93,7 +94,14 @@ def stub_house(tmp_path: Path) -> Path:
     _write(tmp_path / "protos/palpate/v1/frames_pb2.py")
     _write(tmp_path / "protos/palpate/v1/__init__.py")
     for contract in LINTER["contracts"]:
-        for name in (*contract.get("source_modules", ()), *contract.get("forbidden_modules", ())):
+        layered = [
+            f"{container}.{name}"
+            for container in contract.get("containers", ())
+            for layer in contract["layers"]
+            for name in layer.split(" | ")
+        ]
+        named = (*contract.get("source_modules", ()), *contract.get("forbidden_modules", ()))
+        for name in (*layered, *named):
             parts = name.split(".")
             if parts[0] == "palpate" and len(parts) > 2:
                 _write(tmp_path.joinpath(parts[1], *parts, "__init__.py"))

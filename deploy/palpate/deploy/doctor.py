@@ -39,7 +39,12 @@ _PACKAGES = (
     ("rerun", "rerun-sdk", "services"),
     ("matplotlib", "matplotlib", "services"),
     ("torch", "torch", "training"),
-    ("h5py", "h5py", "training"),
+    # Stores of simulations and data sets: `fem` is the lighter of the two extras that bring it.
+    ("h5py", "h5py", "fem"),
+    ("warp", "warp-lang", "fem"),
+    ("scipy", "scipy", "fem"),
+    ("pymetis", "pymetis", "fem"),
+    ("threadpoolctl", "threadpoolctl", "fem"),
 )
 _YEAR_MIN = 2024
 _ROUTER_WAIT_S = 1.0

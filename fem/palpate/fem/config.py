@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from palpate.protos.errors import ConfigError
 
+EDGE_M = 0.47e-3
+"""Edge of the parametric mesh's elements on the pad, by default [m]: 31,581 unknowns."""
+
 # Range of each parameter that the model is made for; the paper's optimisation bounds (Table
 # "Optimization parameters") lie inside. Outside, a mesh folds or the number is a slip of units.
 LIMITS = {

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
@@ -10,6 +13,35 @@ from numpy.typing import NDArray
 wp.config.log_level = wp.LOG_ERROR
 
 DEVICE = "cpu"
+
+_NO_GPU = b"GPU execution will not be available"
+
+
+def _start() -> None:
+    """Start Warp, without its warning that this machine has no GPU, which nobody asked for.
+
+    Its native code writes the warning straight to descriptor 2, whatever the log level, and no
+    setting of it says otherwise (Warp 1.19, `init_cuda_driver`). What else it writes is passed on.
+    """
+    try:
+        stderr = os.dup(2)
+    except OSError:  # closed, so nobody would see it
+        wp.init()
+        return
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            said.seek(0)
+            for line in said:
+                if _NO_GPU not in line:
+                    os.write(2, line)
+
+
+_start()
 
 
 def scalars(array: NDArray[np.float64]) -> wp.array:

@@ -10,61 +10,28 @@ from typing import Annotated
 
 import typer
 
-from palpate.protos.errors import MissingExtraError
-
-EXTRA_MODULES = ("scipy", "warp", "pymetis", "threadpoolctl", "h5py", "matplotlib")
-"""What ``palpate[fem]`` installs and a bare palpate has not."""
-
-
-class _FemGroup(typer.core.TyperGroup):
-    """A group whose commands say which extra is missing."""
-
-    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
-        """Run the command that was given."""
-        try:
-            return super().invoke(ctx)
-        except ModuleNotFoundError as error:
-            missing = (error.name or "").partition(".")[0]
-            if missing in EXTRA_MODULES:
-                raise MissingExtraError(missing, extra="fem") from error
-            raise
-
+from palpate.fem.cli.group import FemGroup
+from palpate.fem.cli.options import (
+    EdgeOption,
+    FrictionOption,
+    JsonOption,
+    LayersOption,
+    MeasuredArgument,
+    MeshOption,
+    ModulusOption,
+    ParametersOption,
+    Study,
+    ThicknessOption,
+    WorkersOption,
+)
 
 fem_app = typer.Typer(
-    cls=_FemGroup,
+    cls=FemGroup,
     help="The fingertip in finite elements: simulate, verify, calibrate, serve (palpate[fem]).",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-MeshOption = Annotated[
-    str, typer.Option("--mesh", metavar="biotac|FOLDER", help="Mesh, or folder of the public one.")
-]
-EdgeOption = Annotated[
-    float | None, typer.Option("--edge-mm", help="Edge of the mesh's elements on the pad [mm].")
-]
-LayersOption = Annotated[int, typer.Option("--layers", min=1, help="Elements through the skin.")]
-ParametersOption = Annotated[
-    Path | None,
-    typer.Option("--parameters", metavar="FIT.json", help="Fingertip as `calibrate` found it."),
-]
-ThicknessOption = Annotated[
-    float | None, typer.Option("--skin-thickness-mm", help="Skin thickness [mm].")
-]
-ModulusOption = Annotated[
-    float | None, typer.Option("--shear-modulus-kpa", help="Shear modulus of the skin [kPa].")
-]
-FrictionOption = Annotated[
-    float | None, typer.Option("--friction", help="Friction coefficient of indenter and skin.")
-]
-WorkersOption = Annotated[
-    int, typer.Option("--workers", min=0, help="Processes that solve; 0 = one for each core.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
-MeasuredArgument = Annotated[
-    Path, typer.Argument(metavar="MEASURED.h5", help="Measured indentations.")
-]
 
 
 def _example(*lines: str) -> str:
@@ -155,18 +122,35 @@ def run(
     )
 
 
+@fem_app.command(epilog=_example("palpate fem export runs/paper.sim paper.h5"))
+def export(
+    store: Annotated[Path, typer.Argument(metavar="NAME.sim", help="A store of simulations.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.h5", help="The file; never replaced.")],
+) -> None:
+    """Copy a store into one HDF5 file, to hand on; every reader takes it like the store."""
+    from palpate.fem.cli.export import export_command
+
+    raise typer.Exit(export_command(store, out))
+
+
 @fem_app.command(epilog=_example("palpate fem verify", "palpate fem verify --only hertz --json"))
 def verify(
     only: Annotated[
         str | None, typer.Option("--only", metavar="WORD", help="Tests whose name has this word.")
     ] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Also tests that take minutes.")] = False,
+    shared_data: Annotated[
+        Path | None,
+        typer.Option(
+            "--public-data", metavar="FOLDER", help="Folder that holds nvlabs_biotac_mesh."
+        ),
+    ] = None,
     json_: JsonOption = False,
 ) -> None:
     """Check the solver against closed forms and itself; a line each with value and tolerance."""
     from palpate.fem.cli.check import verify_command
 
-    raise typer.Exit(verify_command(only=only, slow=slow, as_json=json_))
+    raise typer.Exit(verify_command(only=only, slow=slow, shared_data=shared_data, as_json=json_))
 
 
 @fem_app.command(epilog=_example("palpate fem bench --json"))
@@ -179,6 +163,18 @@ def bench(
     from palpate.fem.cli.check import bench_command
 
     raise typer.Exit(bench_command(edge_mm=edge_mm, layers=layers, as_json=json_))
+
+
+@fem_app.command(epilog=_example("palpate fem study mesh --png mesh.png"))
+def study(
+    what: Annotated[Study, typer.Argument(metavar="mesh|steps", help="What is refined.")],
+    png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw it.")] = None,
+    json_: JsonOption = False,
+) -> None:
+    """What finer meshes or smaller steps change: sphere, cube on its edge and ring, 3 mm deep."""
+    from palpate.fem.cli.study import study_command
+
+    raise typer.Exit(study_command(what.value, png=png, as_json=json_))
 
 
 @fem_app.command(epilog=_example("palpate fem calibrate measured.h5 --out fit.json"))
@@ -202,6 +198,28 @@ def calibrate(
 
     model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers)
     raise typer.Exit(calibrate_command(measured, out, only or [], model, png=png, workers=workers))
+
+
+@fem_app.command(epilog=_example("palpate fem recover", "palpate fem recover --edge-mm 0.9"))
+def recover(
+    noise_n: Annotated[
+        float, typer.Option("--noise-n", min=0.0, help="Noise of each force axis [N].")
+    ] = 0.02,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    workers: WorkersOption = 0,
+    edge_mm: EdgeOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Plant parameters, simulate noisy forces with them, and see whether calibration finds them."""
+    from palpate.fem.cli.model import model_of
+    from palpate.fem.cli.recover import recover_command
+
+    model = model_of(mesh="biotac", edge_mm=edge_mm, layers=2)
+    raise typer.Exit(
+        recover_command(
+            model, edge_mm=edge_mm, noise_n=noise_n, seed=seed, workers=workers, as_json=json_
+        )
+    )
 
 
 @fem_app.command(

@@ -6,38 +6,46 @@ import importlib
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate.fem.cli.show import progress_bar
 from palpate.protos.errors import ConfigError
 
-
-class Check(Protocol):
-    """One line of the verification suite, as ``palpate.fem.verify.run`` hands it over."""
-
-    name: str
-    value: float
-    reference: float
-    tolerance: float
-    passed: bool
-    seconds: float
-    note: str
+if TYPE_CHECKING:
+    from palpate.fem.verify import Check
 
 
-def verify_command(*, only: str | None, slow: bool, as_json: bool) -> int:
+def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as_json: bool) -> int:
     """Run the verification suite; a line for each check as it ends.
 
+    Args:
+        only: Word in the names of the checks that are run; None = all.
+        slow: Also those that take minutes.
+        shared_data: Folder that holds the public BioTac's folder; None = beside the project.
+        as_json: Print JSON instead of a table.
+
     Returns:
-        0, or 1 if a check failed.
+        0, or 1 if a check failed; one that was skipped has not.
 
     Raises:
-        ConfigError: No check has such a name.
+        ConfigError: No check has such a name, or the public BioTac is not in ``shared_data``.
     """
-    verify: Any = importlib.import_module("palpate.fem.verify")
+    from palpate.fem.verify import PUBLIC_SKIN, run
+
+    # Where it is asked for by name, a check that is skipped for its lack would be an answer missed.
+    if shared_data is not None and not (shared_data / PUBLIC_SKIN).is_dir():
+        raise ConfigError(
+            f"--public-data {shared_data}: there is no {PUBLIC_SKIN} in it",
+            remedy=f"give the folder that holds {PUBLIC_SKIN}, or leave it out",
+        )
     checks: list[Check] = []
     with progress_bar() as bar:
         task = bar.add_task("verify", total=None)
@@ -46,7 +54,7 @@ def verify_command(*, only: str | None, slow: bool, as_json: bool) -> int:
             checks.append(check)
             bar.update(task, completed=done, total=total, info=check.name)
 
-        verify.run(only=only or "", slow=slow, on_check=on_check)
+        run(only=only or "", slow=slow, shared_data=shared_data, on_check=on_check)
     if not checks:
         raise ConfigError(f"no check has {only!r} in its name", remedy="leave out --only")
     if as_json:
@@ -83,32 +91,41 @@ def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
 
 
 def _show_checks(checks: list[Check]) -> None:
-    failed = [check.name for check in checks if not check.passed]
+    skipped = sum(check.skipped for check in checks)
+    passed = sum(check.passed and not check.skipped for check in checks)
     table = Table(
         title="verification",
-        caption=f"{len(checks) - len(failed)} of {len(checks)} passed in "
-        f"{sum(check.seconds for check in checks):.0f} s",
+        box=SIMPLE_HEAD,  # without lines between its columns a note is not cut off at 80 characters
+        padding=(0, 1, 0, 0),
+        caption=f"{passed} of {len(checks)} passed"
+        + (f", {skipped} skipped" if skipped else "")
+        + f" in {sum(check.seconds for check in checks):.0f} s",
     )
-    for heading in ("check", "value", "reference", "tolerance", "", "note"):
+    for heading in ("check", "value", "reference", "unit", "tolerance", "", "note"):
         justify = "right" if heading in ("value", "reference", "tolerance") else "left"
-        table.add_column(heading, justify=justify, overflow="fold")  # type: ignore[arg-type]
+        width = 24 if heading == "check" else None
+        table.add_column(heading, justify=justify, overflow="fold", width=width)  # type: ignore[arg-type]
     for check in checks:
         table.add_row(
             check.name,
-            f"{check.value:.6g}",
-            f"{check.reference:.6g}",
+            *("" if check.skipped else f"{x:.6g}" for x in (check.value, check.reference)),
+            check.unit,
             f"{check.tolerance:.1g}",
-            "[green]ok[/]" if check.passed else "[red]FAILED[/]",
-            check.note,
+            _verdict(check),
+            escape(check.note),
         )
     Console().print(table)
 
 
+def _verdict(check: Check) -> str:
+    if check.skipped:
+        return "[yellow]skipped[/]"
+    return "[green]ok[/]" if check.passed else "[red]FAILED[/]"
+
+
 def _plain(check: Check) -> dict[str, object]:
     """For JSON, which has no NaN and no infinity."""
-    names = ("name", "value", "reference", "tolerance", "passed", "seconds", "note")
-    values = {name: getattr(check, name) for name in names}
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
+        for name, value in asdict(check).items()
     }

@@ -15,7 +15,7 @@ from palpate.fem.calibration.result import Evaluation
 from palpate.fem.cli.calibrate import simulator_for
 from palpate.fem.cli.model import Model
 from palpate.fem.cli.show import progress_bar
-from palpate.fem.config import FingertipParameters
+from palpate.fem.config import EDGE_M, FingertipParameters
 from palpate.fem.mechanics.solver import Fingertip
 from palpate.fem.mesh.parametric import biotac
 
@@ -27,13 +27,13 @@ HEADINGS = ("parameter", "planted", "found", "error", "deviation", "tolerance", 
 
 
 def recover_command(
-    model: Model, *, edge_mm: float, noise_n: float, seed: int, workers: int, as_json: bool
+    model: Model, *, edge_mm: float | None, noise_n: float, seed: int, workers: int, as_json: bool
 ) -> int:
     """Plant, simulate, add noise, calibrate, compare.
 
     Args:
         model: Mesh of the calibration; its parameters are not used.
-        edge_mm: Edge of that mesh on the pad [mm].
+        edge_mm: Edge of that mesh on the pad [mm]; None = the default mesh.
         noise_n: Standard deviation of the noise of each axis [N].
         seed: Of the noise.
         workers: Processes that solve.
@@ -42,7 +42,9 @@ def recover_command(
     Returns:
         0, or 1 if a parameter is farther off than its tolerance.
     """
-    geometry = biotac(thickness_m=PLANTED.skin_thickness_m, edge_m=edge_mm * 1e-3)
+    geometry = biotac(
+        thickness_m=PLANTED.skin_thickness_m, edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3
+    )
     planned = plan_recovery(Fingertip.pressurised(geometry, replace(PLANTED)))
     with (
         simulator_for(model, workers, len(planned)) as (simulator, executor),

@@ -200,9 +200,10 @@ def _show(
         opened = SimulationStore.open(store)
         plot_overview([opened.summary(name) for name in opened.ids()], png, title=store.name)
     elif done and done[0].steps:
+        from palpate.fem.indenter.outline import outline_of
         from palpate.fem.plot.step import plot_step
 
-        plot_step(fingertip, done[0], png)
+        plot_step(fingertip, done[0], png, indenter=outline_of(done[0].indenter))
     else:
         console.print(f"{png} is not drawn: no step converged")
         return

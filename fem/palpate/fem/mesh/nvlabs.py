@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.mesh.check import check_mesh
 from palpate.fem.mesh.core import Core, DistanceGrid, volume_inside
-from palpate.fem.mesh.distance import box_around, grid_points, tabulate
+from palpate.fem.mesh.distance import box_around, grid_points, signed_distance, tabulate
 from palpate.fem.mesh.extrude import extrude
 from palpate.fem.mesh.geometry import Geometry, check_limits
 from palpate.fem.mesh.surface import components, edges, enclosed_volume, node_normals, open_edges
@@ -22,6 +22,7 @@ from palpate.protos.errors import ConfigError, SimulationError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
+Surface = tuple[Floats, Ints]  # vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3)
 
 SKIN = Path("meshes/biotac/int_ext_skin/int_ext_skin_combined_ftw.tet")
 PARTS = Path("meshes/biotac/bc/top_side_core_bc.obj")
@@ -30,13 +31,12 @@ PARTS = Path("meshes/biotac/bc/top_side_core_bc.obj")
 # X0 is the centre of the sphere that fits the core's tip (radius 5.33 mm, r.m.s. 0.016 mm).
 X0_M = -13.96e-3
 DRAWN_THICKNESS_M = 1.57e-3  # of the public skin: what nail and clamp touch is decided with it
-TOUCH_M = 0.15e-3  # the grown skin lies up to so far from the public one on its flat parts
+ATTACH_M = 1e-5  # the public model's attachDistance: its skin is glued to what lies so near
 SMOOTHING = 4  # rounds; fewer let the columns cross at the proximal edge, more round it off
 SPACING_M = 0.25e-3
 MARGIN_M = 2.0e-3  # around the core: more than the fluid film is thick anywhere
 ROUNDING_M = 0.15e-3  # standard deviation of the blur that rounds the core's facets
 CLEARANCE_M = 15e-6  # least gap between core and unpressurised skin
-DORSAL, PROXIMAL = np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0])
 
 
 def to_sensor_frame(points: Floats) -> Floats:
@@ -64,12 +64,12 @@ def read_nvlabs(folder: Path, *, thickness_m: float = 1.57e-3, layers: int = 2) 
     check_limits(thickness_m=thickness_m, layers=layers)
     points, tets = read_tet(folder / SKIN)
     points = to_sensor_frame(points)
-    inner, faces = _inner_surface(points, boundary(tets, points), folder / SKIN)
+    cavity, skin = _surfaces(points, boundary(tets, points), folder / SKIN)
     parts, triangles = read_obj(folder / PARTS)
-    parts = to_sensor_frame(parts)
-    nail, clamp, body = _parts(parts, triangles, folder / PARTS)
+    slabs, core = _parts(to_sensor_frame(parts), triangles, folder / PARTS)
+    inner, faces = cavity
     normal = smooth_normals(inner, faces, SMOOTHING)
-    held = _held(inner + DRAWN_THICKNESS_M * normal, normal, parts[nail], parts[clamp])
+    held = _held(inner + DRAWN_THICKNESS_M * normal, skin, slabs)
     mesh = extrude(
         inner,
         inner + thickness_m * normal,
@@ -79,11 +79,17 @@ def read_nvlabs(folder: Path, *, thickness_m: float = 1.57e-3, layers: int = 2) 
         name=f"nvlabs-{thickness_m * 1e3:.3f}mm-{layers}",
     )
     check_mesh(mesh)
-    return Geometry(mesh, _core(parts, triangles[body], inner, faces))
+    return Geometry(mesh, _core(core, cavity))
 
 
-def _inner_surface(points: Floats, faces: Ints, path: Path) -> tuple[Floats, Ints]:
-    """Nodes and faces of the cavity, normals out of it."""
+def _compact(points: Floats, faces: Ints) -> Surface:
+    """Some of a file's faces with only the vertices they use."""
+    used, compact = np.unique(faces, return_inverse=True)
+    return points[used], compact.reshape(-1, 3).astype(np.int32)
+
+
+def _surfaces(points: Floats, faces: Ints, path: Path) -> tuple[Surface, Surface]:
+    """Of the cavity, normals out of it, and of the skin's outside."""
     loose = open_edges(faces)
     if len(loose):
         raise ConfigError(f"{path}: its surface is open at {len(loose)} edges", remedy=REMEDY)
@@ -92,24 +98,22 @@ def _inner_surface(points: Floats, faces: Ints, path: Path) -> tuple[Floats, Int
     cavities = [i for i, volume in volumes.items() if volume < 0]
     if len(cavities) != 1:
         raise ConfigError(f"{path}: it has {len(cavities)} cavities, not one", remedy=REMEDY)
-    inner = faces[label == cavities[0]][:, ::-1]
-    used, compact = np.unique(inner, return_inverse=True)
-    return points[used], compact.reshape(-1, 3).astype(np.int32)
+    cavity = label == cavities[0]
+    return _compact(points, faces[cavity][:, ::-1]), _compact(points, faces[~cavity])
 
 
-def _parts(points: Floats, faces: Ints, path: Path) -> tuple[Ints, Ints, Ints]:
-    """Vertex ids of nail and clamp, face ids of the core."""
+def _parts(points: Floats, faces: Ints, path: Path) -> tuple[list[Surface], Surface]:
+    """Nail and clamp, and the core."""
     label = components(faces, len(points))
     ids = np.unique(label)
     if len(ids) != 3 or len(open_edges(faces)):
         raise ConfigError(
             f"{path}: it holds {len(ids)} parts, not a closed nail, clamp and core", remedy=REMEDY
         )
-    volume = [enclosed_volume(points, faces[label == i]) for i in ids]
-    core = int(ids[int(np.argmax(volume))])
-    slabs = [np.unique(faces[label == i]).astype(np.int32) for i in ids if i != core]
-    nail, clamp = sorted(slabs, key=lambda slab: -float(points[slab, 2].mean()))
-    return nail, clamp, np.flatnonzero(label == core).astype(np.int32)
+    *slabs, core = sorted(ids, key=lambda i: enclosed_volume(points, faces[label == i]))
+    return [_compact(points, faces[label == i]) for i in slabs], _compact(
+        points, faces[label == core]
+    )
 
 
 def smooth_normals(points: Floats, faces: Ints, rounds: int) -> Floats:
@@ -123,38 +127,37 @@ def smooth_normals(points: Floats, faces: Ints, rounds: int) -> Floats:
     return normal
 
 
-def _held(outer: Floats, normal: Floats, nail: Floats, clamp: Floats) -> Ints:
-    """Columns whose outer node lies on the underside of the nail or on the clamp's face."""
-    low, high = nail.min(axis=0), nail.max(axis=0)
-    within = ((outer > low - TOUCH_M) & (outer < high + TOUCH_M))[:, :2].all(axis=1)
-    on_nail = within & (np.abs(outer[:, 2] - low[2]) < TOUCH_M) & (normal @ DORSAL > 0.9)
-    low, high = clamp.min(axis=0), clamp.max(axis=0)
-    within = ((outer > low - TOUCH_M) & (outer < high + TOUCH_M))[:, 1:].all(axis=1)
-    on_clamp = within & (np.abs(outer[:, 0] - high[0]) < TOUCH_M) & (normal @ PROXIMAL > 0.9)
-    if not on_nail.any() or not on_clamp.any():
+def _held(outer: Floats, skin: Surface, slabs: list[Surface]) -> Ints:
+    """Columns that end where the public skin touches nail or clamp.
+
+    It is asked of the point of the public skin next to a column's outer node, not of the node: the
+    grown skin lies up to 0.1 mm off the public one, which would need a tolerance of its own. Not of
+    the nearest vertex either: those are 0.9 mm apart, and each would hold or free all around it.
+    """
+    _, foot = signed_distance(outer, *skin)
+    touching = [np.abs(signed_distance(foot, *slab)[0]) < ATTACH_M for slab in slabs]
+    if not all(on_slab.any() for on_slab in touching):
         raise ConfigError("nail or clamp do not touch the skin", remedy=REMEDY)
-    return np.flatnonzero(on_nail | on_clamp).astype(np.int32)
+    return np.flatnonzero(np.any(touching, axis=0)).astype(np.int32)
 
 
-def _core(parts: Floats, body: Ints, inner: Floats, faces: Ints) -> Core:
+def _core(body: Surface, cavity: Surface) -> Core:
     """The public core, kept within the cavity less a clearance, as a smooth distance."""
     from scipy import ndimage
 
-    used, compact = np.unique(body, return_inverse=True)
-    vertices, triangles = parts[used], compact.reshape(-1, 3).astype(np.int32)
+    vertices, triangles = body
+    inner, faces = cavity
     origin, size = box_around(vertices, MARGIN_M, SPACING_M)
     at = grid_points(origin, SPACING_M, size)
     core = tabulate(vertices, triangles, at)
-    cavity = tabulate(inner, faces, at)
+    room = tabulate(inner, faces, at)
     corner = inner[faces]
     probes = np.concatenate(
         [inner, corner.mean(axis=1), (corner + np.roll(corner, 1, 1)).reshape(-1, 3) / 2]
     )
     clearance = CLEARANCE_M
     for _ in range(8):
-        values = ndimage.gaussian_filter(
-            np.maximum(core, cavity + clearance), ROUNDING_M / SPACING_M
-        )
+        values = ndimage.gaussian_filter(np.maximum(core, room + clearance), ROUNDING_M / SPACING_M)
         grid = DistanceGrid.sampled(origin, SPACING_M, values)
         gap = float(grid.evaluate(probes)[0].min())
         if gap > 0.9 * CLEARANCE_M:

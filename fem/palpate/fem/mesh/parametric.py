@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.fem.config import EDGE_M
 from palpate.fem.mesh.check import check_mesh
 from palpate.fem.mesh.core import Core, DistanceGrid
 from palpate.fem.mesh.distance import box_around, grid_points, spread
@@ -57,7 +58,7 @@ CORE_EDGE_M = 0.6e-3  # of the surface for pictures
 def biotac(
     *,
     thickness_m: float = 1.57e-3,
-    edge_m: float = 0.47e-3,
+    edge_m: float = EDGE_M,
     layers: int = 2,
     cavity: CavityShape | None = None,
     core: CoreShape | None = None,

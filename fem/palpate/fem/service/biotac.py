@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
-from palpate.fem.config import FingertipParameters
+from palpate.fem.config import EDGE_M, FingertipParameters
 from palpate.fem.indenter.catalogue import make_indenter
 from palpate.fem.mechanics.solver import Fingertip, Settings
 from palpate.fem.mesh.geometry import Geometry
@@ -17,9 +17,6 @@ from palpate.protos.errors import ConfigError
 
 PARAMETRIC = "biotac"
 """Name of the open parametric mesh; anything else is a folder with the public meshes."""
-
-EDGE_M = 0.47e-3
-"""Edge of its elements on the pad, by default [m]: over 4,000 nodes on the surface."""
 
 
 class BiotacTip:

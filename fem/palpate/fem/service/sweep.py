@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from palpate.fem.indenter.outline import outline_of
 from palpate.fem.result import Trajectory
 from palpate.fem.service.batch import Batch, BatchReport, OnReport, Plan
-from palpate.fem.store.content import Outline
 from palpate.fem.store.files import StoreTakenError
 from palpate.fem.store.writer import Place, StoreWriter
 
@@ -21,13 +21,13 @@ def sweep_into_store(
     *,
     stop: threading.Event,
     on_report: OnReport | None = None,
-    outline: Callable[[str], Outline] | None = None,
     stress: bool = False,
     command: str = "",
 ) -> tuple[BatchReport, int]:
     """Run what a store does not hold yet; each trajectory is on the disk as soon as it has ended.
 
-    Several sweeps, of one command line or of several, may fill one store at the same time.
+    Several sweeps, of one command line or of several, may fill one store at the same time. Each
+    trajectory carries the outline of its indenter, for pictures.
 
     Args:
         batch: Runs them; closed by whoever made it.
@@ -35,7 +35,6 @@ def sweep_into_store(
         path: The store, ``NAME.sim``; made if it is not there.
         stop: Set it to end early; what runs then is not kept.
         on_report: Called whenever something has happened.
-        outline: Gives the surface of an indenter by its name, for pictures.
         stress: Whether to keep stress.
         command: What runs it, for people.
 
@@ -50,7 +49,7 @@ def sweep_into_store(
     if fingertip is None:
         return BatchReport(len(plans), stopped=True), 0
     with StoreWriter(
-        path, fingertip, shared=True, outline=outline, stress=stress, command=command
+        path, fingertip, shared=True, outline=outline_of, stress=stress, command=command
     ) as store:
         done = store.done()
         left = [plan for plan in plans if plan.name not in done]
@@ -72,6 +71,5 @@ def sweep_into_store(
             )
         finally:
             for place in places.values():
-                with place:  # lets go of what was not written
-                    pass
+                place.close()  # lets go of what was not written
     return report, len(plans) - len(left)

@@ -10,9 +10,8 @@ import errno
 import fcntl
 import os
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from palpate.protos.closing import Closing
 from palpate.protos.errors import DatasetError, ErrorCode
 
 PART = ".part"
@@ -44,7 +43,7 @@ def disk_error(path: Path, error: OSError) -> StoreDiskError:
     )
 
 
-class Claim:
+class Claim(Closing):
     """The right to write one file, until the block ends or the process does.
 
     Args:
@@ -123,24 +122,13 @@ class Claim:
         if not self._open:
             raise ValueError(f"the claim on {self.target} has ended")
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Let go of it, unwritten. Nothing if it was written."""
         if not self._open:
             return
         self._open = False
         self.part.unlink(missing_ok=True)
         os.close(self._file)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.release()
 
 
 class FolderLock:

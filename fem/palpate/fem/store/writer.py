@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from palpate.fem.result import Trajectory
 from palpate.fem.store.content import Outline, StoredFingertip, check_id
@@ -20,10 +19,11 @@ from palpate.fem.store.files import (
 from palpate.fem.store.hdf5 import file_image, write_fingertip
 from palpate.fem.store.read import FINGERTIP, SUFFIX, TRAJECTORIES, UNFINISHED, SimulationStore
 from palpate.fem.store.trajectory import write_trajectory
+from palpate.protos.closing import Closing
 from palpate.protos.errors import ConfigError, DatasetError
 
 
-class StoreWriter(SimulationStore):
+class StoreWriter(SimulationStore, Closing):
     """A store that takes trajectories; made if it is not there, else continued.
 
     Alone by default. Where several processes share the work, each opens the store with ``shared``
@@ -100,7 +100,7 @@ class StoreWriter(SimulationStore):
                     remedy=f"leave out what done() lists, or remove {claim.target}",
                 )
         except BaseException:
-            claim.release()
+            claim.close()
             raise
         return Place(self, trajectory, claim)
 
@@ -124,17 +124,6 @@ class StoreWriter(SimulationStore):
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def image(self, trajectory: str, result: Trajectory, sensor: str) -> bytes:
         """Bytes of the file of a trajectory."""
@@ -211,7 +200,7 @@ class StoreWriter(SimulationStore):
             )
 
 
-class Place:
+class Place(Closing):
     """The right to write one trajectory, from :meth:`StoreWriter.claim`."""
 
     def __init__(self, store: StoreWriter, trajectory: str, claim: Claim) -> None:
@@ -225,13 +214,6 @@ class Place:
         """
         self._claim.commit(self._store.image(self._trajectory, result, sensor))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._claim.release()
+    def close(self) -> None:
+        """Let go of it, unwritten. Nothing if it was written."""
+        self._claim.close()

@@ -1,0 +1,54 @@
+"""``palpate fem export``: a store of simulations as one file."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from palpate.fem.cli.show import progress_bar
+from palpate.fem.store.export import export
+from palpate.fem.store.read import SimulationStore
+from palpate.protos.errors import ConfigError
+
+SUFFIX = ".h5"
+
+
+def export_command(store: Path, out: Path) -> int:
+    """Read a store against its checksums, copy it into one file and say what is in it.
+
+    Returns:
+        0.
+
+    Raises:
+        ConfigError: ``out`` is there already, or is not called ``.h5``.
+        DatasetError: ``store`` is none, is one file already, or is damaged.
+        StoreDiskError: The disk is full or refuses.
+    """
+    if out.suffix != SUFFIX:
+        raise ConfigError(f"{out} does not end in {SUFFIX}", remedy=f"call it {out.stem}{SUFFIX}")
+    if out.exists():
+        raise ConfigError(f"{out} is there already", remedy="name another file, or remove it")
+    opened = SimulationStore.open(store)
+    with progress_bar() as bar:
+        task = bar.add_task("check", total=None)
+        # Copying takes damaged bytes over as they are; whoever gets the file could not mend it.
+        opened.fingertip()
+        opened.check()
+        bar.update(task, description="copy")
+        count = export(
+            opened,
+            out,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        )
+    size_mb = out.stat().st_size / 1e6
+    Console().print(
+        f"{out}: {count} trajectories, {size_mb:.1f} MB",
+        soft_wrap=True,
+        markup=False,
+        highlight=False,
+    )
+    return 0

@@ -1,0 +1,93 @@
+"""``palpate fem verify``: every check is told, with its unit, also what could not be measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from palpate.fem.cli.app import fem_app
+from palpate.fem.verify import PUBLIC_SKIN
+from palpate.fem.verify.check import Absent, Case, Check, Measured
+from palpate.protos.errors import ConfigError
+
+
+def _absent() -> Measured:
+    raise Absent("no public mesh [here]")
+
+
+CASES = (
+    Case("hertz", lambda: Measured(1.01, 1.0), 1e-3, "N"),
+    Case("patch test", lambda: Measured(0.0, note="to the last bit"), 1e-12),
+    Case("skin/filled", _absent, 1e-2, "kPa"),
+)
+
+
+@pytest.fixture(autouse=True)
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path | None]:
+    """Three checks instead of the suite; the folders that it is asked to look in."""
+    folders: list[Path | None] = []
+
+    def run(
+        *, only: str, slow: bool, shared_data: Path | None, on_check: Callable[..., None]
+    ) -> list[Check]:
+        folders.append(shared_data)
+        checks = [case() for case in CASES if only in case.name]
+        for done, check in enumerate(checks, start=1):
+            on_check(check, done, len(checks))
+        return checks
+
+    monkeypatch.setattr("palpate.fem.verify.run", run)
+    monkeypatch.setenv("COLUMNS", "200")
+    return folders
+
+
+def verify(*words: object) -> Result:
+    """Run the command; what it raises is raised here."""
+    return CliRunner().invoke(fem_app, ["verify", *map(str, words)], catch_exceptions=False)
+
+
+def _row(result: Result, name: str) -> list[str]:
+    (line,) = [line for line in result.stdout.splitlines() if name in line]
+    return [cell.strip() for cell in line.split("  ") if cell.strip()]
+
+
+def test_every_check_is_told() -> None:
+    done = verify()
+    assert done.exit_code == 1
+    assert "1 of 3 passed, 1 skipped" in done.stdout
+    assert _row(done, "hertz") == ["hertz", "1.01", "1", "N", "0.001", "FAILED"]
+    assert _row(done, "patch test")[-2:] == ["ok", "to the last bit"]
+
+
+def test_what_is_skipped_says_why_and_fails_nothing() -> None:
+    done = verify("--only", "skin")
+    assert done.exit_code == 0
+    assert _row(done, "skin/filled") == [
+        *("skin/filled", "kPa", "0.01", "skipped"),
+        "skipped: no public mesh [here]",
+    ]
+
+
+def test_json_is_json() -> None:
+    checks = {check["name"]: check for check in json.loads(verify("--json").stdout)}
+    assert [check["passed"] for check in checks.values()] == [False, True, True]
+    skipped = checks["skin/filled"]
+    assert (skipped["skipped"], skipped["value"], skipped["unit"]) == (True, None, "kPa")
+
+
+def test_no_such_check() -> None:
+    assert verify("--only", "patch").exit_code == 0
+    with pytest.raises(ConfigError, match="nonsense"):
+        verify("--only", "nonsense")
+
+
+def test_the_public_mesh_may_lie_elsewhere(tmp_path: Path, asked: list[Path | None]) -> None:
+    with pytest.raises(ConfigError, match=PUBLIC_SKIN):
+        verify("--public-data", tmp_path)
+    (tmp_path / PUBLIC_SKIN).mkdir()
+    verify("--public-data", tmp_path)
+    assert asked == [tmp_path]
