@@ -175,17 +175,21 @@ class _Search:
         return [state.only(kept) for state in states]
 
     def scan(self) -> tuple[State, Fit]:
-        """Best point of the coarse scan; a case that fails at most points is left out."""
+        """Best point of the coarse scan; a case that fails at most points is left out.
+
+        Where most cases fail it is the point's fault, e.g. as paths begin inside a thick skin.
+        """
         states = self.simulate(self.settings.scan_points())
         while True:
             fits = [self.evaluate(state, "scan") for state in states]
-            failed = [sum(i in fit.failures for fit in fits) for i in range(len(self.cases))]
+            fair = [fit for fit in fits if len(fit.failures) <= len(self.cases) / 2] or fits
+            failed = [sum(i in fit.failures for fit in fair) for i in range(len(self.cases))]
             worst = int(np.argmax(failed))
             none_left = not any(math.isfinite(fit.cost) for fit in fits)
-            if not none_left and failed[worst] <= len(states) / 2:
+            if not none_left and failed[worst] <= len(fair) / 2:
                 best = int(np.argmin([fit.cost for fit in fits]))
                 return states[best], fits[best]
-            fit = next(fit for fit in fits if worst in fit.failures)
+            fit = next(fit for fit in fair if worst in fit.failures)
             if len(self.cases) == 1:
                 raise _hopeless(self.cases, fit)
             states = self.drop(worst, f"simulation: {fit.failures[worst]}", states)

@@ -31,6 +31,9 @@ PRESSES = {
     "proximal": _Press("cube", -4e-3, 2.0e-3, 30.0, 180.0),
 }
 
+CLEARANCE_M = 1e-3
+"""Paths begin so far from the skin [m]: the calibration tries thicker ones, too."""
+
 
 def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
     """Poses for the presses, from first contact with this finger's pad on."""
@@ -42,6 +45,14 @@ def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
             normal, math.radians(press.angle_deg), math.radians(press.azimuth_deg)
         )
         indenter = make_indenter(press.indenter)
-        path = press_path(indenter, target, direction, surface, depth_m=press.depth_m, steps=steps)
+        path = press_path(
+            indenter,
+            target,
+            direction,
+            surface,
+            depth_m=press.depth_m,
+            steps=steps,
+            clearance_m=CLEARANCE_M,
+        )
         planned.append(Planned(name, press.indenter, path))
     return planned

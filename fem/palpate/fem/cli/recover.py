@@ -78,6 +78,8 @@ def recover_command(
         for row in recovery.rows():
             table.add_row(*row)
         Console().print(table)
+        for name, why in recovery.calibration.excluded.items():
+            Console().print(f"left out: {name}: {why}", markup=False, highlight=False)
     return 0 if recovery.passed else 1
 
 
@@ -87,6 +89,11 @@ def _plain(recovery: Recovery, noise_n: float, seed: int) -> dict[str, object]:
         "seed": seed,
         "passed": recovery.passed,
         "simulations": recovery.calibration.simulations,
+        "converged": recovery.calibration.converged,
+        "cost_n": recovery.calibration.cost,
+        "left_out": recovery.calibration.excluded,
+        "notes": recovery.calibration.notes,
+        "deviation": {name: recovery.sd[name] / value for name, value in recovery.found.items()},
         "planted": recovery.truth,
         "found": recovery.found,
         "error": recovery.errors,
