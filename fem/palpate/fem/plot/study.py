@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,25 +32,26 @@ def plot_study(rows: Sequence[Row], path: Path) -> None:
         force.plot(across, [100 * abs(row.force_change) for row in mine], **style)
         moved.plot(across, [MM * row.displacement_change_m for row in mine], **style)
         cost.plot(across, [row.seconds for row in mine], **style)
-        if meshes:
-            for row, x in zip(mine, across, strict=True):
-                if not math.isnan(row.seconds) and name == rows[0].indenter:
-                    cost.annotate(
-                        f"{row.edge_m * MM:g} mm\n{row.factor_gflop:.1f} GFlop",
-                        (x, row.seconds),
-                        textcoords="offset points",
-                        xytext=(4, -22),
-                        fontsize=7,
-                    )
     force.axhline(100 * FORCE_CHANGE, color=LIMIT, ls="--", lw=1)
     moved.axhline(MM * DISPLACEMENT_CHANGE_M, color=LIMIT, ls="--", lw=1)
-    unit = "unknowns" if meshes else "steps of 3 mm"
-    label(force, unit, "change of the force [%]", "force against the coarser one")
-    label(moved, unit, "mean change [mm]", "displacement of the outer skin")
-    label(cost, unit, "seconds a press", "cost")
+    label(force, "", "change of the force [%]", "force, against the coarser one")
+    label(moved, "", "mean change [mm]", "displacement of the outer skin")
+    label(cost, "", "seconds a press", "cost")
+    first = [row for row in rows if row.indenter == rows[0].indenter]
     for axes in (force, moved, cost):
         grid(axes)
         axes.set_xscale("log")
-        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.0)
+        axes.set_xticks([row.unknowns if meshes else row.steps for row in first], minor=False)
+        axes.set_xticklabels([_name(row, meshes=meshes) for row in first], fontsize=7)
+        axes.minorticks_off()
     force.legend(frameon=False, fontsize=8)
     save(figure, path)
+
+
+def _name(row: Row, *, meshes: bool) -> str:
+    """What stands under a row's points."""
+    if not meshes:
+        return f"{row.steps} steps"
+    gflop = f"{row.factor_gflop:.1f} GFlop"
+    return f"{row.edge_m * MM:g} mm\n{row.unknowns:,}\n{gflop}"
