@@ -24,6 +24,7 @@ def test_a_linear_field_is_carried_over() -> None:
     points[:, 2] = 20.0 * (points[:, :2] ** 2).sum(axis=1)
     slope = np.array([[0.1, 0.02, 0.3], [0.0, 0.2, 0.1], [0.05, 0.1, -0.1]])
     field = study._Field(nodes, 1e-3 + nodes @ slope, 1.0)
+    np.testing.assert_allclose(study._at(field, nodes[:40]), field.displacement[:40], atol=1e-9)
     carried = study._at(field, points)
     np.testing.assert_allclose(carried, 1e-3 + points @ slope, atol=3e-6)
 

@@ -181,6 +181,15 @@ def test_each_indentation_has_its_name_depth_and_place_and_starts_clear() -> Non
             check_clear(indenter, p.path[1], FINGER)
 
 
+def test_fewer_angled_ones_are_the_first_of_all() -> None:
+    whole = {p.name: p for p in Campaign(FINGER, indenters=("ring",), points=1)}
+    some = Campaign(FINGER, indenters=("ring",), points=1, angled=1)
+    assert [p.name for p in some] == ["ring/00/normal", "ring/00/angled-0"]
+    assert len(some) == 2
+    for p in some:
+        np.testing.assert_array_equal(p.path, whole[p.name].path)
+
+
 def test_an_indenters_points_are_its_own_and_do_not_depend_on_the_others() -> None:
     both = list(Campaign(FINGER, indenters=("sphere_small", "sphere_medium"), points=1))
     alone = list(Campaign(FINGER, indenters=("sphere_medium",), points=1))

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.interpolate import RBFInterpolator
 
 from palpate.fem.indenter.approach import Surface
 from palpate.fem.indenter.catalogue import make_indenter
@@ -32,6 +32,9 @@ PRESSES = {
 }
 TARGET_M = (-4e-3, 0.0, -7.5e-3)
 DEPTH_M = 3e-3
+
+SCALE_M = 1e-3
+"""Length by which the interpolation divides, lest its system be ill-conditioned [m]."""
 
 FORCE_CHANGE = 0.02
 """Accepted change of the force by the last refinement."""
@@ -167,16 +170,11 @@ def _press(tip: Fingertip, name: str, edge: float, steps: int, last: dict[str, _
 
 
 def _at(field: _Field, points: Floats) -> Floats:
-    """A field at other points of the skin [m]: a plane through the nearest nodes of each."""
-    _, near = KDTree(field.nodes).query(points, 12)
-    arms = field.nodes[near] - points[:, None]
-    away = np.linalg.norm(arms, axis=2, keepdims=True)
-    reach = away.max(axis=1, keepdims=True)
-    weight = np.exp(-((away / reach) ** 2))
-    design = np.concatenate((np.ones_like(away), arms / reach), axis=2) * weight
-    # Small singular values belong to the skin's normal, along which the nodes do not spread.
-    fits = np.linalg.pinv(design, rcond=0.02) @ (field.displacement[near] * weight)
-    return np.asarray(fits[:, 0])
+    """A field at other points of the skin [m]; at its own nodes it is itself."""
+    between = RBFInterpolator(
+        field.nodes / SCALE_M, field.displacement, neighbors=16, kernel="linear", degree=0
+    )
+    return np.asarray(between(points / SCALE_M))
 
 
 def _gflop(tip: Fingertip) -> float:

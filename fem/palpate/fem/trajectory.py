@@ -221,6 +221,7 @@ class Campaign:
         seed: Of the points.
         steps: Steps of each path.
         region: Where to aim; None = the sampled region.
+        angled: Angled paths at each point, of the ``AZIMUTHS`` that there are.
     """
 
     surface: Surface
@@ -229,9 +230,10 @@ class Campaign:
     seed: int = 0
     steps: int = STEPS
     region: Region | None = None
+    angled: int = AZIMUTHS
 
     def __len__(self) -> int:
-        return len(self.indenters) * self.points * (1 + AZIMUTHS)
+        return len(self.indenters) * self.points * (1 + self.angled)
 
     def __iter__(self) -> Iterator[Indentation]:
         for name in self.indenters:
@@ -244,7 +246,7 @@ class Campaign:
                 at = f"{indenter.name}/{point:02d}"
                 inward = angled_direction(normal, 0.0, 0.0)
                 yield self._plan(f"{at}/normal", indenter, target, normal, inward, NORMAL_DEPTH_M)
-                for k in range(AZIMUTHS):
+                for k in range(self.angled):
                     towards = angled_direction(normal, ANGLE_RAD, 2.0 * math.pi * k / AZIMUTHS)
                     yield self._plan(
                         f"{at}/angled-{k}", indenter, target, normal, towards, ANGLED_DEPTH_M

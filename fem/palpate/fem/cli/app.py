@@ -65,6 +65,7 @@ def run(
         bool, typer.Option("--sweep", help="The paper's set of indentations.")
     ] = False,
     points: Annotated[int, typer.Option(min=1, help="--sweep: points for each indenter.")] = 10,
+    angled: Annotated[int, typer.Option(min=0, max=4, help="--sweep: angled ones a point.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="--sweep: seed of the points.")] = 0,
     store: Annotated[
         Path | None,
@@ -101,6 +102,7 @@ def run(
                 path=path,
                 sweep=sweep,
                 points=points,
+                angled=angled,
                 seed=seed,
             ),
             model_of(

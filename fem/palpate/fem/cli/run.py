@@ -51,6 +51,7 @@ class Wanted:
     path: Path | None
     sweep: bool
     points: int
+    angled: int
     seed: int
 
 
@@ -151,7 +152,11 @@ def _plans(wanted: Wanted, fingertip: StoredFingertip) -> Sequence[Plan]:
     skin = skin_of(fingertip)
     if wanted.sweep:
         names = tuple(make_indenter(name).name for name in wanted.indenters) or indenter_names()
-        return list(Campaign(skin, names, wanted.points, wanted.seed, wanted.steps))
+        return list(
+            Campaign(
+                skin, names, wanted.points, wanted.seed, wanted.steps, angled=wanted.angled
+            )
+        )
     indenter = make_indenter((wanted.indenters or (DEFAULT_INDENTER,))[0])
     if wanted.path is not None:
         path = read_path(wanted.path)
