@@ -1,0 +1,1 @@
+"""Electrode physics: from the film between skin and core to the sensor's counts."""

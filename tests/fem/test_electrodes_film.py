@@ -1,0 +1,200 @@
+"""The table, the film's mesh with its discs, the gap above it with gradients, the residual film."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from palpate.fem.electrodes.film import FilmMesh, film_mesh
+from palpate.fem.electrodes.gap import GapFinder
+from palpate.fem.electrodes.residual import CLAMP_X_M, opening, thickness
+from palpate.fem.electrodes.table import (
+    DISC_TERMINAL,
+    MIRROR,
+    NORMALS,
+    POSITIONS,
+    TERMINALS,
+    X_NORMALS,
+    X_POSITIONS,
+)
+from palpate.fem.electrodes.unit import UnitParameters
+from palpate.fem.mesh.core import Core
+from palpate.fem.mesh.geometry import Geometry
+from palpate.fem.mesh.parametric import biotac
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.mesh.surface import node_areas, open_edges
+from palpate.protos.errors import ConfigError, SimulationError
+
+Floats = NDArray[np.float64]
+Shell = Callable[..., SolidMesh]
+
+
+@cache
+def finger() -> Geometry:
+    return biotac(edge_m=0.9e-3, layers=1)
+
+
+def test_table_is_the_one_of_the_conventions(root: Path) -> None:
+    text = (root / "docs/conventions.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| E(\d+) \|(.+)\|$", text, re.MULTILINE)
+    numbers = np.array([[float(cell) for cell in row.split("|")] for _, row in rows])
+    assert [int(number) for number, _ in rows] == list(range(1, TERMINALS))
+    np.testing.assert_allclose(POSITIONS, 1e-3 * numbers[:, :3], atol=1e-12)
+    np.testing.assert_allclose(NORMALS, numbers[:, 3:], atol=2e-3)  # ours have unit length
+
+
+def test_table_is_mirror_symmetric() -> None:
+    flip = np.array([1.0, -1.0, 1.0])
+    np.testing.assert_array_equal(POSITIONS[MIRROR], POSITIONS * flip)
+    np.testing.assert_array_equal(NORMALS[MIRROR], NORMALS * flip)
+    np.testing.assert_array_equal(X_POSITIONS[[2, 3, 0, 1]], X_POSITIONS * flip)
+    np.testing.assert_array_equal(X_NORMALS[[2, 3, 0, 1]], X_NORMALS * flip)
+    assert np.bincount(DISC_TERMINAL).tolist() == [4] + [1] * 19
+
+
+def check_one_patch(mesh: FilmMesh) -> None:
+    """A disc in the sense of topology: no holes, no triangles upon one another."""
+    pairs = np.sort(np.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
+    edges, times = np.unique(pairs, axis=0, return_counts=True)
+    assert times.max() == 2
+    assert len(mesh.nodes) - len(edges) + len(mesh.faces) == 1
+    border = open_edges(mesh.faces)
+    assert len(border) == (times == 1).sum()
+    follow = dict(border.tolist())
+    assert len(follow) == len(border)
+    at, seen = border[0, 0], 0
+    while seen == 0 or at != border[0, 0]:
+        at, seen = follow[at], seen + 1
+    assert seen == len(border)  # one loop
+
+
+@pytest.mark.parametrize("edge", [0.4e-3, 0.55e-3, 0.8e-3])
+@pytest.mark.parametrize("recess", [0.0, 0.25e-3])
+def test_film_mesh_is_one_sound_patch_on_the_core(edge: float, recess: float) -> None:
+    core = finger().core
+    mesh = film_mesh(core, edge_m=edge, recess_m=recess)
+    distance, gradient, _ = core.grid.evaluate(mesh.nodes)
+    np.testing.assert_allclose(distance, -recess, atol=1e-9)
+    assert np.einsum("ni,ni->n", gradient, mesh.normals).min() > 0.9
+    corner = mesh.nodes[mesh.faces]
+    outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    middle = mesh.normals[mesh.faces].mean(axis=1)
+    assert (np.einsum("fi,fi->f", outwards, middle) > 0).all()
+    check_one_patch(mesh)
+    area = 441e-6 if recess == 0 else 412e-6  # section 4.3 has 441 mm^2 on another core
+    assert mesh.areas.sum() == pytest.approx(area, rel=0.03)
+
+
+def test_discs_have_their_area_and_grow_smoothly() -> None:
+    core = finger().core
+    diameters = np.linspace(2.4e-3, 2.6e-3, 5)
+    areas = []
+    for diameter in diameters:
+        mesh = film_mesh(core, disc_diameter_m=float(diameter))
+        check_one_patch(mesh)
+        areas.append([mesh.areas[mesh.terminal == i].sum() for i in range(TERMINALS)])
+    wanted = np.pi / 4 * diameters[:, None] ** 2 * np.array([4] + [1] * 19)
+    np.testing.assert_allclose(areas, wanted, rtol=0.02)
+    bend = np.diff(np.log(areas), 2, axis=0) - np.diff(np.log(wanted), 2, axis=0)
+    assert np.abs(bend).max() < 1e-3
+
+
+@pytest.mark.parametrize("key", ["edge_m", "disc_diameter_m", "recess_m"])
+def test_film_mesh_refuses_slips_of_units(key: str) -> None:
+    with pytest.raises(ConfigError, match=key):
+        film_mesh(finger().core, **{key: 2.5})
+
+
+def test_electrodes_must_fit_the_core(ball: Callable[..., Core]) -> None:
+    with pytest.raises(ConfigError, match="disc"):
+        film_mesh(ball(2.5e-3))
+
+
+def sphere_film(shell: Shell, radius: float) -> FilmMesh:
+    skin = shell(10, 1, radius, radius + 1e-3)
+    used, faces = np.unique(skin.inner_faces, return_inverse=True)
+    quads = faces.reshape(-1, 4)
+    points = skin.nodes[used]
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+    normals = points / np.linalg.norm(points, axis=1)[:, None]
+    return FilmMesh(points, normals, triangles, np.zeros(len(triangles), np.int32))
+
+
+def test_gap_between_spheres(shell: Shell) -> None:
+    film, skin = sphere_film(shell, 2.5e-3), shell(24, 1, 3e-3, 4e-3)
+    finder = GapFinder(film, skin)
+    sagitta = 4.5e-6  # of triangles with edges up to 0.33 mm on 3 mm
+    np.testing.assert_allclose(finder.measure(skin.nodes).gap, 0.5e-3, atol=sagitta)
+    # Moved as a whole, far enough that every normal meets other triangles.
+    shift = np.array([0.1e-3, -0.35e-3, 0.2e-3])
+    along = film.normals @ shift
+    exact = along + np.sqrt(along**2 + (3e-3) ** 2 - shift @ shift) - 2.5e-3
+    np.testing.assert_allclose(finder.measure(skin.nodes + shift).gap, exact, atol=2 * sagitta)
+
+
+def test_pressure_is_that_of_the_nodal_forces(shell: Shell) -> None:
+    film, skin = sphere_film(shell, 2.5e-3), shell(24, 1, 3e-3, 4e-3)
+    finder = GapFinder(film, skin)
+    areas = node_areas(skin.nodes, finder.faces)
+    out = skin.nodes / np.linalg.norm(skin.nodes, axis=1)[:, None]
+    gap = finder.measure(skin.nodes, 20e3 * areas[:, None] * out)
+    np.testing.assert_allclose(gap.pressure, 20e3, rtol=5e-3)
+    assert not finder.measure(skin.nodes, -20e3 * areas[:, None] * out).pressure.any()  # no pull
+
+
+def test_gap_gradient_is_that_of_differences() -> None:
+    geometry = finger()
+    finder = GapFinder(film_mesh(geometry.core), geometry.mesh)
+    rng = np.random.default_rng(3)
+    # Off the symmetric state, whose normals meet edges, where the gap has a kink.
+    position = geometry.mesh.nodes + 1e-5 * rng.normal(size=geometry.mesh.nodes.shape)
+    gap = finder.measure(position)
+    way = rng.normal(size=position.shape)
+    step = 1e-10
+    ahead, behind = (finder.measure(position + sign * step * way).gap for sign in (1, -1))
+    answer = gap.along(way)
+    np.testing.assert_allclose(answer, (ahead - behind) / (2 * step), atol=1e-6)
+    weight = rng.normal(size=len(answer))
+    assert (gap.to_skin(weight, len(position)) * way).sum() == pytest.approx(weight @ answer)
+
+
+def test_a_skin_that_is_not_there_is_refused(shell: Shell) -> None:
+    film = sphere_film(shell, 2.5e-3)
+    skin = shell(6, 1, 30e-3, 40e-3)
+    with pytest.raises(SimulationError, match="miss the skin"):
+        GapFinder(film, skin)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    gap=st.floats(-5e-6, 2e-3),
+    pressure=st.floats(0, 2e6),
+    exponent=st.floats(0.3, 2.0),
+)
+def test_residual_film_falls_to_its_floor(gap: float, pressure: float, exponent: float) -> None:
+    unit = UnitParameters(squeeze_exponent=exponent)
+    h, by_gap, by_pressure = thickness(np.array(gap), np.array(pressure), unit)
+    assert unit.floor_m < h <= max(gap, 0) + unit.asperity_m + 1e-6
+    assert 0 <= by_gap <= 1
+    assert by_pressure <= 0
+    step = 1e-4 * (1e3 + pressure)
+    harder = thickness(np.array(gap), np.array(pressure + step), unit)[0]
+    slope = (harder - thickness(np.array(gap), np.array(max(pressure - step, 0)), unit)[0]) / (
+        step + min(step, pressure)
+    )
+    assert slope == pytest.approx(float(by_pressure), rel=2e-3, abs=1e-16)
+
+
+def test_clamp_closes_the_film_behind_its_edge() -> None:
+    unit = UnitParameters(clamp_closing=0.8)
+    points = np.array([[CLAMP_X_M + dx, 0.0, 0.0] for dx in (-4e-3, 0.0, 4e-3)])
+    np.testing.assert_allclose(opening(points, unit), [0.2, 0.6, 1.0], atol=3e-3)
+    assert (opening(points, UnitParameters()) == 1).all()

@@ -1,0 +1,216 @@
+"""Divider and converter, parameters of a unit, and what time does to the signals."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from palpate.fem.electrodes import channels
+from palpate.fem.electrodes.circuit import (
+    convert,
+    counts_slope,
+    ideal_counts,
+    impedance_of,
+    log_response,
+)
+from palpate.fem.electrodes.signals import (
+    ElectrodeSignals,
+    core_temperature_c,
+    log_sigma,
+    spatial_modes,
+)
+from palpate.fem.electrodes.unit import LIMITS, UnitParameters
+from palpate.protos.errors import ConfigError
+
+Floats = NDArray[np.float64]
+UNIT = UnitParameters()
+# Section 4.3: a real sensor at rest, counts and the impedances that follow from 10 kOhm.
+REST = {"E1": (2987, 3.71e3), "E2": (3449, 1.87e3), "E17": (3403, 2.03e3), "E19": (3108, 3.18e3)}
+
+
+def drawn(seed: int) -> UnitParameters:
+    return UNIT.drawn(np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("electrode", REST)
+def test_divider_is_that_of_the_notes(electrode: str) -> None:
+    counts, impedance = REST[electrode]
+    assert ideal_counts(np.full(19, impedance), UNIT)[0] == pytest.approx(counts, abs=2.5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.floats(1e2, 1e6))
+def test_counts_and_impedances_are_inverse(seed: int, size: float) -> None:
+    unit = drawn(seed)
+    impedance = size * np.linspace(0.5, 2, 19)
+    ideal = ideal_counts(impedance, unit)
+    good = (ideal > 1) & (ideal < 4090)
+    np.testing.assert_allclose(impedance_of(ideal, unit)[good], impedance[good], rtol=1e-9)
+    step = 1e-5 * impedance
+    difference = ideal_counts(impedance + step, unit) - ideal_counts(impedance - step, unit)
+    np.testing.assert_allclose(difference / (2 * step), counts_slope(impedance, unit), rtol=1e-5)
+
+
+def test_converter_rounds_and_ends() -> None:
+    assert convert(np.array([-3.0, 0.4, 0.6, 2000.5, 4095.4, 5000.0])).tolist() == [
+        0,
+        0,
+        1,
+        2000,
+        4095,
+        4095,
+    ]
+    assert np.isnan(impedance_of(np.array([0.0] * 18 + [4095.0]), UNIT)).all()
+
+
+def test_log_response_does_not_see_the_conductivity() -> None:
+    rest, pressed = 2e3 * np.linspace(1, 2, 19), 9e3 * np.linspace(2, 1, 19)
+    warm, cold = (
+        log_response(ideal_counts(f * pressed, UNIT), ideal_counts(f * rest, UNIT), UNIT)
+        for f in (0.6, 1.0)
+    )
+    np.testing.assert_allclose(warm, cold, rtol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_unit_survives_json(seed: int) -> None:
+    unit = replace(drawn(seed), name="finger")
+    assert UnitParameters.from_json(unit.to_json()) == unit
+
+
+@pytest.mark.parametrize("key", LIMITS)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -1e9, 1e9, "much", True, None])
+def test_unit_refuses_what_is_out_of_range(key: str, bad: object) -> None:
+    values = json.loads(UNIT.to_json())
+    values[key] = [bad] * 19 if isinstance(values[key], list) else bad
+    with pytest.raises(ConfigError, match=key):
+        UnitParameters.from_json(json.dumps(values))
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("{", "no JSON"),
+        ("[]", "no JSON object"),
+        ('{"sigma": 0.2}', "sigma"),
+        ('{"gain": [0.0]}', "gain"),
+        ('{"gain": 0.0}', "gain"),
+        ('{"floor_m": 5e-5, "asperity_m": 4e-5}', "floor_m"),
+        ('{"name": 3}', "name"),
+    ],
+)
+def test_unit_refuses_what_is_no_unit(text: str, word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        UnitParameters.from_json(text)
+
+
+def test_priors_have_the_sheets_spread() -> None:
+    units = [drawn(seed) for seed in range(400)]
+    logs = np.log([unit.sigma_s_m for unit in units])
+    assert logs.std() == pytest.approx(0.25, rel=0.1)
+    assert np.log([unit.asymmetry for unit in units]).std() == pytest.approx(0.03, rel=0.05)
+    assert max(unit.series_ohm for unit in units) <= 300
+    assert drawn(7) == drawn(7)
+
+
+def test_core_warms_up_with_one_time_constant() -> None:
+    at = [core_temperature_c(t, 25.0, UNIT) for t in (0.0, UNIT.heating_tau_s, 1e6)]
+    np.testing.assert_allclose(at, [25.0, 25 + 10 * (1 - 1 / math.e), 35.0])
+    assert log_sigma(UNIT.reference_c, UNIT) == 0
+    # Section 4.4: 5 K are 78..96 counts at an impedance of the nominal sensor.
+    warm = ideal_counts(np.full(19, 2.7e3) * math.exp(-log_sigma(45.0, UNIT)), UNIT)[0]
+    assert 60 < warm - ideal_counts(np.full(19, 2.7e3), UNIT)[0] < 100
+
+
+def test_signals_of_a_seed_repeat_and_have_the_units_noise() -> None:
+    rest = np.linspace(2500, 3300, 19)
+    one, two = (ElectrodeSignals(UNIT, rest, seed=5) for _ in range(2))
+    a = np.array([one.read(rest, 0.01) for _ in range(400)])
+    np.testing.assert_array_equal(a, [two.read(rest, 0.01) for _ in range(400)])
+    assert a.dtype == np.uint16
+    # Rounding adds 1/12.
+    wanted = math.sqrt(UNIT.noise_counts**2 + 1 / 12)
+    assert a.std(axis=0).mean() == pytest.approx(wanted, rel=0.08)
+
+
+def test_spatial_modes_drift_by_their_share() -> None:
+    modes = spatial_modes()
+    np.testing.assert_allclose(modes.mean(axis=1), 0, atol=1e-12)
+    unit = replace(UNIT, noise_counts=0.0, gradient_sd=0.05)
+    rest = np.full(19, 3200.0)
+    impedance = impedance_of(rest, unit)
+    drifts = []
+    for seed in range(200):
+        warm = ElectrodeSignals(unit, rest, seed=seed).read(rest, 0.01, warmth=1.0)
+        drifts.append(np.log(impedance / impedance_of(warm, unit)))
+    # Two independent modes of unit mean square share the variance over the electrodes.
+    assert np.sqrt(np.mean(np.square(drifts))) == pytest.approx(0.05, rel=0.15)
+    cold = ElectrodeSignals(unit, rest, seed=1).read(rest, 0.01, warmth=0.0)
+    assert (cold == 3200).all()
+
+
+def test_creep_comes_late_and_goes_late() -> None:
+    unit = replace(UNIT, noise_counts=0.0, gradient_sd=0.0, creep_share=0.02, creep_tau_s=15.0)
+    rest, pressed = np.full(19, 3200.0), np.full(19, 1700.0)
+    finger = ElectrodeSignals(unit, rest)
+    assert (finger.read(rest, 1.0) == 3200).all()
+    assert (finger.read(pressed, 1e-6) == 1730).all()
+    assert (finger.read(pressed, 500.0) == 1700).all()
+    assert (finger.read(rest, 1e-6) == 3170).all()  # section 4.5: -30..+10 counts
+    assert finger.read(rest, 15.0)[0] == round(3200 - 30 / math.e)
+    # The same time in many steps.
+    coarse, fine = ElectrodeSignals(unit, rest), ElectrodeSignals(unit, rest)
+    for _ in range(100):
+        last = fine.read(pressed, 0.1)
+    np.testing.assert_array_equal(coarse.read(pressed, 10.0), last)
+
+
+@settings(max_examples=50, deadline=None)
+@given(pressure=st.floats(-20e3, 60e3), temperature=st.floats(5.0, 70.0))
+def test_static_channels_are_inverse(pressure: float, temperature: float) -> None:
+    pdc = channels.pdc_of(np.array(pressure), UNIT)
+    assert channels.pressure_of_pdc(pdc, UNIT) == pytest.approx(pressure, abs=1e-6)
+    tdc = channels.tdc_of(np.array(temperature))
+    assert 0 < tdc < 4095
+    assert channels.temperature_of_tdc(tdc) == pytest.approx(temperature, abs=1e-9)
+
+
+def test_channels_say_what_was_measured() -> None:
+    """Section 4.5: 46-49 C at 1825-2045 counts; section 4.6: a plate of 21-25 kPa, 590-670."""
+    low, high = channels.temperature_of_tdc(np.array([1825.0, 2045.0]))
+    assert 45.5 < low < 47
+    assert 48 < high < 53
+    rise = channels.pdc_of(np.array([21.5e3, 24.5e3]), UNIT) - UNIT.pdc_offset
+    assert 585 < rise[0] < rise[1] < 675
+
+
+@pytest.mark.parametrize(("frequency", "gain"), [(1.0, 0.0995), (10.0, 0.7071), (100.0, 0.995)])
+def test_vibration_passes_above_ten_hertz(frequency: float, gain: float) -> None:
+    time = np.arange(int(3 * channels.PAC_RATE_HZ)) / channels.PAC_RATE_HZ
+    pac = channels.PressureVibration(UNIT).read(5e3 + 100.0 * np.sin(2 * np.pi * frequency * time))
+    settled = channels.pressure_of_pac(pac[len(pac) // 2 :], UNIT)
+    assert np.ptp(settled) / 200.0 == pytest.approx(gain, rel=0.01)
+    assert abs(settled.mean()) < 1.5
+
+
+def test_constant_pressure_and_warmth_are_silent() -> None:
+    pac = channels.PressureVibration(UNIT).read(np.full(100, 7e3))
+    np.testing.assert_array_equal(pac, UNIT.pac_offset)
+    tac = channels.TemperatureChange(UNIT).read(np.full(100, 40.0))
+    np.testing.assert_allclose(tac, UNIT.tac_offset)
+
+
+def test_cooling_is_seen_by_tac_and_fades() -> None:
+    time = np.arange(600) / 100.0
+    cooling = 40.0 - 0.1 * np.clip(time - 1.0, 0.0, 1.0)
+    tac = channels.TemperatureChange(UNIT).read(cooling) - UNIT.tac_offset
+    assert np.abs(tac[:99]).max() < 1e-9
+    assert tac[199] < -100
+    assert abs(tac[-1]) < 0.01 * abs(tac[199])
