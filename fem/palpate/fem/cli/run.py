@@ -153,9 +153,7 @@ def _plans(wanted: Wanted, fingertip: StoredFingertip) -> Sequence[Plan]:
     if wanted.sweep:
         names = tuple(make_indenter(name).name for name in wanted.indenters) or indenter_names()
         return list(
-            Campaign(
-                skin, names, wanted.points, wanted.seed, wanted.steps, angled=wanted.angled
-            )
+            Campaign(skin, names, wanted.points, wanted.seed, wanted.steps, angled=wanted.angled)
         )
     indenter = make_indenter((wanted.indenters or (DEFAULT_INDENTER,))[0])
     if wanted.path is not None:
