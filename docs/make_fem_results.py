@@ -103,10 +103,10 @@ PARTS = ["factorise", "solve", "assemble", "residual", "rest"]
 CLAMP = """
 The angled press goes towards the tip (`angled-0`), but for the long cylinder sideways
 (`angled-1`, with `--indenter cylinder_long --angled 2`): it is as long as the finger, and tilted
-towards the tip its other end meets the rim that the clamp holds (seen in the first runs, and the direction changed
-after that). Those runs are listed below all
-the same: their force is that of the rim (34.3 of 35.0 N in one of them stand on held nodes), not
-of a pinch, and they count neither way.
+towards the tip its other end meets the rim that the clamp holds (seen in the first runs, and the
+direction changed after that). Those runs are listed below all the same: their force is that of
+the rim (34.3 of 35.0 N in one of them stand on held nodes), not of a pinch, and they count
+neither way.
 """
 
 
