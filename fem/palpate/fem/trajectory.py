@@ -222,6 +222,9 @@ class Campaign:
         steps: Steps of each path.
         region: Where to aim; None = the sampled region.
         angled: Angled paths at each point, of the ``AZIMUTHS`` that there are.
+        increment_m: Length of a step [m] instead of ``steps``, as a robot moves; None = ``steps``.
+        overtravel_m: How much deeper than the paper's depths [m]: what a robot that stands wrong by
+            its registration error may reach.
     """
 
     surface: Surface
@@ -231,6 +234,8 @@ class Campaign:
     steps: int = STEPS
     region: Region | None = None
     angled: int = AZIMUTHS
+    increment_m: float | None = None
+    overtravel_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.indenters) * self.points * (1 + self.angled)
@@ -261,8 +266,10 @@ class Campaign:
         direction: Floats,
         depth_m: float,
     ) -> Indentation:
+        depth_m += self.overtravel_m
+        steps = self.steps if self.increment_m is None else round(depth_m / self.increment_m)
         path, contact_m = _press(
-            indenter, target, direction, self.surface, depth_m, self.steps, CLEARANCE_M
+            indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
         )
         return Indentation(name, indenter.name, target, normal, direction, contact_m, depth_m, path)
 

@@ -2,9 +2,9 @@
 
 The film is thin, so its potential lives on the core's surface (learning notes, section 4.2)::
 
-    div(sigma h grad phi) = sum_k chi_k (phi - V_k) / (z_c + h / (2 sigma)),   insulated border,
+    div(sigma h grad phi) = sum_k chi_k (phi - V_k) / (z_c + zeta(h) / sigma),   insulated border,
 
-with linear triangles. The potentials of the film are eliminated (Kron reduction), which leaves the
+with the access length zeta of a disc (`access_length`; the notes have h / 2) and linear triangles. The potentials of the film are eliminated (Kron reduction), which leaves the
 conductance matrix of the 20 terminals.
 """
 
@@ -20,8 +20,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from palpate.fem.electrodes.access import access_length
 from palpate.fem.electrodes.film import FilmMesh
-from palpate.fem.electrodes.table import TERMINALS
+from palpate.fem.electrodes.table import DISC_DIAMETER_M, TERMINALS
 from palpate.protos.errors import SimulationError
 
 Floats = NDArray[np.float64]
@@ -84,7 +85,8 @@ class Conduction:
         mesh, (steep, jump) = self.solver, self._field
         per_face = -self.sigma_s_m / 3 * mesh.areas[:, None] * steep
         share = mesh.share_area[:, None] * jump
-        vertical = share * self._transfer[:, None] ** 2 / (2 * self.sigma_s_m)
+        steepness = (self._access[1] / self.sigma_s_m)[:, None]
+        vertical = share * self._transfer[:, None] ** 2 * steepness
         return np.asarray(mesh.to_nodes @ per_face + mesh.share_to_nodes @ vertical).T
 
     def gradient_log_sigma(self) -> Floats:
@@ -92,30 +94,40 @@ class Conduction:
         mesh, (steep, jump) = self.solver, self._field
         thick = self.film[mesh.mesh.faces].mean(axis=1)
         bulk = self.sigma_s_m * (mesh.areas * thick) @ steep
-        half = self.film[mesh.share_node] / (2 * self.sigma_s_m)
-        return np.asarray(-bulk - (mesh.share_area * self._transfer**2 * half) @ jump)
+        access = self._access[0] / self.sigma_s_m
+        return np.asarray(-bulk - (mesh.share_area * self._transfer**2 * access) @ jump)
 
     def gradient_contact(self) -> Floats:
         """dZ_i / dz_c [1 / m^2], shape (19,)."""
         return np.asarray((self.solver.share_area * self._transfer**2) @ self._field[1])
 
     @property
+    def _access(self) -> tuple[Floats, Floats]:
+        return access_length(self.film[self.solver.share_node], self.solver.disc_radius_m)
+
+    @property
     def _transfer(self) -> Floats:
-        half = self.film[self.solver.share_node] / (2 * self.sigma_s_m)
-        return np.asarray(1 / (self.contact_ohm_m2 + half))
+        return np.asarray(1 / (self.contact_ohm_m2 + self._access[0] / self.sigma_s_m))
 
 
 class FilmConduction:
     """A film mesh made ready: pattern, order of elimination, what is linear in the thickness."""
 
-    def __init__(self, mesh: FilmMesh, terminals: int = TERMINALS) -> None:
+    def __init__(
+        self,
+        mesh: FilmMesh,
+        terminals: int = TERMINALS,
+        *,
+        disc_radius_m: float = DISC_DIAMETER_M / 2,
+    ) -> None:
         """Prepare.
 
         Args:
             mesh: The film.
             terminals: How many there are; each must have a triangle.
+            disc_radius_m: Of the electrodes [m].
         """
-        self.mesh, self.terminals = mesh, terminals
+        self.mesh, self.terminals, self.disc_radius_m = mesh, terminals, disc_radius_m
         count = len(mesh.nodes)
         self.slopes, self.areas = _shape_gradients(mesh)
         faces = mesh.faces.astype(np.int64)
@@ -191,7 +203,8 @@ class FilmConduction:
                 f"the film is {film.min():g} m at its thinnest, sigma {sigma_s_m:g} S/m",
                 remedy="both must be positive; a residual film has a floor",
             )
-        transfer = 1 / (contact_ohm_m2 + film[self.share_node] / (2 * sigma_s_m))
+        access, _ = access_length(film[self.share_node], self.disc_radius_m)
+        transfer = 1 / (contact_ohm_m2 + access / sigma_s_m)
         sheet = sigma_s_m * film[self.mesh.faces].mean(axis=1)
         values = self._entries @ np.concatenate([sheet, transfer * self.share_area])
         size = len(self._starts) - 1

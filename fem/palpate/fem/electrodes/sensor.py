@@ -81,7 +81,9 @@ class Electrodes:
             recess_m=unit.recess_m,
         )
         self.finder = GapFinder(self.film, geometry.mesh)
-        self.conduction = FilmConduction(self.film)
+        self.conduction = FilmConduction(
+            self.film, disc_radius_m=unit.disc_diameter_m / 2
+        )
         self._open = opening(self.film.nodes, unit)
 
     def with_unit(self, unit: UnitParameters) -> Electrodes:
