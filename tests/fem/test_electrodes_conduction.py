@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import Delaunay
 
+from palpate.fem.electrodes.access import access_length
 from palpate.fem.electrodes.conduction import FilmConduction
 from palpate.fem.electrodes.film import FilmMesh
+from palpate.fem.electrodes.table import DISC_DIAMETER_M
 from palpate.protos.errors import SimulationError
 
 Floats = NDArray[np.float64]
@@ -60,6 +62,9 @@ def rings(count: int, radii: tuple[float, float, float]) -> FilmMesh:
     return plane(points, faces, np.where(far < a * 0.999, 1, np.where(far > b, 0, -1)))
 
 
+DISC = DISC_DIAMETER_M / 2
+
+
 def fin_of_disc(a: float, transfer: float) -> float:
     """Resistance from a disc electrode to its rim: the modified Bessel equation inside."""
     sheet = SIGMA * FILM
@@ -86,12 +91,12 @@ def impedance(mesh: FilmMesh, contact: float = CONTACT) -> float:
 
 
 def test_a_strip_is_two_fins_and_a_resistor() -> None:
-    transfer = CONTACT + FILM / (2 * SIGMA)
-    decay = np.sqrt(SIGMA * FILM * transfer)
+    transfer = CONTACT + access_length(np.array(FILM), DISC)[0] / SIGMA
+    decay = float(np.sqrt(SIGMA * FILM * transfer))
     fin = decay / (4e-3 * SIGMA * FILM) / np.tanh(2e-3 / decay)
     exact = 2 * fin + 6e-3 / (4e-3 * SIGMA * FILM)
-    errors = [abs(impedance(strip(8, n)) / exact - 1) for n in (20, 40, 80)]
-    assert errors[2] < 2e-3
+    errors = [abs(impedance(strip(8, n)) / exact - 1) for n in (40, 80, 160)]
+    assert errors[2] < 1e-3
     assert errors[1] < 0.31 * errors[0]  # second order
     assert errors[2] < 0.28 * errors[1]
 
@@ -99,11 +104,11 @@ def test_a_strip_is_two_fins_and_a_resistor() -> None:
 @pytest.mark.parametrize("contact", [0.0, CONTACT])
 def test_disc_within_ring(contact: float) -> None:
     a, b, c = 1.25e-3, 4e-3, 6e-3
-    transfer = contact + FILM / (2 * SIGMA)
+    transfer = contact + float(access_length(np.array(FILM), DISC)[0]) / SIGMA
     exact = fin_of_disc(a, transfer) + np.log(b / a) / (2 * np.pi * SIGMA * FILM)
     exact += fin_of_ring(b, c, transfer)
-    errors = [abs(impedance(rings(n, (a, b, c)), contact) / exact - 1) for n in (12, 24, 48)]
-    assert errors[2] < 3e-3
+    errors = [abs(impedance(rings(n, (a, b, c)), contact) / exact - 1) for n in (24, 48, 96)]
+    assert errors[2] < 1e-3
     assert errors[1] < 0.31 * errors[0]
     assert errors[2] < 0.28 * errors[1]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.electrodes.film import FilmMesh, film_mesh
 from palpate.fem.electrodes.gap import GapFinder
-from palpate.fem.electrodes.residual import CLAMP_X_M, opening, thickness
+from palpate.fem.electrodes.residual import CLAMP_X_M, fit_of, thickness
 from palpate.fem.electrodes.table import (
     DISC_TERMINAL,
     MIRROR,
@@ -196,5 +197,17 @@ def test_residual_film_falls_to_its_floor(gap: float, pressure: float, exponent:
 def test_clamp_closes_the_film_behind_its_edge() -> None:
     unit = UnitParameters(clamp_closing=0.8)
     points = np.array([[CLAMP_X_M + dx, 0.0, 0.0] for dx in (-4e-3, 0.0, 4e-3)])
-    np.testing.assert_allclose(opening(points, unit), [0.2, 0.6, 1.0], atol=3e-3)
-    assert (opening(points, UnitParameters()) == 1).all()
+    np.testing.assert_allclose(fit_of(points, unit).share, [0.2, 0.6, 1.0], atol=3e-3)
+    np.testing.assert_array_equal(fit_of(points, replace(unit, clamp_closing=0.0)).share, 1.0)
+
+
+def test_sides_stand_nearer_and_the_pad_does_not() -> None:
+    unit = UnitParameters(side_closing_m=0.4e-3)
+    angle = np.radians([0.0, 44.0, 60.0, 77.0, 95.0])
+    points = 5e-3 * np.stack([np.full(5, -1.0), np.sin(angle), -np.cos(angle)], axis=1)
+    nearer = fit_of(points, unit).nearer_m
+    np.testing.assert_allclose(nearer[[0, 1, 3, 4]], [0.0, 0.0, 0.4e-3, 0.4e-3], atol=1e-9)
+    assert 0.05e-3 < nearer[2] < 0.35e-3
+    np.testing.assert_array_equal(nearer, fit_of(points * [1, -1, 1], unit).nearer_m)
+    gap = fit_of(points, unit).gap(np.full(5, 1e-3))
+    np.testing.assert_allclose(gap, 1e-3 - nearer, rtol=1e-4)  # the clamp is not quite gone

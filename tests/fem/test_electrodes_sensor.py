@@ -137,7 +137,8 @@ def closed(sensor: Electrodes, film_m: float, pressure_pa: float = 0.0) -> tuple
     return (response.counts - sensor.of_gap(rest).counts) / FULL_SCALE, response.counts
 
 
-# Section 4.4, by another discretisation on another core; 0.03 is the difference to ours.
+# Section 4.4, by another discretisation, on another core, and with h / 2 where `access_length` is
+# shorter: 0.05 is the difference to ours.
 @pytest.mark.parametrize(
     ("film_m", "fall"),
     [(0.3e-3, 0.07), (0.1e-3, 0.22), (0.03e-3, 0.47), (0.01e-3, 0.66), (0.005e-3, 0.74)],
@@ -146,7 +147,7 @@ def test_responses_have_the_size_of_the_notes(
     sensor: Electrodes, film_m: float, fall: float
 ) -> None:
     tared, _ = closed(sensor.with_unit(BARE), film_m - 1e-6)
-    assert tared[E18] == pytest.approx(-fall, abs=0.03)
+    assert tared[E18] == pytest.approx(-fall, abs=0.05)
     assert (tared[LATERAL] > 0.01).all()  # where the fluid goes
     assert tared[LATERAL].max() < 0.06
 
@@ -162,8 +163,8 @@ def test_temperature_moves_all_counts(sensor: Electrodes) -> None:
     nodes = sensor.geometry.mesh.nodes
     cold, rest, warm = (sensor.respond(nodes, log_sigma=s) for s in (-0.125, 0.0, 0.125))
     # Section 4.4: 5 K at 2.5 %/K are -96 and +78 counts.
-    assert (cold.counts - rest.counts).mean() == pytest.approx(-96, abs=10)
-    assert (warm.counts - rest.counts).mean() == pytest.approx(78, abs=10)
+    assert (cold.counts - rest.counts).mean() == pytest.approx(-96, abs=15)
+    assert (warm.counts - rest.counts).mean() == pytest.approx(78, abs=15)
     np.testing.assert_allclose(warm.impedance, np.exp(-0.25) * cold.impedance, rtol=1e-9)
 
 
@@ -209,33 +210,31 @@ def misfit(shared_data: Path) -> Callable[..., Floats]:
 
 
 SIGMA = (0.1, 0.6)
+ASPERITY = (10e-6, 300e-6)
 
 
 def rms(error: Floats) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def test_one_parameter_explains_eighteen_resting_counts(misfit: Callable[..., Floats]) -> None:
-    """The bare pattern has a standard deviation of 152 counts; the notes reach 68 and 104."""
+def test_one_parameter_explains_the_resting_counts(misfit: Callable[..., Floats]) -> None:
+    """Conductivity alone; the bare pattern has a standard deviation of 152 counts.
+
+    The film is closed behind the clamp as the paper's boundary condition has it. The notes reach
+    104 and, without E19, 68 on a mesh with tip and clamp swapped (ADR 0014).
+    """
     everyone = np.ones(SENSING, bool)
     without = everyone.copy()
     without[18] = False
     assert rms(misfit(without, sigma_s_m=SIGMA)) < 70
     error = misfit(everyone, sigma_s_m=SIGMA)
-    assert rms(error) < 115  # not the notes' 104: they had tip and clamp swapped (ADR 0014)
+    assert rms(error) < 90
     assert np.abs(error).argmax() == 18  # E19, by the clamp
 
 
-def test_three_parameters_explain_the_resting_counts(misfit: Callable[..., Floats]) -> None:
-    """Conductivity, the film closed behind the clamp, and series impedance within its prior."""
+def test_series_impedance_explains_more(misfit: Callable[..., Floats]) -> None:
     everyone = np.ones(SENSING, bool)
-    two = rms(misfit(everyone, sigma_s_m=SIGMA, clamp_closing=(0.0, 1.0)))
-    three = rms(
-        misfit(everyone, sigma_s_m=SIGMA, clamp_closing=(0.0, 1.0), series_ohm=(0.0, 300.0))
-    )
-    electric = rms(
-        misfit(everyone, sigma_s_m=SIGMA, contact_ohm_m2=(0.0, 500e-6), series_ohm=(0.0, 300.0))
-    )
-    assert two < 80
-    assert three < two
-    assert electric < 104
+    two = rms(misfit(everyone, sigma_s_m=SIGMA, series_ohm=(0.0, 300.0)))
+    three = rms(misfit(everyone, sigma_s_m=SIGMA, series_ohm=(0.0, 300.0), asperity_m=ASPERITY))
+    assert two < 75
+    assert three <= two

@@ -24,6 +24,8 @@ from palpate.fem.electrodes.signals import (
     ElectrodeSignals,
     core_temperature_c,
     log_sigma,
+    skewed,
+    slot_offsets_s,
     spatial_modes,
 )
 from palpate.fem.electrodes.unit import LIMITS, UnitParameters
@@ -214,3 +216,63 @@ def test_cooling_is_seen_by_tac_and_fades() -> None:
     assert np.abs(tac[:99]).max() < 1e-9
     assert tac[199] < -100
     assert abs(tac[-1]) < 0.01 * abs(tac[199])
+
+
+def test_a_stream_is_the_readings_one_by_one() -> None:
+    rng = np.random.default_rng(3)
+    ideal = 2000.0 + np.cumsum(rng.normal(scale=20.0, size=(700, 19)), axis=0)
+    elapsed = rng.uniform(0.005, 0.5, 700)
+    elapsed[300] = 500.0  # a long pause
+    together = ElectrodeSignals(UNIT, ideal[0], 5).stream(ideal, elapsed)
+    single = ElectrodeSignals(UNIT, ideal[0], 5)
+    noiseless = replace(UNIT, noise_counts=0.0)
+    one_by_one = np.array([single.read(row, dt) for row, dt in zip(ideal, elapsed, strict=True)])
+    np.testing.assert_array_equal(together, one_by_one)
+    parts = ElectrodeSignals(noiseless, ideal[0], 5)
+    split = np.concatenate(
+        [parts.stream(ideal[:13], elapsed[:13]), parts.stream(ideal[13:], elapsed[13:])]
+    )
+    whole = ElectrodeSignals(noiseless, ideal[0], 5).stream(ideal, elapsed)
+    np.testing.assert_array_equal(split, whole)
+
+
+def test_a_drift_of_conductivity_moves_counts_as_a_warmer_film_does() -> None:
+    still = replace(UNIT, noise_counts=0.0, gradient_sd=0.0, creep_share=0.0)
+    impedance = np.linspace(1.5e3, 5e3, 19)
+    ideal = ideal_counts(impedance, still)
+    drift = np.array([0.0, 0.01, -0.01])
+    read = ElectrodeSignals(still, ideal, 0).stream(
+        np.repeat(ideal[None], 3, axis=0), np.ones(3), log_sigma=drift
+    )
+    warm = [ideal_counts(impedance * math.exp(-d), still) for d in drift]
+    np.testing.assert_allclose(read, warm, atol=0.6)
+
+
+def test_electrodes_of_a_frame_are_read_one_after_the_other() -> None:
+    offsets = slot_offsets_s()
+    assert offsets[0] == pytest.approx(10e-3 / 44)
+    assert offsets[-1] < 10e-3
+    time_s: Floats = np.linspace(0.0, 0.99, 100)
+    ramp = 1000.0 + 300.0 * time_s[:, None] * np.ones(19)
+    seen = skewed(ramp, time_s)
+    np.testing.assert_allclose(seen[:-1], ramp[:-1] + 300.0 * offsets)
+    np.testing.assert_array_equal(seen[-1], ramp[-1])
+
+
+def test_strain_and_warmth_leak_into_static_pressure() -> None:
+    leaky = replace(UNIT, pdc_strain_pa_n=20.0, pdc_warmth_pa_k=-30.0)
+    pressure = np.array([0.0, 1e4])
+    clean = channels.pdc_of(pressure, leaky)
+    np.testing.assert_allclose(
+        channels.pdc_of(pressure, leaky, force_n=5.0, warmer_k=2.0) - clean, (100.0 - 60.0) / 36.5
+    )
+
+
+def test_a_cold_indenter_cools_with_one_pole() -> None:
+    cooling = channels.ContactCooling(
+        replace(UNIT, cooling_share=0.2, cooling_tau_s=2.0), indenter_c=20.0
+    )
+    read = [cooling.read(45.0, 0.5, 0.1) for _ in range(200)]
+    assert read[-1] == pytest.approx(45.0 - 0.2 * 0.5 * 25.0, abs=1e-3)
+    assert read[19] == pytest.approx(45.0 - 2.5 * (1 - math.exp(-1.0)))
+    assert cooling.read(45.0, 0.0, 1e3) == pytest.approx(45.0)

@@ -34,9 +34,24 @@ KELVIN = 273.15
 BETA_K, UPPER, LOWER = 4025.0, 155183.0, 46555.0
 
 
-def pdc_of(pressure_pa: Floats, unit: UnitParameters) -> Floats:
-    """PDC [counts] of a fluid pressure above ambient [Pa], any shape; not rounded."""
-    return np.clip(unit.pdc_offset + np.asarray(pressure_pa) / PDC_PA, 0, FULL_SCALE)
+def pdc_of(
+    pressure_pa: Floats,
+    unit: UnitParameters,
+    *,
+    force_n: Floats | float = 0.0,
+    warmer_k: Floats | float = 0.0,
+) -> Floats:
+    """PDC [counts] of a fluid pressure above ambient [Pa], any shape; not rounded.
+
+    Args:
+        pressure_pa: Of the fluid [Pa].
+        unit: The sensor; strain of the core and warmth leak into its PDC (section 4.6).
+        force_n: Net force on the finger [N].
+        warmer_k: Core's temperature above the unit's reference [K].
+    """
+    leak = unit.pdc_strain_pa_n * np.asarray(force_n) + unit.pdc_warmth_pa_k * np.asarray(warmer_k)
+    shown = (np.asarray(pressure_pa) + leak) / PDC_PA
+    return np.clip(unit.pdc_offset + shown, 0, FULL_SCALE)
 
 
 def pressure_of_pdc(counts: Floats, unit: UnitParameters) -> Floats:
@@ -88,6 +103,33 @@ class HighPass:
             self._last = now
             out[i] = now - self._slow
         return out
+
+
+@dataclass
+class ContactCooling:
+    """How an indenter of constant temperature cools the thermistor: one pole (section 4.6).
+
+    Attributes:
+        unit: The sensor; its `cooling_share` and `cooling_tau_s` are used.
+        indenter_c: Temperature of the indenter [degrees C].
+    """
+
+    unit: UnitParameters
+    indenter_c: float = 22.0
+    _cooler: float = field(default=0.0, init=False)
+
+    def read(self, core_c: float, touched: float, elapsed_s: float) -> float:
+        """Temperature at the thermistor [degrees C].
+
+        Args:
+            core_c: Of the core, far from the contact [degrees C].
+            touched: Share of the pad that is touched, 0..1.
+            elapsed_s: Since the last reading [s].
+        """
+        goal = self.unit.cooling_share * touched * (core_c - self.indenter_c)
+        keep = math.exp(-elapsed_s / self.unit.cooling_tau_s)
+        self._cooler = goal + (self._cooler - goal) * keep
+        return core_c - self._cooler
 
 
 @dataclass

@@ -4,8 +4,9 @@ The film is thin, so its potential lives on the core's surface (learning notes, 
 
     div(sigma h grad phi) = sum_k chi_k (phi - V_k) / (z_c + zeta(h) / sigma),   insulated border,
 
-with the access length zeta of a disc (`access_length`; the notes have h / 2) and linear triangles. The potentials of the film are eliminated (Kron reduction), which leaves the
-conductance matrix of the 20 terminals.
+with the access length zeta of a disc (`access_length`; the notes have h / 2) and linear triangles.
+The potentials of the film are eliminated (Kron reduction), which leaves the conductance matrix of
+the 20 terminals.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from palpate.fem.electrodes.circuit import counts_slope, ideal_counts
 from palpate.fem.electrodes.conduction import Conduction, FilmConduction
 from palpate.fem.electrodes.film import EDGE_M, film_mesh
 from palpate.fem.electrodes.gap import Gap, GapFinder
-from palpate.fem.electrodes.residual import opening, thickness
+from palpate.fem.electrodes.residual import fit_of, thickness
 from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.mesh.geometry import Geometry
 from palpate.fem.result import Step
@@ -81,10 +81,8 @@ class Electrodes:
             recess_m=unit.recess_m,
         )
         self.finder = GapFinder(self.film, geometry.mesh)
-        self.conduction = FilmConduction(
-            self.film, disc_radius_m=unit.disc_diameter_m / 2
-        )
-        self._open = opening(self.film.nodes, unit)
+        self.conduction = FilmConduction(self.film, disc_radius_m=unit.disc_diameter_m / 2)
+        self._fit = fit_of(self.film.nodes, unit)
 
     def with_unit(self, unit: UnitParameters) -> Electrodes:
         """The same geometry with another unit; at once where its discs and core are the same."""
@@ -92,7 +90,7 @@ class Electrodes:
         if (unit.disc_diameter_m, unit.recess_m) != (old.disc_diameter_m, old.recess_m):
             return Electrodes(self.geometry, unit, edge_m=self._edge_m)
         other = copy(self)
-        other.unit, other._open = unit, opening(self.film.nodes, unit)
+        other.unit, other._fit = unit, fit_of(self.film.nodes, unit)
         return other
 
     def respond(
@@ -117,7 +115,7 @@ class Electrodes:
     def of_gap(self, gap: Gap, *, log_sigma: float = 0.0) -> Response:
         """Answer to known gaps."""
         unit = self.unit
-        film, by_gap, _ = thickness(self._open * gap.gap, gap.pressure, unit)
+        film, by_gap, _ = thickness(self._fit.gap(gap.gap), gap.pressure, unit)
         solved = self.conduction.solve(
             film,
             sigma_s_m=unit.sigma_s_m * float(np.exp(log_sigma)),
@@ -130,7 +128,7 @@ class Electrodes:
             film=film,
             conduction=solved,
             _slope=counts_slope(solved.impedance, unit),
-            _by_gap=by_gap * self._open,
+            _by_gap=by_gap * self._fit.share,
         )
 
     def counts(

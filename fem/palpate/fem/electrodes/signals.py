@@ -38,6 +38,34 @@ def spatial_modes() -> Floats:
     return np.asarray(raw / raw.std(axis=1, keepdims=True))
 
 
+FRAME_S = 10e-3
+SLOTS = 44
+"""Readings in a frame: 22 of PAC, the other channels between them (learning notes, section 4.6)."""
+
+
+def slot_offsets_s() -> Floats:
+    """When E1..E19 are read after the start of their frame [s], shape (19,): 0.23 to 8.4 ms.
+
+    Every second reading of a frame is PAC's.
+    """
+    return np.asarray((1 + 2 * np.arange(SENSING)) * (FRAME_S / SLOTS))
+
+
+def skewed(ideal: Floats, time_s: Floats) -> Floats:
+    """What each electrode of a frame sees, as none is read when its frame begins.
+
+    Args:
+        ideal: Ideal counts at the starts of frames, shape (T, 19).
+        time_s: Those starts [s], shape (T,), increasing.
+
+    Returns:
+        Ideal counts when each electrode is read, shape (T, 19); the last frame's stay.
+    """
+    offsets = slot_offsets_s()
+    columns = [np.interp(time_s + offsets[i], time_s, ideal[:, i]) for i in range(SENSING)]
+    return np.stack(columns, axis=1)
+
+
 @dataclass
 class ElectrodeSignals:
     """The electrodes of one unit over time.
@@ -71,10 +99,63 @@ class ElectrodeSignals:
         Returns:
             Counts, uint16, shape (19,).
         """
-        late = self.unit.creep_share * (ideal - self.rest)
-        self._creep = late + (self._creep - late) * math.exp(-elapsed_s / self.unit.creep_tau_s)
-        impedance = np.nan_to_num(impedance_of(ideal, self.unit))
+        one: Counts = self.stream(ideal[None], np.array([elapsed_s]), warmth=warmth)[0]
+        return one
+
+    def stream(
+        self,
+        ideal: Floats,
+        elapsed_s: Floats,
+        *,
+        warmth: float = 1.0,
+        log_sigma: Floats | float = 0.0,
+    ) -> Counts:
+        """Counts of many readings in a row.
+
+        Args:
+            ideal: Ideal counts, shape (T, 19).
+            elapsed_s: Since the reading before, shape (T,) [s].
+            warmth: As in `read`.
+            log_sigma: ln of the conductivity over that which the ideal counts were made with, shape
+                (T,) or one number: a drift of the temperature.
+
+        Returns:
+            Counts, uint16, shape (T, 19).
+        """
+        unit = self.unit
+        late = unit.creep_share * (ideal - self.rest)
+        creep = _followed(late, elapsed_s / unit.creep_tau_s, self._creep)
+        if len(creep):
+            self._creep = creep[-1].copy()
+        impedance = np.nan_to_num(impedance_of(ideal, unit))
+        warm = self._modes * warmth + np.broadcast_to(log_sigma, len(ideal))[:, None]
         # d Z = -Z d ln sigma: the film's impedance goes with 1 / sigma.
-        drift = -counts_slope(impedance, self.unit) * impedance * self._modes * warmth
-        noise = self.unit.noise_counts * self._rng.standard_normal(SENSING)
-        return convert(ideal - late + self._creep + drift + noise)
+        drift = -counts_slope(impedance, unit) * impedance * warm
+        noise = unit.noise_counts * self._rng.standard_normal(ideal.shape)
+        return convert(ideal - late + creep + drift + noise)
+
+
+def _followed(goal: Floats, ways: Floats, start: Floats) -> Floats:
+    """A first-order lag's way after a goal that is constant between readings, shape (T, n).
+
+    Args:
+        goal: Shape (T, n).
+        ways: Time from the reading before over the time constant, shape (T,).
+        start: Where it is before, shape (n,).
+    """
+    out = np.empty_like(goal)
+    for begin in range(0, len(goal), _BLOCK):
+        piece, way = goal[begin : begin + _BLOCK], ways[begin : begin + _BLOCK]
+        if way.sum() > _LONGEST:  # exp would lose digits: one by one
+            for i, (one, step) in enumerate(zip(piece, way, strict=True)):
+                start = one + (start - one) * math.exp(-step)
+                out[begin + i] = start
+            continue
+        grown = np.exp(np.cumsum(way))[:, None]
+        gain = -np.expm1(-way)[:, None] * grown
+        out[begin : begin + _BLOCK] = (start + np.cumsum(gain * piece, axis=0)) / grown
+        start = out[min(begin + _BLOCK, len(goal)) - 1]
+    return out
+
+
+_BLOCK, _LONGEST = 256, 20.0
