@@ -24,6 +24,7 @@ from palpate.fem.cli.options import (
     ThicknessOption,
     WorkersOption,
 )
+from palpate.fem.cli.units_app import units_app
 
 fem_app = typer.Typer(
     cls=FemGroup,
@@ -32,6 +33,7 @@ fem_app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+fem_app.add_typer(units_app, name="units")
 
 
 def _example(*lines: str) -> str:

@@ -1,0 +1,1 @@
+"""Several BioTacs on one simulated finger: answers of their electrodes, fitted to ranges."""
