@@ -116,5 +116,5 @@ $(VENV)/.demo: $(VENV)/.made pyproject.toml
 $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	@echo "palpate: installing everything into $(VENV) (torch and the developer's tools), 3-8 minutes"
 	@$(pip_install) '$(TORCH)' | $(show)
-	@$(pip_install) -e '.[all,dev]' | $(show)
+	@$(pip_install) -e '.[all,cluster,dev]' | $(show)
 	@touch $(VENV)/.demo $@

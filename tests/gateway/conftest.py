@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import importlib
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +27,10 @@ from palpate.protos.errors import PalpateError
 from palpate.protos.messages import ServiceRequest, ServiceState, Status, Tare, TareRequest
 from palpate.protos.record import RecordWriter
 from palpate.protos.session import Delivery, Session, Tap, run_router
+from palpate.protos.tape import write_tape
 from palpate.protos.topics import TOPICS, sensor_key
+
+sys.path.append(str(Path(__file__).parent))  # tests import the fakes by name
 
 ELECTRODE_IDS = list(range(17, 36))
 
@@ -117,7 +122,8 @@ def record(tmp_path: Path) -> Callable[..., Path]:
         path = tmp_path / "run.mcap"
         with RecordWriter(path) as writer:
             for unit, sensor in enumerate(sensors):
-                device = make_device("virtual", {"realtime": False, "frames": frames, "unit": unit})
+                options = {"model": "formula", "realtime": False, "frames": frames, "unit": unit}
+                device = make_device("virtual", options)
                 pipeline = Pipeline(device.info)
                 with device:
                     pipeline.begin(device.identity, FileClock(device.identity.serial, 10**18))
@@ -134,6 +140,18 @@ def record(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return make
+
+
+@pytest.fixture
+def tape_path(tmp_path: Path) -> Callable[..., Path]:
+    """Writes tapes; options are the units' electrics."""
+
+    def write(**electrics: float) -> Path:
+        path = tmp_path / "small.npz"
+        write_tape(path, importlib.import_module("tape_fakes").make_tape(**electrics))
+        return path
+
+    return write
 
 
 PATIENCE_S = 10.0

@@ -101,6 +101,15 @@ class TestVirtual(DeviceContract):
         return lambda: make_device("virtual", {"realtime": False, "frames": FRAMES})
 
 
+class TestTwin(DeviceContract):
+    @pytest.fixture
+    def make(self, tape_path: Callable[..., Path]) -> Callable[[], Device]:
+        path = str(tape_path())
+        return lambda: make_device(
+            "virtual", {"tape": path, "realtime": False, "frames": FRAMES, "seed": 3}
+        )
+
+
 class TestVirtualLive(DeviceContract):
     @pytest.fixture
     def make(self) -> Callable[[], Device]:

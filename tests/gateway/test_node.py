@@ -6,6 +6,7 @@ import socket
 import sys
 import threading
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,14 @@ from palpate.protos.config import LinkConfig, parse_config
 from palpate.protos.errors import ConfigError, DeviceLost, ErrorCode, LinkError, RemoteError
 from palpate.protos.messages import Origin, ServiceState
 from palpate.protos.session import Delivery
-from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+from palpate.protos.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 
 PATIENCE_S = 10.0
 
 
 def test_live_virtual_finger(bus: Any) -> None:
-    sensor = {"name": "finger", "driver": "virtual", "options": {"seed": 1, "rate_hz": 200}}
+    options = {"model": "formula", "seed": 1, "rate_hz": 200}
+    sensor = {"name": "finger", "driver": "virtual", "options": options}
     with bus.gateway({"sensors": [sensor], "tare_frames": 20}) as running:
         electrodes = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
         wrench = bus.session.subscriber(WRENCH, delivery=Delivery.QUEUE)
@@ -53,6 +55,42 @@ def test_live_virtual_finger(bus: Any) -> None:
         running.thread.join(PATIENCE_S)
         assert running.error is None
         bus.until(lambda: not [a for a in bus.session.alive() if a.service == "gateway"])
+
+
+def test_live_twin_publishes_the_true_field(bus: Any, tape_path: Callable[..., Path]) -> None:
+    options = {"tape": str(tape_path()), "rate_hz": 200}
+    values = {"sensors": [{"driver": "virtual", "options": options}], "tare_frames": 20}
+    with bus.gateway(values):
+        fields = bus.session.subscriber(FIELD_TRUTH, delivery=Delivery.QUEUE)
+        first, second = (fields.next(timeout_s=PATIENCE_S).message for _ in range(2))
+    assert first.sensor_serial == "VIRTUAL-unit1-S0"
+    assert first.mesh_sha256 == bytes(range(32))
+    assert first.displacement.shape == (9, 3)
+    assert second.stamp.sequence == first.stamp.sequence + 1
+    assert second.stamp.device_tick == first.stamp.device_tick + 10
+    assert second.stamp.origin is Origin.SIMULATED
+
+
+def test_a_finger_that_restarts_is_opened_again(bus: Any, tape_path: Callable[..., Path]) -> None:
+    options = {
+        "tape": str(tape_path()),
+        "rate_hz": 200,
+        "untouched_s": 60,
+        "faults": [{"kind": "restart", "at_s": 0.5}],
+    }
+    with bus.gateway({"sensors": [{"driver": "virtual", "options": options}]}):
+        electrodes = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+        frames = [electrodes.next(timeout_s=PATIENCE_S).message for _ in range(150)]
+        now = bus.until(lambda: bus.status())
+    ticks = [frame.stamp.device_tick for frame in frames]
+    again = ticks.index(0, 1) if ticks[0] == 0 else ticks.index(0)
+    assert ticks[again - 1] == 99
+    assert ticks[again:] == list(range(len(ticks) - again))
+    sequences = [frame.stamp.sequence for frame in frames]
+    assert sequences == list(range(sequences[0], sequences[0] + 150))
+    assert len({frame.sensor_serial for frame in frames}) == 1
+    assert now.counters["device_lost"] == 1
+    assert now.counters["fault_restart_frames"] == 1
 
 
 def test_tare_on_demand(bus: Any) -> None:

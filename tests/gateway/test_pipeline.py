@@ -11,7 +11,7 @@ from palpate.gateway.clock_map import FileClock, LiveClock, PacedClock
 from palpate.gateway.device import DeviceIdentity, DeviceInfo
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.readings import ElectrodeReading, Reading, RecordedMessage
+from palpate.gateway.readings import ElectrodeReading, FieldReading, Reading, RecordedMessage
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.errors import DeviceError
 from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
@@ -156,7 +156,8 @@ def test_paced_items_are_due_at_their_stamp() -> None:
 def test_replaying_twice_gives_the_same_bytes() -> None:
     runs = []
     for _ in range(2):
-        with make_device("virtual", {"realtime": False, "frames": 100}) as device:
+        options = {"model": "formula", "realtime": False, "frames": 100}
+        with make_device("virtual", options) as device:
             made = Pipeline(device.info)
             made.begin(device.identity, FileClock(device.identity.serial, None))
             out: list[Outgoing] = []
@@ -165,6 +166,21 @@ def test_replaying_twice_gives_the_same_bytes() -> None:
             runs.append([TOPICS[item.topic].codec.encode(item.message) for item in out])
     assert runs[0] == runs[1]
     assert len(runs[0]) == 301
+
+
+def test_a_true_field_goes_out_with_the_serial_and_a_sequence_of_its_own() -> None:
+    made = pipeline(live=True)
+    made.push(readings(7), 10**9)
+    still = np.arange(6, dtype=np.float32).reshape(2, 3)
+    out = made.push([FieldReading(k, k * 0.01, b"m" * 32, still) for k in (7, 12)], 10**9)
+    assert [item.topic for item in out] == ["field_truth"] * 2
+    for number, item in enumerate(out, start=1):
+        decoded = TOPICS["field_truth"].codec.decode(
+            TOPICS["field_truth"].codec.encode(item.message)
+        )
+        assert (decoded.stamp.sequence, decoded.sensor_serial) == (number, "BT1")
+        assert decoded.mesh_sha256 == b"m" * 32
+        assert np.array_equal(decoded.displacement, still)
 
 
 def test_record_passes_unchanged_and_its_tares_are_known(record: Callable[..., Path]) -> None:

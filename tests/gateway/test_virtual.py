@@ -1,3 +1,5 @@
+"""The virtual finger by closed formulas, and what every virtual finger does."""
+
 from __future__ import annotations
 
 import time
@@ -16,7 +18,7 @@ from palpate.gateway.virtual_trajectory import touch
 
 
 def collect(**options: Any) -> dict[str, Any]:
-    with make_device("virtual", {"realtime": False, **options}) as device:
+    with make_device("virtual", {"model": "formula", "realtime": False, **options}) as device:
         return arrays(drain(device))
 
 
@@ -57,8 +59,9 @@ def test_same_options_same_counts() -> None:
 
 
 def test_pace_and_limit_do_not_change_the_counts() -> None:
-    fast = collect(seed=1, frames=200, rate_hz=1000)
-    with make_device("virtual", {"seed": 1, "frames": 200, "rate_hz": 1000}) as device:
+    options = {"seed": 1, "frames": 200, "rate_hz": 1000}
+    fast = collect(**options)
+    with make_device("virtual", {**options, "model": "formula"}) as device:
         live = arrays(drain(device))
     assert all(np.array_equal(fast[key], live[key]) for key in fast)
     longer = collect(seed=1, frames=333, rate_hz=1000)

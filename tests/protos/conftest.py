@@ -18,6 +18,8 @@ from palpate.protos.messages import (
     ErrorReply,
     FeatureEstimate,
     FieldEstimate,
+    FieldFrame,
+    FieldRequest,
     IndenterPoseFrame,
     ModelMetadata,
     Origin,
@@ -77,20 +79,21 @@ def examples() -> dict[str, Any]:
         SimulationConvergence(2, 9, 11, 1e-9, 2e-12, 3e-6, 0.25),
     )
     progress = SimulationProgress("r-1", 3, 20, 1.25, SimulationPhase.INDENTING, 2)
+    frame = ElectrodeFrame(
+        stamp,
+        "BT000123",
+        SensorType.BIOTAC,
+        np.arange(19, dtype=np.uint16) * 100 + 2000,
+        1297,
+        np.arange(22, dtype=np.uint16) + 2030,
+        2050,
+        1912,
+        (1 << 44) - 2,
+        227_273,
+        0xFEED,
+    )
     return {
-        "ElectrodeFrame": ElectrodeFrame(
-            stamp,
-            "BT000123",
-            SensorType.BIOTAC,
-            np.arange(19, dtype=np.uint16) * 100 + 2000,
-            1297,
-            np.arange(22, dtype=np.uint16) + 2030,
-            2050,
-            1912,
-            (1 << 44) - 2,
-            227_273,
-            0xFEED,
-        ),
+        "ElectrodeFrame": frame,
         "WrenchFrame": WrenchFrame(
             stamp, "FT-7", _floats(0.5, -0.25, 4.0), _floats(0.01, -0.02, 0.0), True
         ),
@@ -101,6 +104,7 @@ def examples() -> dict[str, Any]:
             np.array([0.5, 0.5, -0.5, 0.5]),
             True,
         ),
+        "FieldFrame": FieldFrame(stamp, "BT000123", mesh, nodes),
         "FeatureEstimate": FeatureEstimate(
             stamp,
             "BT000123",
@@ -143,6 +147,7 @@ def examples() -> dict[str, Any]:
             50,
         ),
         "TareRequest": TareRequest(0xFEED, 50),
+        "FieldRequest": FieldRequest("finger", frame),
         "ServiceRequest": ServiceRequest(),
         "Status": Status(
             "features",

@@ -9,11 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import json_format
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from palpate.protos.codec import CODECS, ELECTRODE_FRAME, FEATURE_ESTIMATE, FIELD_ESTIMATE, Codec
+from palpate.protos.codec import (
+    CODECS,
+    ELECTRODE_FRAME,
+    FEATURE_ESTIMATE,
+    FIELD_ESTIMATE,
+    FIELD_FRAME,
+    FIELD_REQUEST,
+    Codec,
+)
 from palpate.protos.errors import PalpateError, WireError
-from palpate.protos.messages import ElectrodeFrame
-from palpate.v1 import common_pb2, frames_pb2
+from palpate.protos.messages import ElectrodeFrame, FieldFrame, Origin, Stamp
+from palpate.v1 import common_pb2, frames_pb2, service_pb2
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "v1"
 BY_NAME = {codec.schema.rpartition(".")[2]: codec for codec in CODECS}
@@ -139,6 +150,69 @@ def test_nan_in_a_field_is_refused_with_its_row(examples: dict[str, Any]) -> Non
     bad[2, 1] = np.nan
     with pytest.raises(WireError, match="row 2"):
         FIELD_ESTIMATE.encode(dataclasses.replace(estimate, displacement=bad))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"displacement": np.full((4, 3), np.inf, np.float32)}, "non_finite"),
+        ({"displacement": np.zeros((4, 2), np.float32)}, "shape"),
+        ({"displacement": np.zeros((0, 3), np.float32)}, "shape"),
+        ({"displacement": np.zeros((4, 3))}, "dtype"),
+        ({"mesh_sha256": bytes(31)}, "digest"),
+        ({"sensor_serial": ""}, "serial"),
+    ],
+)
+def test_a_bad_field_is_refused_on_both_sides(
+    examples: dict[str, Any], changes: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(WireError) as caught:
+        FIELD_FRAME.encode(dataclasses.replace(examples["FieldFrame"], **changes))
+    assert caught.value.reason == reason
+    message = frames_pb2.FieldFrame.FromString(FIELD_FRAME.encode(examples["FieldFrame"]))
+    for name, value in changes.items():
+        if name != "displacement":
+            setattr(message, name, value)
+            continue
+        if value.dtype != np.float32:
+            return  # the wire cannot say it
+        del message.displacement[:]
+        message.displacement.extend(value.ravel().tolist())
+    with pytest.raises(WireError) as caught:
+        FIELD_FRAME.decode(message.SerializeToString())
+    assert caught.value.reason == reason
+
+
+@given(
+    arrays(
+        np.float32,
+        st.tuples(st.integers(1, 40), st.just(3)),
+        elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
+    )
+)
+def test_any_finite_field_comes_through(field: Any) -> None:
+    stamp = Stamp(1, 0, 0, 0, 0, Origin.SIMULATED)
+    frame = FieldFrame(stamp, "BT", bytes(32), field)
+    payload = FIELD_FRAME.encode(frame)
+    assert same(FIELD_FRAME.decode(payload), frame)
+    assert frames_pb2.FieldFrame.FromString(payload).SerializeToString() == payload
+
+
+@pytest.mark.parametrize("sensor", ["", "*", "a/b", "Finger"])
+def test_a_request_for_a_field_names_a_sensor_and_holds_a_frame(
+    examples: dict[str, Any], sensor: str
+) -> None:
+    request = examples["FieldRequest"]
+    with pytest.raises(WireError) as caught:
+        FIELD_REQUEST.encode(dataclasses.replace(request, sensor=sensor))
+    assert caught.value.reason == "sensor"
+    message = service_pb2.FieldRequest.FromString(FIELD_REQUEST.encode(request))
+    message.sensor = sensor
+    with pytest.raises(WireError) as caught:
+        FIELD_REQUEST.decode(message.SerializeToString())
+    assert caught.value.reason == "sensor"
+    with pytest.raises(WireError):
+        FIELD_REQUEST.decode(service_pb2.FieldRequest(sensor="finger").SerializeToString())
 
 
 def test_nan_on_the_wire_is_refused(examples: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +29,8 @@ from palpate.protos.messages import (
     WrenchFrame,
 )
 from palpate.protos.session import run_router
+
+sys.path.append(str(Path(__file__).parent))  # tests import field_bundles by name
 
 onnx = pytest.importorskip("onnx")
 helper = onnx.helper

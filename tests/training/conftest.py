@@ -1,4 +1,4 @@
-"""A small data set with a known law between electrodes and force."""
+"""Small data sets: one with a known law between electrodes and force, and tiny experiments."""
 
 from __future__ import annotations
 
@@ -8,6 +8,19 @@ import numpy as np
 import pytest
 
 from palpate.training.dataset import FeatureDataset, Provenance
+from palpate.training.twin.assemble import assemble_experiment, assemble_mixed
+from palpate.training.twin.basis import fit_basis
+from palpate.training.twin.content import ExperimentDataset, MixedDataset, SkinMesh
+from palpate.training.twin.trials import MixedRows, TrialHeader, TrialRows
+
+TRIALS = [
+    ("biotac-1", "cube/00/normal"),
+    ("biotac-1", "sphere/00/normal"),
+    ("biotac-1", "sphere/01/angled-2"),
+    ("biotac-2", "cube/00/normal"),
+    ("biotac-2", "sphere/01/angled-2"),
+]
+"""Unit and trajectory of the trials of the tiny experiment, in its order."""
 
 
 @pytest.fixture
@@ -47,3 +60,64 @@ def press_data(provenance: Provenance) -> Callable[..., FeatureDataset]:
         )
 
     return make
+
+
+@pytest.fixture
+def make_rows() -> Callable[..., TrialRows]:
+    """Processed rows of one trial; place and direction follow from the trajectory alone."""
+
+    def make(unit: str, trajectory: str, rows: int = 6) -> TrialRows:
+        plan = np.random.default_rng(list(trajectory.encode()))
+        rng = np.random.default_rng(list(f"{unit} {trajectory}".encode()))
+        travel = 1e-4 * np.arange(rows, dtype=np.float64)
+        start = np.array([plan.uniform(-0.015, 0.0), plan.uniform(-0.004, 0.004), -0.009])
+        way = np.array([0.5 * (plan.random() - 0.5), 0.5 * (plan.random() - 0.5), 1.0])
+        way /= np.linalg.norm(way)
+        return TrialRows(
+            header=TrialHeader(unit, trajectory, trajectory.split("/")[0], "left"),
+            rest=rng.integers(2800, 3200, 19).astype(float),
+            travel_m=travel,
+            tared=rng.uniform(-0.5, 0.1, (rows, 19)),
+            force=np.outer(0.5 + 3e3 * travel, way),
+            location=start + np.outer(travel, way) + rng.normal(0, 1e-6, 3),
+        )
+
+    return make
+
+
+@pytest.fixture
+def experiment(make_rows: Callable[..., TrialRows], provenance: Provenance) -> ExperimentDataset:
+    """Two units, three unique trajectories, five trials of unequal length."""
+    trials = [make_rows(*trial, rows=5 + i) for i, trial in enumerate(TRIALS)]
+    return assemble_experiment(trials, provenance)
+
+
+@pytest.fixture
+def skin() -> SkinMesh:
+    """Twelve nodes that count as a skin."""
+    rng = np.random.default_rng(5)
+    faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
+    return SkinMesh(
+        rng.uniform(-0.01, 0.01, (12, 3)), faces, faces[:1] + 6, np.arange(4, dtype=np.int32), "ab"
+    )
+
+
+@pytest.fixture
+def mixed_rows(make_rows: Callable[..., TrialRows]) -> list[MixedRows]:
+    """The trials of the tiny experiment with a field that follows three laws of travel."""
+    rng = np.random.default_rng(6)
+    shapes = rng.normal(size=(3, 12, 3))
+    found = []
+    for unit, trajectory in TRIALS:
+        rows = make_rows(unit, trajectory)
+        law = np.stack([rows.travel_m, rows.travel_m**2 * 1e3, rows.force[:, 0] * 1e-4])
+        field = np.einsum("kr,kvc->rvc", law, shapes).astype(np.float32)
+        found.append(MixedRows(rows, 1.1 * rows.force, field))
+    return found
+
+
+@pytest.fixture
+def mixed(mixed_rows: list[MixedRows], skin: SkinMesh, provenance: Provenance) -> MixedDataset:
+    """The mixed data set of these trials."""
+    basis = fit_basis(lambda: (one.displacement for one in mixed_rows))
+    return assemble_mixed(mixed_rows, basis, skin, provenance)

@@ -91,7 +91,7 @@ def up(
 
 @app.command(epilog=example("palpate run features --profile virtual"))
 def run(
-    service: Annotated[str, typer.Argument(help="router, gateway, features, recorder or fem")],
+    service: Annotated[str, typer.Argument(help="E.g. gateway, features, field.")],
     profile: ProfileOption = DEFAULT_PROFILE,
 ) -> None:
     """Be one process of a station, unsupervised (what `palpate up` starts)."""

@@ -88,11 +88,19 @@ def review(
     most: Annotated[
         int, typer.Option(min=1, help="Of a store: at most so many trajectories, evenly picked.")
     ] = 8,
+    bundle: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Of a record: a bundle with the mesh of its fields, beside the packaged ones; "
+            "repeatable."
+        ),
+    ] = None,
 ) -> None:
     """Make a Rerun view of a record, or of a store of simulations."""
     from palpate.deploy.files import review_path
 
-    review_path(path, out, png, trajectories=tuple(trajectory or ()), most=most)
+    named = tuple(trajectory or ())
+    review_path(path, out, png, trajectories=named, most=most, bundles=tuple(bundle or ()))
 
 
 def info(file: RecordArgument, json_: JsonOption = False) -> None:

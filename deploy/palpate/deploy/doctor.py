@@ -183,21 +183,28 @@ def _router(profile: Profile) -> Finding:
 
 
 def _bundle(profile: Profile) -> Finding:
-    if "features" not in profile.processes:
-        return Finding("bundle", "ok", "no features service in this profile")
+    tables = {
+        "features": profile.features,
+        "field": profile.field,
+        "synthesis": profile.synthesis,
+    }
+    served = {task: table.bundle for task, table in tables.items() if task in profile.processes}
+    if not served:
+        return Finding("bundle", "ok", "no service of this profile needs one")
     from palpate.protos.bundle import read_bundle
     from palpate.services.repository import resolve
     from palpate.services.runtime import load
 
-    try:
-        bundle = read_bundle(resolve(profile.features.bundle))
-        load(bundle, "features")
-    except PalpateError as error:
-        return Finding("bundle", "fail", error.problem, error.remedy)
-    manifest = bundle.manifest
-    return Finding(
-        "bundle", "ok", f"{manifest.name}:{manifest.version} reproduces its golden vectors"
-    )
+    names = []
+    for task, name in served.items():
+        try:
+            bundle = read_bundle(resolve(name))
+            load(bundle, task)
+        except PalpateError as error:
+            return Finding("bundle", "fail", error.problem, error.remedy)
+        names.append(f"{bundle.manifest.name}:{bundle.manifest.version}")
+    what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
+    return Finding("bundle", "ok", f"{', '.join(names)} {what}")
 
 
 def _disk(profile: Profile) -> Finding:

@@ -75,6 +75,7 @@ def review_path(
     *,
     trajectories: Sequence[str] = (),
     most: int = 8,
+    bundles: Sequence[str] = (),
 ) -> None:
     """Write the Rerun view of a record or of a store of simulations, and on request the picture.
 
@@ -84,9 +85,10 @@ def review_path(
         picture: The PNG to write; None = none.
         trajectories: Of a store: which, by id or pattern; none = a choice from all.
         most: Of a store: how many trajectories at most.
+        bundles: Of a record: bundles that hold the meshes of its fields, beside the packaged ones.
 
     Raises:
-        ConfigError: There is no such path.
+        ConfigError: There is no such path or bundle.
         RecordingError: The record is damaged or not palpate's.
         DatasetError: The store is damaged, or has none of these trajectories.
         MissingExtraError: Rerun, h5py or matplotlib is not installed.
@@ -102,19 +104,22 @@ def review_path(
             f"{path} is a record, which has no trajectories", remedy="leave out --trajectory"
         )
     else:
-        review_record(path, view, picture)
+        review_record(path, view, picture, bundles=bundles)
 
 
-def review_record(path: Path, view: Path | None, picture: Path | None) -> None:
+def review_record(
+    path: Path, view: Path | None, picture: Path | None, *, bundles: Sequence[str] = ()
+) -> None:
     """Write the Rerun view of a record, and on request the picture.
 
     Raises:
+        ConfigError: There is no such bundle.
         RecordingError: The record is damaged or not palpate's.
         MissingExtraError: Rerun or matplotlib is not installed.
     """
     from palpate.services.view import review
 
-    written = review(path, view)
+    written = review(path, view, bundles=bundles)
     print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
     if picture is not None:
         from palpate.services.plot import plot_record

@@ -17,7 +17,15 @@ from palpate.protos.errors import ConfigError
 
 _log = logging.getLogger(__name__)
 
-START_ORDER: tuple[Service, ...] = ("router", "recorder", "features", "fem", "gateway")
+START_ORDER: tuple[Service, ...] = (
+    "router",
+    "recorder",
+    "synthesis",
+    "field",
+    "features",
+    "fem",
+    "gateway",
+)
 """Listeners first; stopped in reverse, so that what the gateway last sent is still recorded."""
 
 
@@ -69,6 +77,18 @@ def _run_features(profile: Profile, stop: threading.Event) -> None:
     features.run(profile.features, profile.link, profile.station, stop)
 
 
+def _run_field(profile: Profile, stop: threading.Event) -> None:
+    from palpate.services import field
+
+    field.run(profile.field, profile.link, profile.station, stop)
+
+
+def _run_synthesis(profile: Profile, stop: threading.Event) -> None:
+    from palpate.services import synthesis
+
+    synthesis.run(profile.synthesis, profile.link, profile.station, stop)
+
+
 def _run_recorder(profile: Profile, stop: threading.Event) -> None:
     from palpate.services import recorder
 
@@ -85,6 +105,8 @@ _RUN: dict[Service, Callable[[Profile, threading.Event], None]] = {
     "router": _run_router,
     "gateway": _run_gateway,
     "features": _run_features,
+    "field": _run_field,
+    "synthesis": _run_synthesis,
     "recorder": _run_recorder,
     "fem": _run_fem,
 }

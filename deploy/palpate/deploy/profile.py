@@ -34,7 +34,7 @@ from palpate.protos.config import (
 )
 from palpate.protos.errors import ConfigError
 from palpate.protos.names import Name
-from palpate.services.config import FeaturesConfig, RecorderConfig
+from palpate.services.config import FeaturesConfig, FieldConfig, RecorderConfig, SynthesisConfig
 
 PROFILES = Path(__file__).parent / "profiles"
 """Profiles that come with palpate."""
@@ -42,9 +42,9 @@ PROFILES = Path(__file__).parent / "profiles"
 ENV_PREFIX = "PALPATE_"
 ENV_NESTED = "__"
 
-Service = Literal["router", "gateway", "features", "recorder", "fem"]
+Service = Literal["router", "gateway", "features", "field", "synthesis", "recorder", "fem"]
 SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
-"""What a station runs by default; ``fem`` is named where it is wanted."""
+"""What a station runs by default; the others are named where they are wanted."""
 
 
 class RouterConfig(StrictConfig):
@@ -86,6 +86,8 @@ class Profile(StrictConfig):
         router: Where the router listens.
         gateway: The sensors.
         features: Electrodes to features.
+        field: Electrodes to displacement fields, where ``processes`` names ``field``.
+        synthesis: Displacement fields to electrodes, where ``processes`` names ``synthesis``.
         recorder: What is recorded, and where.
         fem: How simulations are served, where ``processes`` names ``fem``.
         log: What the processes write into their logs.
@@ -97,6 +99,8 @@ class Profile(StrictConfig):
     router: RouterConfig = RouterConfig()
     gateway: GatewayConfig = Field(default_factory=GatewayConfig)
     features: FeaturesConfig = FeaturesConfig()
+    field: FieldConfig = FieldConfig()
+    synthesis: SynthesisConfig = SynthesisConfig()
     recorder: RecorderConfig = RecorderConfig()
     fem: FemConfig = FemConfig()
     log: LogConfig = LogConfig()

@@ -31,13 +31,16 @@ _COLOURS = {
 TELLING_COUNTERS = (
     "frames_published",
     "frames_received",
+    "fields_received",
     "estimates_published",
     "recorded_electrodes",
     "recorded_features",
+    "recorded_field",
     "simulations_complete",
 )
 _TROUBLE = (
     "lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown", "failed",
+    "wrong",
 )  # fmt: skip
 
 

@@ -25,11 +25,15 @@ class _LazyGroup(typer.core.TyperGroup):
             MissingExtraError: The training extra is not installed.
         """
         found: dict[str, Any] = typer.main.get_command(_app(self.room)).commands  # type: ignore[attr-defined]
-        return found
+        return {**found, **self.joined()}
 
     @commands.setter
     def commands(self, value: dict[str, Any]) -> None:
         """Typer gives the commands it knows of at the start: none."""
+
+    def joined(self) -> dict[str, Any]:
+        """Commands that join this room with others, which only deploy may."""
+        return {}
 
 
 class _TrainGroup(_LazyGroup):
@@ -38,6 +42,15 @@ class _TrainGroup(_LazyGroup):
 
 class _DataGroup(_LazyGroup):
     room = "data"
+
+    def joined(self) -> dict[str, Any]:
+        """``generate`` needs finite elements to make data and training to process it."""
+        from palpate.deploy.cli_generate import generate_app, sample_app
+
+        return {
+            "generate": typer.main.get_command(generate_app),
+            "sample": typer.main.get_command(sample_app),
+        }
 
 
 train = typer.Typer(

@@ -20,7 +20,7 @@ from palpate.protos.health import Health, HealthReporter
 from palpate.protos.messages import ServiceState
 from palpate.protos.pauses import avoid_pauses
 from palpate.protos.session import Presence, Session
-from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+from palpate.protos.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def run(
                 ),
                 {
                     topic.name: session.publisher(topic, sensor=sensor.name, lossless=lossless)
-                    for topic in (ELECTRODES, WRENCH, POSE, TARE)
+                    for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE)
                 },
                 health,
                 pace=config.pace,

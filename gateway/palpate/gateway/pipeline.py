@@ -6,17 +6,18 @@ import threading
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import Any
 
-from palpate.gateway.clock_map import ClockMap, HostTime
+from palpate.gateway.clock_map import ClockMap
 from palpate.gateway.device import DeviceIdentity, DeviceInfo
 from palpate.gateway.readings import (
     ElectrodeReading,
+    FieldReading,
     PoseReading,
     Reading,
     RecordedMessage,
     WrenchReading,
 )
+from palpate.gateway.stamps import Stamps
 from palpate.gateway.tare import MAX_SD_COUNTS, TARE_FRAMES, TareCollector, TareLedger
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.codec import TARE as TARE_CODEC
@@ -24,12 +25,12 @@ from palpate.protos.errors import DeviceError, PalpateError, WireError
 from palpate.protos.messages import (
     NO_TARE,
     ElectrodeFrame,
+    FieldFrame,
     IndenterPoseFrame,
-    Stamp,
     Tare,
     WrenchFrame,
 )
-from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+from palpate.protos.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 
 _HELD_WINDOWS = 10
 """A recording is held back for this many attempts to tare before it goes out untared."""
@@ -46,7 +47,7 @@ class Outgoing:
     """
 
     topic: str
-    message: ElectrodeFrame | WrenchFrame | IndenterPoseFrame | Tare | bytes
+    message: ElectrodeFrame | WrenchFrame | IndenterPoseFrame | FieldFrame | Tare | bytes
     due_ns: int
 
 
@@ -80,8 +81,7 @@ class Pipeline:
         self._max_sd_counts = max_sd_counts
         self._serial = ""
         self._slot_period_ns = 0
-        self._clock: ClockMap | None = None
-        self._sequences: dict[str, int] = {}
+        self._stamps = Stamps(info.origin)
         self._first_tare: TareCollector | None = TareCollector(tare_frames, max_sd_counts)
         self._held: list[Outgoing] = []
         self._held_frames = 0
@@ -94,7 +94,7 @@ class Pipeline:
         """The device was opened, or opened again; sequences and tares go on."""
         self._serial = identity.serial
         self._slot_period_ns = max(1, round(identity.slot_period_s * 1e9))
-        self._clock = clock
+        self._stamps.begin(clock)
 
     def ask_tare(self, frames: int) -> Future[Tare]:
         """Tare with the next frames (0 = the usual number); from any thread.
@@ -129,13 +129,17 @@ class Pipeline:
             if isinstance(reading, ElectrodeReading):
                 self._electrodes(reading, arrival_ns, out)
             elif isinstance(reading, WrenchReading):
-                stamp, due_ns = self._stamp(WRENCH.name, reading, arrival_ns)
+                stamp, due_ns = self._stamps.stamp(WRENCH.name, reading, arrival_ns)
                 wrench = WrenchFrame(
                     stamp, reading.serial, reading.force, reading.torque, reading.overload
                 )
                 self._pass(Outgoing(WRENCH.name, wrench, due_ns), out)
+            elif isinstance(reading, FieldReading):
+                stamp, due_ns = self._stamps.stamp(FIELD_TRUTH.name, reading, arrival_ns)
+                field = FieldFrame(stamp, self._serial, reading.mesh_sha256, reading.displacement)
+                self._pass(Outgoing(FIELD_TRUTH.name, field, due_ns), out)
             elif isinstance(reading, PoseReading):
-                stamp, due_ns = self._stamp(POSE.name, reading, arrival_ns)
+                stamp, due_ns = self._stamps.stamp(POSE.name, reading, arrival_ns)
                 pose = IndenterPoseFrame(
                     stamp,
                     reading.indenter,
@@ -166,7 +170,9 @@ class Pipeline:
         return self._release(NO_TARE)
 
     def _electrodes(self, reading: ElectrodeReading, arrival_ns: int, out: list[Outgoing]) -> None:
-        stamp, due_ns = self._stamp(ELECTRODES.name, reading, arrival_ns, reading.missed_before)
+        stamp, due_ns = self._stamps.stamp(
+            ELECTRODES.name, reading, arrival_ns, reading.missed_before
+        )
         frame = ElectrodeFrame(
             stamp,
             self._serial,
@@ -274,7 +280,7 @@ class Pipeline:
                 self.counters["tares"] += 1
             except WireError:  # it still goes out as recorded; whoever needs it will reject it
                 self.counters["tares_refused"] += 1
-        _, due_ns = self._times(reading.time_s, arrival_ns)
+        _, due_ns = self._stamps.times(reading.time_s, arrival_ns)
         return Outgoing(reading.topic, reading.payload, due_ns)
 
     def _count_recorded_loss(self, payload: bytes) -> None:
@@ -284,27 +290,3 @@ class Pipeline:
             return
         self.counters["missing_frames"] += frame.stamp.missed_before
         self.counters["frames_untared"] += frame.tare_id == NO_TARE
-
-    def _times(self, time_s: float, arrival_ns: int) -> tuple[HostTime, int]:
-        if self._clock is None:
-            raise RuntimeError("begin() comes before push()")
-        times = self._clock.map(time_s, arrival_ns)
-        return times, times.monotonic_ns if self._clock.paced else 0
-
-    def _stamp(
-        self, topic: str, reading: Any, arrival_ns: int, missed_before: int = 0
-    ) -> tuple[Stamp, int]:
-        times, due_ns = self._times(reading.time_s, arrival_ns)
-        assert self._clock is not None
-        sequence = self._sequences.get(topic, 0) + 1
-        self._sequences[topic] = sequence
-        stamp = Stamp(
-            sequence,
-            reading.tick,
-            times.monotonic_ns,
-            times.wall_ns,
-            self._clock.clock_id,
-            self._info.origin,
-            missed_before,
-        )
-        return stamp, due_ns

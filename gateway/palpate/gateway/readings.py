@@ -83,6 +83,24 @@ class PoseReading:
 
 
 @dataclass(frozen=True, slots=True)
+class FieldReading:
+    """The displacement of the skin, where the source knows it.
+
+    Attributes:
+        tick: The device's own unwrapped counter.
+        time_s: The device's time [s].
+        mesh_sha256: Content hash of the mesh, 32 bytes.
+        displacement: Nodal displacement from the pressurised state [m], sensor frame, float32,
+            shape ``(V, 3)``.
+    """
+
+    tick: int
+    time_s: float
+    mesh_sha256: bytes
+    displacement: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class RecordedMessage:
     """A message of a palpate record, to be published again byte for byte.
 
@@ -97,4 +115,4 @@ class RecordedMessage:
     time_s: float
 
 
-Reading = ElectrodeReading | WrenchReading | PoseReading | RecordedMessage
+Reading = ElectrodeReading | WrenchReading | PoseReading | FieldReading | RecordedMessage

@@ -1,7 +1,8 @@
 """Replay of a palpate record (MCAP): one sensor's readings, byte for byte as they were recorded.
 
-Frames, wrenches, poses and tares are published again unchanged, stamps and tare ids included, so
-whatever is computed from them comes out bit-identical. Recorded estimates are not published again.
+Frames, wrenches, poses, true fields and tares are published again unchanged, stamps and tare ids
+included, so whatever is computed from them comes out bit-identical. Recorded estimates are not
+published again.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from palpate.protos.config import StrictConfig
 from palpate.protos.errors import ConfigError, RecordingError, WireError
 from palpate.protos.messages import ElectrodeFrame, Origin, SensorType
 from palpate.protos.record import RecordItem, read_record
-from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
+from palpate.protos.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 
-_REPLAYED = frozenset(topic.name for topic in (ELECTRODES, WRENCH, POSE, TARE))
+_REPLAYED = frozenset(topic.name for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE))
 _BATCH = 64
 """Messages in one answer of ``read``."""
 

@@ -1,93 +1,75 @@
 """The virtual finger: a deterministic BioTac with ground truth, for work without hardware.
 
-Same options, same counts, on any host and at any pace. It yields what an experiment yields:
-electrodes, the wrench on the finger, and the pose of the indenter. The first second (at least 50
-frames) is untouched, so that a tare succeeds.
+Same options, same counts, at any pace. It yields what an experiment yields: electrodes, the wrench
+on the finger, the pose of the indenter, and if it plays a tape the displacement of the skin. The
+first second (at least 50 frames) is untouched, so that a tare succeeds. What moves it is a model
+(``virtual_tape``, ``virtual_formula``); this file paces it, ends it, and lets it go wrong.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections import deque
 from collections.abc import Iterator, Mapping
-from typing import Literal
+from dataclasses import replace
+from itertools import islice
 
 import numpy as np
-from pydantic import Field
 
 from palpate.gateway import channels as ch
 from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate.gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
-from palpate.gateway.virtual_geometry import pressing
-from palpate.gateway.virtual_physics import (
-    INDENTER_RADII_M,
-    Contact,
-    Unit,
-    contact,
-    electrode_counts,
-    films,
-)
-from palpate.gateway.virtual_signals import (
-    ELECTRODE_NOISE,
-    PAC_NOISE,
-    converted,
-    pac,
-    slow_channels,
-    warmth,
-)
-from palpate.gateway.virtual_trajectory import Episode, pause, touch
-from palpate.protos.config import StrictConfig
-from palpate.protos.errors import DeviceTimeout
-from palpate.protos.messages import Origin, SensorType
-
-_UNTOUCHED_FRAMES = 50
-_BLOCK_FRAMES = 16
-"""Frames computed at once: NumPy's cost per call is shared, yet no read stalls for long."""
+from palpate.gateway.readings import ElectrodeReading, Reading, RecordedMessage
+from palpate.gateway.virtual_faults import FaultLine
+from palpate.gateway.virtual_formula import Formula
+from palpate.gateway.virtual_options import Group, Model, VirtualOptions
+from palpate.gateway.virtual_tape import Twin, find_tape
+from palpate.protos.errors import ConfigError, DeviceLost, DeviceTimeout
+from palpate.protos.messages import COUNTS_MAX, Origin, SensorType
 
 _RESYNC_S = 1.0
 """A host that lags more than this has slept: the frames meanwhile are lost, not late [s]."""
 
 
-class VirtualOptions(StrictConfig):
-    """Options of the ``virtual`` driver.
+_EVENTS = ("frames", "samples", "missing_frames", "saturated_samples")
 
-    Attributes:
-        seed: Of trajectories and noise.
-        unit: Number of the finger; fixes its electrics.
-        serial: Serial number; empty = made from unit and seed.
-        indenter: Sphere that presses.
-        rate_hz: Frames per second [Hz].
-        realtime: Paced by the host's clock, as hardware is; False = as fast as it is read.
-        untouched_s: Time before the first touch [s]; at least 50 frames.
-        episodes: Touches, then the source ends; 0 = endless.
-        frames: Frames, then the source ends; 0 = endless.
-        duration_s: Device time, then the source ends [s]; 0 = endless.
+
+def make_model(options: VirtualOptions) -> Model:
+    """What the options say moves the finger.
+
+    Raises:
+        ConfigError: There is no such tape, unit, trajectory or indenter, or options of one model
+            come with the other.
+        DatasetError: The tape is damaged.
     """
-
-    seed: int = Field(default=0, ge=0)
-    unit: int = Field(default=1, ge=0)
-    serial: str = ""
-    indenter: Literal["sphere_3-5mm", "sphere_7mm", "sphere_14mm"] = "sphere_14mm"
-    rate_hz: float = Field(default=100.0, ge=1.0, le=2000.0)
-    realtime: bool = True
-    untouched_s: float = Field(default=1.0, ge=0.0)
-    episodes: int = Field(default=0, ge=0)
-    frames: int = Field(default=0, ge=0)
-    duration_s: float = Field(default=0.0, ge=0.0)
+    path = None if options.model == "formula" else find_tape(options.tape)
+    if path is not None:
+        return Twin(options, path)
+    if options.model == "tape":
+        raise ConfigError("no tape ships with this palpate", remedy="name one with the option tape")
+    if options.tape or options.trajectories:
+        name = "tape" if options.tape else "trajectories"
+        raise ConfigError(
+            f"option {name!r} is of the model 'tape', and the virtual finger is the formula",
+            remedy=f"leave {name!r} out, or give model = 'tape' and a tape",
+        )
+    return Formula(options)
 
 
 class Virtual(Device):
-    """A virtual BioTac with ground truth."""
+    """A virtual BioTac with ground truth.
+
+    After a fault ``restart`` the next opening goes on with the play, with ticks from 0; any other
+    begins anew.
+    """
 
     options_class = VirtualOptions
 
     def __init__(self, options: VirtualOptions) -> None:
+        self._model = make_model(options)
         super().__init__(
             DeviceInfo(
                 driver="virtual",
                 sensor_type=SensorType.BIOTAC,
-                model=f"virtual finger, {options.indenter}",
+                model=self._model.line,
                 rate_hz=options.rate_hz,
                 live=options.realtime,
                 finite=bool(options.episodes or options.frames or options.duration_s),
@@ -95,186 +77,136 @@ class Virtual(Device):
             )
         )
         self._options = options
-        self._radius_m = INDENTER_RADII_M[options.indenter]
-        self._unit = Unit.number(options.unit)
-        self._counters = {"frames": 0, "samples": 0, "missing_frames": 0}
-        self._ready: deque[tuple[Reading, ...]] = deque()
-        self._blocks: Iterator[list[tuple[Reading, ...]]] = iter(())
+        self._groups: Iterator[Group] = iter(())
+        self._group: Group | None = None
+        self._faults = FaultLine((), options.rate_hz, options.seed)
+        self._events: dict[str, int] = {}
+        self._restarted = False
         self._begun_s = 0.0
-        self._delivered = 0
-        self._skipped = 0
-        self._missed = 0
+        # Number of the next group in the play; where in the play the device's ticks began; and
+        # frames lost because the host slept: the device went on, the play waited.
+        self._now = self._origin = self._skipped = 0
+        self._last_tick = -1
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Frames, slots in them, and frames lost because the host slept."""
-        return dict(self._counters)
+        """Frames, slots in them, frames lost, samples at the converter's ends, and faults."""
+        return {**self._events, **self._faults.counters}
 
     def _open(self) -> DeviceIdentity:
         options = self._options
-        self._counters = dict.fromkeys(self._counters, 0)
-        self._ready.clear()
-        self._blocks = self._make_blocks()
-        self._delivered = self._skipped = self._missed = 0
+        self._events = dict.fromkeys(_EVENTS, 0)
+        if self._restarted:
+            self._restarted = False
+            self._faults.clear_counters()
+        else:
+            self._faults = FaultLine(options.faults, options.rate_hz, options.seed)
+            blocks = self._model.run()
+            self._groups = islice((group for block in blocks for group in block), self._limit())
+            self._group = None
+            self._now = 0
+        self._origin = self._now
+        self._skipped = 0
+        self._last_tick = -1
         self._begun_s = time.monotonic()
         return DeviceIdentity(
-            serial=options.serial or f"VIRTUAL-U{options.unit}-S{options.seed}",
+            serial=options.serial or self._model.serial,
             slot_period_s=1.0 / (options.rate_hz * ch.SLOTS_PER_FRAME),
         )
 
+    def _limit(self) -> int | None:
+        """Frames until the source ends; None = endless."""
+        options = self._options
+        by_time = round(options.duration_s * options.rate_hz) if options.duration_s else None
+        given = [limit for limit in (options.frames or None, by_time) if limit is not None]
+        return min(given, default=None)
+
     def _close(self) -> None:
-        self._ready.clear()
-        self._blocks = iter(())
+        if not self._restarted:
+            self._groups = iter(())
+            self._group = None
 
     def _read(self, timeout_s: float) -> list[Reading]:
-        # The next block is computed while there is time to wait, not when its frame is due.
-        if not self._ready:
-            self._ready.extend(next(self._blocks, ()))
-        if not self._ready:
-            return []
-        if not self._options.realtime:
-            readings = [reading for group in self._ready for reading in group]
-            self._count(len(self._ready))
-            self._ready.clear()
-            return readings
-        self._wait(timeout_s)
-        group = self._ready.popleft()
-        self._count(1)
-        return [self._shifted(reading) for reading in group] if self._skipped else list(group)
+        if self._restarted:
+            raise self._lost()
+        options = self._options
+        until_s = time.monotonic() + timeout_s
+        quiet = 0
+        while True:
+            # The next frame is computed while there is time to wait, not when it is due.
+            if self._group is None:
+                self._group = next(self._groups, None)
+            if self._group is None:
+                return []
+            away = self._faults.restart(self._now)
+            if away is not None:
+                self._pass_over(away)
+                self._restarted = True
+                raise self._lost()
+            if options.realtime:
+                self._wait(until_s, timeout_s)
+            silent = self._faults.silent(self._now)
+            readings = [] if silent else self._readings(self._group)
+            self._group = None
+            self._now += 1
+            if readings:
+                return readings
+            # Without a clock, the time that is waited in silence is the finger's own.
+            quiet += 1
+            if not options.realtime and quiet >= timeout_s * options.rate_hz - 1e-6:
+                raise self._timeout(timeout_s)
 
-    def _wait(self, timeout_s: float) -> None:
+    def _wait(self, until_s: float, timeout_s: float) -> None:
         """Sleep until the next frame is due; deadlines are absolute, so errors do not add up."""
-        due_s = self._begun_s + (self._delivered + self._skipped) / self._options.rate_hz
-        wait_s = due_s - time.monotonic()
-        self._missed = 0
-        if wait_s > timeout_s:
-            time.sleep(max(timeout_s, 0.0))
-            raise DeviceTimeout(
-                f"the virtual finger has no frame within {timeout_s:g} s",
-                remedy=f"wait longer than its period of {1.0 / self._options.rate_hz:g} s",
-            )
-        if wait_s > 0.0:
-            time.sleep(wait_s)
-        elif wait_s < -_RESYNC_S:
-            self._missed = int(-wait_s * self._options.rate_hz)
-            self._skipped += self._missed
-            self._counters["missing_frames"] += self._missed
-
-    def _count(self, frames: int) -> None:
-        self._delivered += frames
-        self._counters["frames"] += frames
-        self._counters["samples"] += frames * ch.SLOTS_PER_FRAME
-
-    def _shifted(self, reading: Reading) -> Reading:
-        """The reading as a device gives it that went on while the host slept."""
-        tick = self._delivered - 1 + self._skipped
-        time_s = tick / self._options.rate_hz
-        if isinstance(reading, ElectrodeReading):
-            return ElectrodeReading(
-                tick,
-                time_s,
-                self._missed,
-                reading.electrodes,
-                reading.pdc,
-                reading.pac,
-                reading.tac,
-                reading.tdc,
-                reading.validity,
-            )
-        if isinstance(reading, WrenchReading):
-            return WrenchReading(tick, time_s, reading.force, reading.torque, reading.serial)
-        if isinstance(reading, PoseReading):
-            return PoseReading(
-                tick,
-                time_s,
-                reading.indenter,
-                reading.position,
-                reading.orientation,
-                reading.in_contact,
-            )
-        return reading
-
-    def _episodes(self) -> Iterator[Episode]:
-        options = self._options
-        yield pause(max(options.untouched_s, _UNTOUCHED_FRAMES / options.rate_hz))
-        number = 0
-        while not options.episodes or number < options.episodes:
-            yield touch(options.seed, number)
-            number += 1
-
-    def _frame_limit(self) -> float:
-        options = self._options
-        by_time = round(options.duration_s * options.rate_hz) if options.duration_s else math.inf
-        return min(options.frames or math.inf, by_time)
-
-    def _make_blocks(self) -> Iterator[list[tuple[Reading, ...]]]:
-        random = np.random.default_rng([self._options.seed, 2])
-        limit = self._frame_limit()
-        first = 0
-        for episode in self._episodes():
-            length = max(1, math.ceil(episode.duration_s * self._options.rate_hz - 1e-9))
-            for start in range(0, length, _BLOCK_FRAMES):
-                count = min(_BLOCK_FRAMES, length - start)
-                block = self._block(episode, start, first + start, count, random)
-                if first + start + count >= limit:
-                    yield block[: int(limit) - first - start]
-                    return
-                yield block
-            first += length
-
-    def _block(
-        self, episode: Episode, start: int, tick: int, count: int, random: np.random.Generator
-    ) -> list[tuple[Reading, ...]]:
-        """Frames ``start`` to ``start + count - 1`` of an episode, the first of which is ``tick``.
-
-        One more instant than frames, because PAC follows the pressure until the next frame.
-        """
         rate_hz = self._options.rate_hz
-        ahead = contact(episode, np.arange(start, start + count + 2) / rate_hz, self._radius_m)
-        state = Contact(
-            ahead.depth[:count],
-            ahead.tip[:count],
-            ahead.normal_force[:count],
-            ahead.traction[:count],
-            ahead.force[:count],
-            ahead.pressure[:count],
-        )
-        times_s = np.arange(tick, tick + count) / rate_hz
-        drift = 1.0 + 0.004 * warmth(times_s) + 0.001 * np.sin(times_s * (2.0 * math.pi / 180.0))
+        due_s = self._begun_s + (self._now - self._origin + self._skipped) / rate_hz
+        now_s = time.monotonic()
+        if due_s > until_s:
+            time.sleep(max(until_s - now_s, 0.0))
+            raise self._timeout(timeout_s)
+        if due_s > now_s:
+            time.sleep(due_s - now_s)
+        elif now_s - due_s > _RESYNC_S:
+            self._skipped += int((now_s - due_s) * rate_hz)
 
-        clean = electrode_counts(films(episode, state, self._radius_m), self._unit, drift)
-        electrodes = converted(clean + random.normal(0.0, ELECTRODE_NOISE, clean.shape))
-        moving = pac(ahead.pressure, rate_hz)
-        dynamic = converted(moving + random.normal(0.0, PAC_NOISE, moving.shape))
-        slow = slow_channels(state.pressure, self._unit.pdc_rest, times_s)
-        pdc, tac, tdc = converted(slow + random.normal(0.0, 0.5, slow.shape)).T.tolist()
-        torque = np.cross(state.tip, state.force).astype(np.float32)
-        force = state.force.astype(np.float32)
-        in_contact = (state.depth > 0.0).tolist()
-        orientation = pressing(episode.place.normal)
-        ticks, times = range(tick, tick + count), times_s.tolist()
-        return [
-            (
-                ElectrodeReading(
-                    ticks[k],
-                    times[k],
-                    0,
-                    electrodes[k],
-                    pdc[k],
-                    dynamic[k],
-                    tac[k],
-                    tdc[k],
-                    ch.ALL_VALID,
-                ),
-                WrenchReading(ticks[k], times[k], force[k], torque[k], "VIRTUAL-FT"),
-                PoseReading(
-                    ticks[k],
-                    times[k],
-                    self._options.indenter,
-                    state.tip[k],
-                    orientation,
-                    in_contact[k],
-                ),
-            )
-            for k in range(count)
-        ]
+    def _readings(self, group: Group) -> list[Reading]:
+        """The group as the device delivers it: with its faults, in the device's own ticks."""
+        shift = self._skipped - self._origin
+        tick = self._now + shift
+        time_s = tick / self._options.rate_hz
+        out: list[Reading] = []
+        for reading in self._faults.apply(self._now, group):
+            if isinstance(reading, RecordedMessage):
+                continue  # a model makes none
+            if isinstance(reading, ElectrodeReading):
+                missed = tick - self._last_tick - 1
+                self._last_tick = tick
+                self._count(reading, missed)
+                if missed:
+                    reading = replace(reading, missed_before=missed)
+            out.append(replace(reading, tick=tick, time_s=time_s) if shift else reading)
+        return out
+
+    def _count(self, reading: ElectrodeReading, missed: int) -> None:
+        events = self._events
+        events["frames"] += 1
+        events["samples"] += ch.SLOTS_PER_FRAME
+        events["missing_frames"] += missed
+        for counts in (reading.electrodes, reading.pac):
+            # 0 and 4095 are the only multiples of 4095 in 12 bits.
+            events["saturated_samples"] += int(np.count_nonzero(counts % COUNTS_MAX == 0))
+
+    def _pass_over(self, groups: int) -> None:
+        """Let the play go on while the device is away."""
+        for _ in range(groups):
+            self._group = next(self._groups, None)
+        self._now += groups
+
+    def _lost(self) -> DeviceLost:
+        return DeviceLost("the virtual finger has restarted", remedy="open it again")
+
+    def _timeout(self, timeout_s: float) -> DeviceTimeout:
+        return DeviceTimeout(
+            f"the virtual finger has no frame within {timeout_s:g} s",
+            remedy=f"wait longer than its period of {1.0 / self._options.rate_hz:g} s",
+        )

@@ -15,11 +15,19 @@ ELECTRODE_NOISE = 0.5
 PAC_NOISE = 2.0
 """Idle sensors of public captures: about 5 counts peak, sd."""
 
-_PAC_REST = 2040.0
-_PAC_PA_PER_COUNT = 0.37
-_PAC_HIGH_PASS_S = 1.0 / (2.0 * math.pi * 10.0)
+SLOW_NOISE = 0.5
+"""Of PDC, TAC and TDC [counts], sd."""
+
+WRENCH_SERIAL = "VIRTUAL-FT"
+"""Serial number of the virtual force/torque sensor."""
+
+PAC_PA_PER_COUNT = 0.37
+PAC_HIGH_PASS_S = 1.0 / (2.0 * math.pi * 10.0)
 """PAC passes 10 Hz and up: for slow pressing it reads this times the rate of pressure [s]."""
-_PDC_PA_PER_COUNT = 36.5
+
+PDC_PA_PER_COUNT = 36.5
+
+_PAC_REST = 2040.0
 _TAC_REST = 2050.0
 _TDC_REST = 1900.0
 _TDC_WARM_UP = 60.0
@@ -33,7 +41,7 @@ def warmth(time_s: Array) -> Array:
 
 def pac(pressure: Array, rate_hz: float) -> Array:
     """Noise-free PAC [counts], shape ``(N, 22)``, from the pressure at N + 2 frame starts [Pa]."""
-    speed = np.diff(pressure) * (rate_hz * _PAC_HIGH_PASS_S / _PAC_PA_PER_COUNT)
+    speed = np.diff(pressure) * (rate_hz * PAC_HIGH_PASS_S / PAC_PA_PER_COUNT)
     share = np.arange(PAC_SAMPLES) / PAC_SAMPLES
     return _PAC_REST + speed[:-1, None] * (1.0 - share) + speed[1:, None] * share
 
@@ -42,7 +50,7 @@ def slow_channels(pressure: Array, pdc_rest: float, time_s: Array) -> Array:
     """Noise-free PDC, TAC, TDC [counts], shape ``(N, 3)``."""
     return np.stack(
         [
-            pdc_rest + pressure / _PDC_PA_PER_COUNT,
+            pdc_rest + pressure / PDC_PA_PER_COUNT,
             np.full(len(time_s), _TAC_REST),
             _TDC_REST + _TDC_WARM_UP * warmth(time_s),
         ],

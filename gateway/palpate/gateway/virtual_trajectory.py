@@ -49,15 +49,15 @@ class Episode:
         if self.depth_m < 0.0:
             return np.full_like(time_s, self.depth_m)
         approach, press, _, hold, release = self.times_s
-        down = _ease(time_s, 0.0, approach) - 1.0
-        up = _ease(time_s, release, self.duration_s)
-        pressed = _ease(time_s, approach, press) - _ease(time_s, hold, release)
+        down = ease(time_s, 0.0, approach) - 1.0
+        up = ease(time_s, release, self.duration_s)
+        pressed = ease(time_s, approach, press) - ease(time_s, hold, release)
         return CLEARANCE_M * (down - up) + self.depth_m * pressed
 
     def shear(self, time_s: Array) -> Array:
         """Tangential travel along ``direction`` [m] at times from the start [s]."""
         _, press, shear, hold, release = self.times_s
-        return self.shear_m * (_ease(time_s, press, shear) - _ease(time_s, hold, release))
+        return self.shear_m * (ease(time_s, press, shear) - ease(time_s, hold, release))
 
 
 def pause(duration_s: float) -> Episode:
@@ -84,7 +84,7 @@ def touch(seed: int, number: int) -> Episode:
     )
 
 
-def _ease(time_s: Array, start_s: float, end_s: float) -> Array:
+def ease(time_s: Array, start_s: float, end_s: float) -> Array:
     """Smooth step from 0 at ``start_s`` to 1 at ``end_s``: no jump of the velocity."""
     share = np.clip((time_s - start_s) / max(end_s - start_s, 1e-9), 0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)

@@ -1,8 +1,9 @@
 """The bundle: a model as it is shipped, served and checked (docs/adr/0008-bundle.md).
 
 A folder of three files. ``manifest.json`` says what the model is and holds the digests of
-``model.onnx`` and ``golden.npz`` (inputs and the outputs they must give). The bundle's own digest
-is the SHA-256 of the manifest's bytes and travels with each estimate.
+``model.onnx`` and ``golden.npz`` (inputs and the outputs they must give); a model of fields has a
+fourth, ``mesh.npz``. The bundle's own digest is the SHA-256 of the manifest's bytes and travels
+with each estimate.
 """
 
 from __future__ import annotations
@@ -15,88 +16,37 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.protos.errors import BundleError
-from palpate.protos.messages import SensorType, TensorInfo
+from palpate.protos.field_mesh import FieldMesh, check_mesh, mesh_from_bytes, mesh_to_bytes
+from palpate.protos.manifest import (
+    BUNDLE_CONTRACT_VERSION,
+    Manifest,
+    check_task,
+    parse_manifest,
+)
+from palpate.protos.tasks import TASKS, check_tensors
 
-BUNDLE_CONTRACT_VERSION = 1
-MODEL, MANIFEST, GOLDEN = "model.onnx", "manifest.json", "golden.npz"
+__all__ = [
+    "BUNDLE_CONTRACT_VERSION",
+    "TASKS",
+    "Bundle",
+    "Manifest",
+    "check_bundle_mesh",
+    "check_task",
+    "read_bundle",
+    "read_mesh",
+    "sha256_hex",
+    "write_bundle",
+]
+
+MODEL, MANIFEST, GOLDEN, MESH = "model.onnx", "manifest.json", "golden.npz", "mesh.npz"
 _FILE_BYTES_MAX = 256 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class TaskContract:
-    """What a model of this task takes and gives; ``optional`` outputs may be absent together."""
-
-    inputs: tuple[TensorInfo, ...]
-    outputs: tuple[TensorInfo, ...]
-    optional: tuple[TensorInfo, ...] = ()
-
-
-def _tensor(name: str, width: int, unit: str) -> TensorInfo:
-    return TensorInfo(name, "float32", (-1, width), unit)
-
-
-TASKS: dict[str, TaskContract] = {
-    "features": TaskContract(
-        inputs=(_tensor("electrodes", 19, "tared counts"),),
-        outputs=(_tensor("force", 3, "N"), _tensor("force_sd", 3, "N")),
-        optional=(
-            _tensor("contact_location", 3, "m"),
-            _tensor("contact_location_sd", 3, "m"),
-        ),
-    ),
-}
-"""What each task's model takes and gives. Normalisation is inside the graph."""
-
-
-@dataclass(frozen=True, slots=True)
-class Manifest:
-    """What a bundle says of itself.
-
-    Attributes:
-        name: Name of the bundle.
-        version: Its version, from 1.
-        task: A key of ``TASKS``.
-        inputs: Inputs of the model.
-        outputs: Outputs of the model.
-        sensor_type: Name of the sensor type it takes.
-        contact_threshold_n: Below this estimated force [N] there is no contact.
-        training_data_sha256: Digest of the data set, hex.
-        trained_on: One line for people.
-        metrics: Held-out results; names end in the unit.
-        model_sha256: Digest of ``model.onnx``, hex.
-        golden_sha256: Digest of ``golden.npz``, hex.
-        created: UTC time, ISO 8601.
-        palpate_version: What wrote it.
-        opset: ONNX operator set.
-        normalisation: For people; the graph does it.
-        contract_version: Of the bundle contract.
-    """
-
-    name: str
-    version: int
-    task: str
-    inputs: tuple[TensorInfo, ...]
-    outputs: tuple[TensorInfo, ...]
-    sensor_type: str
-    contact_threshold_n: float
-    training_data_sha256: str
-    trained_on: str
-    metrics: Mapping[str, float]
-    model_sha256: str
-    golden_sha256: str
-    created: str
-    palpate_version: str
-    opset: int
-    normalisation: Mapping[str, Any] = field(default_factory=dict)
-    contract_version: int = BUNDLE_CONTRACT_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +59,7 @@ class Bundle:
         golden: Inputs and expected outputs by name, batch first.
         sha256: Digest of the manifest, 32 bytes.
         folder: Where it came from.
+        mesh: Mesh of its fields; None for a task without.
     """
 
     manifest: Manifest
@@ -116,6 +67,7 @@ class Bundle:
     golden: Mapping[str, npt.NDArray[np.float32]]
     sha256: bytes
     folder: Path
+    mesh: FieldMesh | None = None
 
 
 def sha256_hex(data: bytes) -> str:
@@ -123,31 +75,37 @@ def sha256_hex(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def check_task(manifest: Manifest, where: str) -> TaskContract:
-    """Check that inputs and outputs are those of the manifest's task.
+def check_bundle_mesh(mesh: FieldMesh | None, manifest: Manifest, where: str) -> None:
+    """Check that a task of fields has its mesh, and that others have none.
+
+    Args:
+        mesh: What the bundle holds.
+        manifest: What it says of itself.
+        where: Names it, for the error.
 
     Raises:
-        BundleError: An unknown task, or tensors that differ from its contract.
+        BundleError: No mesh, one too many, or not the one that manifest and tensors mean.
     """
-    contract = TASKS.get(manifest.task)
-    if contract is None:
+    _, nodes = check_tensors(manifest.task, manifest.inputs, manifest.outputs, where)
+    if (mesh is None) != (nodes is None):
+        what = "needs a mesh" if mesh is None else "has no mesh"
         raise BundleError(
-            f"{where}: task {manifest.task!r} is not one of {', '.join(sorted(TASKS))}",
-            remedy="upgrade palpate, or train a bundle for one of these tasks",
+            f"{where}: a bundle of task {manifest.task!r} {what}",
+            remedy=f"{MESH} belongs to bundles of fields, and to no others",
         )
-    allowed = [contract.outputs, contract.outputs + contract.optional]
-    if manifest.inputs != contract.inputs or tuple(manifest.outputs) not in allowed:
+    if mesh is None:
+        return
+    if len(mesh.nodes) != nodes:
         raise BundleError(
-            f"{where}: inputs {_names(manifest.inputs)} and outputs {_names(manifest.outputs)} "
-            f"are not those of task {manifest.task!r}: {_names(contract.inputs)} -> "
-            f"{_names(contract.outputs + contract.optional)}",
-            remedy="export the model again with palpate train",
+            f"{where}: the mesh has {len(mesh.nodes)} nodes, the tensors are for {nodes}",
+            remedy="export the model again with the mesh it was trained on",
         )
-    return contract
-
-
-def _names(tensors: tuple[TensorInfo, ...]) -> str:
-    return ", ".join(f"{t.name} {t.dtype}{list(t.shape)} [{t.unit}]" for t in tensors)
+    if manifest.mesh_sha256 != mesh.sha256.hex():
+        raise BundleError(
+            f"{where}: the manifest is for mesh {manifest.mesh_sha256[:12]!r}, {MESH} holds "
+            f"{mesh.sha256.hex()[:12]!r}",
+            remedy="export the model again with the mesh it was trained on",
+        )
 
 
 def write_bundle(
@@ -156,6 +114,7 @@ def write_bundle(
     model: bytes,
     golden: Mapping[str, npt.NDArray[np.float32]],
     manifest: Manifest,
+    mesh: FieldMesh | None = None,
 ) -> bytes:
     """Write a bundle as a whole or not at all.
 
@@ -164,6 +123,7 @@ def write_bundle(
         model: ONNX bytes.
         golden: Inputs and outputs by name.
         manifest: Its digests are filled in here.
+        mesh: Mesh of its fields, for a task that has some.
 
     Returns:
         The bundle's digest, 32 bytes.
@@ -171,7 +131,10 @@ def write_bundle(
     Raises:
         BundleError: It breaks the contract, or the folder exists.
     """
-    check_task(manifest, str(folder))
+    if mesh is not None:
+        check_mesh(mesh, f"{folder}: mesh")
+        manifest = replace(manifest, mesh_sha256=mesh.sha256.hex())
+    check_bundle_mesh(mesh, manifest, str(folder))
     missing = {t.name for t in manifest.inputs + manifest.outputs} - set(golden)
     if missing:
         raise BundleError(
@@ -185,15 +148,22 @@ def write_bundle(
     buffer = io.BytesIO()
     np.savez(buffer, **{name: np.asarray(value, np.float32) for name, value in golden.items()})  # type: ignore[arg-type]
     golden_bytes = buffer.getvalue()
+    files = {MODEL: model, GOLDEN: golden_bytes}
     values = asdict(manifest) | {
         "model_sha256": sha256_hex(model),
         "golden_sha256": sha256_hex(golden_bytes),
     }
+    if mesh is None:
+        # Manifests were written before there were meshes; theirs must keep their bytes.
+        del values["mesh_sha256"], values["mesh_file_sha256"]
+    else:
+        files[MESH] = mesh_to_bytes(mesh)
+        values["mesh_file_sha256"] = sha256_hex(files[MESH])
     text = (json.dumps(values, indent=2, sort_keys=True) + "\n").encode()
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        for name, data in ((MODEL, model), (GOLDEN, golden_bytes), (MANIFEST, text)):
+        for name, data in (*files.items(), (MANIFEST, text)):
             (temporary / name).write_bytes(data)
         temporary.chmod(0o755)
         os.rename(temporary, folder)
@@ -211,21 +181,40 @@ def read_bundle(folder: Path) -> Bundle:
         BundleError: Names the folder and what is wrong.
     """
     text = _read(folder, MANIFEST)
-    manifest = _parse_manifest(text, folder)
+    manifest = parse_manifest(text, folder / MANIFEST)
     check_task(manifest, str(folder))
-    model, golden_bytes = _read(folder, MODEL), _read(folder, GOLDEN)
-    for name, data, wanted in (
-        (MODEL, model, manifest.model_sha256),
-        (GOLDEN, golden_bytes, manifest.golden_sha256),
-    ):
-        if sha256_hex(data) != wanted:
-            raise BundleError(
-                f"{folder / name} is not the file its manifest was written for (digest differs)",
-                remedy="restore the bundle from where it was made; do not edit bundles",
-            )
-    return Bundle(
-        manifest, model, _read_golden(golden_bytes, folder), hashlib.sha256(text).digest(), folder
-    )
+    model = _read_checked(folder, MODEL, manifest.model_sha256)
+    golden = _read_golden(_read_checked(folder, GOLDEN, manifest.golden_sha256), folder)
+    mesh = _read_mesh(folder, manifest)
+    return Bundle(manifest, model, golden, hashlib.sha256(text).digest(), folder, mesh)
+
+
+def read_mesh(folder: Path) -> FieldMesh | None:
+    """Read the mesh of a bundle and nothing else; None for a bundle without.
+
+    Raises:
+        BundleError: Names the folder and what is wrong.
+    """
+    return _read_mesh(folder, parse_manifest(_read(folder, MANIFEST), folder / MANIFEST))
+
+
+def _read_mesh(folder: Path, manifest: Manifest) -> FieldMesh | None:
+    mesh = None
+    if manifest.mesh_file_sha256:
+        data = _read_checked(folder, MESH, manifest.mesh_file_sha256)
+        mesh = mesh_from_bytes(data, str(folder / MESH))
+    check_bundle_mesh(mesh, manifest, str(folder))
+    return mesh
+
+
+def _read_checked(folder: Path, name: str, sha256: str) -> bytes:
+    data = _read(folder, name)
+    if sha256_hex(data) != sha256:
+        raise BundleError(
+            f"{folder / name} is not the file its manifest was written for (digest differs)",
+            remedy="restore the bundle from where it was made; do not edit bundles",
+        )
+    return data
 
 
 def _read(folder: Path, name: str) -> bytes:
@@ -239,7 +228,8 @@ def _read(folder: Path, name: str) -> bytes:
     except OSError as error:
         raise BundleError(
             f"{path} cannot be read: {error.strerror or error}",
-            remedy="a bundle is a folder with model.onnx, manifest.json and golden.npz",
+            remedy="a bundle is a folder with model.onnx, manifest.json, golden.npz and, of "
+            "fields, mesh.npz",
         ) from error
 
 
@@ -251,42 +241,3 @@ def _read_golden(data: bytes, folder: Path) -> dict[str, npt.NDArray[np.float32]
         raise BundleError(
             f"{folder / GOLDEN} is not a NumPy archive: {error}", remedy="export the bundle again"
         ) from error
-
-
-def _tensor_info(values: Mapping[str, Any]) -> TensorInfo:
-    shape = tuple(int(n) for n in values["shape"])
-    return TensorInfo(str(values["name"]), str(values["dtype"]), shape, str(values["unit"]))
-
-
-def _parse_manifest(text: bytes, folder: Path) -> Manifest:
-    where = folder / MANIFEST
-    try:
-        values = json.loads(text)
-        if not isinstance(values, dict):
-            raise ValueError("not an object")
-        version = values.get("contract_version")
-        if isinstance(version, int) and version > BUNDLE_CONTRACT_VERSION:
-            raise BundleError(
-                f"{where} is written for bundle contract v{version}, this palpate knows "
-                f"v{BUNDLE_CONTRACT_VERSION}",
-                remedy="upgrade palpate on this host: pip install --upgrade palpate",
-            )
-        known = {f.name for f in fields(Manifest)}
-        if unknown := set(values) - known:
-            raise ValueError(f"unknown keys {', '.join(sorted(unknown))}")
-        for key in ("inputs", "outputs"):
-            values[key] = tuple(_tensor_info(t) for t in values[key])
-        manifest = Manifest(**values)
-        if not np.isfinite(float(manifest.contact_threshold_n)):
-            raise ValueError("contact_threshold_n is not finite")
-        if manifest.contract_version != BUNDLE_CONTRACT_VERSION:
-            raise ValueError(f"contract_version {manifest.contract_version!r} is not known")
-        if manifest.sensor_type not in SensorType.__members__:
-            raise ValueError(f"sensor_type {manifest.sensor_type!r} is not known")
-    except BundleError:
-        raise
-    except (ValueError, TypeError, KeyError) as error:
-        raise BundleError(
-            f"{where} is not a bundle manifest: {error}", remedy="export the bundle again"
-        ) from error
-    return manifest

@@ -1,4 +1,4 @@
-"""What a robot uses: features now, tare, who is alive.
+"""What a robot uses: features and fields now, tare, who is alive.
 
 Five lines::
 
@@ -18,11 +18,15 @@ from typing import Any, TypeVar
 
 from palpate.protos.closing import Closing
 from palpate.protos.codec import (
+    FIELD_ESTIMATE,
+    FIELD_FRAME,
+    FIELD_REQUEST,
     MODEL_METADATA,
     SERVICE_REQUEST,
     SIMULATION_CANCEL_REPLY,
     SIMULATION_CANCEL_REQUEST,
     STATUS,
+    SYNTHESIS_ESTIMATE,
     TARE,
     TARE_REQUEST,
 )
@@ -32,6 +36,8 @@ from palpate.protos.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     FieldEstimate,
+    FieldFrame,
+    FieldRequest,
     ModelMetadata,
     ServiceRequest,
     SimulationCancelRequest,
@@ -41,6 +47,7 @@ from palpate.protos.messages import (
     SynthesisEstimate,
     Tare,
     TareRequest,
+    as_field_frame,
 )
 from palpate.protos.session import Alive, Delivery, Received, Session, Subscriber
 from palpate.protos.simulations import OnProgress, OnStep, ask_simulation
@@ -94,6 +101,52 @@ class Client(Closing):
     def synthesis(self, sensor: str, *, max_age_s: float = 0.2) -> SynthesisEstimate:
         """Synthesised tared counts now; see ``features``."""
         return self._latest(SYNTHESIS, sensor, max_age_s)
+
+    def estimate_field(
+        self, sensor: str, frame: ElectrodeFrame | None = None, *, timeout_s: float | None = None
+    ) -> FieldEstimate:
+        """Ask for the displacement of each skin node of one frame, however old it is.
+
+        Args:
+            sensor: Name of the sensor.
+            frame: The frame; None = the sensor's newest, see ``electrodes``.
+            timeout_s: How long it may take [s]; None = the client's timeout.
+
+        Raises:
+            LinkError: No field service runs.
+            RemoteError: It has no field for this frame, e.g. because the frame is not tared.
+            StaleError: No frame is given and none is young enough.
+        """
+        return self.session.query(
+            "estimate",
+            service="field",
+            request=FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
+            request_codec=FIELD_REQUEST,
+            reply_codec=FIELD_ESTIMATE,
+            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+        )
+
+    def synthesise(
+        self, field: FieldFrame | FieldEstimate, *, timeout_s: float | None = None
+    ) -> SynthesisEstimate:
+        """Ask for the tared counts that go with a field.
+
+        Args:
+            field: Known or estimated, on the mesh of the served bundle.
+            timeout_s: How long it may take [s]; None = the client's timeout.
+
+        Raises:
+            LinkError: No synthesis service runs.
+            RemoteError: It has no answer for this field, e.g. because the mesh is another.
+        """
+        return self.session.query(
+            "synthesise",
+            service="synthesis",
+            request=as_field_frame(field),
+            request_codec=FIELD_FRAME,
+            reply_codec=SYNTHESIS_ESTIMATE,
+            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+        )
 
     def next_features(self, sensor: str, *, timeout_s: float = 1.0) -> Received[FeatureEstimate]:
         """Wait for the next estimate that was not returned yet.

@@ -25,6 +25,7 @@ from palpate.protos.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     FieldEstimate,
+    FieldFrame,
     IndenterPoseFrame,
     SimulationProgress,
     Stamp,
@@ -102,6 +103,15 @@ WRENCH: Topic[WrenchFrame] = Topic(
 POSE: Topic[IndenterPoseFrame] = Topic(
     "pose", codec.INDENTER_POSE_FRAME, 100, _RT, True, True, "where the indenter is"
 )
+FIELD_TRUTH: Topic[FieldFrame] = Topic(
+    "field_truth",
+    codec.FIELD_FRAME,
+    20,
+    Priority.DATA_HIGH,
+    True,
+    False,
+    "known displacement of each skin node",
+)
 TARE: Topic[Tare] = Topic(
     "tare", codec.TARE, 0, Priority.DATA_HIGH, True, False, "a new baseline of one sensor"
 )
@@ -146,6 +156,7 @@ TOPICS: dict[str, Topic[Any]] = {
         ELECTRODES,
         WRENCH,
         POSE,
+        FIELD_TRUTH,
         TARE,
         FEATURES,
         FIELD,

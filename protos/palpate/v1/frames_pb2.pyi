@@ -1,7 +1,8 @@
 from palpate.v1 import common_pb2 as _common_pb2
+from google.protobuf.internal import containers as _containers
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Mapping as _Mapping
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
@@ -57,3 +58,15 @@ class IndenterPoseFrame(_message.Message):
     pose_sensor_indenter: _common_pb2.Pose
     in_contact: bool
     def __init__(self, stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., indenter: _Optional[str] = ..., pose_sensor_indenter: _Optional[_Union[_common_pb2.Pose, _Mapping]] = ..., in_contact: _Optional[bool] = ...) -> None: ...
+
+class FieldFrame(_message.Message):
+    __slots__ = ("stamp", "sensor_serial", "mesh_sha256", "displacement")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
+    MESH_SHA256_FIELD_NUMBER: _ClassVar[int]
+    DISPLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    stamp: _common_pb2.Stamp
+    sensor_serial: str
+    mesh_sha256: bytes
+    displacement: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., mesh_sha256: _Optional[bytes] = ..., displacement: _Optional[_Iterable[float]] = ...) -> None: ...

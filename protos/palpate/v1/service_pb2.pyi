@@ -1,4 +1,5 @@
 from palpate.v1 import common_pb2 as _common_pb2
+from palpate.v1 import frames_pb2 as _frames_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
@@ -180,3 +181,11 @@ class Error(_message.Message):
     remedy: str
     retry_after_ms: int
     def __init__(self, code: _Optional[_Union[ErrorCode, str]] = ..., message: _Optional[str] = ..., remedy: _Optional[str] = ..., retry_after_ms: _Optional[int] = ...) -> None: ...
+
+class FieldRequest(_message.Message):
+    __slots__ = ("sensor", "frame")
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    sensor: str
+    frame: _frames_pb2.ElectrodeFrame
+    def __init__(self, sensor: _Optional[str] = ..., frame: _Optional[_Union[_frames_pb2.ElectrodeFrame, _Mapping]] = ...) -> None: ...

@@ -1,10 +1,13 @@
-"""How a record is laid out on the screen. With ``view`` the only place that knows Rerun."""
+"""How a record is laid out. With ``view`` and ``field_view`` the only place that knows Rerun."""
 
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from palpate.protos.extras import require
 from palpate.services import anatomy
@@ -19,6 +22,12 @@ ESTIMATE_COLOUR = (255, 196, 61)
 ERROR_COLOUR = (214, 120, 222)
 QUIET_COLOUR = (120, 144, 170)
 BACKGROUND = (24, 26, 31)
+
+FIELD_FULL_M = 2e-3
+"""Displacement drawn in the last colour; the same in every file, so that files can be compared."""
+
+_FULL_SCALE_COUNTS = 400.0
+"""Tared counts at which an electrode is drawn in full colour."""
 
 MAX_SENSORS = 8
 """Tabs in one view; more sensors are recorded but not laid out."""
@@ -36,14 +45,35 @@ def electrode_colours() -> list[tuple[int, int, int]]:
     return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
 
 
-def blueprint(sensors: Sequence[str]) -> Any:
+def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
+    """Colours of electrodes by their tared counts: cool where lowered, warm where raised.
+
+    Args:
+        tared: Tared counts, shape ``(N, 19)``.
+
+    Returns:
+        Packed RGBA, uint32, shape ``(N, 19)``.
+    """
+    strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
+    rest = np.array([150.0, 156.0, 166.0])
+    full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))
+    rgb = (rest + strength * (full - rest)).astype(np.uint32)
+    packed = (rgb[..., 0] << 24) | (rgb[..., 1] << 16) | (rgb[..., 2] << 8) | 255
+    shades: npt.NDArray[np.uint32] = packed.astype(np.uint32)
+    return shades
+
+
+def blueprint(sensors: Sequence[str], *, with_fields: Collection[str] = ()) -> Any:
     """Layout for these sensors: one tab each, fingertip left, signals right.
 
     Args:
         sensors: Names of the sensors, in order of their tabs.
+        with_fields: Those of them that have fields, which get a row more.
     """
     rrb = require("rerun.blueprint", extra="services")
-    tabs = [_sensor_tab(rrb, sensor) for sensor in sensors[:MAX_SENSORS]]
+    tabs = [
+        _sensor_tab(rrb, sensor, fields=sensor in with_fields) for sensor in sensors[:MAX_SENSORS]
+    ]
     return rrb.Blueprint(
         tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following"),
@@ -54,7 +84,7 @@ def blueprint(sensors: Sequence[str]) -> Any:
     )
 
 
-def _sensor_tab(rrb: Any, sensor: str) -> Any:
+def _sensor_tab(rrb: Any, sensor: str, *, fields: bool) -> Any:
     def plot(origin: str, name: str, *, legend: bool = True) -> Any:
         return rrb.TimeSeriesView(
             origin=f"{sensor}/{origin}",
@@ -64,18 +94,21 @@ def _sensor_tab(rrb: Any, sensor: str) -> Any:
             background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),
         )
 
-    finger = rrb.Spatial3DView(
-        origin=f"{sensor}/finger",
-        name="Fingertip [m]: contact and force, estimate against truth",
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        # From the side of the pad, tip to the left, as one looks at one's own finger.
-        eye_controls=rrb.EyeControls3D(
-            position=(0.009, -0.020, -0.024),
-            look_target=(-0.0055, 0.0, -0.003),
-            eye_up=(0.0, 0.0, 1.0),
-        ),
-    )
+    def body(origin: str, name: str) -> Any:
+        return rrb.Spatial3DView(
+            origin=f"{sensor}/{origin}",
+            name=name,
+            background=BACKGROUND,
+            line_grid=rrb.LineGrid3D(visible=False),
+            # From the side of the pad, tip to the left, as one looks at one's own finger.
+            eye_controls=rrb.EyeControls3D(
+                position=(0.009, -0.020, -0.024),
+                look_target=(-0.0055, 0.0, -0.003),
+                eye_up=(0.0, 0.0, 1.0),
+            ),
+        )
+
+    finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
     signals = rrb.Vertical(
         plot("electrodes", "Electrodes E1-E19 [counts]", legend=False),
         rrb.Horizontal(
@@ -92,12 +125,19 @@ def _sensor_tab(rrb: Any, sensor: str) -> Any:
         plot("error/force", "Error of the force [N]", legend=False),
         plot("error/location", "Error of the contact location [m]", legend=False),
     )
-    return rrb.Vertical(
+    rows = [
         rrb.Horizontal(finger, signals, column_shares=[2, 3]),
         rrb.Horizontal(forces, errors, column_shares=[3, 2]),
-        row_shares=[1, 1],
-        name=sensor,
-    )
+    ]
+    if fields:
+        scale = f"grey 0 mm to yellow {1e3 * FIELD_FULL_M:g} mm"
+        skins = [body(f"field/{of}", f"Skin, {of}: {scale}") for of in ("truth", "estimate")]
+        compared = rrb.Vertical(
+            plot("electrodes/tared", "Electrodes, measured and tared [counts]", legend=False),
+            plot("synthesised", "Electrodes, synthesised from a field [counts]", legend=False),
+        )
+        rows.insert(1, rrb.Horizontal(*skins, compared, column_shares=[1, 1, 1]))
+    return rrb.Vertical(*rows, row_shares=[1] * len(rows), name=sensor)
 
 
 def fixtures() -> Iterator[tuple[str, Any]]:
@@ -110,6 +150,7 @@ def fixtures() -> Iterator[tuple[str, Any]]:
     names, wheel = electrode_names(), electrode_colours()
     yield "electrodes/raw", line(names, wheel, 1.2)
     yield "electrodes/tared", line(names, wheel, 1.2)
+    yield "synthesised", line(names, wheel, 1.2)
     yield "pdc", line("PDC", [QUIET_COLOUR], 1.5)
     yield "pac", line("PAC", [QUIET_COLOUR], 1.0)
     for axis, colour in zip(AXES, AXIS_COLOURS, strict=True):

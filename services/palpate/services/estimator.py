@@ -1,4 +1,4 @@
-"""One frame to one estimate: a pure function of frame, tare and bundle.
+"""One message to one estimate: pure functions of frame or field, tare and bundle.
 
 No clock and no state go in, so that replaying a record gives the same bytes again.
 """
@@ -14,14 +14,18 @@ from palpate.protos.messages import (
     NO_TARE,
     ElectrodeFrame,
     FeatureEstimate,
+    FieldEstimate,
+    FieldFrame,
     FloatArray,
+    SynthesisEstimate,
     Tare,
+    as_field_frame,
 )
 from palpate.services.runtime import Runtime
 
 
 class Refusal(StrEnum):
-    """Why a frame got no estimate; the value is the name it is counted by."""
+    """Why a message got no estimate; the value is the name it is counted by."""
 
     UNTARED = "untared"
     """The frame was taken before any tare, or the tare given is not the one it names."""
@@ -32,8 +36,11 @@ class Refusal(StrEnum):
     WRONG_SENSOR = "wrong_sensor"
     """The bundle was made for another type of sensor."""
 
+    WRONG_MESH = "wrong_mesh"
+    """The field is one of another mesh than the bundle's."""
+
     NON_FINITE = "non_finite"
-    """The model answered with NaN, infinity or a negative standard deviation."""
+    """The input holds NaN or infinity, or the model answered so, or with a negative deviation."""
 
 
 def tared_counts(frame: ElectrodeFrame, tare: Tare) -> FloatArray:
@@ -54,15 +61,9 @@ def estimate(
     Returns:
         The estimate, or why there is none. Never an estimate from bad input.
     """
-    if frame.sensor_type is not runtime.sensor_type:
-        return Refusal.WRONG_SENSOR
-    if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
-        return Refusal.UNTARED
-    if not frame.electrodes_valid:
-        return Refusal.INVALID_CHANNELS
-    outputs = runtime.run(tared_counts(frame, tare))
-    if outputs is None:
-        return Refusal.NON_FINITE
+    outputs = _run_on_electrodes(frame, tare, runtime)
+    if isinstance(outputs, Refusal):
+        return outputs
     force = outputs["force"]
     x, y, z = force.tolist()
     in_contact = sqrt(x * x + y * y + z * z) >= runtime.contact_threshold_n
@@ -77,3 +78,74 @@ def estimate(
         contact_location=outputs.get("contact_location") if in_contact else None,
         contact_location_sd=outputs.get("contact_location_sd") if in_contact else None,
     )
+
+
+def estimate_field(
+    frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
+) -> FieldEstimate | Refusal:
+    """Estimate the displacement of each skin node from one frame.
+
+    Args:
+        frame: Raw counts of one sampling round.
+        tare: The tare that ``frame.tare_id`` names; None where nobody knows it.
+        runtime: A loaded bundle of the task ``field``.
+
+    Returns:
+        The estimate on the bundle's mesh, or why there is none.
+    """
+    outputs = _run_on_electrodes(frame, tare, runtime)
+    if isinstance(outputs, Refusal):
+        return outputs
+    return FieldEstimate(
+        source=frame.stamp,
+        sensor_serial=frame.sensor_serial,
+        bundle_sha256=runtime.sha256,
+        tare_id=frame.tare_id,
+        mesh_sha256=runtime.mesh_sha256,
+        displacement=outputs["displacement"].reshape(-1, 3),
+        displacement_sd=outputs.get("displacement_sd"),
+    )
+
+
+def synthesise(field: FieldFrame | FieldEstimate, runtime: Runtime) -> SynthesisEstimate | Refusal:
+    """Estimate the tared counts that go with a displacement field.
+
+    Args:
+        field: Known or estimated, on the mesh of the bundle.
+        runtime: A loaded bundle of the task ``synthesis``.
+
+    Returns:
+        The estimate, or why there is none.
+    """
+    known = as_field_frame(field)
+    sample = known.displacement.reshape(-1)
+    if known.mesh_sha256 != runtime.mesh_sha256 or sample.shape != runtime.sample_shape:
+        return Refusal.WRONG_MESH
+    # A network may hide it: a rectifier turns NaN into 0 on some machines.
+    if not np.isfinite(sample).all():
+        return Refusal.NON_FINITE
+    outputs = runtime.run(sample)
+    if outputs is None:
+        return Refusal.NON_FINITE
+    return SynthesisEstimate(
+        source=known.stamp,
+        sensor_serial=known.sensor_serial,
+        bundle_sha256=runtime.sha256,
+        mesh_sha256=runtime.mesh_sha256,
+        tared_counts=outputs["tared_counts"],
+        tared_counts_sd=outputs["tared_counts_sd"],
+    )
+
+
+def _run_on_electrodes(
+    frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
+) -> dict[str, FloatArray] | Refusal:
+    """Outputs of a model for the tared counts of a frame, or why there are none."""
+    if frame.sensor_type is not runtime.sensor_type:
+        return Refusal.WRONG_SENSOR
+    if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
+        return Refusal.UNTARED
+    if not frame.electrodes_valid:
+        return Refusal.INVALID_CHANNELS
+    outputs = runtime.run(tared_counts(frame, tare))
+    return Refusal.NON_FINITE if outputs is None else outputs

@@ -17,6 +17,7 @@ from palpate.protos.session import Sample
 from palpate.protos.topics import TOPICS, Topic
 from palpate.services.config import RecorderConfig
 from palpate.services.disk import DiskError, disk_error, free_bytes
+from palpate.services.meshes import MeshLibrary
 from palpate.services.recovery import Recovery
 from palpate.services.scene import SensorScene
 from palpate.services.viewing import ViewWorker
@@ -44,6 +45,9 @@ class RecordKeeper:
         config: What is recorded, and where.
         station: Stands in the names of the files.
         health: Hears of every event.
+
+    Raises:
+        ConfigError: One of ``config.bundles`` does not exist.
     """
 
     def __init__(self, config: RecorderConfig, station: str, health: Health) -> None:
@@ -61,6 +65,7 @@ class RecordKeeper:
         self._checked_s = 0.0
         self._tried_s = float("-inf")
         self._recovery = Recovery(config.out, health)
+        self._meshes = MeshLibrary(config.bundles)
 
     def start(self) -> None:
         """Make the folder, save what a killed run left behind, open the first record.
@@ -148,8 +153,7 @@ class RecordKeeper:
         """Hand the counters over to health."""
         counts, self._counts = self._counts, Counter()
         for view in self._views:
-            counts.update(view.counters)
-            view.counters.clear()
+            counts.update(view.take_counts())
         self._views = [v for v in self._views if v is self._view or not v.join(0.0)]
         for name, count in counts.items():
             self._health.count(name, count)
@@ -185,7 +189,10 @@ class RecordKeeper:
         self._opened_s = time.monotonic()
         if self._config.rrd:
             self._view = ViewWorker(
-                path.with_suffix(".rrd"), title=path.stem, max_bytes=self._config.rrd_max_bytes
+                path.with_suffix(".rrd"),
+                title=path.stem,
+                max_bytes=self._config.rrd_max_bytes,
+                meshes=self._meshes,
             )
             self._views.append(self._view)
         self._health.set_state(ServiceState.READY, f"recording to {path}")

@@ -46,7 +46,7 @@ def run(
         instance: Name of this process among several recorders.
 
     Raises:
-        ConfigError: An unknown topic.
+        ConfigError: An unknown topic, or a bundle that does not exist.
         LinkError: The bus cannot be joined.
         RecordingError: The folder of the records cannot be made.
     """

@@ -8,19 +8,24 @@ golden vectors.
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Mapping
 from math import isfinite
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.protos.bundle import BUNDLE_CONTRACT_VERSION, Bundle, Manifest, check_task
+from palpate.protos.bundle import (
+    BUNDLE_CONTRACT_VERSION,
+    Bundle,
+    Manifest,
+    check_bundle_mesh,
+    check_task,
+)
 from palpate.protos.errors import BundleError
-from palpate.protos.extras import require
 from palpate.protos.messages import FloatArray, ModelMetadata, SensorType
-from palpate.services.external_data import has_external_data
+from palpate.services.opening import REMEDY, first_line, open_model
 
 log = logging.getLogger(__name__)
 
@@ -31,19 +36,20 @@ of another CPU's kernels stays an order of magnitude below it."""
 WARM_UP_RUNS = 50
 """Runs before a model counts as warm: the first is 5-10 times slower than those that follow."""
 
-_DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(int64)": "int64"}
+_FEW = 64  # values up to which plain Python is faster than NumPy's reductions
 _ALIGN = 16  # float32 values to a 64-byte cache line, the alignment ONNX Runtime's own buffers have
-_REMEDY = "export the bundle again with palpate.training, or serve another one"
 
 
 class Runtime:
-    """A loaded bundle that answers one sample at a time. Use from one thread.
+    """A loaded bundle that answers one sample at a time. Several threads wait for one another.
 
     Attributes:
         manifest: What the bundle says of itself.
         sha256: Digest of the manifest, 32 bytes; stands in every estimate.
         sensor_type: The type of sensor it was made for.
         contact_threshold_n: Net force from which on there is contact [N].
+        mesh: Mesh of its fields; None for a task without.
+        mesh_sha256: Content hash of that mesh, 32 bytes; empty for a task without.
     """
 
     def __init__(self, bundle: Bundle, task: str) -> None:
@@ -51,12 +57,14 @@ class Runtime:
         self.manifest = manifest
         self.sha256 = bundle.sha256
         self.contact_threshold_n = float(manifest.contact_threshold_n)
+        self.mesh = bundle.mesh
+        self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
+        self._lock = threading.Lock()
         self._label = f"bundle {manifest.name}:{manifest.version}"
         _check_manifest(manifest, task, self._label)
         self.sensor_type = SensorType[manifest.sensor_type]
-        _check_self_contained(bundle.model, self._label)
-        self._session = _open_session(bundle.model, self._label)
-        _check_model(manifest, self._session, self._label)
+        check_bundle_mesh(bundle.mesh, manifest, self._label)
+        self._session = open_model(bundle.model, manifest, self._label)
         self._check_golden(bundle.golden)
         self._bind()
         self._warm_up()
@@ -65,25 +73,40 @@ class Runtime:
         """Run the model on one sample.
 
         Args:
-            sample: The model's one input without batch axis, e.g. tared counts, shape ``(19,)``.
+            sample: The model's one input without batch axis, e.g. tared counts, shape ``(19,)``,
+                or a displacement field, flat, shape ``(3 V,)``.
 
         Returns:
             Outputs by name without batch axis, on memory of their own; None if any value is not
             finite or a standard deviation is negative.
         """
-        self._input[0] = sample
-        self._session.run_with_iobinding(self._binding)
-        values = self._output.copy()
-        outputs = {name: values[start:stop] for name, start, stop in self._slices}
-        # A dozen numbers: plain Python is several times faster than NumPy's reductions. The sum of
-        # float32 values cannot overflow a double, and NaN or infinity in any of them survives it.
+        with self._lock:
+            self._input[0] = sample
+            self._session.run_with_iobinding(self._binding)
+            values = self._output.copy()
+        return (
+            {name: values[start:stop] for name, start, stop in self._slices}
+            if self._believable(values)
+            else None
+        )
+
+    def _believable(self, values: FloatArray) -> bool:
+        """Whether all values are finite and no standard deviation is negative."""
+        if values.size > _FEW:
+            return bool(np.isfinite(values).all()) and all(
+                values[start:stop].min() >= 0 for start, stop in self._deviations
+            )
+        # The sum of float32 values cannot overflow a double, and NaN or infinity in any of them
+        # survives it.
         numbers = values.tolist()
-        if not isfinite(sum(numbers)):
-            return None
-        for start, stop in self._deviations:
-            if min(numbers[start:stop]) < 0:
-                return None
-        return outputs
+        return isfinite(sum(numbers)) and all(
+            min(numbers[start:stop]) >= 0 for start, stop in self._deviations
+        )
+
+    @property
+    def sample_shape(self) -> tuple[int, ...]:
+        """Shape of one sample: ``(19,)``, or ``(3 V,)`` for a field."""
+        return self._input.shape[1:]
 
     def metadata(self) -> ModelMetadata:
         """What a robot is told of the model that answers it."""
@@ -106,7 +129,7 @@ class Runtime:
         missing = [name for name in names if name not in golden]
         if missing:
             raise BundleError(
-                f"{self._label}: golden.npz has no {', '.join(missing)}", remedy=_REMEDY
+                f"{self._label}: golden.npz has no {', '.join(missing)}", remedy=REMEDY
             )
         feeds = {tensor.name: golden[tensor.name] for tensor in self.manifest.inputs}
         outputs = [tensor.name for tensor in self.manifest.outputs]
@@ -114,8 +137,8 @@ class Runtime:
             answers = self._session.run(outputs, feeds)
         except Exception as error:  # ONNX Runtime's errors share no base of their own
             raise BundleError(
-                f"{self._label}: the model does not run on its golden inputs: {_short(error)}",
-                remedy=_REMEDY,
+                f"{self._label}: the model does not run on its golden inputs: {first_line(error)}",
+                remedy=REMEDY,
             ) from error
         for name, answer in zip(outputs, answers, strict=True):
             self._check_answer(name, np.asarray(answer), golden[name])
@@ -126,13 +149,13 @@ class Runtime:
         if not np.isfinite(answer).all():
             raise BundleError(
                 f"{self._label}: output {name!r} is NaN or infinite on its golden input",
-                remedy=_REMEDY,
+                remedy=REMEDY,
             )
         if answer.shape != expected.shape:
             raise BundleError(
                 f"{self._label}: output {name!r} has shape {answer.shape} on its golden input, "
                 f"golden.npz says {expected.shape}",
-                remedy=_REMEDY,
+                remedy=REMEDY,
             )
         scale = float(np.max(np.abs(expected), initial=0.0)) or 1.0
         deviation = float(np.max(np.abs(answer - expected), initial=0.0)) / scale
@@ -140,7 +163,7 @@ class Runtime:
             raise BundleError(
                 f"{self._label}: output {name!r} deviates from golden.npz by {deviation:.2g} of "
                 f"its largest value, {GOLDEN_TOLERANCE:g} is allowed",
-                remedy=_REMEDY,
+                remedy=REMEDY,
             )
 
     def _bind(self) -> None:
@@ -169,14 +192,14 @@ class Runtime:
             self._binding.bind_output(name, "cpu", 0, np.float32, (1, *tensor.shape[1:]), address)
 
     def _warm_up(self) -> None:
-        silence = np.zeros(self._input.shape[1:], np.float32)
+        silence = np.zeros(self.sample_shape, np.float32)
         for _ in range(WARM_UP_RUNS):
             outputs = self.run(silence)
         if outputs is None:
             raise BundleError(
                 f"{self._label}: the answer to an untouched sensor (all zero) is not finite, or a "
                 "standard deviation is negative",
-                remedy=_REMEDY,
+                remedy=REMEDY,
             )
 
 
@@ -215,72 +238,3 @@ def _check_manifest(manifest: Manifest, task: str, label: str) -> None:
             f"{label} is for the unknown sensor type {manifest.sensor_type!r}",
             remedy=f"known sensor types: {', '.join(SensorType.__members__)}",
         )
-
-
-def _check_self_contained(model: bytes, label: str) -> None:
-    try:
-        external = has_external_data(model)
-    except ValueError as error:
-        raise BundleError(
-            f"{label}: model.onnx does not load: {error}, so it is no ONNX file", remedy=_REMEDY
-        ) from error
-    if external:
-        raise BundleError(
-            f"{label}: model.onnx keeps weights in another file, which no digest covers",
-            remedy="export it with all weights inside model.onnx",
-        )
-
-
-def _open_session(model: bytes, label: str) -> Any:
-    ort: ModuleType = require("onnxruntime", extra="services")
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    # Spinning threads burn a core between two frames and buy nothing at 100 Hz.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.log_severity_level = 4  # its errors come as exceptions; stderr is not a log
-    try:
-        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's errors share no base of their own
-        text = str(error)
-        if "opset" in text.lower():
-            problem = f"{label}: ONNX Runtime {ort.__version__} does not know its opset"
-            remedy = "export for an older opset, or upgrade onnxruntime"
-        else:
-            problem = f"{label}: model.onnx does not load: {_short(error)}"
-            remedy = _REMEDY
-        raise BundleError(problem, remedy=remedy) from error
-
-
-def _check_model(manifest: Manifest, session: Any, label: str) -> None:
-    """The graph must have the tensors that its manifest names; those are the task's already."""
-    for side, declared, nodes in (
-        ("input", manifest.inputs, session.get_inputs()),
-        ("output", manifest.outputs, session.get_outputs()),
-    ):
-        wanted = {tensor.name: (tensor.dtype, tuple(tensor.shape)) for tensor in declared}
-        found = {node.name: _signature(node) for node in nodes}
-        if found != wanted:
-            raise BundleError(
-                f"{label}: model.onnx has {side}s {_describe(found)}; manifest.json says "
-                f"{_describe(wanted)}",
-                remedy=f"export it to the contract of the task {manifest.task!r}",
-            )
-
-
-def _signature(node: Any) -> tuple[str, tuple[int, ...]]:
-    # ONNX Runtime gives a name or None for a free batch size.
-    shape = tuple(size if isinstance(size, int) else -1 for size in node.shape)
-    return _DTYPES.get(node.type, node.type), shape
-
-
-def _describe(tensors: dict[str, tuple[str, tuple[int, ...]]]) -> str:
-    return ", ".join(
-        f"{name} {dtype}{list(shape)}" for name, (dtype, shape) in sorted(tensors.items())
-    )
-
-
-def _short(error: Exception) -> str:
-    """First line of a foreign message, without the source paths of whoever built it."""
-    return str(error).splitlines()[0].split(" : ")[-1][:200]

@@ -17,11 +17,16 @@ from palpate.protos.messages import (
     NO_TARE,
     ElectrodeFrame,
     FeatureEstimate,
+    FieldEstimate,
+    FieldFrame,
     IndenterPoseFrame,
     Stamp,
+    SynthesisEstimate,
     Tare,
     WrenchFrame,
+    as_field_frame,
 )
+from palpate.services.field_scene import FieldRow, FieldThinner
 
 Values = npt.NDArray[Any]
 
@@ -65,6 +70,8 @@ class Rows:
         arrow: The same where it is known whether and where it acts.
         location: Contact location likewise [m], shape ``(3,)`` or None.
         error: Magnitude of the error of ``force`` [N] and ``location`` [m], shape ``(1,)``.
+        fields: Fields to draw by ``truth`` or ``estimate``.
+        synthesised: Tared counts synthesised from a field, shape ``(19,)`` [counts].
     """
 
     electrodes: dict[str, list[Row]] = field(default_factory=lambda: {"raw": [], "tared": []})
@@ -73,6 +80,8 @@ class Rows:
     arrow: dict[str, list[Row]] = field(default_factory=_by_source)
     location: dict[str, list[Row]] = field(default_factory=_by_source)
     error: dict[str, list[Row]] = field(default_factory=lambda: {"force": [], "location": []})
+    fields: dict[str, list[FieldRow]] = field(default_factory=lambda: {"truth": [], "estimate": []})
+    synthesised: list[Row] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -132,14 +141,16 @@ class SensorScene:
     """Sorts the messages of one sensor into rows to draw."""
 
     TOPICS: ClassVar[frozenset[str]] = frozenset(
-        {"electrodes", "tare", "wrench", "pose", "features"}
+        {"electrodes", "tare", "wrench", "pose", "features", "field", "field_truth", "synthesis"}
     )
 
     def __init__(self) -> None:
         self._rows = Rows()
         self._matcher = Matcher()
         self._tares: dict[int, Tare] = {}
+        self._thinners = {"truth": FieldThinner(), "estimate": FieldThinner()}
         self.pending = False
+        self.has_fields = False
 
     def add(self, message: Any) -> None:
         """Take one decoded message."""
@@ -155,6 +166,13 @@ class SensorScene:
             self._add_wrench(message)
         elif isinstance(message, IndenterPoseFrame):
             self._add_pose(message)
+        elif isinstance(message, FieldFrame):
+            self._add_field("truth", message)
+        elif isinstance(message, FieldEstimate):
+            self._add_field("estimate", as_field_frame(message))
+        elif isinstance(message, SynthesisEstimate):
+            self.has_fields = True
+            self._rows.synthesised.append(_row(message.source, message.tared_counts))
 
     def take(self) -> Rows:
         """Hand over what has come, and start afresh."""
@@ -196,6 +214,12 @@ class SensorScene:
         self._rows.location["truth"].append(_row(pose.stamp, position))
         self._add_true_arrow(reading)
         self._add_location_error(pose.stamp, reading)
+
+    def _add_field(self, name: str, known: FieldFrame) -> None:
+        self.has_fields = True
+        row = self._thinners[name].row(known)
+        if row is not None:
+            self._rows.fields[name].append(row)
 
     def _add_true_arrow(self, reading: Reading) -> None:
         if reading.wrench is not None and reading.pose is not None:

@@ -1,20 +1,20 @@
 """The Rerun view of a record: messages in, one ``.rrd`` with an explicit layout out.
 
 For looking only; the MCAP is the record. Columns are sent in batches, which is twenty times cheaper
-than logging each frame. With ``blueprint`` the only place that knows Rerun, whose names change with
-each release.
+than logging each frame. With ``blueprint`` and ``field_view`` the only place that knows Rerun,
+whose names change with each release.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from palpate.protos.errors import RecordingError
 from palpate.protos.extras import require
@@ -22,6 +22,8 @@ from palpate.protos.messages import PAC_SAMPLES
 from palpate.protos.record import read_record
 from palpate.protos.topics import TOPICS
 from palpate.services import blueprint
+from palpate.services.field_view import FieldDrawer
+from palpate.services.meshes import MeshLibrary
 from palpate.services.scene import Row, SensorScene
 
 log = logging.getLogger(__name__)
@@ -34,9 +36,6 @@ BATCH_MESSAGES = 200
 ARROW_M_PER_N = 2e-3
 """Length of a force arrow in the picture."""
 
-_FULL_SCALE_COUNTS = 400.0
-"""Tared counts at which an electrode is drawn in full colour."""
-
 
 class View:
     """Writes one ``.rrd``. Not thread-safe.
@@ -45,16 +44,27 @@ class View:
         path: The file to write.
         title: Shown as the recording's name.
         max_bytes: From this size on nothing more is written [bytes]; None = no bound.
+        meshes: Where the meshes of fields are found; None = in the packaged bundles.
     """
 
-    def __init__(self, path: Path, *, title: str, max_bytes: int | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        title: str,
+        max_bytes: int | None = None,
+        meshes: MeshLibrary | None = None,
+    ) -> None:
         self._rr = require("rerun", extra="services")
         self.path = path
         self.full = False
         self._max_bytes = max_bytes
         self._scenes: dict[str, SensorScene] = {}
         self._drawn: set[str] = set()
+        self._with_fields: set[str] = set()
         self._stream = self._rr.RecordingStream(APPLICATION)
+        library = MeshLibrary() if meshes is None else meshes
+        self._fields = FieldDrawer(self._rr, self._stream, self._send, library)
         self._open = False
         self._title = title
 
@@ -71,6 +81,11 @@ class View:
             self.close()
         else:
             self._disconnect()
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What could not be drawn, see ``FieldDrawer``."""
+        return self._fields.counters
 
     def add(self, sensor: str, message: Any) -> None:
         """Take one message; it is drawn with the next :meth:`flush`.
@@ -131,10 +146,12 @@ class View:
 
     def _prepare(self, sensors: list[str]) -> None:
         new = [sensor for sensor in sensors if sensor not in self._drawn]
-        if not new:
+        with_fields = {sensor for sensor in sensors if self._scenes[sensor].has_fields}
+        if not new and with_fields <= self._with_fields:
             return
         self._drawn.update(new)
-        layout = blueprint.blueprint(sorted(self._drawn))
+        self._with_fields |= with_fields
+        layout = blueprint.blueprint(sorted(self._drawn), with_fields=self._with_fields)
         if self._open:
             self._stream.send_blueprint(layout)
         else:
@@ -157,7 +174,7 @@ class View:
                 )
         tared = rows.electrodes["tared"]
         if tared:
-            shades = _shades(np.stack([frame.values for frame in tared]))
+            shades = blueprint.electrode_shades(np.stack([frame.values for frame in tared]))
             count = shades.shape[1]
             columns = rr.Points3D.columns(colors=shades.reshape(-1)).partition([count] * len(tared))
             self._send(f"{sensor}/finger/electrodes", tared, columns)
@@ -173,6 +190,13 @@ class View:
             if errors:
                 values = np.array([row.values[0] for row in errors])
                 self._send(f"{sensor}/error/{what}", errors, rr.Scalars.columns(scalars=values))
+
+        for name, fields in rows.fields.items():
+            self._fields.draw(f"{sensor}/field/{name}", fields)
+        if rows.synthesised:
+            values = np.stack([row.values for row in rows.synthesised])
+            columns = rr.Scalars.columns(scalars=values)
+            self._send(f"{sensor}/synthesised", rows.synthesised, columns)
 
     def _draw_force(self, sensor: str, name: str, rows: list[Row]) -> None:
         if not rows:
@@ -237,44 +261,31 @@ class View:
         )
 
 
-def _shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
-    """Colours of electrodes by their tared counts: cool where lowered, warm where raised.
-
-    Args:
-        tared: Tared counts, shape ``(N, 19)``.
-
-    Returns:
-        Packed RGBA, uint32, shape ``(N, 19)``.
-    """
-    strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
-    rest = np.array([150.0, 156.0, 166.0])
-    full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))
-    rgb = (rest + strength * (full - rest)).astype(np.uint32)
-    packed = (rgb[..., 0] << 24) | (rgb[..., 1] << 16) | (rgb[..., 2] << 8) | 255
-    shades: npt.NDArray[np.uint32] = packed.astype(np.uint32)
-    return shades
-
-
-def review(record: Path, view: Path | None = None) -> Path:
+def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = ()) -> Path:
     """Make the view of an existing record.
 
     Args:
         record: An MCAP record of palpate.
         view: The file to write; None = beside the record with the ending ``.rrd``.
+        bundles: Bundles that hold the meshes of its fields, beside the packaged ones.
 
     Returns:
         The file written.
 
     Raises:
+        ConfigError: One of ``bundles`` does not exist.
         RecordingError: The record is truncated or not palpate's.
         MissingExtraError: Rerun is not installed.
     """
     target = record.with_suffix(".rrd") if view is None else view
-    with View(target, title=record.stem) as drawn:
+    with View(target, title=record.stem, meshes=MeshLibrary(bundles)) as drawn:
         for count, item in enumerate(read_record(record), start=1):
             topic = item.address.topic
             if topic in SensorScene.TOPICS:
                 drawn.add(item.address.sensor, TOPICS[topic].codec.decode(item.payload))
             if count % (BATCH_MESSAGES * len(SensorScene.TOPICS)) == 0:
                 drawn.flush()
+    for name, count in drawn.counters.items():
+        if count:
+            log.warning("%s: %s %d", target, name, count)
     return target

@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from palpate.protos.errors import PalpateError
+from palpate.protos.messages import FieldEstimate, FieldFrame
+from palpate.services.meshes import MeshLibrary
 
 if TYPE_CHECKING:
     from palpate.services.view import View
@@ -21,24 +24,32 @@ PERIOD_S = 0.5
 CAPACITY = 100_000
 """Messages that may wait to be drawn; beyond it they are counted, not drawn."""
 
+FIELDS = 500
+"""Fields among them: 42 MB at 7,000 nodes each."""
+
 
 class ViewWorker:
     """Draws what it is offered into one ``.rrd``.
 
-    ``counters``: ``view_dropped`` (offered too fast), ``view_failed`` (the view was given up).
+    Counts ``view_dropped`` (offered too fast), ``view_failed`` (the view was given up), and
+    those of the view itself, e.g. ``view_no_mesh``.
 
     Args:
         path: The file to write.
         title: Shown as the recording's name.
         max_bytes: From this size on nothing more is written [bytes].
+        meshes: Where the meshes of fields are found.
     """
 
-    def __init__(self, path: Path, *, title: str, max_bytes: int) -> None:
+    def __init__(self, path: Path, *, title: str, max_bytes: int, meshes: MeshLibrary) -> None:
         self.path = path
-        self.counters: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
+        self._lock = threading.Lock()
         self._failed = False
         self._title = title
         self._max_bytes = max_bytes
+        self._meshes = meshes
+        self._room_for_fields = threading.Semaphore(FIELDS)
         self._waiting: deque[tuple[str, Any]] = deque()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
@@ -48,10 +59,17 @@ class ViewWorker:
         """Hand over a decoded message; never blocks and never raises."""
         if self._failed:
             return
-        if len(self._waiting) >= CAPACITY:
-            self.counters["view_dropped"] += 1
+        full = len(self._waiting) >= CAPACITY
+        if full or (_is_field(message) and not self._room_for_fields.acquire(blocking=False)):
+            self._count({"view_dropped": 1})
             return
         self._waiting.append((sensor, message))
+
+    def take_counts(self) -> Counter[str]:
+        """Hand over what was counted since the last time."""
+        with self._lock:
+            counts, self._counts = self._counts, Counter()
+        return counts
 
     def finish(self) -> None:
         """Draw the rest and close the file, without waiting for it."""
@@ -67,7 +85,9 @@ class ViewWorker:
             # Imported here: Rerun takes half a second to import, the record must not wait for it.
             from palpate.services.view import View
 
-            with View(self.path, title=self._title, max_bytes=self._max_bytes) as view:
+            with View(
+                self.path, title=self._title, max_bytes=self._max_bytes, meshes=self._meshes
+            ) as view:
                 while not self._stop.wait(PERIOD_S):
                     self._draw(view)
                 self._draw(view)
@@ -80,11 +100,24 @@ class ViewWorker:
             self._give_up()
 
     def _give_up(self) -> None:
-        self.counters["view_failed"] += 1
+        self._count({"view_failed": 1})
         self._failed = True
         self._waiting.clear()
 
     def _draw(self, view: View) -> None:
         for _ in range(len(self._waiting)):
-            view.add(*self._waiting.popleft())
+            sensor, message = self._waiting.popleft()
+            if _is_field(message):
+                self._room_for_fields.release()
+            view.add(sensor, message)
         view.flush()
+        self._count(view.counters)
+        view.counters.clear()
+
+    def _count(self, events: Mapping[str, int]) -> None:
+        with self._lock:
+            self._counts.update(events)
+
+
+def _is_field(message: Any) -> bool:
+    return isinstance(message, FieldEstimate | FieldFrame)

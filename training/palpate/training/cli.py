@@ -7,16 +7,16 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from palpate.training.dataset import FeatureDataset
+from palpate.training import cli_data, cli_fields, cli_figures
+from palpate.training.cli_data import contents
 from palpate.training.ingest_lasa import BLOCKS_PER_RECORDING, ELECTRODE_LAG_ROWS, ingest_lasa
 from palpate.training.ingest_record import ingest_record
-from palpate.training.schema import UNITS, open_dataset, write_dataset
+from palpate.training.schema import open_dataset, write_dataset
 
 train_app = typer.Typer(no_args_is_help=True, help="Train networks and write model bundles.")
 data_app = typer.Typer(no_args_is_help=True, help="Make data sets and look into them.")
@@ -77,44 +77,10 @@ def data_ingest_record(
     console.print(contents(data, str(out)))
 
 
-@data_app.command("inspect")
-def data_inspect(
-    path: Annotated[Path, typer.Argument(help="Data set (.h5).")],
-) -> None:
-    """Check a data set and show what is in it.
-
-    palpate data inspect presses.h5
-    """
-    console.print(contents(open_dataset(path), str(path)))
-
-
-def contents(data: FeatureDataset, title: str) -> Table:
-    """What a data set holds: arrays, units, ranges, provenance."""
-    groups, blocks = len(np.unique(data.group)), len(np.unique(data.block))
-    table = Table(
-        title=title,
-        caption=f"{len(data)} rows, {groups} groups, {blocks} blocks,"
-        f" sensors {', '.join(data.sensor_names)}\n"
-        f"source: {data.provenance.source}\nlicence: {data.provenance.licence}\n"
-        f"made by: {data.provenance.command or '-'} (palpate {data.provenance.palpate_version})\n"
-        f"notes: {data.provenance.notes or '-'}\ncontent sha256: {data.content_sha256()}",
-        caption_justify="left",
-    )
-    for heading in ("dataset", "type", "shape", "unit"):
-        table.add_column(heading)
-    for heading in ("min", "median", "max"):
-        table.add_column(heading, justify="right")
-    for name, array in data.arrays().items():
-        values = array.astype(np.float64)
-        low, middle, high = np.nanpercentile(values, [0, 50, 100])
-        table.add_row(
-            name,
-            str(array.dtype),
-            str(array.shape),
-            UNITS[name],
-            *(f"{value:.6g}" for value in (low, middle, high)),
-        )
-    return table
+data_app.command("inspect")(cli_data.data_inspect)
+data_app.command("export")(cli_data.data_export)
+data_app.command("features")(cli_data.data_features)
+data_app.command("figures")(cli_figures.data_figures)
 
 
 @train_app.command("force-real")
@@ -168,3 +134,6 @@ def train_features_command(
     for key, value in report.metrics.items():
         table.add_row(key, f"{value:.5g}")
     console.print(table)
+
+
+cli_fields.add_commands(train_app)

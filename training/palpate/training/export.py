@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -82,7 +82,21 @@ class FeaturesGraph(nn.Module):
 
 
 def to_onnx(graph: FeaturesGraph) -> bytes:
+    """Export the ``features`` graph; see ``onnx_bytes``."""
+    names = [tensor.name for tensor in graph.outputs]
+    return onnx_bytes(graph, "electrodes", torch.zeros(4, 19), names)
+
+
+def onnx_bytes(
+    graph: nn.Module, input_name: str, example: Tensor, output_names: Sequence[str]
+) -> bytes:
     """Export with a free batch axis, everything in one file, the same bytes each time.
+
+    Args:
+        graph: Takes one tensor, batch first.
+        input_name: Name of the input.
+        example: An input of more than one row.
+        output_names: Names of the outputs, in order.
 
     Raises:
         MissingExtraError: onnx or onnxscript is not installed.
@@ -90,7 +104,6 @@ def to_onnx(graph: FeaturesGraph) -> bytes:
     onnx = require("onnx", extra="training")
     require("onnxscript", extra="training")
     graph.eval()
-    names = [tensor.name for tensor in graph.outputs]
     exporter = logging.getLogger("torch.onnx")
     level = exporter.level
     with warnings.catch_warnings():
@@ -99,10 +112,10 @@ def to_onnx(graph: FeaturesGraph) -> bytes:
         exporter.setLevel(logging.ERROR)
         program = torch.onnx.export(
             graph,
-            (torch.zeros(4, 19),),
-            input_names=["electrodes"],
-            output_names=names,
-            dynamic_shapes={"electrodes": {0: torch.export.Dim("batch")}},
+            (example,),
+            input_names=[input_name],
+            output_names=list(output_names),
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
             opset_version=OPSET,
             dynamo=True,
             external_data=False,
@@ -146,19 +159,7 @@ def check_parity(graph: FeaturesGraph, model: bytes, inputs: FloatArray) -> floa
         BundleError: It is ``PARITY_MAX`` or more, or the file does not run.
         MissingExtraError: onnxruntime is not installed.
     """
-    runtime = require("onnxruntime", extra="training")
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = 1
-    try:
-        session = runtime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        together = session.run(None, {"electrodes": inputs})
-        single = [session.run(None, {"electrodes": inputs[i : i + 1]}) for i in range(len(inputs))]
-    except Exception as error:  # ONNX Runtime's errors share no public base class
-        raise BundleError(
-            f"ONNX Runtime refuses the exported model: {error}",
-            remedy="check the operator set against the installed onnxruntime",
-        ) from error
-    one_by_one = [np.concatenate(parts) for parts in zip(*single, strict=True)]
+    together, one_by_one = run_onnx(model, "electrodes", inputs)
     with torch.inference_mode():
         truth = [output.numpy() for output in graph(torch.from_numpy(inputs))]
     scales = [1.0, 1.0]
@@ -182,6 +183,30 @@ def check_parity(graph: FeaturesGraph, model: bytes, inputs: FloatArray) -> floa
                 )
             worst = max(worst, difference)
     return worst
+
+
+def run_onnx(
+    model: bytes, input_name: str, inputs: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Outputs of ONNX Runtime for rows together, and for the same rows one by one.
+
+    Raises:
+        BundleError: The file does not run.
+        MissingExtraError: onnxruntime is not installed.
+    """
+    runtime = require("onnxruntime", extra="training")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1
+    try:
+        session = runtime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        together = session.run(None, {input_name: inputs})
+        single = [session.run(None, {input_name: inputs[i : i + 1]}) for i in range(len(inputs))]
+    except Exception as error:  # ONNX Runtime's errors share no public base class
+        raise BundleError(
+            f"ONNX Runtime refuses the exported model: {error}",
+            remedy="check the operator set against the installed onnxruntime",
+        ) from error
+    return together, [np.concatenate(parts) for parts in zip(*single, strict=True)]
 
 
 def export_features(

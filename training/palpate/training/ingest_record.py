@@ -39,7 +39,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(slots=True)
-class _Streams:
+class Streams:
     """What a record holds of one sensor."""
 
     frames: list[ElectrodeFrame] = field(default_factory=list)
@@ -63,7 +63,7 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
         RecordingError: Not a whole record.
         DatasetError: The record lacks a stream, or no row could be aligned.
     """
-    sensors = _read(path)
+    sensors = read_streams(path)
     parts: list[dict[str, npt.NDArray[Any]]] = []
     names: list[str] = []
     for name, streams in sorted(sensors.items()):
@@ -101,14 +101,19 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
     )
 
 
-def _read(path: Path) -> dict[str, _Streams]:
-    sensors: dict[str, _Streams] = {}
+def read_streams(path: Path) -> dict[str, Streams]:
+    """Streams of every sensor of a record, by name, in order of writing.
+
+    Raises:
+        RecordingError: Not a whole record.
+    """
+    sensors: dict[str, Streams] = {}
     for item in read_record(path):
         sensor = item.address.sensor
         topic = item.address.topic
         if topic not in (ELECTRODES.name, WRENCH.name, POSE.name, TARE.name):
             continue
-        streams = sensors.setdefault(sensor, _Streams())
+        streams = sensors.setdefault(sensor, Streams())
         if topic == ELECTRODES.name:
             streams.frames.append(ELECTRODES.codec.decode(item.payload))
         elif topic == WRENCH.name:
@@ -121,7 +126,7 @@ def _read(path: Path) -> dict[str, _Streams]:
     return sensors
 
 
-def _align(path: Path, name: str, streams: _Streams) -> dict[str, npt.NDArray[Any]]:
+def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any]]:
     if not streams.wrenches:
         raise DatasetError(
             f"{path}: sensor {name!r} has no wrench stream",
@@ -141,21 +146,21 @@ def _align(path: Path, name: str, streams: _Streams) -> dict[str, npt.NDArray[An
             " frame",
             remedy="tare before recording, and record the stream tare",
         )
-    frames.sort(key=lambda frame: _time(frame.stamp, streams))
-    times = np.array([_time(frame.stamp, streams) for frame in frames], dtype=np.int64)
+    frames.sort(key=lambda frame: time_of(frame.stamp, streams))
+    times = np.array([time_of(frame.stamp, streams) for frame in frames], dtype=np.int64)
 
-    force, has_force = _interpolate(
+    force, has_force = interpolate(
         times,
-        np.array([_time(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
+        np.array([time_of(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
         np.array([w.force for w in streams.wrenches], dtype=np.float64),
     )
     kept = has_force
     location = touching = None
     if streams.poses:
-        pose_times = np.array([_time(p.stamp, streams) for p in streams.poses], dtype=np.int64)
+        pose_times = np.array([time_of(p.stamp, streams) for p in streams.poses], dtype=np.int64)
         positions = np.array([p.position for p in streams.poses], dtype=np.float64)
         contact = np.array([[p.in_contact] for p in streams.poses], dtype=np.float64)
-        both, has_pose = _interpolate(times, pose_times, np.hstack([positions, contact]))
+        both, has_pose = interpolate(times, pose_times, np.hstack([positions, contact]))
         location, touching = both[:, :3], both[:, 3] >= 0.5
         kept = kept & has_pose
     if not kept.any():
@@ -182,8 +187,8 @@ def _align(path: Path, name: str, streams: _Streams) -> dict[str, npt.NDArray[An
     return columns
 
 
-def _time(stamp: Stamp, streams: _Streams) -> int:
-    """Monotonic time where the first frame and this stamp share the clock, else wall time."""
+def time_of(stamp: Stamp, streams: Streams) -> int:
+    """Monotonic time [ns] where the streams' first readings share the clock, else wall time."""
     shared = all(
         stamps[0].stamp.clock_id == streams.frames[0].stamp.clock_id
         for stamps in (streams.wrenches, streams.poses)
@@ -192,7 +197,7 @@ def _time(stamp: Stamp, streams: _Streams) -> int:
     return stamp.monotonic_ns if shared else stamp.wall_ns
 
 
-def _interpolate(at: Times, times: Times, values: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
+def interpolate(at: Times, times: Times, values: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
     """Values at other times, linear between neighbours, and where that is allowed.
 
     Allowed is a time whose nearest reading is within the tolerance. Across a gap of more than

@@ -23,7 +23,7 @@ _SMALLEST_SD = 1e-6
 
 
 class Mlp(nn.Module):
-    """Tared counts ``(N, 19)`` -> one quantity ``(N, 3)`` in its own unit.
+    """Tared counts ``(N, 19)`` -> one quantity, by default ``(N, 3)``, in its own unit.
 
     Standardisation of the inputs and of the outputs are constants of the graph, so whoever runs
     it needs to know nothing about the training data.
@@ -32,6 +32,7 @@ class Mlp(nn.Module):
         widths: Hidden layers.
         inputs: Number of input channels.
         activation: After each hidden layer.
+        outputs: Number of output channels.
     """
 
     input_mean: Tensor
@@ -44,27 +45,28 @@ class Mlp(nn.Module):
         widths: Sequence[int] = PAPER_WIDTHS,
         inputs: int = ELECTRODES,
         activation: Activation = "silu",
+        outputs: int = 3,
     ) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         for before, after in zip((inputs, *widths[:-1]), widths, strict=True):
             layers += [nn.Linear(before, after), nn.SiLU() if activation == "silu" else nn.ReLU()]
-        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], 3))
+        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
         self.register_buffer("input_mean", torch.zeros(inputs))
         self.register_buffer("input_sd", torch.ones(inputs))
-        self.register_buffer("output_mean", torch.zeros(3))
-        self.register_buffer("output_sd", torch.ones(3))
+        self.register_buffer("output_mean", torch.zeros(outputs))
+        self.register_buffer("output_sd", torch.ones(outputs))
 
     def forward(self, tared_counts: Tensor) -> Tensor:
-        """Estimate of the quantity, shape ``(N, 3)``."""
-        scaled = (tared_counts - self.input_mean) / self.input_sd  # (N, 19)
-        estimate: Tensor = self.layers(scaled) * self.output_sd + self.output_mean  # (N, 3)
+        """Estimate of the quantity, shape ``(N, outputs)``."""
+        scaled = (tared_counts - self.input_mean) / self.input_sd
+        estimate: Tensor = self.layers(scaled) * self.output_sd + self.output_mean
         return estimate
 
     def normalise_from(
         self, inputs: npt.NDArray[np.float32], targets: npt.NDArray[np.float32]
     ) -> None:
-        """Set the constants from training rows: ``(N, 19)`` [counts] and ``(N, 3)``."""
+        """Set the constants from training rows: inputs ``(N, I)`` and targets ``(N, O)``."""
         for values, mean, sd in (
             (inputs, self.input_mean, self.input_sd),
             (targets, self.output_mean, self.output_sd),
@@ -82,7 +84,7 @@ class Mlp(nn.Module):
 def predict(
     net: nn.Module, inputs: npt.NDArray[np.float32], *, batch_rows: int = 8192
 ) -> npt.NDArray[np.float32]:
-    """Run a network over rows: ``(N, 19)`` -> ``(N, 3)``."""
+    """Run a network over rows: ``(N, I)`` -> ``(N, O)``."""
     net.eval()
     with torch.inference_mode():
         parts = [net(part).numpy() for part in torch.split(torch.from_numpy(inputs), batch_rows)]

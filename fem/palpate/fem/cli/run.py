@@ -5,14 +5,11 @@ from __future__ import annotations
 import hashlib
 import math
 import shlex
-import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from palpate.fem.aim import pad_point
 from palpate.fem.cli.model import Model, workers_for
@@ -24,6 +21,7 @@ from palpate.fem.cli.show import (
     show_trajectory,
     write_json,
 )
+from palpate.fem.cli.stopping import stop_on_signal
 from palpate.fem.indenter.catalogue import indenter_names, make_indenter
 from palpate.fem.indenter.path import read_path
 from palpate.fem.result import Trajectory
@@ -79,7 +77,7 @@ def run_command(
     jobs = None if wanted.sweep else 1
     count, threads = workers_for(workers, jobs)
     done: list[Trajectory] = []
-    with _stop_on_signal() as stop, _batch(model, count, threads, limit_s) as batch:
+    with stop_on_signal() as stop, _batch(model, count, threads, limit_s) as batch:
         with progress_bar() as bar:
             task = bar.add_task("pressurise", total=None)
             fingertip = batch.fingertip(stop)
@@ -233,23 +231,3 @@ def _batch(model: Model, workers: int, threads: int, limit_s: float) -> Iterator
         yield batch
     finally:
         batch.close()
-
-
-@contextmanager
-def _stop_on_signal() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C or ``SIGTERM`` sets; a second Ctrl-C ends at once."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        console.print("stopping; what has ended is kept")
-        stop.set()
-
-    before = {
-        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

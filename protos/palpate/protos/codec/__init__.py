@@ -2,9 +2,15 @@
 
 from palpate.protos.codec.base import Codec
 from palpate.protos.codec.estimates import FEATURE_ESTIMATE, FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
-from palpate.protos.codec.frames import ELECTRODE_FRAME, INDENTER_POSE_FRAME, WRENCH_FRAME
+from palpate.protos.codec.frames import (
+    ELECTRODE_FRAME,
+    FIELD_FRAME,
+    INDENTER_POSE_FRAME,
+    WRENCH_FRAME,
+)
 from palpate.protos.codec.service import (
     ERROR,
+    FIELD_REQUEST,
     MODEL_METADATA,
     SERVICE_REQUEST,
     STATUS,
@@ -23,11 +29,13 @@ CODECS = (
     ELECTRODE_FRAME,
     WRENCH_FRAME,
     INDENTER_POSE_FRAME,
+    FIELD_FRAME,
     FEATURE_ESTIMATE,
     FIELD_ESTIMATE,
     SYNTHESIS_ESTIMATE,
     TARE,
     TARE_REQUEST,
+    FIELD_REQUEST,
     SERVICE_REQUEST,
     STATUS,
     MODEL_METADATA,
@@ -46,6 +54,8 @@ __all__ = [
     "ERROR",
     "FEATURE_ESTIMATE",
     "FIELD_ESTIMATE",
+    "FIELD_FRAME",
+    "FIELD_REQUEST",
     "INDENTER_POSE_FRAME",
     "MODEL_METADATA",
     "SERVICE_REQUEST",

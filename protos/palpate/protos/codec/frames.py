@@ -1,4 +1,4 @@
-"""Codec of frames: what a gateway publishes at 100 Hz. Hot path: checks are inlined on purpose."""
+"""Codec of frames: what a gateway publishes. Hot path: checks are inlined on purpose."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ import numpy as np
 
 from palpate.protos.codec.base import Codec, codec_of
 from palpate.protos.codec.checks import (
+    check_digest,
+    check_field,
     check_serial,
+    field_from_wire,
     pose_values,
     reject,
+    splice,
     stamp_from_wire,
     stamp_to_wire,
     vector3_from_wire,
@@ -19,6 +23,7 @@ from palpate.protos.messages import (
     COUNTS_MAX,
     PAC_SAMPLES,
     ElectrodeFrame,
+    FieldFrame,
     IndenterPoseFrame,
     SensorType,
     WrenchFrame,
@@ -37,7 +42,8 @@ def _check_counts(raw: bytes, count: int, what: str) -> None:
         reject("counts_range", f"{what}[{at}] exceeds 12 bits ({COUNTS_MAX} counts)")
 
 
-def _electrodes_from_wire(msg: frames_pb2.ElectrodeFrame) -> ElectrodeFrame:
+def electrodes_from_wire(msg: frames_pb2.ElectrodeFrame) -> ElectrodeFrame:
+    """Check and convert an electrode frame."""
     kind = _SENSOR_TYPES.get(msg.sensor_type)
     if kind is None:
         reject("sensor_type", f"sensor_type {msg.sensor_type} is not known")
@@ -151,8 +157,27 @@ def _pose_encode(frame: IndenterPoseFrame) -> bytes:
     return msg.SerializeToString()
 
 
+def _field_from_wire(msg: frames_pb2.FieldFrame) -> FieldFrame:
+    return FieldFrame(
+        stamp_from_wire(msg.stamp),
+        check_serial(msg.sensor_serial),
+        check_digest(msg.mesh_sha256, "mesh_sha256"),
+        field_from_wire(msg.displacement, 3, "displacement"),
+    )
+
+
+def _field_encode(frame: FieldFrame) -> bytes:
+    msg = frames_pb2.FieldFrame(
+        sensor_serial=check_serial(frame.sensor_serial),
+        mesh_sha256=check_digest(frame.mesh_sha256, "mesh_sha256"),
+    )
+    stamp_to_wire(frame.stamp, msg.stamp)
+    displacement = check_field(frame.displacement, 3, "displacement")
+    return msg.SerializeToString() + splice(4, displacement)
+
+
 ELECTRODE_FRAME: Codec[ElectrodeFrame] = codec_of(
-    frames_pb2.ElectrodeFrame, _electrodes_encode, _electrodes_from_wire
+    frames_pb2.ElectrodeFrame, _electrodes_encode, electrodes_from_wire
 )
 WRENCH_FRAME: Codec[WrenchFrame] = codec_of(
     frames_pb2.WrenchFrame, _wrench_encode, _wrench_from_wire
@@ -160,3 +185,4 @@ WRENCH_FRAME: Codec[WrenchFrame] = codec_of(
 INDENTER_POSE_FRAME: Codec[IndenterPoseFrame] = codec_of(
     frames_pb2.IndenterPoseFrame, _pose_encode, _pose_from_wire
 )
+FIELD_FRAME: Codec[FieldFrame] = codec_of(frames_pb2.FieldFrame, _field_encode, _field_from_wire)

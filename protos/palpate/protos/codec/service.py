@@ -10,15 +10,18 @@ from palpate.protos.codec.base import Codec, codec_of
 from palpate.protos.codec.checks import (
     check_digest,
     check_serial,
+    delimited,
     field_from_wire,
     reject,
     stamp_from_wire,
     stamp_to_wire,
 )
-from palpate.protos.errors import ErrorCode
+from palpate.protos.codec.frames import ELECTRODE_FRAME, electrodes_from_wire
+from palpate.protos.errors import ConfigError, ErrorCode
 from palpate.protos.messages import (
     NO_TARE,
     ErrorReply,
+    FieldRequest,
     ModelMetadata,
     ServiceRequest,
     ServiceState,
@@ -27,6 +30,7 @@ from palpate.protos.messages import (
     TareRequest,
     TensorInfo,
 )
+from palpate.protos.names import check_name
 from palpate.v1 import service_pb2
 
 _STATES = {int(state): state for state in ServiceState}
@@ -172,6 +176,22 @@ def _metadata_encode(metadata: ModelMetadata) -> bytes:
     ).SerializeToString()
 
 
+def _check_sensor(sensor: str) -> str:
+    try:
+        return check_name(sensor, "sensor")
+    except ConfigError as error:
+        reject("sensor", error.problem)
+
+
+def _field_request_from_wire(msg: service_pb2.FieldRequest) -> FieldRequest:
+    return FieldRequest(_check_sensor(msg.sensor), electrodes_from_wire(msg.frame))
+
+
+def _field_request_encode(request: FieldRequest) -> bytes:
+    head = service_pb2.FieldRequest(sensor=_check_sensor(request.sensor))
+    return head.SerializeToString() + delimited(2, ELECTRODE_FRAME.encode(request.frame))
+
+
 TARE: Codec[Tare] = codec_of(service_pb2.Tare, _tare_encode, _tare_from_wire)
 TARE_REQUEST: Codec[TareRequest] = codec_of(
     service_pb2.TareRequest,
@@ -180,6 +200,9 @@ TARE_REQUEST: Codec[TareRequest] = codec_of(
 )
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()
+)
+FIELD_REQUEST: Codec[FieldRequest] = codec_of(
+    service_pb2.FieldRequest, _field_request_encode, _field_request_from_wire
 )
 STATUS: Codec[Status] = codec_of(service_pb2.Status, _status_encode, _status_from_wire)
 MODEL_METADATA: Codec[ModelMetadata] = codec_of(

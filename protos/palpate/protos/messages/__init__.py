@@ -8,6 +8,7 @@ from palpate.protos.messages.estimates import (
     FeatureEstimate,
     FieldEstimate,
     SynthesisEstimate,
+    as_field_frame,
 )
 from palpate.protos.messages.frames import (
     COUNTS_MAX,
@@ -15,6 +16,7 @@ from palpate.protos.messages.frames import (
     PAC_SAMPLES,
     CountArray,
     ElectrodeFrame,
+    FieldFrame,
     FloatArray,
     IndenterPoseFrame,
     Origin,
@@ -24,6 +26,7 @@ from palpate.protos.messages.frames import (
 )
 from palpate.protos.messages.service import (
     ErrorReply,
+    FieldRequest,
     ModelMetadata,
     ServiceRequest,
     ServiceState,
@@ -57,6 +60,8 @@ __all__ = [
     "ErrorReply",
     "FeatureEstimate",
     "FieldEstimate",
+    "FieldFrame",
+    "FieldRequest",
     "FloatArray",
     "IndenterPoseFrame",
     "ModelMetadata",
@@ -82,4 +87,5 @@ __all__ = [
     "TareRequest",
     "TensorInfo",
     "WrenchFrame",
+    "as_field_frame",
 ]

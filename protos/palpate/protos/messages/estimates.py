@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from palpate.protos.messages.frames import FloatArray, Stamp
+from palpate.protos.messages.frames import FieldFrame, FloatArray, Stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,3 +79,10 @@ class SynthesisEstimate:
     mesh_sha256: bytes
     tared_counts: FloatArray
     tared_counts_sd: FloatArray | None = None
+
+
+def as_field_frame(field: FieldFrame | FieldEstimate) -> FieldFrame:
+    """A field without saying whether it is known or estimated; same stamp, sensor and mesh."""
+    if isinstance(field, FieldFrame):
+        return field
+    return FieldFrame(field.source, field.sensor_serial, field.mesh_sha256, field.displacement)

@@ -142,3 +142,21 @@ class IndenterPoseFrame:
     position: npt.NDArray[np.float64]
     orientation: npt.NDArray[np.float64]
     in_contact: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FieldFrame:
+    """A displacement field that is known, not estimated: of a simulation, or other ground truth.
+
+    Attributes:
+        stamp: When.
+        sensor_serial: Serial number of the BioTac whose skin is meant.
+        mesh_sha256: Content hash of the mesh, 32 bytes.
+        displacement: Nodal displacement from the pressurised state [m], sensor frame, float32,
+            shape ``(V, 3)``.
+    """
+
+    stamp: Stamp
+    sensor_serial: str
+    mesh_sha256: bytes
+    displacement: FloatArray

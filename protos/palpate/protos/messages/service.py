@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from palpate.protos.errors import ErrorCode
-from palpate.protos.messages.frames import NO_TARE, FloatArray, Stamp
+from palpate.protos.messages.frames import NO_TARE, ElectrodeFrame, FloatArray, Stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,19 @@ class TareRequest:
 
     tare_id: int = NO_TARE
     frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class FieldRequest:
+    """Ask a field service for the field of one frame.
+
+    Attributes:
+        sensor: Name of the sensor in the key of its streams; its gateway knows the frame's tare.
+        frame: Raw counts of one sampling round.
+    """
+
+    sensor: str
+    frame: ElectrodeFrame
 
 
 @dataclass(frozen=True, slots=True)

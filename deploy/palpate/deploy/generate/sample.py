@@ -1,0 +1,143 @@
+"""A small part of an experiment that travels with the program: a data set, a tape to play."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.deploy.generate.assemble import skin_mesh
+from palpate.deploy.generate.mechanics import STORE
+from palpate.deploy.generate.pipeline import MIXED
+from palpate.deploy.generate.trials import FOLDER, read_trials
+from palpate.fem.population.member import Member
+from palpate.fem.result import Trajectory
+from palpate.fem.store.read import SimulationStore
+from palpate.protos.errors import DatasetError
+from palpate.protos.tape import TapePress, build_tape, tape_unit, write_tape
+from palpate.training.twin.basis import encode, fit_basis
+from palpate.training.twin.content import FloatArray, MixedDataset
+from palpate.training.twin.hdf5 import read_mixed, write_mixed
+from palpate.training.twin.subset import subset
+
+Floats = NDArray[np.float64]
+
+DATASET_MODES = 12
+"""Modes of the sample's fields: 0.8 MB, a hundredth of a millimetre."""
+
+TAPE_STEPS = 16
+"""Steps of a press on tape; between them a player interpolates."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What was written.
+
+    Attributes:
+        trajectories: Ids of both.
+        trials: In the data set.
+        dataset_bytes: Its size.
+        tape_bytes: Size of the tape.
+    """
+
+    trajectories: tuple[str, ...]
+    trials: int
+    dataset_bytes: int
+    tape_bytes: int
+
+
+def make_sample(folder: Path, members: Sequence[Member], dataset: Path, tape: Path) -> Sample:
+    """Take one normal and one angled trajectory of each indenter.
+
+    Args:
+        folder: A finished experiment.
+        members: Its units.
+        dataset: Mixed data set to write.
+        tape: Tape to write.
+
+    Raises:
+        DatasetError: The folder is no finished experiment, or damaged.
+    """
+    mixed = read_mixed(folder / MIXED)
+    wanted = _picked(mixed)
+    trials = [
+        k
+        for k, t in enumerate(mixed.experiment.trial_trajectory)
+        if mixed.experiment.trajectories[t] in wanted
+    ]
+    small = _fewer_modes(subset(mixed, trials))
+    write_mixed(dataset, small)
+    _write_tape(folder, members, wanted, tape)
+    return Sample(wanted, len(trials), dataset.stat().st_size, tape.stat().st_size)
+
+
+def _picked(mixed: MixedDataset) -> tuple[str, ...]:
+    """Of each indenter the first normal and the first angled trajectory of most units."""
+    data = mixed.experiment
+    units = np.bincount(data.trial_trajectory, minlength=len(data.trajectories))
+    picked: dict[tuple[str, bool], str] = {}
+    for k in sorted(range(len(units)), key=lambda k: (-units[k], data.trajectories[k])):
+        name = data.trajectories[k]
+        if units[k]:
+            picked.setdefault((data.indenters[k], name.endswith("/normal")), name)
+    if not picked:
+        raise DatasetError("the mixed data set has no trial", remedy="generate it again")
+    return tuple(sorted(picked.values()))
+
+
+def _fewer_modes(mixed: MixedDataset) -> MixedDataset:
+    fields = mixed.displacement(slice(0, len(mixed)))
+
+    def blocks() -> list[FloatArray]:
+        return [fields]
+
+    basis = fit_basis(blocks, count=DATASET_MODES)
+    return replace(mixed, basis=basis, coefficients=encode(basis, fields))
+
+
+def _write_tape(folder: Path, members: Sequence[Member], names: Sequence[str], path: Path) -> None:
+    store = SimulationStore.open(folder / STORE)
+    fingertip = store.fingertip()
+    mesh = skin_mesh(fingertip)
+    played = [member.unit for member in members]
+    presses, rests = [], {}
+    for name in names:
+        done = read_trials(folder / FOLDER, name)
+        rests.update({unit: rows[0] for unit, rows in done.counts.items()})
+        counts = np.stack([done.counts[unit.name] for unit in played])
+        rest_pa = fingertip.fluid_pressure_pa
+        presses.append(_press(name, store.trajectory(name), counts, rest_pa))
+    build = build_tape(
+        units=[tape_unit(unit.name, unit.to_json(), rests[unit.name]) for unit in played],
+        presses=presses,
+        rest_pressure_pa=fingertip.fluid_pressure_pa,
+        nodes=mesh.nodes,
+        outer_faces=mesh.outer_faces,
+        inner_faces=mesh.inner_faces,
+        mesh_sha256=bytes.fromhex(mesh.sha256),
+        source="palpate data generate; made by palpate, use as you like",
+    )
+    write_tape(path, build)
+
+
+def _press(name: str, trajectory: Trajectory, counts: Floats, rest_pa: float) -> TapePress:
+    """Untouched, then a few of the converged steps."""
+    steps = trajectory.steps[: counts.shape[1] - 1]
+    some = np.unique(np.linspace(0, len(steps) - 1, TAPE_STEPS).round().astype(int))
+    chosen = [steps[k] for k in some]
+    still = np.zeros((1, 3))
+    return TapePress(
+        id=name,
+        indenter=trajectory.indenter,
+        poses=np.concatenate([trajectory.path[:1], [step.pose for step in chosen]]),
+        force=np.concatenate([still, [step.force for step in chosen]]),
+        torque=np.concatenate([still, [step.torque for step in chosen]]),
+        fluid_pressure_pa=np.array([rest_pa, *(step.fluid_pressure_pa for step in chosen)]),
+        counts=counts[:, np.concatenate([[0], some + 1])],
+        displacement=np.concatenate(
+            [np.zeros_like(chosen[0].displacement)[None], [step.displacement for step in chosen]]
+        ),
+    )

@@ -1,0 +1,65 @@
+"""From a frame to its estimate: find the tare that it names, then ask the pure function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from palpate.protos.messages import NO_TARE, ElectrodeFrame, Tare
+from palpate.protos.session import Session
+from palpate.protos.tares import TareBook
+from palpate.services.answering import Freshness
+from palpate.services.baselines import Baselines
+from palpate.services.config import ElectrodesConfig
+from palpate.services.estimator import Refusal
+from palpate.services.runtime import Runtime
+
+E = TypeVar("E")
+
+TARE_UNKNOWN = "tare_unknown"
+
+
+class TaredFrames(Generic[E]):
+    """Answers frames, each with its own tare. Use from one thread.
+
+    Args:
+        session: Where tares are heard of and asked for.
+        config: How long to wait for one.
+        runtime: The loaded bundle.
+        estimate: The pure function of frame, tare and bundle.
+        any_age: Answer a frame that has grown old while its tare was looked for: somebody asked
+            for this very frame.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        config: ElectrodesConfig,
+        runtime: Runtime,
+        estimate: Callable[[ElectrodeFrame, Tare | None, Runtime], E | Refusal],
+        *,
+        any_age: bool = False,
+    ) -> None:
+        book = TareBook(session, query_timeout_s=config.tare_timeout_s)
+        self._baselines = Baselines(book, patient=config.delivery == "every")
+        self._freshness = None if any_age else Freshness(config)
+        self._runtime = runtime
+        self._estimate = estimate
+
+    def answer(self, sensor: str, frame: ElectrodeFrame) -> E | str:
+        """The estimate of a frame, or the reason why there is none.
+
+        Args:
+            sensor: Name of the sensor.
+            frame: Raw counts of one sampling round.
+        """
+        tare = None
+        if frame.tare_id != NO_TARE:
+            tare, waited = self._baselines.find(sensor, frame.tare_id)
+            if tare is None:
+                return TARE_UNKNOWN
+            if waited and self._freshness is not None:
+                reason = self._freshness.refusal(frame.stamp)
+                if reason is not None:
+                    return reason
+        return self._estimate(frame, tare, self._runtime)

@@ -1,0 +1,176 @@
+"""The experiment on the twin, end to end and small: stages, going on, clusters, damaged folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.deploy.generate.mechanics import STORE
+from palpate.deploy.generate.pipeline import EXPERIMENT, MIXED, Generated, generate
+from palpate.deploy.generate.spec import FILE, ExperimentSpec, provenance_sha256
+from palpate.deploy.generate.spread import Processes, Ray, WorkerLostError
+from palpate.deploy.generate.trials import FOLDER
+from palpate.fem.electrodes.unit import UnitParameters
+from palpate.fem.population.member import PAPER, Member
+from palpate.fem.store.read import SimulationStore
+from palpate.protos.errors import ConfigError, DatasetError
+from palpate.training.twin.hdf5 import read_experiment, read_mixed
+
+SPEC = ExperimentSpec(
+    points=1, angled=1, edge_m=1.2e-3, overtravel_m=0.2e-3, indenters=("sphere_medium",)
+)
+
+
+def members() -> tuple[Member, ...]:
+    """Two units, one of which was pressed deeper than planned."""
+    unit = replace(UnitParameters(), noise_counts=1.0)
+    return (
+        Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
+        Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
+    )
+
+
+def run(folder: Path, *, ray: str | None = None) -> Generated:
+    done = generate(folder, SPEC, members(), workers=1, ray=ray)
+    assert done is not None
+    return done
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory: pytest.TempPathFactory) -> Generated:
+    return run(tmp_path_factory.mktemp("twin") / "one")
+
+
+def test_both_data_sets_hold_what_was_executed(generated: Generated) -> None:
+    experiment = read_experiment(generated.folder / EXPERIMENT)
+    mixed = read_mixed(generated.folder / MIXED)
+    assert experiment.unit_names == ("biotac-1", "biotac-2")
+    assert set(experiment.trajectories) == {
+        "sphere_medium/00/normal",
+        "sphere_medium/00/angled-0",
+    }
+    assert len(experiment.trial_unit) == 4
+    size = np.linalg.norm(experiment.force, axis=1)
+    first = np.concatenate([[True], np.diff(experiment.trial) != 0])
+    np.testing.assert_allclose(size[first], 0.5, rtol=1e-5)
+    assert experiment.force[:, 2].min() > 0  # the pad is pressed towards the nail
+    # Twenty rows a trial, and the simulated force is what the sensor measured but for its noise.
+    assert len(mixed) == 20 * len(mixed.experiment.trial_unit)
+    difference = np.linalg.norm(mixed.simulated_force - mixed.experiment.force, axis=1)
+    assert np.median(difference) < 0.1
+    assert mixed.basis.loss_mean_m < 1e-6
+    moved = np.linalg.norm(mixed.displacement(slice(0, len(mixed))), axis=2)
+    assert moved.max(axis=1).min() > 0.2e-3
+    assert len(mixed.mesh.subset) == 128
+
+
+def test_a_unit_that_stands_wrong_is_pressed_deeper(generated: Generated) -> None:
+    data = generated.data.experiment
+    largest = [np.linalg.norm(data.force[data.row_unit == unit], axis=1).max() for unit in range(2)]
+    assert largest[0] > 1.02 * largest[1]
+    # ... and says so: its tip is believed to be lower than it is.
+    last = [
+        data.location[(data.row_unit == u) & (data.row_trajectory == 1)][-1, 2] for u in range(2)
+    ]
+    assert abs(last[0] - last[1]) < 0.15e-3  # both believe to have gone as far
+
+
+def test_rows_carry_the_digest_of_all_that_decides_them(generated: Generated) -> None:
+    key = SimulationStore.open(generated.folder / STORE).fingertip().key
+    digest = provenance_sha256(SPEC, members(), key)
+    assert generated.data.mixed.experiment.provenance.input_sha256 == digest
+    other = provenance_sha256(replace(SPEC, seed=1), members(), key)
+    assert other != digest
+
+
+@pytest.fixture
+def again(generated: Generated) -> Iterator[Generated]:
+    """The same folder; what a test damages is made again."""
+    yield generated
+    run(generated.folder)
+
+
+def test_a_killed_run_goes_on_with_the_same_rows(again: Generated) -> None:
+    before = again.data.experiment
+    trial = next((again.folder / FOLDER).glob("*normal.npz"))
+    kept = next((again.folder / FOLDER).glob("*angled-0.npz"))
+    stamp = kept.stat().st_mtime_ns
+    trial.unlink()
+    trial.with_suffix(".part").write_bytes(b"half")
+    (again.folder / EXPERIMENT).unlink()
+    after = run(again.folder).data.experiment
+    np.testing.assert_array_equal(after.tared, before.tared)
+    np.testing.assert_array_equal(after.force, before.force)
+    assert kept.stat().st_mtime_ns == stamp  # what was there was not made again
+    assert (again.folder / EXPERIMENT).exists()
+
+
+def test_a_cluster_gives_the_same_rows(generated: Generated, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="needs palpate[cluster]")
+    there = run(tmp_path / "cluster", ray="local").data
+    here = generated.data
+    # The same solver on the same processor; threads may be shared out otherwise.
+    np.testing.assert_allclose(there.experiment.force, here.experiment.force, atol=1e-3)
+    assert there.experiment.trajectories == here.experiment.trajectories
+
+
+def test_another_experiment_does_not_go_into_the_same_folder(generated: Generated) -> None:
+    with pytest.raises(ConfigError, match="seed 3 is not 0"):
+        generate(generated.folder, replace(SPEC, seed=3), members(), workers=1)
+    with pytest.raises(ConfigError, match="members"):
+        generate(generated.folder, SPEC, members()[:1], workers=1)
+
+
+def test_damaged_files_are_named(again: Generated) -> None:
+    trial = next((again.folder / FOLDER).glob("*normal.npz"))
+    whole = trial.read_bytes()
+    trial.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DatasetError, match=r"normal\.npz"):
+        run(again.folder)
+    trial.unlink()
+
+
+def test_a_damaged_spec_is_named(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text("{", encoding="utf-8")
+    with pytest.raises(ConfigError, match=FILE):
+        generate(tmp_path, SPEC, members(), workers=1)
+    (tmp_path / FILE).write_text(json.dumps({"schema": "other"}), encoding="utf-8")
+    with pytest.raises(ConfigError, match="another experiment"):
+        generate(tmp_path, SPEC, members(), workers=1)
+
+
+def square(value: int) -> int:
+    """A task."""
+    if value < 0:
+        raise DatasetError("negative", remedy="give another")
+    return value * value
+
+
+def end_process(value: int) -> int:
+    """A task that takes its process with it."""
+    import os
+
+    os._exit(value)
+
+
+def test_processes_answer_every_task_and_hand_errors_on() -> None:
+    pool = Processes(2)
+    try:
+        assert sorted(pool.run(square, range(20))) == [(k, k * k) for k in range(20)]
+        with pytest.raises(DatasetError, match="negative"):
+            list(pool.run(square, [-1]))
+        with pytest.raises(WorkerLostError, match="died"):
+            list(pool.run(end_process, [1]))
+    finally:
+        pool.close()
+
+
+def test_ray_that_is_not_there_is_said() -> None:
+    pytest.importorskip("ray", reason="needs palpate[cluster]")
+    with pytest.raises(OSError, match="no Ray cluster"):
+        Ray("127.0.0.1:1")

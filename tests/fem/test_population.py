@@ -1,0 +1,141 @@
+"""Units on one finger: answers, and a fit that finds the range of a planted unit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from palpate.fem.electrodes.gap import Gap
+from palpate.fem.electrodes.sensor import Electrodes
+from palpate.fem.electrodes.table import POSITIONS
+from palpate.fem.electrodes.unit import UnitParameters
+from palpate.fem.mesh.parametric import biotac
+from palpate.fem.population.answers import Extremes
+from palpate.fem.population.fit import fit_unit
+from palpate.fem.population.fitting import OVERTRAVELS_M, Deep, overtravel_for
+from palpate.fem.population.member import (
+    PAPER,
+    Member,
+    Wanted,
+    read_population,
+    write_population,
+)
+from palpate.protos.errors import ConfigError, DatasetError
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def sensor() -> Electrodes:
+    return Electrodes(biotac(edge_m=0.8e-3), edge_m=0.9e-3)
+
+
+@pytest.fixture(scope="module")
+def states(sensor: Electrodes) -> tuple[list[Gap], Gap]:
+    """Presses over single electrodes: closed there, open elsewhere; and the untouched finger."""
+    rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
+    pressed = []
+    for centre in POSITIONS[[0, 1, 3, 8, 16, 17]]:
+        away = np.linalg.norm(sensor.film.nodes - centre, axis=1)
+        inside = np.exp(-((away / 2.5e-3) ** 2))
+        gap = rest.gap * (1 - inside) + 0.2e-3 * (1 - inside)
+        pressed.append(replace(rest, gap=gap, pressure=2e5 * inside**4))
+    return pressed, rest
+
+
+def tared(sensor: Electrodes, states: list[Gap], rest: Gap) -> Floats:
+    base = sensor.of_gap(rest).counts
+    return np.array([sensor.of_gap(gap).counts - base for gap in states]) / 4095
+
+
+def test_fit_finds_the_range_of_a_planted_unit(
+    sensor: Electrodes, states: tuple[list[Gap], Gap]
+) -> None:
+    pressed, rest = states
+    planted = replace(
+        UnitParameters(), sigma_s_m=0.30, squeeze_pa=1.2e4, floor_m=3e-6, side_closing_m=0.15e-3
+    )
+    ends = Extremes.of(tared(sensor.with_unit(planted), pressed, rest))
+    start = replace(UnitParameters(), name="unit")
+    before = Extremes.of(tared(sensor.with_unit(start), pressed, rest))
+    assert max(abs(before.low - ends.low), abs(before.high - ends.high)) > 0.01
+    fitted = fit_unit(sensor.with_unit(start), pressed, rest, (ends.low, ends.high))
+    assert fitted.found.low == pytest.approx(ends.low, abs=4e-3)
+    assert fitted.found.high == pytest.approx(ends.high, abs=4e-3)
+    again = Extremes.of(tared(sensor.with_unit(fitted.unit), pressed, rest))
+    assert (again.low, again.high) == pytest.approx((fitted.found.low, fitted.found.high))
+    assert fitted.unit.name == "unit"
+
+
+def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
+    sensor: Electrodes, states: tuple[list[Gap], Gap]
+) -> None:
+    pressed, rest = states
+    wide, narrow = (
+        sensor.with_unit(replace(UnitParameters(), side_closing_m=m)) for m in (0.0, 0.35e-3)
+    )
+    lateral = [0, 3, 5, 10, 13, 15]
+    assert (narrow.of_gap(rest).counts < wide.of_gap(rest).counts)[lateral].all()
+    highest = [tared(one, pressed, rest)[:, lateral].max() for one in (wide, narrow)]
+    assert highest[1] > 1.3 * highest[0]
+
+
+def deep(indenter: str, forces: list[float]) -> Deep:
+    """A trajectory planned to end at its third step, 0.1 mm a step."""
+    left = 1e-4 * (2.0 - np.arange(len(forces)))
+    return Deep(f"{indenter}/00/normal", indenter, left, np.array(forces), (None,) * 7)
+
+
+def test_overtravel_is_what_the_largest_force_asks_for() -> None:
+    wanted = Wanted("one", -0.5, 0.1, 10.0, ("sphere_",))
+    states = [
+        deep("sphere_small", [1.0, 2.0, 4.0, 7.0, 9.5, 14.0]),
+        deep("cube", [5.0, 10.0, 20.0, 30.0, 31.0, 32.0]),  # another unit's
+    ]
+    index, force = overtravel_for(states, wanted, most_m=6e-4)
+    assert (index, force) == (2, 9.5)
+    assert overtravel_for(states, wanted, most_m=1e-4) == (1, 7.0)
+    assert states[0].deepest(float(OVERTRAVELS_M[0])) == 2
+    with pytest.raises(DatasetError, match="one"):
+        overtravel_for(states[1:], wanted, most_m=6e-4)
+
+
+def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
+    members = [
+        Member(replace(UnitParameters(), name=wanted.name), wanted, 1e-4 * i, {"low": -0.5})
+        for i, wanted in enumerate(PAPER)
+    ]
+    path = tmp_path / "three.json"
+    write_population(path, members, source="test")
+    assert list(read_population(path)) == members
+    content = json.loads(path.read_text(encoding="utf-8"))
+    for break_it, word in (
+        (lambda c: c.update(schema="other/1"), "schema"),
+        (lambda c: c["members"][0]["unit"].update(sigma_s_m=-1.0), "sigma_s_m"),
+        (lambda c: c["members"][1].pop("overtravel_m"), "overtravel_m"),
+        (lambda c: c["members"].append(c["members"][0]), "biotac-1"),
+        (lambda c: c.update(members=[]), "nothing"),
+    ):
+        broken = json.loads(json.dumps(content))
+        break_it(broken)
+        path.write_text(json.dumps(broken), encoding="utf-8")
+        with pytest.raises(ConfigError, match=word):
+            read_population(path)
+    with pytest.raises(ConfigError, match="nowhere"):
+        read_population(tmp_path / "nowhere.json")
+
+
+def test_shipped_units_have_the_published_ranges() -> None:
+    """Fitted on the whole generated set; the numbers beside them were found on it."""
+    members = read_population()
+    assert [member.unit.name for member in members] == [wanted.name for wanted in PAPER]
+    for member, wanted in zip(members, PAPER, strict=True):
+        assert member.wanted == wanted
+        assert member.found["low"] == pytest.approx(wanted.low, abs=0.03)
+        assert member.found["high"] == pytest.approx(wanted.high, abs=0.03)
+        assert member.found["max_force_n"] == pytest.approx(wanted.max_force_n, rel=0.2)

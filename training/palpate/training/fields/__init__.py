@@ -1,0 +1,1 @@
+"""Electrodes to displacement fields of the skin, and back: small networks on the mixed data set."""

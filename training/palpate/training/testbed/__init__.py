@@ -1,0 +1,1 @@
+"""The testbed: registration, kinematics, plan, and the streams of real and played experiments."""
