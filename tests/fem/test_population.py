@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +89,7 @@ def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
 
 def deep(indenter: str, forces: list[float]) -> Deep:
     """A trajectory planned to end at its third step, 0.1 mm a step."""
-    left = 1e-4 * (2.0 - np.arange(len(forces)))
+    left: Floats = np.array([1e-4 * (2 - k) for k in range(len(forces))])
     return Deep(f"{indenter}/00/normal", indenter, left, np.array(forces), (None,) * 7)
 
 
@@ -114,13 +116,14 @@ def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
     write_population(path, members, source="test")
     assert list(read_population(path)) == members
     content = json.loads(path.read_text(encoding="utf-8"))
-    for break_it, word in (
+    cases: list[tuple[Callable[[Any], Any], str]] = [
         (lambda c: c.update(schema="other/1"), "schema"),
         (lambda c: c["members"][0]["unit"].update(sigma_s_m=-1.0), "sigma_s_m"),
         (lambda c: c["members"][1].pop("overtravel_m"), "overtravel_m"),
         (lambda c: c["members"].append(c["members"][0]), "biotac-1"),
         (lambda c: c.update(members=[]), "nothing"),
-    ):
+    ]
+    for break_it, word in cases:
         broken = json.loads(json.dumps(content))
         break_it(broken)
         path.write_text(json.dumps(broken), encoding="utf-8")

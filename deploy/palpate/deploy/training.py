@@ -44,11 +44,15 @@ class _DataGroup(_LazyGroup):
     room = "data"
 
     def joined(self) -> dict[str, Any]:
-        """``generate`` needs finite elements to make data and training to process it."""
+        """What needs finite elements to simulate the skin, and training for all else."""
         from palpate.deploy.cli_generate import generate_app, sample_app
+        from palpate.deploy.cli_plan import plan_app
+        from palpate.deploy.cli_process import process_app
 
         return {
             "generate": typer.main.get_command(generate_app),
+            "plan": typer.main.get_command(plan_app),
+            "process": typer.main.get_command(process_app),
             "sample": typer.main.get_command(sample_app),
         }
 

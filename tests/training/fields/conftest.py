@@ -64,7 +64,7 @@ def dent(points: Floats, centre: Floats, depth: Floats, shear: Floats) -> Floats
     """Displacement [m] of points (V, 3) by presses at a centre of so many depths (S,)."""
     normal = -centre / np.linalg.norm(centre)
     shape = np.exp(-np.sum((points - centre) ** 2, axis=1) / (2 * DENT_M**2))
-    return depth[:, None, None] * shape[None, :, None] * (normal + shear)
+    return np.asarray(depth[:, None, None] * shape[None, :, None] * (normal + shear))
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from palpate.protos.bundle import read_bundle
 from palpate.training.cli import train_app
+from palpate.training.cli_fields import EPOCHS
 from palpate.training.evaluate import Result
-from palpate.training.fields import fit
 from palpate.training.fields.evaluate import ALL, MEAN, OWN, RIDGE, ZERO, TaskReport, typical
 from palpate.training.fields.evaluate_field import evaluate_field
 from palpate.training.fields.evaluate_synthesis import evaluate_synthesis
@@ -121,34 +122,26 @@ def test_files_and_the_papers_rows(
     assert f" {1e3 * value:.3f} (" in row
 
 
-def test_one_command_writes_the_table(
-    mixed: MixedDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from palpate.training.fields import evaluate_synthesis as synthesis_room
-    from palpate.training.fields import features_report
-
-    monkeypatch.setattr(fit.FitConfig, "__init__", _brief(fit.FitConfig.__init__))
-    defaults = features_report.evaluate_features.__kwdefaults__
-    monkeypatch.setitem(defaults, "config", SHORT)
-    assert synthesis_room.FitConfig().epochs == 2
+def test_one_command_writes_the_table(mixed: MixedDataset, tmp_path: Path) -> None:
     write_mixed(tmp_path / "mixed.h5", mixed)
     write_experiment(tmp_path / "experiment.h5", mixed.experiment)
+    few = ["--epochs", "2"]
     words = ["twin", str(tmp_path / "mixed.h5"), str(tmp_path / "experiment.h5")]
-    result = CliRunner().invoke(train_app, [*words, str(tmp_path / "out"), "--seeds", "1"])
+    result = CliRunner().invoke(train_app, [*words, str(tmp_path / "out"), "--seeds", "1", *few])
     assert result.exit_code == 0, result.output
     assert (tmp_path / "out" / "twin.md").is_file()
+    assert json.loads((tmp_path / "out" / "twin-field.json").read_text())["config"]["epochs"] == 2
     for command, option in (("field", "--units"), ("synthesis", "--unit")):
         words = [command, str(tmp_path / "mixed.h5"), str(tmp_path / command), option, "biotac-2"]
-        result = CliRunner().invoke(train_app, words)
+        result = CliRunner().invoke(train_app, [*words, *few])
         assert result.exit_code == 0, result.output
-        assert (tmp_path / command / "model.onnx").is_file()
+        bundle = read_bundle(tmp_path / command)
+        assert bundle.manifest.task == command
+        assert ": biotac-2;" in bundle.manifest.trained_on
 
 
-def _brief(original: object) -> object:
-    def start(self: FitConfig, **settings: object) -> None:
-        original(self, **{"widths": (16,), "epochs": 2, "patience": 2, **settings})  # type: ignore[operator]
-
-    return start
+def test_the_commands_train_as_long_as_the_library() -> None:
+    assert FitConfig().epochs == EPOCHS
 
 
 def test_typical_row_is_the_median_of_the_harder_half() -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from palpate.training import cli_data, cli_fields, cli_figures
+from palpate.training import cli_data, cli_fields, cli_figures, cli_testbed
 from palpate.training.cli_data import contents
 from palpate.training.ingest_lasa import BLOCKS_PER_RECORDING, ELECTRODE_LAG_ROWS, ingest_lasa
 from palpate.training.ingest_record import ingest_record
@@ -77,6 +77,8 @@ def data_ingest_record(
     console.print(contents(data, str(out)))
 
 
+data_app.command("register")(cli_testbed.data_register)
+data_app.command("ingest")(cli_testbed.data_ingest)
 data_app.command("inspect")(cli_data.data_inspect)
 data_app.command("export")(cli_data.data_export)
 data_app.command("features")(cli_data.data_features)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.protos.errors import ConfigError
+from palpate.training.cli_testbed import print_trials
 from palpate.training.dataset import FeatureDataset
 from palpate.training.schema import SCHEMA, UNITS, open_dataset, write_dataset
 from palpate.training.twin.container import schema_of
@@ -21,6 +22,7 @@ from palpate.training.twin.export import export_csv, export_published
 from palpate.training.twin.features import UNTOUCHED_ROWS, features
 from palpate.training.twin.inspect import Contents, load
 from palpate.training.twin.inspect import contents as experiment_contents
+from palpate.training.twin.raw_file import TRIALS_SCHEMA
 
 console = Console()
 
@@ -45,7 +47,11 @@ def data_inspect(
 
     palpate data inspect presses.h5
     """
-    if path.is_file() and schema_of(path) == SCHEMA:
+    schema = schema_of(path) if path.is_file() else ""
+    if schema == TRIALS_SCHEMA:
+        print_trials(path, as_json=as_json)
+        return
+    if schema == SCHEMA:
         data = open_dataset(path)
         if as_json:
             console.print_json(json.dumps(_features_summary(data)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,11 @@ from rich.table import Table
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
 Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
 Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
+Epochs = Annotated[int, typer.Option(min=1, help="Passes over the training rows at most.")]
 Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
+
+EPOCHS = 150
+"""The default of ``FitConfig``, whose module needs torch."""
 
 console = Console()
 
@@ -29,6 +34,7 @@ def train_field(
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "field",
     version: Version = 1,
     seed: Seed = 0,
+    epochs: Epochs = EPOCHS,
 ) -> None:
     """Electrodes -> displacement of the whole skin: train, test on unseen trajectories, write.
 
@@ -38,7 +44,7 @@ def train_field(
     from palpate.training.fields.fit import FitConfig
     from palpate.training.twin.hdf5 import read_mixed
 
-    config = FitConfig()
+    config = FitConfig(epochs=epochs)
     chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
     with _progress() as progress:
         task = progress.add_task("field", total=config.epochs)
@@ -62,6 +68,7 @@ def train_synthesis(
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "synthesis",
     version: Version = 1,
     seed: Seed = 0,
+    epochs: Epochs = EPOCHS,
 ) -> None:
     """Displacement of the skin -> electrodes of one unit: train, test on unseen, write.
 
@@ -71,7 +78,7 @@ def train_synthesis(
     from palpate.training.fields.fit import FitConfig
     from palpate.training.twin.hdf5 import read_mixed
 
-    config = FitConfig()
+    config = FitConfig(epochs=epochs)
     with _progress() as progress:
         task = progress.add_task("synthesis", total=config.epochs)
         metrics = synthesis_bundle(
@@ -93,6 +100,7 @@ def train_twin(
     out: Annotated[Path, typer.Argument(help="Folder for twin.md, its figures and JSON.")],
     seeds: Annotated[int, typer.Option(min=1, help="Networks of each kind.")] = 3,
     split_seed: Annotated[int, typer.Option(help="Seed of the split.")] = 0,
+    epochs: Epochs = EPOCHS,
 ) -> None:
     """Field, synthesis, force and location on unseen trajectories, beside the paper's numbers.
 
@@ -101,7 +109,12 @@ def train_twin(
     from palpate.training.fields.evaluate import networks
     from palpate.training.fields.evaluate_field import evaluate_field
     from palpate.training.fields.evaluate_synthesis import evaluate_synthesis
-    from palpate.training.fields.features_report import evaluate_features, features_networks
+    from palpate.training.fields.features_report import (
+        PAPER_CONFIG,
+        evaluate_features,
+        features_networks,
+    )
+    from palpate.training.fields.fit import FitConfig
     from palpate.training.fields.report import write_report
     from palpate.training.twin.hdf5 import read_experiment, read_mixed
 
@@ -113,11 +126,15 @@ def train_twin(
         def tick() -> None:
             progress.advance(task)
 
+        config = FitConfig(epochs=epochs)
+        paper = replace(PAPER_CONFIG, epochs=min(epochs, PAPER_CONFIG.epochs))
         reports = [
-            evaluate_field(fields, seeds=seeds, split_seed=split_seed, on_network=tick),
-            evaluate_synthesis(fields, seeds=seeds, split_seed=split_seed, on_network=tick),
-            *evaluate_features(presses, seeds=seeds, split_seed=split_seed, on_network=tick),
+            evaluate(fields, seeds=seeds, split_seed=split_seed, config=config, on_network=tick)
+            for evaluate in (evaluate_field, evaluate_synthesis)
         ]
+        reports += evaluate_features(
+            presses, seeds=seeds, split_seed=split_seed, config=paper, on_network=tick
+        )
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     for path in write_report(out, reports, fields.mesh, command=command, seeds=seeds):
         console.print(f"wrote {path}")

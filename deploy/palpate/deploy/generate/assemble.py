@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from palpate.deploy.generate.mechanics import OnProgress
 from palpate.deploy.generate.trials import file_of, read_trials
+from palpate.fem.result import Trajectory
 from palpate.fem.store.content import StoredFingertip
 from palpate.fem.store.read import SimulationStore
 from palpate.fem.trajectory import CLEARANCE_M
@@ -80,23 +81,65 @@ def assemble(
         dropped += [(f"{unit} {name}", why) for unit, why in done.dropped]
         if done.rows:
             rows[name] = done.rows
-            simulated[name] = _simulated(store, name, done.believed)
+            simulated[name] = simulated_trial(name, store.trajectory(name), done.believed)
         on_progress(k + 1, len(names), "read")
     every = [one for some in rows.values() for one in some]
     experiment = assemble_experiment(every, provenance, unit_names=unit_names)
+    mixed = join(
+        every,
+        simulated,
+        dropped,
+        fingertip,
+        provenance,
+        unit_names=unit_names,
+        on_progress=on_progress,
+    )
+    return Assembled(experiment, mixed, sorted(dropped))
+
+
+def join(
+    rows: Sequence[TrialRows],
+    simulated: dict[str, SimulatedTrial],
+    dropped: list[tuple[str, str]],
+    fingertip: StoredFingertip,
+    provenance: Provenance,
+    *,
+    unit_names: tuple[str, ...],
+    on_progress: OnProgress,
+) -> MixedDataset:
+    """Make the mixed data set of trials, real ones or the twin's, and their simulations.
+
+    Args:
+        rows: Trials whose trajectories were simulated.
+        simulated: By trajectory.
+        dropped: Gets trial and reason of each that cannot be mixed.
+        fingertip: What was simulated.
+        provenance: Of the data set.
+        unit_names: Units, in order.
+        on_progress: Called before each part of the work.
+
+    Raises:
+        DatasetError: Nothing is left.
+    """
     mesh = skin_mesh(fingertip)
     on_progress(0, 1, "basis of the fields")
     basis = fit_basis(lambda: _blocks(simulated.values()))
     on_progress(0, 1, "mixed data set")
     mixed = assemble_mixed(
-        _mixed(every, simulated, dropped), basis, mesh, provenance, unit_names=unit_names
+        _mixed(rows, simulated, dropped), basis, mesh, provenance, unit_names=unit_names
     )
     on_progress(1, 1, "mixed data set")
-    return Assembled(experiment, mixed, sorted(dropped))
+    return mixed
 
 
-def _simulated(store: SimulationStore, name: str, believed: int) -> SimulatedTrial:
-    trajectory = store.trajectory(name)
+def simulated_trial(name: str, trajectory: Trajectory, believed: int) -> SimulatedTrial:
+    """A simulated trajectory from first contact on, as it is mixed with trials.
+
+    Args:
+        name: Its id.
+        trajectory: As simulated.
+        believed: How many of its steps to take, one or more.
+    """
     steps = trajectory.steps[:believed]
     poses = np.array([step.pose[:3] for step in steps])
     travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1) - CLEARANCE_M

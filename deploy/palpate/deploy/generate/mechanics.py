@@ -33,6 +33,11 @@ OnProgress = Callable[[int, int, str], None]
 """Called with how many are done, of how many, and a word on them."""
 
 
+def fingertip_of(spec: ExperimentSpec) -> StoredFingertip:
+    """The pressurised fingertip of an experiment, made in this process."""
+    return biotac(**spec.mesh_options)(spec.parameters, lambda _: None).describe()  # type: ignore[arg-type]
+
+
 def plans_of(spec: ExperimentSpec, fingertip: StoredFingertip) -> list[Indentation]:
     """All planned trajectories, first points first: what is there early is a fair sample."""
     names = tuple(make_indenter(name).name for name in spec.indenters) or indenter_names()
@@ -97,7 +102,7 @@ def simulate_on_cluster(
         DatasetError: The store is another fingertip's or damaged, or the disk refuses.
         WorkerLostError: The cluster lost machines again and again.
     """
-    fingertip = biotac(**spec.mesh_options)(spec.parameters, lambda _: None).describe()  # type: ignore[arg-type]
+    fingertip = fingertip_of(spec)
     plans = plans_of(spec, fingertip)
     with StoreWriter(store, fingertip, shared=True, outline=outline_of, command=COMMAND) as writer:
         done = writer.done()

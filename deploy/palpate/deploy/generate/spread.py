@@ -121,7 +121,11 @@ class Ray:
             WorkerLostError: A machine was lost more often than Ray repeats a task.
         """
         ray = self._ray
-        remote = ray.remote(num_cpus=1, max_retries=3)(function)
+
+        def call(task: Task) -> Answer:  # Ray takes functions only, no partial ones
+            return function(task)
+
+        remote = ray.remote(num_cpus=1, max_retries=3)(call)
         most = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
         pending: dict[Any, Task] = {}
         more = iter(tasks)

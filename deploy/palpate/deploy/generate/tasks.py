@@ -118,7 +118,7 @@ class TrialMaker:
 
     def __call__(self, task: TrialTask) -> TrialsDone:
         """Perform and process the trials of one trajectory."""
-        steps = task.trajectory.steps[: self._clear(task.trajectory)]
+        steps = task.trajectory.steps[: clear_steps(task.trajectory, self._held)]
         answers = self._population.answer(steps)
         counts = {
             name: np.concatenate([rest[None], answers[name]])
@@ -133,16 +133,21 @@ class TrialMaker:
                 dropped.append((name, str(failure)))
         return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
 
-    def _clear(self, trajectory: Trajectory) -> int:
-        """Steps before the indenter bears on what nail and clamp hold.
 
-        Such trajectories collide with the mount: the paper leaves them out.
-        """
-        for k, step in enumerate(trajectory.steps):
-            force = np.linalg.norm(step.indenter_force, axis=1)
-            if force[self._held].sum() > MOUNT_SHARE * force.sum():
-                return k
-        return len(trajectory.steps)
+def clear_steps(trajectory: Trajectory, held: NDArray[np.integer[Any]]) -> int:
+    """Steps before the indenter bears on what nail and clamp hold.
+
+    Such trajectories collide with the mount: the paper leaves them out.
+
+    Args:
+        trajectory: As simulated.
+        held: Ids of the nodes that are held.
+    """
+    for k, step in enumerate(trajectory.steps):
+        force = np.linalg.norm(step.indenter_force, axis=1)
+        if force[held].sum() > MOUNT_SHARE * force.sum():
+            return k
+    return len(trajectory.steps)
 
 
 MOUNT_SHARE = 0.05

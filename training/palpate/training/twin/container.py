@@ -89,24 +89,28 @@ def write_tables(
     Raises:
         DatasetError: The disk refused.
     """
-    h5 = require("h5py", extra="training")
     digest = tables.content_sha256()
+    with written_whole(path) as file:
+        write_header(file, schema, version, digest, tables.provenance, tables.numbers)
+        for name, column in columns.items():
+            write_array(file, name, column, tables.arrays[name])
+    logger.info("wrote %s: content %s", path, digest[:12])
+    return digest
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Iterator[h5py.File]:
+    """A file to write to, which gets its name when the block ends without an error.
+
+    Raises:
+        DatasetError: The disk refused.
+    """
+    h5 = require("h5py", extra="training")
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with h5.File(partial, "w") as file:
-            file.attrs.update(
-                {
-                    "schema": schema,
-                    "schema_version": version,
-                    "frame": SENSOR_FRAME,
-                    "content_sha256": digest,
-                    **tables.numbers,
-                    **{f"provenance.{k}": v for k, v in asdict(tables.provenance).items()},
-                }
-            )
-            for name, column in columns.items():
-                _write_array(h5, file, name, column, tables.arrays[name])
+            yield file
         os.replace(partial, path)
     except OSError as error:
         raise DatasetError(
@@ -115,14 +119,35 @@ def write_tables(
     finally:
         with contextlib.suppress(OSError):  # its folder may be what could not be made
             partial.unlink(missing_ok=True)
-    logger.info("wrote %s: content %s", path, digest[:12])
-    return digest
 
 
-def _write_array(
-    h5: Any, file: h5py.File, name: str, column: Column, array: npt.NDArray[Any]
+def write_header(
+    file: h5py.File,
+    schema: str,
+    version: int,
+    content_sha256: str,
+    provenance: Provenance,
+    numbers: Mapping[str, float | str | int],
 ) -> None:
+    """Write what a file says of itself, as its attributes."""
+    file.attrs.update(
+        {
+            "schema": schema,
+            "schema_version": version,
+            "frame": SENSOR_FRAME,
+            "content_sha256": content_sha256,
+            **numbers,
+            **{f"provenance.{k}": v for k, v in asdict(provenance).items()},
+        }
+    )
+
+
+def write_array(
+    file: h5py.File | h5py.Group, name: str, column: Column, array: npt.NDArray[Any]
+) -> None:
+    """Write an array with its unit, in chunks and compressed."""
     if column.dtype is str:
+        h5 = require("h5py", extra="training")
         # Texts lie on HDF5's heap, which no filter reaches.
         dataset = file.create_dataset(name, data=array, dtype=h5.string_dtype())
     else:
@@ -146,7 +171,7 @@ def schema_of(path: Path) -> str:
         DatasetError: It is missing or not a readable HDF5 file.
     """
     with opened(path) as file:
-        return _text(file.attrs.get("schema", ""))
+        return text(file.attrs.get("schema", ""))
 
 
 @contextlib.contextmanager
@@ -179,8 +204,8 @@ def read_tables(
             in another unit or type, or its content was changed; names file and array.
     """
     with opened(path) as file:
-        _check_header(path, file, schema, version)
-        arrays = {name: _read(path, file, name, column) for name, column in columns.items()}
+        check_header(path, file, schema, version)
+        arrays = {name: read_array(path, file, name, column) for name, column in columns.items()}
         attributes = dict(file.attrs)
     for name in (*numbers, "content_sha256"):
         if name not in attributes:
@@ -188,14 +213,9 @@ def read_tables(
     tables = Tables(
         arrays,
         {name: _plain(attributes[name]) for name in numbers},
-        Provenance(
-            **{
-                key: _text(attributes.get(f"provenance.{key}", ""))
-                for key in Provenance.__dataclass_fields__
-            }
-        ),
+        read_provenance(attributes),
     )
-    if _text(attributes["content_sha256"]) != tables.content_sha256():
+    if text(attributes["content_sha256"]) != tables.content_sha256():
         raise DatasetError(
             f"{path}: the content does not match its content_sha256",
             remedy="the rows were changed after writing; make the file again",
@@ -203,8 +223,23 @@ def read_tables(
     return tables
 
 
-def _check_header(path: Path, file: h5py.File, schema: str, version: int) -> None:
-    found = _text(file.attrs.get("schema", ""))
+def read_provenance(attributes: Mapping[str, Any]) -> Provenance:
+    """Where a file comes from, by its attributes; empty where it does not say."""
+    return Provenance(
+        **{
+            key: text(attributes.get(f"provenance.{key}", ""))
+            for key in Provenance.__dataclass_fields__
+        }
+    )
+
+
+def check_header(path: Path, file: h5py.File, schema: str, version: int) -> None:
+    """Check schema, version and frame.
+
+    Raises:
+        DatasetError: One is another.
+    """
+    found = text(file.attrs.get("schema", ""))
     if found != schema:
         raise DatasetError(
             f"{path}: schema is {found or 'not stated'!r}, expected {schema!r}",
@@ -216,7 +251,7 @@ def _check_header(path: Path, file: h5py.File, schema: str, version: int) -> Non
             f"{path}: schema version {number}, this palpate reads {version}",
             remedy="update palpate" if number > version else "make the file again",
         )
-    frame = _text(file.attrs.get("frame", ""))
+    frame = text(file.attrs.get("frame", ""))
     if frame != SENSOR_FRAME:
         raise DatasetError(
             f"{path}: attribute frame is {frame!r}",
@@ -224,13 +259,20 @@ def _check_header(path: Path, file: h5py.File, schema: str, version: int) -> Non
         )
 
 
-def _read(path: Path, file: h5py.File, name: str, column: Column) -> npt.NDArray[Any]:
+def read_array(
+    path: Path, file: h5py.File | h5py.Group, name: str, column: Column
+) -> npt.NDArray[Any]:
+    """Read an array and check unit and type.
+
+    Raises:
+        DatasetError: It is missing, or has another unit or type; names file and array.
+    """
     if name not in file:
         raise DatasetError(
             f"{path}: dataset {name!r} is missing", remedy=f"write {name} [{column.unit}]"
         )
     dataset = file[name]
-    unit = _text(dataset.attrs.get("unit", ""))
+    unit = text(dataset.attrs.get("unit", ""))
     if unit != column.unit:
         raise DatasetError(
             f"{path}: {name} is in {unit or 'no stated unit'!r}, expected {column.unit!r}",
@@ -238,7 +280,7 @@ def _read(path: Path, file: h5py.File, name: str, column: Column) -> npt.NDArray
         )
     array: npt.NDArray[Any] = dataset[()]
     if column.dtype is str:
-        return np.array([_text(value) for value in array], dtype=object)
+        return np.array([text(value) for value in array], dtype=object)
     if array.dtype != column.dtype:
         raise DatasetError(
             f"{path}: {name} is {array.dtype}, expected {np.dtype(column.dtype)}",
@@ -248,8 +290,9 @@ def _read(path: Path, file: h5py.File, name: str, column: Column) -> npt.NDArray
 
 
 def _plain(value: object) -> float | str:
-    return float(value) if isinstance(value, (float, np.floating)) else _text(value)
+    return float(value) if isinstance(value, (float, np.floating)) else text(value)
 
 
-def _text(value: object) -> str:
+def text(value: object) -> str:
+    """An attribute or element of HDF5 as text."""
     return value.decode() if isinstance(value, bytes) else str(value)
