@@ -20,7 +20,7 @@ from palpate.deploy.generate.trials import FOLDER
 from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.population.member import PAPER, Member
 from palpate.fem.store.read import SimulationStore
-from palpate.protos.errors import ConfigError, DatasetError
+from palpate.protos.errors import ConfigError, DatasetError, LinkError
 from palpate.training.twin.hdf5 import read_experiment, read_mixed
 
 SPEC = ExperimentSpec(
@@ -151,7 +151,7 @@ def test_processes_answer_every_task_and_hand_errors_on() -> None:
     try:
         answers = sorted(pool.run(math.sqrt, [float(k * k) for k in range(20)]))
         assert answers == [(float(k * k), float(k)) for k in range(20)]
-        with pytest.raises(ValueError, match="math domain|nonnegative"):
+        with pytest.raises(ValueError, match=r"math domain|nonnegative"):
             list(pool.run(math.sqrt, [-1.0]))
         with pytest.raises(WorkerLostError, match="died"):
             list(pool.run(os._exit, [1]))
@@ -161,5 +161,6 @@ def test_processes_answer_every_task_and_hand_errors_on() -> None:
 
 def test_ray_that_is_not_there_is_said() -> None:
     pytest.importorskip("ray", reason="needs palpate[cluster]")
-    with pytest.raises(OSError, match="no Ray cluster"):
-        Ray("127.0.0.1:1")
+    for address in ("127.0.0.1:1", "nowhere:x"):
+        with pytest.raises(LinkError, match="no Ray cluster"):
+            Ray(address)

@@ -37,7 +37,7 @@ def trial(
         electrodes=random.integers(2000, 3000, (count, 19)).astype(np.uint16),
         force=force,
         tip=random.normal(0.0, 1e-3, (count, 3)),
-        travel_m=1e-4 * (increment + 1.0),
+        travel_m=np.asarray(1e-4 * (increment + 1.0), np.float64),
         increment_end=np.arange(SAMPLES - 1, count, SAMPLES, dtype=np.int64),
     )
 

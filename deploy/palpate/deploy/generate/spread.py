@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -84,6 +85,26 @@ class Processes:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
+def _check_reachable(address: str) -> None:
+    """Ray itself asks a dead address for minutes, then ends the process.
+
+    Raises:
+        LinkError: Nothing listens there, or it is no address.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=REACH_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise LinkError(
+            f"no Ray cluster answers at {address!r}: {error}",
+            remedy="start one (ray start --head), or leave --ray out",
+        ) from error
+
+
+REACH_S = 5.0
+"""How long a cluster's port may take to answer [s]."""
+
+
 class Ray:
     """A Ray cluster; tasks keep what they make between calls in processes that Ray reuses."""
 
@@ -99,6 +120,8 @@ class Ray:
             LinkError: No cluster answers.
         """
         self._ray: Any = require("ray", extra="cluster")
+        if ":" in address:
+            _check_reachable(address)
         try:
             self._ray.init(
                 address=None if address == "local" else address,
