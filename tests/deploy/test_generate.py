@@ -14,6 +14,7 @@ import pytest
 
 from palpate.deploy.generate.mechanics import STORE
 from palpate.deploy.generate.pipeline import EXPERIMENT, MIXED, Generated, generate
+from palpate.deploy.generate.sample import make_sample
 from palpate.deploy.generate.spec import FILE, ExperimentSpec, provenance_sha256
 from palpate.deploy.generate.spread import Processes, Ray, WorkerLostError
 from palpate.deploy.generate.trials import FOLDER
@@ -21,6 +22,7 @@ from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.population.member import PAPER, Member
 from palpate.fem.store.read import SimulationStore
 from palpate.protos.errors import ConfigError, DatasetError, LinkError
+from palpate.protos.tape import read_tape
 from palpate.training.twin.hdf5 import read_experiment, read_mixed
 
 SPEC = ExperimentSpec(
@@ -164,3 +166,30 @@ def test_ray_that_is_not_there_is_said() -> None:
     for address in ("127.0.0.1:1", "nowhere:x"):
         with pytest.raises(LinkError, match="no Ray cluster"):
             Ray(address)
+
+
+def test_sample_is_small_and_playable_and_the_rest_lacks_it(
+    generated: Generated, tmp_path: Path
+) -> None:
+    """One normal and one angled press: here that is all there is, so nothing is left."""
+    with pytest.raises(DatasetError):
+        make_sample(
+            generated.folder,
+            members(),
+            tmp_path / "a.h5",
+            tmp_path / "a.npz",
+            tmp_path / "rest",
+        )
+    done = make_sample(generated.folder, members(), tmp_path / "s.h5", tmp_path / "t.npz")
+    assert set(done.trajectories) == set(generated.data.mixed.experiment.trajectories)
+    small, whole = read_mixed(tmp_path / "s.h5"), generated.data.mixed
+    np.testing.assert_array_equal(small.experiment.tared, whole.experiment.tared)
+    rows = slice(0, len(whole))
+    lost = np.linalg.norm(small.displacement(rows) - whole.displacement(rows), axis=2)
+    assert lost.mean() < 10e-6
+    tape = read_tape(tmp_path / "t.npz")
+    assert [unit.name for unit in tape.units] == ["biotac-1", "biotac-2"]
+    press = next(one for one in tape.trajectories if one.id.endswith("/normal"))
+    np.testing.assert_allclose(press.counts[0, 0], tape.units[0].rest_counts)
+    assert np.linalg.norm(press.force[-1]) > np.linalg.norm(press.force[1])
+    assert done.dataset_bytes + done.tape_bytes < 3e6

@@ -104,6 +104,10 @@ def sample(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A finished experiment.")],
     dataset: Annotated[Path, typer.Option("--dataset", metavar="FILE.h5", help="To write.")],
     tape: Annotated[Path, typer.Option("--tape", metavar="FILE.npz", help="To write.")],
+    rest: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Takes both data sets without what the tape plays."),
+    ] = None,
     units: Annotated[
         Path | None,
         typer.Option("--units", metavar="FILE.json", help="Population; none = the shipped three."),
@@ -113,7 +117,7 @@ def sample(
     from palpate.deploy.generate.sample import make_sample
     from palpate.fem.population.member import read_population
 
-    done = make_sample(folder, read_population(units), dataset, tape)
+    done = make_sample(folder, read_population(units), dataset, tape, rest)
     typer.echo(
         f"{len(done.trajectories)} trajectories; {dataset}: {done.trials} trials,"
         f" {done.dataset_bytes / 1e6:.2f} MB; {tape}: {done.tape_bytes / 1e6:.2f} MB"

@@ -182,26 +182,35 @@ def _mix(
             left_out.append((trial_name(one.header), why))
         on_progress(k + 1, len(names), "simulations")
     if not believable:
-        raise DatasetError(
-            f"{store.path}: no simulation of any trial"
-            + (f"; the first: {left_out[0][0]}: {left_out[0][1]}" if left_out else ""),
-            remedy="give the store of the plan that was executed, or leave --mechanics out",
-        )
+        raise _nothing_mixed(store, left_out)
     provenance = replace(
         experiment.provenance,
         source=f"{experiment.provenance.source}; simulation of {store.path.name}",
         notes=f"{experiment.provenance.notes}; fingertip {fingertip.key}",
     )
-    both = join(
-        believable,
-        simulated,
-        left_out,
-        fingertip,
-        provenance,
-        unit_names=experiment.unit_names,
-        on_progress=on_progress,
-    )
+    try:
+        both = join(
+            believable,
+            simulated,
+            left_out,
+            fingertip,
+            provenance,
+            unit_names=experiment.unit_names,
+            on_progress=on_progress,
+        )
+    except DatasetError as error:
+        if len(left_out) == len(rows):
+            raise _nothing_mixed(store, left_out) from error
+        raise
     return both, tuple(sorted(left_out))
+
+
+def _nothing_mixed(store: SimulationStore, left_out: Sequence[tuple[str, str]]) -> DatasetError:
+    trial, why = left_out[-1]
+    return DatasetError(
+        f"{store.path}: none of {len(left_out)} trials could be mixed; the last: {trial}: {why}",
+        remedy="give the store of the plan that was executed, or leave --mechanics out",
+    )
 
 
 def _away(rows: TrialRows, trajectory: Trajectory) -> float:

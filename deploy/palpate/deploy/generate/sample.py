@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.deploy.generate.assemble import skin_mesh
 from palpate.deploy.generate.mechanics import STORE
-from palpate.deploy.generate.pipeline import MIXED
+from palpate.deploy.generate.pipeline import EXPERIMENT, MIXED
 from palpate.deploy.generate.trials import FOLDER, read_trials
 from palpate.fem.population.member import Member
 from palpate.fem.result import Trajectory
@@ -19,8 +19,13 @@ from palpate.fem.store.read import SimulationStore
 from palpate.protos.errors import DatasetError
 from palpate.protos.tape import TapePress, build_tape, tape_unit, write_tape
 from palpate.training.twin.basis import encode, fit_basis
-from palpate.training.twin.content import FloatArray, MixedDataset
-from palpate.training.twin.hdf5 import read_mixed, write_mixed
+from palpate.training.twin.content import ExperimentDataset, FloatArray, MixedDataset
+from palpate.training.twin.hdf5 import (
+    read_experiment,
+    read_mixed,
+    write_experiment,
+    write_mixed,
+)
 from palpate.training.twin.subset import subset
 
 Floats = NDArray[np.float64]
@@ -49,7 +54,9 @@ class Sample:
     tape_bytes: int
 
 
-def make_sample(folder: Path, members: Sequence[Member], dataset: Path, tape: Path) -> Sample:
+def make_sample(
+    folder: Path, members: Sequence[Member], dataset: Path, tape: Path, rest: Path | None = None
+) -> Sample:
     """Take one normal and one angled trajectory of each indenter.
 
     Args:
@@ -57,17 +64,21 @@ def make_sample(folder: Path, members: Sequence[Member], dataset: Path, tape: Pa
         members: Its units.
         dataset: Mixed data set to write.
         tape: Tape to write.
+        rest: Folder that takes both data sets without these trajectories; None = none. Who plays
+            the tape to a network must have trained it on these.
 
     Raises:
         DatasetError: The folder is no finished experiment, or damaged.
     """
     mixed = read_mixed(folder / MIXED)
     wanted = _picked(mixed)
-    trials = [
-        k
-        for k, t in enumerate(mixed.experiment.trial_trajectory)
-        if mixed.experiment.trajectories[t] in wanted
-    ]
+    trials = _trials(mixed.experiment, wanted, inside=True)
+    if rest is not None:
+        experiment = read_experiment(folder / EXPERIMENT)
+        rest.mkdir(parents=True, exist_ok=True)
+        others = _trials(experiment, wanted, inside=False)
+        write_experiment(rest / EXPERIMENT, subset(experiment, others))
+        write_mixed(rest / MIXED, subset(mixed, _trials(mixed.experiment, wanted, inside=False)))
     small = _fewer_modes(subset(mixed, trials))
     write_mixed(dataset, small)
     _write_tape(folder, members, wanted, tape)
@@ -86,6 +97,13 @@ def _picked(mixed: MixedDataset) -> tuple[str, ...]:
     if not picked:
         raise DatasetError("the mixed data set has no trial", remedy="generate it again")
     return tuple(sorted(picked.values()))
+
+
+def _trials(data: ExperimentDataset, names: Sequence[str], *, inside: bool) -> list[int]:
+    """Trials whose trajectory is one of these, or none of them."""
+    return [
+        k for k, t in enumerate(data.trial_trajectory) if (data.trajectories[t] in names) is inside
+    ]
 
 
 def _fewer_modes(mixed: MixedDataset) -> MixedDataset:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -75,7 +76,7 @@ def read_trials(folder: Path, name: str) -> TrialsDone:
     path = file_of(folder, name)
     try:
         return unpack(path.read_bytes())
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DatasetError(
             f"{path} is damaged: {error}", remedy="remove it and run the command again"
         ) from error
