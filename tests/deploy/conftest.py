@@ -68,7 +68,7 @@ def station(tmp_path: Path) -> tuple[Path, LinkConfig]:
         listen = ["{endpoint}"]
         [[gateway.sensors]]
         name = "finger"
-        options = {{ seed = 3, untouched_s = 0.5 }}
+        options = {{ model = "formula", seed = 3, untouched_s = 0.5 }}
         [recorder]
         out = "{tmp_path / "runs"}"
         """,

@@ -16,8 +16,8 @@ from palpate.fem.config import LIMITS
 if TYPE_CHECKING:
     from palpate.deploy.generate.pipeline import Generated
 
-generate_app = typer.Typer()
-sample_app = typer.Typer()
+generate_app = typer.Typer(add_completion=False, rich_markup_mode=None)
+sample_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @generate_app.command(

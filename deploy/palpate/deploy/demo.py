@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from palpate.deploy.demo_errors import Comparison, Moment
+from palpate.deploy.demo_fields import FieldComparison, FieldMedians
 from palpate.deploy.failure import FAILED
 from palpate.deploy.ports import free_endpoint
 from palpate.deploy.profile import Profile, changed, load_profile
@@ -53,17 +54,19 @@ def run_demo(seconds: float, out: Path) -> int:
         link={"connect": (endpoint,)},
         recorder={"out": str(out)},
     )
-    resolve(profile.features.bundle)  # a bundle that is not there is said before anything starts
+    for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
+        resolve(bundle)  # one that is not there is said before anything starts
     before = set(out.glob("*.mcap"))
     stop = stop_on_signals()
     console.print(
-        f"virtual finger -> features -> recorder, for {seconds:g} s after the first estimate",
+        "virtual finger -> features, fields, synthesis -> recorder, for "
+        f"{seconds:g} s after the first estimate",
         highlight=False,
     )
-    comparison = Comparison()
+    comparison, fields = Comparison(), FieldComparison()
     with Supervisor(profile, "demo") as supervisor:
         try:
-            _watch(console, profile, comparison, seconds, stop)
+            _watch(console, profile, comparison, fields, seconds, stop)
         except LinkError as error:
             raise LinkError(
                 f"{error.problem}; the router says: {supervisor.log_tail('router') or 'nothing'}",
@@ -74,13 +77,14 @@ def run_demo(seconds: float, out: Path) -> int:
                 if tail := supervisor.log_tail(service):
                     console.print(f"--- {service}\n{tail}", markup=False, highlight=False)
     records = sorted(set(out.glob("*.mcap")) - before)
-    return _report(console, comparison, records)
+    return _report(console, comparison, fields.medians(), records)
 
 
 def _watch(
     console: Console,
     profile: Profile,
     comparison: Comparison,
+    fields: FieldComparison,
     seconds: float,
     stop: threading.Event,
 ) -> None:
@@ -90,6 +94,7 @@ def _watch(
         Live(console=console, auto_refresh=False, transient=False) as live,
     ):
         streams = comparison.subscribe(robot.session, _SENSOR, Delivery.QUEUE)
+        field_streams = fields.subscribe(robot.session, _SENSOR, Delivery.QUEUE)
         end = time.monotonic() + _FIRST_S
         redraw = 0.0
         started = False
@@ -98,19 +103,21 @@ def _watch(
                 comparison.take(streams, timeout_s=0.05)
             except StreamTimeout:
                 continue
+            finally:
+                fields.take(field_streams)
             if comparison.count and not started:
                 started, end = True, now + seconds
             if comparison.newest is None or now < redraw:
                 continue
             if console.is_terminal:
-                live.update(_table(comparison, end - now), refresh=True)
+                live.update(_table(comparison, fields.medians(), end - now), refresh=True)
                 redraw = now + _REFRESH_S
             else:
                 console.print(_line(comparison.newest), highlight=False, soft_wrap=True)
                 redraw = now + _LINE_S
 
 
-def _table(comparison: Comparison, left_s: float) -> Table:
+def _table(comparison: Comparison, fields: FieldMedians, left_s: float) -> Table:
     moment = comparison.newest
     assert moment is not None
     table = Table(title="touch of the virtual finger", title_justify="left")
@@ -138,6 +145,15 @@ def _table(comparison: Comparison, left_s: float) -> Table:
             else f"{(estimate[axis] - truth[axis]) * 1e3:+.2f}",
             f"{medians.location_axes_m[axis] * 1e3:.2f}",
         )
+    table.add_section()
+    table.add_row(
+        "skin, mean of all nodes [mm]",
+        f"{fields.moved_m * 1e3:.3f}",
+        "",
+        "",
+        f"{fields.field_m * 1e3:.3f}",
+    )
+    table.add_row("electrodes from the field [counts]", "", "", "", f"{fields.counts:.0f}")
     touched = "[green]touched[/]" if moment.in_contact else "[dim]untouched[/]"
     table.caption = (
         f"{touched}   {comparison.count:,} estimates   age {moment.age_s * 1e3:.1f} ms"
@@ -158,7 +174,9 @@ def _line(moment: Moment) -> str:
     return line + ("" if moment.in_contact else "  (untouched)")
 
 
-def _report(console: Console, comparison: Comparison, records: list[Path]) -> int:
+def _report(
+    console: Console, comparison: Comparison, fields: FieldMedians, records: list[Path]
+) -> int:
     """Draw the picture, print where everything is and how good it was."""
     if not comparison.count or not records:
         console.print("no estimate came; see the logs above and try: palpate doctor")
@@ -169,6 +187,13 @@ def _report(console: Console, comparison: Comparison, records: list[Path]) -> in
         f"{comparison.count:,} estimates; median error: force {medians.force_n:.3f} N, "
         f"location {medians.location_m * 1e3:.2f} mm (in contact); "
         f"median age at the client {medians.age_s * 1e3:.1f} ms",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(
+        f"{fields.fields:,} fields; median error of a node {fields.field_m * 1e3:.3f} mm where "
+        f"nodes move {fields.moved_m * 1e3:.3f} mm; {fields.syntheses:,} syntheses, "
+        f"{fields.counts:.0f} counts r.m.s.",
         highlight=False,
         soft_wrap=True,
     )

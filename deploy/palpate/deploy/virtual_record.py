@@ -40,7 +40,14 @@ def write_virtual_record(
     Raises:
         RecordingError: The disk refuses.
     """
-    options = {"seed": seed, "unit": unit, "frames": frames, "realtime": False, "rate_hz": rate_hz}
+    options = {
+        "model": "formula",  # endless different presses; a tape repeats its own
+        "seed": seed,
+        "unit": unit,
+        "frames": frames,
+        "realtime": False,
+        "rate_hz": rate_hz,
+    }
     keys = {name: sensor_key(_STATION, SENSOR, name) for name in TOPICS}
     written = 0
     facts = {"station": _STATION, "source": f"virtual finger, seed {seed}, unit {unit}"}
