@@ -12,25 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner, Result
 
 from palpate.deploy.cli import app
-from palpate.fem.indenter.approach import first_contact
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.service.start import skin_of
 from palpate.fem.store.content import StoredFingertip
 from palpate.fem.store.read import SimulationStore
 from palpate.fem.store.sample import sample_fingertip, sample_trajectory
 from palpate.fem.store.writer import StoreWriter
-from palpate.fem.trajectory import Campaign
 from palpate.training.dataset import Provenance
 from palpate.training.testbed import arm as stand_in
 from palpate.training.testbed.perform import perform
-from palpate.training.testbed.plan import APPROACH_M, Motion, Plan, Station, Trajectory, make_plan
-from palpate.training.testbed.registration import Registration
-from palpate.training.testbed.registration_file import write_registrations
-from palpate.training.testbed.trajectory_file import read_trajectories, write_trajectories
+from palpate.training.testbed.plan import Motion, Plan, Station, Trajectory, make_plan
+from palpate.training.testbed.trajectory_file import write_trajectories
 from palpate.training.twin.content import ExperimentDataset
 from palpate.training.twin.hdf5 import read_experiment, read_mixed
 from palpate.training.twin.processing import process
@@ -299,100 +292,3 @@ def test_process_goes_up_to_the_mount_and_no_further(
         along = [float(step.pose[2]) for step in pressed.steps]
         most = along[first - 1] - float(np.interp(0.5, force, along))
         assert read_mixed(mixed).experiment.travel_m[-1] == pytest.approx(most, rel=1e-5)
-
-
-@pytest.fixture(scope="module")
-def registration(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("registration") / "r.json"
-    found = {
-        side: Registration(stand_in.sensor_robot(side), ("a", "b", "c"), np.zeros(3), 1)
-        for side in stand_in.SIDES
-    }
-    return write_registrations(path, found)
-
-
-PLAN = ("--points", 2, "--angled", 1, "--indenter", "sphere_7mm", "--json")
-
-
-def test_plan_is_the_papers_on_the_simulated_skin(
-    store: Path, fingertip: StoredFingertip, tmp_path: Path
-) -> None:
-    out = tmp_path / "p.jsonl"
-    result = run("data", "plan", out, "--store", store, "--seed", 5, *PLAN[:-1])
-    # the store holds trajectories of these names, which aim elsewhere
-    assert result.exit_code == 2
-    assert "--seed" in result.stderr
-    assert not out.exists()
-
-    empty = tmp_path / "empty.sim"
-    StoreWriter(empty, fingertip).close()
-    result = run("data", "plan", out, "--store", empty, "--seed", 5, *PLAN)
-    assert result.exit_code == 0, result.output
-    plan = read_trajectories(out)
-    found = json.loads(result.stdout)
-    assert found["trajectories"] + len(found["eliminated"]) == 4
-    campaign = Campaign(skin_of(fingertip), ("sphere_medium",), points=2, angled=1, seed=5)
-    wanted = {item.name: item for item in campaign}
-    assert plan.motions
-    for motion in plan.motions:
-        item, planned = motion.trajectory, wanted[motion.trajectory.trajectory]
-        assert item.depth_m == (3e-3 if item.trajectory.endswith("/normal") else 1.5e-3)
-        np.testing.assert_array_equal(item.target, planned.target)
-        np.testing.assert_allclose(item.direction, planned.direction, atol=1e-12)
-        # 3 mm after its start the indenter touches the skin
-        contact = first_contact(
-            make_indenter(item.indenter),
-            item.poses[0, 3:],
-            item.target,
-            item.direction,
-            skin_of(fingertip),
-        )
-        touched = item.poses[round(APPROACH_M / 1e-4), :3]
-        np.testing.assert_allclose(touched, item.target + contact * item.direction, atol=1e-7)
-        assert item.arm == ("left" if item.target[1] >= 0 else "right")
-        assert motion.joints is not None
-    assert found["arms"] == {
-        arm: sum(m.trajectory.arm == arm for m in plan.motions) for arm in plan.stations
-    }
-
-
-def test_plan_for_arms_of_ones_own(
-    fingertip: StoredFingertip, registration: Path, tmp_path: Path
-) -> None:
-    empty = tmp_path / "empty.sim"
-    StoreWriter(empty, fingertip).close()
-    out = tmp_path / "p.jsonl"
-    words = ("data", "plan", out, "--store", empty, *PLAN)
-    # poses only: the robot's controller finds the joints
-    result = run(*words, "--registration", registration)
-    assert result.exit_code == 0, result.output
-    plan = read_trajectories(out)
-    assert len(plan.motions) == 4
-    assert all(motion.joints is None for motion in plan.motions)
-    # one arm does everything; a tool a metre long reaches nothing
-    one = json.loads(registration.read_text())
-    one["arms"].pop("right")
-    (tmp_path / "one.json").write_text(json.dumps(one))
-    urdf = stand_in.write_arm_urdf("left", tmp_path / "left.urdf")
-    arm = ("--registration", tmp_path / "one.json", "--urdf", f"left={urdf}", "--tip-frame")
-    result = run(*words, *arm, "flange", "--tool-mm", 60)
-    assert result.exit_code == 0, result.output
-    assert set(json.loads(result.stdout)["arms"]) == {"left"}
-    assert all(motion.joints is not None for motion in read_trajectories(out).motions)
-    out.unlink()
-    for more, said in (
-        ((*arm, "flange", "--tool-mm", 2000), "all 4 trajectories are eliminated"),
-        ((*arm, "wrist"), "no frame 'wrist'"),
-        (("--urdf", f"left={urdf}", "--tip-frame", "flange"), "no registration"),
-        (("--edge-mm", 1.0), "have no say"),
-    ):
-        exit_code, stderr = failure(*words, *more)
-        assert (exit_code, said in stderr) == (2, True), stderr
-        assert not out.exists()
-
-
-def test_commands_say_what_they_are() -> None:
-    group: Any = typer.main.get_command(app)
-    commands = group.commands["data"].commands
-    for name in ("plan", "register", "ingest", "process", "inspect", "export", "generate"):
-        assert commands[name].help

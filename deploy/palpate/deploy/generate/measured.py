@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate.deploy.generate.assemble import join, simulated_trial
 from palpate.deploy.generate.mechanics import OnProgress
-from palpate.deploy.generate.tasks import clear_steps
+from palpate.fem.population.mount import clear_steps
 from palpate.fem.result import Trajectory
 from palpate.fem.store.read import SimulationStore
 from palpate.protos.errors import ConfigError, DatasetError

@@ -20,6 +20,7 @@ from palpate.fem.electrodes.signals import ElectrodeSignals, skewed
 from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.population.answers import Population
 from palpate.fem.population.member import Member
+from palpate.fem.population.mount import clear_steps
 from palpate.fem.result import Trajectory
 from palpate.fem.service.biotac import BiotacTip, biotac
 from palpate.fem.store.content import StoredFingertip
@@ -132,26 +133,6 @@ class TrialMaker:
             except DatasetError as failure:
                 dropped.append((name, str(failure)))
         return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
-
-
-def clear_steps(trajectory: Trajectory, held: NDArray[np.integer[Any]]) -> int:
-    """Steps before the indenter bears on what nail and clamp hold.
-
-    Such trajectories collide with the mount: the paper leaves them out.
-
-    Args:
-        trajectory: As simulated.
-        held: Ids of the nodes that are held.
-    """
-    for k, step in enumerate(trajectory.steps):
-        force = np.linalg.norm(step.indenter_force, axis=1)
-        if force[held].sum() > MOUNT_SHARE * force.sum():
-            return k
-    return len(trajectory.steps)
-
-
-MOUNT_SHARE = 0.05
-"""Share of the nodal forces that what is held may bear."""
 
 
 def _perform(

@@ -80,10 +80,10 @@ def show_command(file: Path | None, *, as_json: bool) -> int:
 
 def _table(members: Sequence[Member]) -> None:
     table = Table(title="units: found (published)")
-    for column in ("unit", "lowest", "highest", "force [N]", "overtravel [mm]"):
-        table.add_column(column)
+    for column in ("unit", "lowest", "highest", "force [N]", "deeper by [mm]"):
+        table.add_column(column, overflow="fold")
     for column in ("sigma [S/m]", "sides nearer [mm]", "squeeze [kPa]", "floor [um]"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for member in members:
         unit, wanted, found = member.unit, member.wanted, member.found
         table.add_row(

@@ -14,6 +14,7 @@ from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.mesh.geometry import Geometry
 from palpate.fem.population.fit import fit_unit
 from palpate.fem.population.member import Member, Wanted
+from palpate.fem.population.mount import clear_steps
 from palpate.fem.store.read import SimulationStore
 from palpate.protos.errors import DatasetError
 
@@ -67,18 +68,19 @@ def deep_states(
     Raises:
         DatasetError: The store is empty or damaged.
     """
-    nodes = store.fingertip().pressurised_nodes
+    fingertip = store.fingertip()
+    nodes = fingertip.pressurised_nodes
     found = []
     for name in store.ids():
         trajectory = store.trajectory(name)
-        steps = trajectory.steps
+        steps = trajectory.steps[: clear_steps(trajectory, fingertip.mesh.fixed)]
         poses = np.array([step.pose[:3] for step in steps]).reshape(-1, 3)
         travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1)
         deep = Deep(
             name,
             trajectory.indenter,
             planned(name) - travel,
-            np.linalg.norm(trajectory.forces, axis=1),
+            np.linalg.norm(trajectory.forces[: len(steps)], axis=1),
             (),
         )
         at = [deep.deepest(extra) for extra in OVERTRAVELS_M]
