@@ -18,8 +18,12 @@ from palpate.training.ingest_lasa import BLOCKS_PER_RECORDING, ELECTRODE_LAG_ROW
 from palpate.training.ingest_record import ingest_record
 from palpate.training.schema import open_dataset, write_dataset
 
-train_app = typer.Typer(no_args_is_help=True, help="Train networks and write model bundles.")
-data_app = typer.Typer(no_args_is_help=True, help="Make data sets and look into them.")
+train_app = typer.Typer(
+    no_args_is_help=True, help="Train networks and write model bundles.", rich_markup_mode=None
+)
+data_app = typer.Typer(
+    no_args_is_help=True, help="Make data sets and look into them.", rich_markup_mode=None
+)
 
 console = Console()
 
