@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,9 @@ def test_demo_ends_with_record_view_and_picture(
     assert result.returncode == 0, result.stdout + result.stderr
     assert "truth" in result.stdout
     assert "median error" in result.stdout
+    found = re.search(r"([\d,]+) fields; .* ([\d,]+) syntheses", result.stdout)
+    assert found is not None, result.stdout
+    assert all(int(count.replace(",", "")) > 5 for count in found.groups())
     (record,) = out.glob("*.mcap")
     counts = {key.rpartition("/")[2]: n for key, n in summarise(record).counts.items()}
     assert counts["features"] > 100

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from palpate.deploy.demo_fields import FieldComparison, FieldStreams
-from palpate.protos.errors import StreamTimeout
+from palpate.protos.errors import LinkError, StreamTimeout
 from palpate.protos.messages import Origin, Stamp
 
 MS = 1_000_000
@@ -54,7 +54,18 @@ def stamp(ms: int) -> Stamp:
 
 @pytest.fixture
 def streams() -> Any:
-    return FieldStreams(*(Stream() for _ in range(5)))  # type: ignore[arg-type]
+    none: Any = [Stream() for _ in range(4)]
+    return FieldStreams(*none, tare=find)
+
+
+REST = np.full(19, 3000.0)
+
+
+def find(tare_id: int) -> Any:
+    """The tare of before the client came: nobody announces it again."""
+    if tare_id != 7:
+        raise LinkError("no gateway", remedy="start one")
+    return Message(electrodes=REST)
 
 
 def moved(mm: float) -> Any:
@@ -103,17 +114,17 @@ def test_untouched_moments_and_other_meshes_do_not_count(streams: Any) -> None:
 
 def test_synthesis_is_held_against_the_tared_frame_of_the_same_instant(streams: Any) -> None:
     comparison = FieldComparison()
-    rest = np.full(19, 3000.0)
-    streams.tare.waiting.append(Message(electrodes=rest, tare_id=7))
-    pressed = rest.copy()
+    pressed = REST.copy()
     pressed[3] -= 500
-    for at, counts in ((10, pressed), (20, rest)):
-        streams.electrodes.waiting.append(Message(stamp=stamp(at), electrodes=counts))
-    for at in (10, 20, 30):
+    for at, counts, tare_id in ((10, pressed, 7), (20, REST, 7), (40, pressed, 8)):
+        frame = Message(stamp=stamp(at), electrodes=counts, tare_id=tare_id)
+        streams.electrodes.waiting.append(frame)
+    for at in (10, 20, 30, 40):
         streams.synthesis.waiting.append(
-            Message(source=stamp(at), tared_counts=pressed - rest + 19.0)
+            Message(source=stamp(at), tared_counts=pressed - REST + 19.0)
         )
     comparison.take(streams)
     found = comparison.medians()
-    assert found.syntheses == 1  # untouched at 20 ms, no frame at 30 ms
+    # Untouched at 20 ms, no frame at 30 ms, a tare that nobody knows at 40 ms.
+    assert found.syntheses == 1
     assert found.counts == pytest.approx(19.0)

@@ -192,8 +192,8 @@ def _report(
     )
     console.print(
         f"{fields.fields:,} fields; median error of a node {fields.field_m * 1e3:.3f} mm where "
-        f"nodes move {fields.moved_m * 1e3:.3f} mm; {fields.syntheses:,} syntheses, "
-        f"{fields.counts:.0f} counts r.m.s.",
+        f"nodes move {fields.moved_m * 1e3:.3f} mm; {fields.syntheses:,} syntheses of the "
+        f"electrodes, median error {fields.counts:.0f} counts r.m.s.",
         highlight=False,
         soft_wrap=True,
     )

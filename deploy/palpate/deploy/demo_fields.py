@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.protos.errors import StreamTimeout
+from palpate.protos.errors import PalpateError, StreamTimeout
 from palpate.protos.messages import (
     NO_TARE,
     ElectrodeFrame,
@@ -19,7 +20,8 @@ from palpate.protos.messages import (
     Tare,
 )
 from palpate.protos.session import Delivery, Session, Subscriber
-from palpate.protos.topics import ELECTRODES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE
+from palpate.protos.tares import TareBook
+from palpate.protos.topics import ELECTRODES, FIELD, FIELD_TRUTH, SYNTHESIS
 
 Values = npt.NDArray[Any]
 
@@ -32,13 +34,13 @@ MOVED_M = 0.05e-3
 
 @dataclass(frozen=True, slots=True)
 class FieldStreams:
-    """What is compared."""
+    """What is compared; ``tare`` finds the one that a frame names, which may be older than we."""
 
     field: Subscriber[FieldEstimate]
     truth: Subscriber[FieldFrame]
     synthesis: Subscriber[SynthesisEstimate]
     electrodes: Subscriber[ElectrodeFrame]
-    tare: Subscriber[Tare]
+    tare: Callable[[int], Tare]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,25 +69,23 @@ class FieldComparison:
         self._truth: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
         self._waiting: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
         self._counts: OrderedDict[int, tuple[int, Values]] = OrderedDict()
-        self._tares: dict[int, Values] = {}
         self._moved: list[float] = []
         self._errors: list[float] = []
         self._electrodes: list[float] = []
 
     def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> FieldStreams:
         """Subscribe to estimates and truth of a sensor."""
+        book = TareBook(session)
         return FieldStreams(
             session.subscriber(FIELD, sensor=sensor, delivery=delivery),
             session.subscriber(FIELD_TRUTH, sensor=sensor, delivery=delivery),
             session.subscriber(SYNTHESIS, sensor=sensor, delivery=delivery),
             session.subscriber(ELECTRODES, sensor=sensor, delivery=delivery),
-            session.subscriber(TARE, sensor=sensor, delivery=delivery),
+            lambda tare_id: book.baseline(sensor, tare_id),
         )
 
     def take(self, streams: FieldStreams) -> None:
         """Take in all that has come; never waits."""
-        for tare in _all(streams.tare):
-            self._tares[tare.tare_id] = np.asarray(tare.electrodes, np.float64)
         for frame in _all(streams.electrodes):
             counts = np.asarray(frame.electrodes, np.float64)
             self._counts[frame.stamp.monotonic_ns] = (frame.tare_id, counts)
@@ -97,7 +97,7 @@ class FieldComparison:
             self._waiting.append((estimate.source.monotonic_ns, estimate.displacement))
         self._match()
         for synthesis in _all(streams.synthesis):
-            self._compare(synthesis)
+            self._compare(synthesis, streams.tare)
 
     def medians(self) -> FieldMedians:
         """Of all that was compared so far."""
@@ -134,12 +134,15 @@ class FieldComparison:
             before = (when, field)
         return None
 
-    def _compare(self, synthesis: SynthesisEstimate) -> None:
+    def _compare(self, synthesis: SynthesisEstimate, find: Callable[[int], Tare]) -> None:
         tare_id, counts = self._counts.get(synthesis.source.monotonic_ns, (NO_TARE, None))
-        rest = self._tares.get(tare_id)
-        if counts is None or rest is None:
+        if counts is None or tare_id == NO_TARE:
             return
-        tared = counts - rest
+        try:
+            rest = find(tare_id)
+        except PalpateError:  # the gateway is gone; what was compared stays
+            return
+        tared = counts - np.asarray(rest.electrodes, np.float64)
         if np.abs(tared).max() < _TOUCHED_COUNTS:
             return
         difference = np.asarray(synthesis.tared_counts, np.float64) - tared
