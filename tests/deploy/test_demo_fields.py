@@ -54,8 +54,8 @@ def stamp(ms: int) -> Stamp:
 
 @pytest.fixture
 def streams() -> Any:
-    none: Any = [Stream() for _ in range(4)]
-    return FieldStreams(*none, tare=find)
+    parts: Any = [*(Stream() for _ in range(4)), find]
+    return FieldStreams(*parts)
 
 
 REST = np.full(19, 3000.0)
