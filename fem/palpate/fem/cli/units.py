@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate.fem.cli.show import progress_bar
@@ -80,21 +81,23 @@ def show_command(file: Path | None, *, as_json: bool) -> int:
 
 def _table(members: Sequence[Member]) -> None:
     table = Table(title="units: found (published)")
-    for column in ("unit", "lowest", "highest", "force [N]", "deeper by [mm]"):
-        table.add_column(column, overflow="fold")
-    for column in ("sigma [S/m]", "sides nearer [mm]", "squeeze [kPa]", "floor [um]"):
-        table.add_column(column, overflow="fold")
+    table.add_column("")
     for member in members:
-        unit, wanted, found = member.unit, member.wanted, member.found
-        table.add_row(
-            unit.name,
-            f"{found['low']:.3f} ({wanted.low})",
-            f"{found['high']:.3f} ({wanted.high})",
-            f"{found['max_force_n']:.1f} ({wanted.max_force_n})",
-            f"{member.overtravel_m * 1e3:.1f}",
-            f"{unit.sigma_s_m:.3f}",
-            f"{unit.side_closing_m * 1e3:.2f}",
-            f"{unit.squeeze_pa * 1e-3:.1f}",
-            f"{unit.floor_m * 1e6:.1f}",
-        )
+        table.add_column(member.unit.name, justify="right")
+    rows: list[tuple[str, Callable[[Member], str]]] = [
+        ("lowest tared value", lambda m: f"{m.found['low']:.3f} ({m.wanted.low})"),
+        ("highest tared value", lambda m: f"{m.found['high']:.3f} ({m.wanted.high})"),
+        (
+            "largest force [N]",
+            lambda m: f"{m.found['max_force_n']:.1f} ({m.wanted.max_force_n})",
+        ),
+        ("pressed deeper by [mm]", lambda m: f"{m.overtravel_m * 1e3:.1f}"),
+        ("conductivity [S/m]", lambda m: f"{m.unit.sigma_s_m:.3f}"),
+        ("sides nearer to the core by [mm]", lambda m: f"{m.unit.side_closing_m * 1e3:.2f}"),
+        ("squeeze pressure [kPa]", lambda m: f"{m.unit.squeeze_pa * 1e-3:.1f}"),
+        ("film at infinite pressure [um]", lambda m: f"{m.unit.floor_m * 1e6:.1f}"),
+    ]
+    for label, value in rows:
+        # Rich takes [N] for a style.
+        table.add_row(escape(label), *(value(member) for member in members))
     console.print(table)

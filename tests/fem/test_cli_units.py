@@ -1,0 +1,42 @@
+"""``palpate fem units``: what a newcomer sees."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from palpate.fem.cli.app import fem_app
+from palpate.fem.population.member import PAPER
+from palpate.protos.errors import ConfigError, DatasetError
+
+
+def test_show_names_each_unit_with_what_it_was_fitted_to() -> None:
+    shown = CliRunner().invoke(fem_app, ["units", "show"], env={"COLUMNS": "100"})
+    assert shown.exit_code == 0, shown.output
+    for wanted in PAPER:
+        assert wanted.name in shown.output
+        assert f"({wanted.max_force_n})" in shown.output
+    assert "[N]" in shown.output
+    as_json = CliRunner().invoke(fem_app, ["units", "show", "--json"])
+    assert [one["unit"]["name"] for one in json.loads(as_json.output)] == [
+        wanted.name for wanted in PAPER
+    ]
+
+
+def test_what_cannot_be_fitted_or_shown_is_refused(tmp_path: Path) -> None:
+    for arguments, error, word in (
+        (["units", "show", str(tmp_path / "no.json")], ConfigError, "no.json"),
+        (["units", "fit", str(tmp_path / "no.sim"), "--out", "x.json"], DatasetError, "no.sim"),
+        (
+            ["units", "fit", str(tmp_path), "--out", "x.json", "--overtravel-mm", "-1"],
+            ConfigError,
+            "overtravel",
+        ),
+    ):
+        result = CliRunner().invoke(fem_app, arguments)
+        assert result.exit_code != 0
+        with pytest.raises(error, match=word):
+            raise result.exception or AssertionError(result.output)
