@@ -260,7 +260,7 @@ def test_lossless_replay_answers_every_frame_with_the_bytes_of_the_estimator(
 def test_ready_token_goes_when_it_stops(serve: Serve, link: LinkConfig, until: Until) -> None:
     with Session.open(link) as observer:
         with serve():
-            assert [a.ready for a in observer.alive()] == [True]
+            until(lambda: [a.ready for a in observer.alive()] == [True])
         until(lambda: observer.alive() == [])
 
 
