@@ -21,7 +21,6 @@ from palpate.training.twin.assemble import assemble_experiment, assemble_mixed
 from palpate.training.twin.basis import fit_basis
 from palpate.training.twin.content import (
     ExperimentDataset,
-    FieldBasis,
     MixedDataset,
     SkinMesh,
 )
@@ -205,8 +204,3 @@ def _triangles(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     if faces.shape[1] == 3:
         return faces
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]).astype(np.int32)
-
-
-def fields_loss_um(basis: FieldBasis) -> float:
-    """Mean nodal distance that the compressed fields lose [um]."""
-    return basis.loss_mean_m * 1e6
