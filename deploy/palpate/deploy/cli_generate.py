@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from palpate.deploy.left_out import show_left_out
 from palpate.deploy.options import JsonOption
 from palpate.fem.config import LIMITS
+from palpate.protos.command import typed_command
 
 if TYPE_CHECKING:
     from palpate.deploy.generate.pipeline import Generated
@@ -86,7 +86,7 @@ def generate(
             ray=ray,
             stop=stop,
             on_stage=on_stage,
-            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            command=typed_command(),
         )
     if result is None:
         typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
@@ -150,11 +150,5 @@ def _show(result: Generated) -> None:
         if key != "dropped":
             typer.echo(f"{key:20} {value}")
     typer.echo(f"{'left out':20} {len(dropped)} trials of one or both data sets")
-    for trial, why in dropped[:_SHOWN]:
-        typer.echo(f"  {trial}: {why}")
-    if len(dropped) > _SHOWN:
-        typer.echo(f"  ... {len(dropped) - _SHOWN} more; all of them: --json")
+    show_left_out(dropped)
     typer.echo(f"look at it: palpate data inspect {result.folder / 'mixed.h5'}")
-
-
-_SHOWN = 10

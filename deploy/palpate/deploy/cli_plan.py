@@ -9,19 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from palpate.deploy.left_out import show_left_out
 from palpate.deploy.options import JsonOption
 from palpate.protos.errors import ConfigError
 
 if TYPE_CHECKING:
     from palpate.training.testbed.plan import Eliminated, Plan
 
-plan_app = typer.Typer()
-
-SHOWN = 10
-"""Eliminated trajectories that people are told of, with the reason."""
-
-DEFAULT_EDGE_MM = 0.6
-DEFAULT_FILL_ML = 0.6
+plan_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @plan_app.command(
@@ -65,7 +60,7 @@ def plan(
     """Plan nine indenters x ten points x (one normal, four angled presses) for one or two arms."""
     from palpate.deploy.generate.mechanics import fingertip_of
     from palpate.deploy.generate.planning import plan_experiment, stations_of
-    from palpate.deploy.generate.spec import ExperimentSpec
+    from palpate.deploy.generate.spec import EDGE_M, FLUID_VOLUME_M3, ExperimentSpec
     from palpate.fem.cli.show import console, progress_bar
     from palpate.fem.indenter.catalogue import make_indenter
     from palpate.fem.store.read import SimulationStore
@@ -82,8 +77,8 @@ def plan(
         points=points,
         angled=angled,
         seed=seed,
-        edge_m=(DEFAULT_EDGE_MM if edge_mm is None else edge_mm) * 1e-3,
-        fluid_volume_m3=(DEFAULT_FILL_ML if fill_ml is None else fill_ml) * 1e-6,
+        edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3,
+        fluid_volume_m3=FLUID_VOLUME_M3 if fill_ml is None else fill_ml * 1e-6,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),
     )
     stations = stations_of(
@@ -131,7 +126,4 @@ def _show(out: Path, found: Plan, eliminated: list[Eliminated]) -> None:
     hours = found.motions[-1].time_s[-1] / 3600.0
     typer.echo(f"{out}: {len(found.motions)} trajectories ({who}), {hours:.1f} h")
     typer.echo(f"eliminated: {len(eliminated)}")
-    for one in eliminated[:SHOWN]:
-        typer.echo(f"  {one.trajectory}: {one.reason}")
-    if len(eliminated) > SHOWN:
-        typer.echo(f"  ... {len(eliminated) - SHOWN} more; all of them: --json")
+    show_left_out([(one.trajectory, one.reason) for one in eliminated])

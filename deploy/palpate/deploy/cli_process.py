@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from palpate.deploy.left_out import show_left_out
 from palpate.deploy.options import JsonOption
+from palpate.protos.command import typed_command
 
 if TYPE_CHECKING:
     from palpate.deploy.generate.measured import Dropped, Processed
 
-process_app = typer.Typer()
-
-SHOWN = 10
-"""Trials left out that people are told of, with the reason."""
+process_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @process_app.command(
@@ -54,7 +51,7 @@ def process(
             out,
             mechanics=mechanics,
             mixed=mixed,
-            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            command=typed_command(),
             on_progress=on_progress,
         )
     if as_json:
@@ -102,7 +99,4 @@ def _show(done: Processed, out: Path, mixed: Path | None) -> None:
 def _show_dropped(what: str, dropped: Dropped) -> None:
     if dropped:
         typer.echo(f"{what}: {len(dropped)} trials")
-    for trial, why in dropped[:SHOWN]:
-        typer.echo(f"  {trial}: {why}")
-    if len(dropped) > SHOWN:
-        typer.echo(f"  ... {len(dropped) - SHOWN} more; all of them: --json")
+    show_left_out(dropped)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from palpate.protos.command import typed_command
 from palpate.training import cli_data, cli_fields, cli_figures, cli_testbed
 from palpate.training.cli_data import contents
 from palpate.training.ingest_lasa import BLOCKS_PER_RECORDING, ELECTRODE_LAG_ROWS, ingest_lasa
@@ -26,11 +25,6 @@ data_app = typer.Typer(
 )
 
 console = Console()
-
-
-def _command() -> str:
-    """The command line as typed, for provenance; without the folder of the program."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def _progress() -> Progress:
@@ -58,7 +52,9 @@ def data_ingest_lasa(
 
     palpate data ingest-lasa force_calibration.npz lasa.h5
     """
-    data = ingest_lasa(source, command=_command(), blocks_per_recording=blocks, lag_rows=lag_rows)
+    data = ingest_lasa(
+        source, command=typed_command(), blocks_per_recording=blocks, lag_rows=lag_rows
+    )
     write_dataset(out, data)
     console.print(contents(data, str(out)))
 
@@ -76,7 +72,7 @@ def data_ingest_record(
     palpate data ingest-record presses.mcap presses.h5
     """
     with console.status(f"reading {source.name}"):
-        data = ingest_record(source, command=_command(), licence=licence)
+        data = ingest_record(source, command=typed_command(), licence=licence)
         write_dataset(out, data)
     console.print(contents(data, str(out)))
 
@@ -106,7 +102,7 @@ def train_force_real(
     with _progress() as progress:
         task = progress.add_task("networks", total=experiment_count(dataset, seeds))
         report = run_force_real(dataset, seeds=seeds, on_network=lambda: progress.advance(task))
-    write_report(out, report, command=_command())
+    write_report(out, report, command=typed_command())
     console.print(rich_table(report.results, "Force on real BioTacs"))
     console.print(f"wrote {out}/force-real.md, .json, .png")
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from palpate.protos.command import typed_command
 
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
 Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
@@ -135,7 +135,7 @@ def train_twin(
         reports += evaluate_features(
             presses, seeds=seeds, split_seed=split_seed, config=paper, on_network=tick
         )
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    command = typed_command()
     for path in write_report(out, reports, fields.mesh, command=command, seeds=seeds):
         console.print(f"wrote {path}")
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from palpate.protos.command import typed_command
 from palpate.protos.errors import ConfigError
 
 PUBLIC_DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -62,7 +61,7 @@ def data_figures(
         statistics = write_page(
             out,
             sources,
-            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            command=typed_command(),
             on_step=lambda step: status.update(f"{step} ..."),
         )
     console.print(

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
@@ -17,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from palpate.protos.command import typed_command
 from palpate.protos.errors import ConfigError
 from palpate.training.dataset import Provenance
 from palpate.training.schema import palpate_version
@@ -135,7 +134,7 @@ def data_ingest(
             trials,
             Provenance(
                 source=f"record {record.name} of {sensor}, plan {plan.name}",
-                command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+                command=typed_command(),
                 input_sha256=_sha256(record),
                 licence=licence,
                 palpate_version=palpate_version(),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 
 from palpate.protos.errors import DatasetError
 from palpate.protos.extras import require
+from palpate.protos.whole import written_whole
 from palpate.training.dataset import SENSOR_FRAME, SHAPES, FeatureDataset, Provenance
 
 if TYPE_CHECKING:
@@ -65,30 +64,19 @@ def write_dataset(path: Path, data: FeatureDataset) -> str:
         DatasetError: The disk refused.
     """
     h5 = require("h5py", extra="training")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     digest = data.content_sha256()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5.File(partial, "w") as file:
-            _write_attributes(file, data, digest)
-            for name, array in data.arrays().items():
-                dataset = file.create_dataset(
-                    name,
-                    data=array,
-                    chunks=(min(_CHUNK_ROWS, len(data)), *array.shape[1:]),
-                    compression="gzip",
-                    compression_opts=4,
-                    shuffle=True,
-                )
-                dataset.attrs["unit"] = UNITS[name]
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # its folder may be what could not be made
-            partial.unlink(missing_ok=True)
+    with written_whole(path) as partial, h5.File(partial, "w") as file:
+        _write_attributes(file, data, digest)
+        for name, array in data.arrays().items():
+            dataset = file.create_dataset(
+                name,
+                data=array,
+                chunks=(min(_CHUNK_ROWS, len(data)), *array.shape[1:]),
+                compression="gzip",
+                compression_opts=4,
+                shuffle=True,
+            )
+            dataset.attrs["unit"] = UNITS[name]
     logger.info("wrote %s: %d rows, content %s", path, len(data), digest[:12])
     return digest
 

@@ -17,6 +17,7 @@ from palpate.fem.electrodes.signals import (
 from palpate.fem.population.answers import Population
 from palpate.fem.population.member import Member
 from palpate.fem.store.content import StoredFingertip
+from palpate.protos.whole import written_whole
 
 FILE = "idle.npz"
 RATE_HZ = 100.0
@@ -58,8 +59,6 @@ def write_idle(
         arrays[unit.name] = signals.stream(
             skewed(ideal, time_s), elapsed, log_sigma=warmed - warmed[0]
         )
-    part = path.with_name(f".{FILE}.part")
-    with part.open("wb") as file:
+    with written_whole(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-    part.replace(path)
     return path

@@ -19,6 +19,7 @@ from palpate.fem.store.content import StoredFingertip
 from palpate.fem.store.read import SimulationStore
 from palpate.fem.trajectory import Indentation
 from palpate.protos.errors import DatasetError
+from palpate.protos.whole import written_whole
 from palpate.training.testbed.plan import assign_arm
 
 FOLDER = "trials"
@@ -45,12 +46,11 @@ def make_trials(
         on_progress: Called after each trajectory.
 
     Raises:
-        DatasetError: The store is damaged.
+        DatasetError: The store is damaged, or the disk refuses.
     """
     fingertip = store.fingertip()
     there = set(store.ids())
     plans = [plan for plan in plans_of(spec, fingertip) if plan.name in there]
-    folder.mkdir(parents=True, exist_ok=True)
     left = [plan for plan in plans if not file_of(folder, plan.name).exists()]
     done = len(plans) - len(left)
     on_progress(done, len(plans), "")
@@ -59,10 +59,8 @@ def make_trials(
     units = tuple(member.unit for member in members)
     work: Callable[[TrialTask], bytes] = partial(_work, _Films(fingertip, units))
     for task, data in spread.run(work, _tasks(spec, store, members, left)):
-        path = file_of(folder, task.name)
-        part = path.with_suffix(".part")
-        part.write_bytes(data)
-        part.replace(path)
+        with written_whole(file_of(folder, task.name)) as part:
+            part.write_bytes(data)
         done += 1
         on_progress(done, len(plans), task.name)
 

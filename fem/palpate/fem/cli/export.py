@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 
 from rich.console import Console
@@ -11,6 +9,7 @@ from rich.console import Console
 from palpate.fem.cli.show import progress_bar
 from palpate.fem.store.export import export
 from palpate.fem.store.read import SimulationStore
+from palpate.protos.command import typed_command
 from palpate.protos.errors import ConfigError
 
 SUFFIX = ".h5"
@@ -42,7 +41,7 @@ def export_command(store: Path, out: Path) -> int:
             opened,
             out,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
-            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            command=typed_command(),
         )
     size_mb = out.stat().st_size / 1e6
     Console().print(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +27,7 @@ from palpate.fem.service.batch import Batch, BatchReport, Plan, Press
 from palpate.fem.service.start import check_start, skin_of
 from palpate.fem.store.content import StoredFingertip
 from palpate.fem.trajectory import Campaign, angled_direction, press_path
+from palpate.protos.command import typed_command
 from palpate.protos.errors import ConfigError
 
 DEFAULT_INDENTER = "sphere_medium"
@@ -111,7 +110,7 @@ def run_command(
                     stop=stop,
                     on_report=on_report,
                     stress=stress,
-                    command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+                    command=typed_command(),
                 )
     if store is not None and not wanted.sweep:
         done = _from_store(store, plans)

@@ -12,6 +12,7 @@ from typing import Any
 
 from palpate.fem.electrodes.unit import UnitParameters
 from palpate.protos.errors import ConfigError
+from palpate.protos.whole import written_whole
 
 SCHEMA = "palpate.population/1"
 SHIPPED = "three.json"
@@ -73,9 +74,8 @@ def write_population(path: Path, members: Sequence[Member], *, source: str) -> N
         "source": source,
         "members": [asdict(member) for member in members],
     }
-    partial = path.with_name(f".{path.name}.part")
-    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with written_whole(path) as partial:
+        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def read_population(path: Path | None = None) -> tuple[Member, ...]:

@@ -13,7 +13,6 @@ towards them and its origin 150 mm above the bench; the plate with the holes is 
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.protos.errors import ConfigError
+from palpate.protos.whole import written_whole
 from palpate.training.testbed.transform import Floats, Transform
 
 SIDES = ("left", "right")
@@ -99,10 +99,14 @@ def arm_urdf(side: str, link_errors: npt.ArrayLike | None = None) -> str:
 
 
 def write_arm_urdf(side: str, path: Path) -> Path:
-    """Write the URDF of an arm; whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(arm_urdf(side), encoding="utf-8")
-    os.replace(part, path)
+    """Write the URDF of an arm; whole or not at all.
+
+    Raises:
+        ConfigError: Another side.
+        DatasetError: The disk refused.
+    """
+    with written_whole(path) as partial:
+        partial.write_text(arm_urdf(side), encoding="utf-8")
     return path
 
 

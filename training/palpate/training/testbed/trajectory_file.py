@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +21,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from palpate.protos.errors import ConfigError, DatasetError
+from palpate.protos.whole import written_whole
 from palpate.training.testbed.plan import (
     DWELL_S,
     INCREMENT_M,
@@ -102,9 +102,8 @@ def write_trajectories(plan: Plan, path: Path) -> Path:
         "trajectories": len(plan.motions),
         "content_sha256": hashlib.sha256(body).hexdigest(),
     }
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(json.dumps(header).encode() + b"\n" + body)
-    os.replace(part, path)
+    with written_whole(path) as partial:
+        partial.write_bytes(json.dumps(header).encode() + b"\n" + body)
     return path
 
 

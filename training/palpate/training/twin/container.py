@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy.typing as npt
 
 from palpate.protos.errors import DatasetError
 from palpate.protos.extras import require
+from palpate.protos.whole import written_whole
 from palpate.training.dataset import SENSOR_FRAME, Provenance
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def write_tables(
         DatasetError: The disk refused.
     """
     digest = tables.content_sha256()
-    with written_whole(path) as file:
+    with hdf5_written_whole(path) as file:
         write_header(file, schema, version, digest, tables.provenance, tables.numbers)
         for name, column in columns.items():
             write_array(file, name, column, tables.arrays[name])
@@ -99,26 +99,15 @@ def write_tables(
 
 
 @contextlib.contextmanager
-def written_whole(path: Path) -> Iterator[h5py.File]:
-    """A file to write to, which gets its name when the block ends without an error.
+def hdf5_written_whole(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file to write to, which gets its name when the block ends without an error.
 
     Raises:
         DatasetError: The disk refused.
     """
     h5 = require("h5py", extra="training")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5.File(partial, "w") as file:
-            yield file
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # its folder may be what could not be made
-            partial.unlink(missing_ok=True)
+    with written_whole(path) as partial, h5.File(partial, "w") as file:
+        yield file
 
 
 def write_header(

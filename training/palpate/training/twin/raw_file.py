@@ -24,13 +24,13 @@ from palpate.training.twin.container import (
     Column,
     Tables,
     check_header,
+    hdf5_written_whole,
     opened,
     read_array,
     read_provenance,
     text,
     write_array,
     write_header,
-    written_whole,
 )
 from palpate.training.twin.processing import trial_name
 from palpate.training.twin.trials import RawTrial, TrialHeader
@@ -92,7 +92,7 @@ def write_trials(path: Path, trials: Iterable[RawTrial], provenance: Provenance)
     """
     seen: set[tuple[str, str]] = set()
     digests: list[str] = []
-    with written_whole(path) as file:
+    with hdf5_written_whole(path) as file:
         for trial in trials:
             _check_new(str(path), trial.header, seen)
             _check_streams(f"{path}: {trial_name(trial.header)}", trial)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.protos.errors import DatasetError
+from palpate.protos.whole import written_whole
 from palpate.training.twin.content import ExperimentDataset, MixedDataset
 from palpate.training.twin.hdf5 import content_sha256
 from palpate.training.twin_figures.contact import draw_contacts
@@ -180,15 +179,5 @@ def _provenance(data: ExperimentDataset) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # its folder may be what could not be made
-            partial.unlink(missing_ok=True)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.protos.errors import DatasetError
 from palpate.protos.extras import require
+from palpate.protos.whole import written_whole
 
 INK = "#30343b"
 GRID = "#e4e4e8"
@@ -48,18 +46,8 @@ def save(figure: Any, path: Path) -> None:
     Raises:
         DatasetError: The disk refused.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
         figure.savefig(partial, dpi=110, format="png", metadata={"Software": None})
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # its folder may be what could not be made
-            partial.unlink(missing_ok=True)
 
 
 def label(axes: Any, across: str, up: str, title: str = "") -> None:
