@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.fem.mechanics.element import Elements, elements
 from palpate.fem.mechanics.laws import ContactSettings
-from palpate.fem.mechanics.material import NeoHooke
+from palpate.fem.mechanics.material import BARRIER_FROM, NeoHooke
 from palpate.fem.mechanics.state import State
 from palpate.fem.mechanics.system import System
 from palpate.fem.mesh.solid import SolidMesh
@@ -61,6 +61,10 @@ def test_stress_and_stiffness_are_derivatives_of_the_energy() -> None:
     random = np.random.default_rng(0)
     law = NeoHooke(MU)
     f = np.eye(3) + random.uniform(-0.3, 0.3, (20, 3, 3))
+    logarithm = np.log(np.linalg.det(f))
+    assert logarithm.min() < -BARRIER_FROM  # squeezed, grown and untouched points are among them
+    assert logarithm.max() > BARRIER_FROM
+    assert (np.abs(logarithm) < BARRIER_FROM).any()
     move = random.normal(size=(20, 3, 3))
     step = 1e-6
     up, down = f + step * move, f - step * move
@@ -79,7 +83,23 @@ def test_stress_is_zero_at_rest_turns_with_the_body_and_knows_no_volume() -> Non
     turn *= np.linalg.det(turn)[:, None, None]
     np.testing.assert_allclose(law.gradient(np.eye(3)), 0.0, atol=1e-10)
     np.testing.assert_allclose(law.gradient(turn @ f), turn @ law.gradient(f), atol=1e-8)
-    np.testing.assert_allclose(law.function(1.3 * f), law.function(f), rtol=1e-12)
+    np.testing.assert_allclose(
+        NeoHooke(MU, barrier=0.0).function(1.3 * f), NeoHooke(MU, barrier=0.0).function(f)
+    )
+
+
+def test_the_barrier_is_nothing_until_a_point_loses_its_volume() -> None:
+    random = np.random.default_rng(13)
+    f = np.eye(3) + random.uniform(-0.3, 0.3, (200, 3, 3))
+    for size in (0.78, 1.0, 1.28):
+        there = (size / np.linalg.det(f)[:, None, None]) ** (1 / 3) * f
+        for kind in ("function", "gradient", "hessian"):
+            found = getattr(NeoHooke(MU), kind)(there)
+            np.testing.assert_allclose(found, getattr(NeoHooke(MU, barrier=0.0), kind)(there))
+    pressed, grown = (
+        np.trace(NeoHooke(MU).gradient(scale ** (1 / 3) * np.eye(3))) for scale in (0.7, 1.4)
+    )
+    assert pressed < 0.0 < grown
 
 
 @BOTH

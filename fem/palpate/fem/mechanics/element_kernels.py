@@ -3,7 +3,9 @@
 
 Energy of an element, with v its volume and p its pressure (Simo, Taylor and Pister 1985)::
 
-    sum_q w_q mu/2 (J^(-2/3) I1 - 3)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
+    sum_q w_q mu/2 (J^(-2/3) I1 - 3 + barrier b^2)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
+
+and b = max(0, |ln J| - 0.25), which nothing feels but skin in a pinch (see ``material.py``).
 
 The pressure is condensed: the tangent keeps the size of the displacements, but p is a state of its
 own, so Newton's convergence does not depend on kappa. NumPy twins: ``element.py``.
@@ -16,7 +18,18 @@ from __future__ import annotations
 
 import warp as wp
 
+from palpate.fem.mechanics.material import BARRIER_FROM
+
+FROM = wp.constant(wp.float64(BARRIER_FROM))
+
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def beyond(j: wp.float64):
+    """b sign(ln J): how far ln J is past where the barrier begins."""
+    logarithm = wp.log(wp.max(j, wp.float64(1.0e-3)))
+    return wp.sign(logarithm) * wp.max(wp.abs(logarithm) - FROM, wp.float64(0.0))
 
 
 @wp.kernel
@@ -26,6 +39,7 @@ def element_state(
     gradient: wp.array3d(dtype=wp.vec3d),
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
+    barrier: wp.float64,
     # State in:
     first: int,
     position_in: wp.array(dtype=wp.vec3d),
@@ -55,8 +69,9 @@ def element_state(
         inverse_t = wp.transpose(wp.inverse(f))
         scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
         i1 = wp.ddot(f, f)
-        # w P = scale (F - I1/3 F^-T) + w p J F^-T
-        stress = scale * f + (w * pressure * j - scale * i1 / wp.float64(3.0)) * inverse_t
+        # w P = scale (F - I1/3 F^-T) + w (p J + mu barrier b sign(ln J)) F^-T
+        along = w * (pressure * j + mu * barrier * beyond(j)) - scale * i1 / wp.float64(3.0)
+        stress = scale * f + along * inverse_t
         for a in range(n):
             g = gradient[e, q, a]
             wp.atomic_add(force_out, elements[e, a], stress * g)
@@ -72,6 +87,7 @@ def point_state(
     gradient: wp.array3d(dtype=wp.vec3d),
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
+    barrier: wp.float64,
     # State in:
     first: int,
     position_in: wp.array(dtype=wp.vec3d),
@@ -85,7 +101,8 @@ def point_state(
     """Vectors a tangent is made of, per element, quadrature point and node.
 
     With g = F^-T grad N and h = F grad N: spatial = g, left = -2/3 c h, right = left + (2/9 c I1 +
-    w p J) g, scale = (c, c I1 / 3 - w p J), c = w mu J^(-2/3).
+    w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J)),
+    c = w mu J^(-2/3).
     """
     e = first + wp.tid()
     n = elements.shape[1]
@@ -99,8 +116,11 @@ def point_state(
         inverse_t = wp.transpose(wp.inverse(f))
         c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
         ci1 = c * wp.ddot(f, f)
-        wpj = w * pressure * j
-        along = ci1 * wp.float64(2.0) / wp.float64(9.0) + wpj
+        b = beyond(j)
+        wpj = w * (pressure * j + mu * barrier * b)
+        along = ci1 * wp.float64(2.0) / wp.float64(9.0) + w * pressure * j
+        if b != wp.float64(0.0):
+            along += w * mu * barrier
         for a in range(n):
             g = inverse_t * gradient[e, q, a]
             left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[e, q, a])
@@ -204,6 +224,7 @@ def element_stress(
     gradient: wp.array3d(dtype=wp.vec3d),
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
+    barrier: wp.float64,
     # State in:
     first: int,
     position_in: wp.array(dtype=wp.vec3d),
@@ -225,5 +246,7 @@ def element_stress(
         deviator = b - third * wp.identity(n=3, dtype=wp.float64)
         power = wp.pow(wp.abs(j), wp.float64(-2.0) / wp.float64(3.0))
         total += (weight[e, q] * mu * power) * deviator
+        # J times the barrier's mean stress; the weights are of the undeformed volume.
+        total += (weight[e, q] * mu * barrier * beyond(j)) * wp.identity(n=3, dtype=wp.float64)
         volume += weight[e, q] * j
     stress_out[e] = total / volume + pressure_in[e] * wp.identity(n=3, dtype=wp.float64)

@@ -1,4 +1,10 @@
-"""The skin's law: isochoric neo-Hooke; energy, first Piola stress and tangent at points."""
+"""The skin's law: isochoric neo-Hooke; energy, first Piola stress and tangent at points.
+
+An element's *mean* volume is kept by its pressure; the volume at one of its quadrature points is
+not, and where skin is pinched between a hard indenter and the core the points of one element may
+go to J = 0.3 beside J = 2 (an hourglass that Q1-P0 does not resist), until Newton finds no
+equilibrium. A barrier takes over there, and is exactly nothing below: J within 0.78..1.28.
+"""
 
 from __future__ import annotations
 
@@ -9,29 +15,41 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+VOLUME_BARRIER = 60.0
+"""Stiffness of the barrier in shear moduli; see ADR 0013 for what it does to forces."""
+
+BARRIER_FROM = 0.25
+"""|ln J| at which the barrier begins."""
+
 
 @dataclass(frozen=True, slots=True)
 class NeoHooke:
-    """W = mu/2 (J^(-2/3) tr(F^T F) - 3); the volume is the element's affair.
+    """W = mu/2 (J^(-2/3) tr(F^T F) - 3 + barrier max(0, |ln J| - 0.25)^2).
 
-    For J = 1 this is the paper's equation "neo_hookean" up to a constant. The arguments ``f`` are
-    deformation gradients, shape (..., 3, 3).
+    For J = 1 this is the paper's equation "neo_hookean" up to a constant; an element's volume is
+    its pressure's affair. The arguments ``f`` are deformation gradients, shape (..., 3, 3).
 
     Attributes:
         mu: Shear modulus [Pa].
+        barrier: Against volume that changes at a point alone, in shear moduli; 0 = none.
     """
 
     mu: float
+    barrier: float = VOLUME_BARRIER
 
     def function(self, f: Floats) -> Floats:
         """Energy per unit of undeformed volume [J/m^3], shape (...)."""
         j = np.linalg.det(f)
-        return np.asarray(self.mu / 2 * (j ** (-2 / 3) * np.sum(f * f, axis=(-2, -1)) - 3))
+        isochoric = j ** (-2 / 3) * np.sum(f * f, axis=(-2, -1)) - 3
+        beyond, _ = self._beyond(j)
+        return np.asarray(self.mu / 2 * (isochoric + self.barrier * beyond**2))
 
     def gradient(self, f: Floats) -> Floats:
         """First Piola stress dW/dF [Pa], shape (..., 3, 3)."""
         scale, trace, inverse_t = self._parts(f)
-        return np.asarray(scale * (f - trace / 3 * inverse_t))
+        beyond, sign = self._beyond(np.linalg.det(f)[..., None, None])
+        volumetric = self.mu * self.barrier * sign * beyond * inverse_t
+        return np.asarray(scale * (f - trace / 3 * inverse_t) + volumetric)
 
     def hessian(self, f: Floats) -> Floats:
         """d^2 W / dF_ij dF_kl [Pa], shape (..., 3, 3, 3, 3)."""
@@ -42,9 +60,19 @@ class NeoHooke:
         gg = np.einsum("...ij,...kl->...ijkl", g, g)
         swapped = np.einsum("...il,...kj->...ijkl", g, g)
         identity = np.einsum("ik,jl->ijkl", eye, eye)
+        beyond, sign = self._beyond(np.linalg.det(f)[..., None, None, None, None])
+        volumetric = (beyond > 0.0) * gg - sign * beyond * swapped
         return np.asarray(
             scale * (identity - 2 / 3 * fg + 2 / 9 * trace * gg + trace / 3 * swapped)
+            + self.mu * self.barrier * volumetric
         )
+
+    @staticmethod
+    def _beyond(j: Floats) -> tuple[Floats, Floats]:
+        """How far |ln J| is past where the barrier begins, and the sign of ln J."""
+        logarithm = np.log(j)
+        beyond = np.maximum(0.0, np.abs(logarithm) - BARRIER_FROM)
+        return np.asarray(beyond), np.asarray(np.sign(logarithm))
 
     def _parts(self, f: Floats) -> tuple[Floats, Floats, Floats]:
         j = np.linalg.det(f)[..., None, None]

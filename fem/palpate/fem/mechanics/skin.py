@@ -24,6 +24,7 @@ class Skin:
         *,
         shear_modulus_pa: float,
         bulk_ratio: float,
+        volume_barrier: float,
     ) -> None:
         """Prepare the elements.
 
@@ -32,8 +33,9 @@ class Skin:
             pairs: Block of each node pair of each element.
             shear_modulus_pa: Neo-Hookean modulus [Pa].
             bulk_ratio: Bulk over shear modulus.
+            volume_barrier: See ``NeoHooke.barrier``.
         """
-        self.mu = shear_modulus_pa
+        self.mu, self.volume_barrier = shear_modulus_pa, volume_barrier
         self.gradient_values, self.weight_values = rest_gradients(mesh)
         self.rest_volume = self.weight_values.sum(axis=1)
         self.count, nodes = mesh.elements.shape
@@ -139,7 +141,8 @@ class Skin:
 
     @property
     def _model(self) -> list[object]:
-        return [self._elements, self._gradient, self._weight, wp.float64(self.mu)]
+        constants = wp.float64(self.mu), wp.float64(self.volume_barrier)
+        return [self._elements, self._gradient, self._weight, *constants]
 
     @property
     def _condensed(self) -> list[wp.array]:

@@ -16,6 +16,7 @@ from palpate.fem.indenter.shape import Indenter
 from palpate.fem.mechanics.balance import Balance
 from palpate.fem.mechanics.indentation import Indentation
 from palpate.fem.mechanics.laws import ContactSettings, Press
+from palpate.fem.mechanics.material import VOLUME_BARRIER
 from palpate.fem.mechanics.newton import Newton, NewtonSettings, Report
 from palpate.fem.mechanics.state import State
 from palpate.fem.mechanics.system import System
@@ -43,6 +44,7 @@ class Settings:
         force_limit_n: A trajectory ends where the indenter's force exceeds this [N]; the paper saw
             23-32 N at most.
         smallest_increment: Fraction of a step below which it is given up.
+        volume_barrier: See ``NeoHooke.barrier``.
         predict: Whether increments start from an extrapolation of the last two.
         solver: See `make_factor`.
     """
@@ -51,6 +53,7 @@ class Settings:
     contact: ContactSettings = field(default_factory=ContactSettings)
     force_limit_n: float = 32.0
     smallest_increment: float = 1 / 64
+    volume_barrier: float = VOLUME_BARRIER
     predict: bool = True
     solver: str = "auto"
 
@@ -69,6 +72,7 @@ class Fingertip:
             shear_modulus_pa=parameters.shear_modulus_pa,
             bulk_ratio=parameters.bulk_ratio,
             contact=settings.contact.scaled(parameters.shear_modulus_pa / REFERENCE_MODULUS_PA),
+            volume_barrier=settings.volume_barrier,
         )
         pattern = self.system.pattern
         self.newton = Newton(

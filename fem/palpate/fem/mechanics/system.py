@@ -14,6 +14,7 @@ from palpate.fem.mechanics import contact_kernels, core_kernels, element_kernels
 from palpate.fem.mechanics.balance import TRACTION_FLOOR_PA, Balance
 from palpate.fem.mechanics.cavity import Cavity
 from palpate.fem.mechanics.laws import ContactSettings, Press
+from palpate.fem.mechanics.material import VOLUME_BARRIER
 from palpate.fem.mechanics.pattern import make_pattern
 from palpate.fem.mechanics.skin import Skin
 from palpate.fem.mechanics.state import State
@@ -38,6 +39,7 @@ class System:
         shear_modulus_pa: float,
         bulk_ratio: float,
         contact: ContactSettings,
+        volume_barrier: float = VOLUME_BARRIER,
         held: NDArray[np.bool_] | None = None,
     ) -> None:
         """Prepare the equations.
@@ -48,6 +50,7 @@ class System:
             shear_modulus_pa: Neo-Hookean modulus [Pa].
             bulk_ratio: Bulk over shear modulus.
             contact: Constants of the contact laws.
+            volume_barrier: See ``NeoHooke.barrier``.
             held: Prescribed components (V, 3); None = the mesh's fixed nodes. Their positions are
                 those in the state.
         """
@@ -66,6 +69,7 @@ class System:
             self.pattern.element_pairs,
             shear_modulus_pa=shear_modulus_pa,
             bulk_ratio=bulk_ratio,
+            volume_barrier=volume_barrier,
         )
         nodes = len(mesh.nodes)
         self.outer = Surface(mesh.nodes, mesh.outer_faces, self.pattern.outer_pairs)
