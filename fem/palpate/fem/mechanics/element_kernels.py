@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def beyond(j: wp.float64):
-    """b sign(ln J): how far ln J is past where the barrier begins."""
+    """How far ln J is past where the barrier begins, with its sign: b sign(ln J)."""
     logarithm = wp.log(wp.max(j, wp.float64(1.0e-3)))
     return wp.sign(logarithm) * wp.max(wp.abs(logarithm) - FROM, wp.float64(0.0))
 

@@ -28,6 +28,13 @@ OVERSHOOT = 0.1
 """By how much of the force limit its last increment may go beyond it."""
 
 
+SNAP = 0.1
+"""Share of the force that may be lost where plain steps find no equilibrium and creeping does.
+
+More is not the branch that the skin was on: nodes that bear the pinch have slipped out of it, which
+a continuous skin does not do. The trajectory ends before."""
+
+
 @dataclass(slots=True)
 class _Work:
     """What the increments of one step cost."""
@@ -61,6 +68,7 @@ class Indentation:
         self.state = tip.state.copy()
         self.outcome: Outcome | None = None
         self.reason = ""
+        self.force = 0.0  # of the last increment [N]
         tip.system.settle(self.state, self.press)
         tip.newton.forget()
         # Of the last two increments: where they ended and how long they were, for the predictor.
@@ -84,11 +92,11 @@ class Indentation:
                 if 1.0 - goal < 1e-6:
                     goal = 1.0
                 pose = interpolate_pose(self.path[k - 1], self.path[k], goal)
-                origin = (self.state, self.press, self.before, self.before_length)
+                origin = (self.state, self.press, self.before, self.before_length, self.force)
                 report, balance = self.increment(pose, size)
                 work.add(report)
                 if report.converged and self._overshoots(balance, size):
-                    self.state, self.press, self.before, self.before_length = origin
+                    self.state, self.press, self.before, self.before_length, self.force = origin
                     size *= 0.5
                     continue
                 if report.converged:
@@ -148,16 +156,22 @@ class Indentation:
         kept, press = self.state.copy(), self.press.at(pose)
         trial = self.predicted(length)
         report, balance = self.tip.equilibrium(trial, press, self.tip.cavity, self._stop)
-        if not report.converged and self.outcome is None and self.before is not None:
-            # The extrapolation may have led astray, e.g. at first touch.
+        if not report.converged and self.outcome is None:
+            # The extrapolation may have led astray, e.g. at first touch, or the skin is pinched.
             trial = kept.copy()
-            second, balance = self.tip.equilibrium(trial, press, self.tip.cavity, self._stop)
+            second, balance = self.tip.equilibrium(
+                trial, press, self.tip.cavity, self._stop, creep=True
+            )
             second.iterations += report.iterations
             second.factorisations += report.factorisations
             report = second
+            if report.converged and _force(balance) < (1.0 - SNAP) * self.force:
+                self.outcome = Outcome.DIVERGED
+                self.reason = f"the skin snaps: {self.force:.1f} N fall to {_force(balance):.1f} N"
+                report.converged = False
         if report.converged:
             self.before, self.before_length = kept, length
-            self.state, self.press = trial, press
+            self.state, self.press, self.force = trial, press, _force(balance)
             self.tip.system.settle(trial, press)
         else:
             self.before = None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from palpate.fem.mechanics.balance import Balance
+from palpate.fem.mechanics.creep import Creep
 from palpate.fem.mechanics.laws import Press
 from palpate.fem.mechanics.state import State
 from palpate.fem.mechanics.system import System
@@ -38,6 +39,7 @@ class NewtonSettings:
         gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
         traction_tolerance: Error of a point's friction over the largest traction.
         iterations: Give up after this many.
+        creep_iterations: The same where the skin is held back.
         largest_move_m: A longer step of any node is shortened [m].
         keep_factor: A factor is kept while each iteration shrinks the error at least this much
             and no contact changes.
@@ -50,6 +52,7 @@ class NewtonSettings:
     gap_tolerance_m: float = 0.1e-6
     traction_tolerance: float = 0.01
     iterations: int = 20
+    creep_iterations: int = 40
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
     keep_elastic: float = 0.15
@@ -82,6 +85,7 @@ class Newton:
         *,
         volume: float | None,
         should_stop: Callable[[], bool] | None = None,
+        creep: bool = False,
     ) -> tuple[Report, Balance]:
         """Bring ``state`` into equilibrium, in place.
 
@@ -90,9 +94,11 @@ class Newton:
             press: Indenter at its pose.
             volume: Volume the cavity shall have [m^3]; None = the fluid pressure is given.
             should_stop: Asked once an iteration; True ends it unconverged.
+            creep: Whether to hold the skin back on the way, see `Creep`: slower, and it arrives
+                where plain steps go round in circles.
         """
         with one_thread():
-            return self._iterate(state, press, volume, should_stop)
+            return self._iterate(state, press, volume, should_stop, Creep() if creep else None)
 
     def _iterate(
         self,
@@ -100,29 +106,32 @@ class Newton:
         press: Press | None,
         volume: float | None,
         should_stop: Callable[[], bool] | None,
+        creep: Creep | None,
     ) -> tuple[Report, Balance]:
         settings, system, report = self.settings, self.system, Report()
         balance = system.balance(state, press)
         fits, elastic = False, not (self._has_elastic and settings.keep_elastic)
+        limit = settings.creep_iterations if creep else settings.iterations
         error = self._error(balance, volume)
         report.residuals.append(error)
         while True:
             if self._converged(balance, volume):
                 report.converged = True
                 return report, balance
-            if report.iterations >= settings.iterations:
+            if report.iterations >= limit:
                 report.reason = f"no equilibrium after {report.iterations} iterations"
                 return report, balance
             if should_stop is not None and should_stop():
                 report.reason = "stopped"
                 return report, balance
             try:
-                if not fits:
-                    self._border = None
-                    self.factor.factorise(system.tangent_values(elastic=elastic))
-                    self._has_elastic = True
+                if creep:
+                    report.factorisations += self._held_back(creep)
+                elif not fits:
+                    self._factorise(elastic=elastic)
                     report.factorisations += 1
-                balance = self._step(state, press, balance, volume, self._damping(report))
+                damping = 1.0 if creep else self._damping(report)
+                balance = self._step(state, press, balance, volume, damping)
             except SimulationError as failure:
                 report.reason = failure.problem
                 return report, balance
@@ -137,10 +146,27 @@ class Newton:
             # has come near.
             elastic = report.iterations == 1 or error > settings.keep_elastic * before
             fits = error < settings.keep_factor * before and not system.sets_changed
+            if creep:
+                creep.after(balance.residual)
 
     def forget(self) -> None:
         """Keep nothing of the last tangent: what follows does not depend on what came before."""
         self._border, self._has_elastic = None, False
+
+    def _factorise(self, *, elastic: bool, drag: float = 0.0) -> None:
+        self._border = None
+        self.factor.factorise(self.system.tangent_values(elastic=elastic, drag=drag))
+        self._has_elastic = True
+
+    def _held_back(self, creep: Creep) -> int:
+        """Factorise with a drag that leaves no unstable direction; how many factorisations."""
+        self._factorise(elastic=True, drag=creep.drag)
+        count = 1
+        while self.factor.negative and creep.may_rise:
+            creep.rise()
+            self._factorise(elastic=False, drag=creep.drag)
+            count += 1
+        return count
 
     def _damping(self, report: Report) -> float:
         """Fraction of the next step: half where the error goes round in circles.
@@ -224,6 +250,13 @@ class Newton:
                 strict=True,
             ):
                 now[:] = before + fraction * (target - before)
+            # A point that lets go does so at once: half of its pressure again and again would
+            # never be none, and the point would hang on.
+            for now, target in zip(
+                (state.core_pressure, state.indenter_pressure), targets[1:3], strict=True
+            ):
+                now[target <= 0.0] = 0.0
+            state.traction[targets[2] <= 0.0] = 0.0
             trial = system.balance(state, press)
             if trial.smallest_jacobian > 0.0:
                 return trial

@@ -196,9 +196,11 @@ class Fingertip:
         press: Press | None,
         volume: float | None,
         should_stop: Callable[[], bool] | None,
+        *,
+        creep: bool = False,
     ) -> tuple[Report, Balance]:
         """One increment."""
-        return self.newton.solve(state, press, volume=volume, should_stop=should_stop)
+        return self.newton.solve(state, press, volume=volume, should_stop=should_stop, creep=creep)
 
     def indent(
         self,

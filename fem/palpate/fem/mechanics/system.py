@@ -86,6 +86,10 @@ class System:
         self._sum = np.zeros((self.pattern.blocks, 9))
         self._sum_array = mat33s(self._sum.reshape(-1, 3, 3))
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="palpate-fem")
+        share = np.zeros(nodes)
+        corners = mesh.elements.shape[1]
+        np.add.at(share, mesh.elements, (self.skin.rest_volume / corners)[:, None])
+        self._drag = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
         self._at: tuple[wp.array, wp.array, float] | None = None
 
     def balance(self, state: State, press: Press | None) -> Balance:
@@ -114,7 +118,7 @@ class System:
         self._both(first_half, second_half)
         return self._sum_up(state)
 
-    def tangent_values(self, *, elastic: bool = True) -> Floats:
+    def tangent_values(self, *, elastic: bool = True, drag: float = 0.0) -> Floats:
         """Upper triangle of the symmetric tangent at the last `balance`.
 
         What belongs to this tangent (volume gradients, friction's rest) is kept until the next.
@@ -122,6 +126,8 @@ class System:
         Args:
             elastic: Whether skin and fluid are done anew; else they are those of the last time, and
                 only contact is new.
+            drag: Stiffness that holds every node where it is, in units of the skin's own: mu times
+                the edge of the cube that is the node's share of the skin.
         """
         if elastic:
             assert self._at is not None
@@ -145,7 +151,9 @@ class System:
         for surface in (self.outer, self.inner):
             surface.add_tangent(self._sum_array)
             surface.freeze()
-        return self._sum.reshape(-1)[self.pattern.gather]
+        values = self._sum.reshape(-1)[self.pattern.gather]
+        values[self.pattern.indptr[:-1]] += drag * self._drag  # a row begins with its diagonal
+        return values
 
     @property
     def slides(self) -> bool:
