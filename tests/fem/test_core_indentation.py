@@ -162,7 +162,9 @@ def test_an_increment_that_goes_far_past_the_limit_is_cut_back(
 @pytest.fixture(scope="module")
 def hasty(fill: Fill) -> Fingertip:
     """Gives up soon."""
-    return fill(Settings(newton=NewtonSettings(iterations=8), smallest_increment=0.6))
+    return fill(
+        Settings(newton=NewtonSettings(iterations=8, creep_iterations=8), smallest_increment=0.6)
+    )
 
 
 def test_what_cannot_be_solved_is_reported_with_what_could(hasty: Fingertip) -> None:
@@ -197,7 +199,7 @@ def test_a_step_is_cut_until_it_goes(finger: Fingertip, hasty: Fingertip) -> Non
     hasty_settings = replace(hasty.settings, smallest_increment=1 / 64)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hasty, "settings", hasty_settings)
-        patch.setattr(hasty.newton, "settings", NewtonSettings(iterations=5))
+        patch.setattr(hasty.newton, "settings", NewtonSettings(iterations=5, creep_iterations=5))
         cut = hasty.indent(BALL, path)
     assert cut.outcome is Outcome.COMPLETE
     assert cut.steps[0].convergence.increments > 1

@@ -1,0 +1,154 @@
+"""Creeping: from an unstable state to a stable one, without a force of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from palpate.fem.indenter.catalogue import make_indenter
+from palpate.fem.mechanics.creep import LEAST, MOST, START, Creep
+from palpate.fem.mechanics.indentation import Indentation
+from palpate.fem.mechanics.laws import ContactSettings, Press
+from palpate.fem.mechanics.newton import Newton, NewtonSettings
+from palpate.fem.mechanics.solver import Fingertip
+from palpate.fem.mechanics.state import State
+from palpate.fem.mechanics.system import System
+from palpate.fem.mesh.solid import SolidMesh
+from palpate.fem.result import Outcome
+from palpate.fem.sparse.factor import make_factor
+
+Floats = NDArray[np.float64]
+Mesh = Callable[..., SolidMesh]
+Fill = Callable[..., Fingertip]
+
+BALL = make_indenter("sphere_medium")
+
+
+def test_drag_falls_to_none_and_comes_back_where_nothing_is_won() -> None:
+    creep = Creep()
+    drags = [creep.drag]
+    for residual in (1.0, 3.0, 0.5, 2.0, 0.3, 0.1):  # leaving an unstable state, forces may grow
+        creep.after(residual)
+        drags.append(creep.drag)
+    assert drags[0] == START
+    assert all(later < earlier or later == 0.0 for earlier, later in pairwise(drags))
+    assert creep.drag == 0.0
+    creep.after(0.29)
+    assert creep.drag == START  # two iterations ago it was as good
+
+
+def test_drag_rises_from_none_as_far_as_it_may() -> None:
+    creep = Creep(drag=0.0)
+    creep.rise()
+    assert creep.drag == LEAST
+    while creep.may_rise:
+        creep.rise()
+    assert creep.drag == MOST
+
+
+def newton_of(mesh: SolidMesh, held: NDArray[np.bool_], solver: str = "fronts-double") -> Newton:
+    system = System(
+        mesh, None, shear_modulus_pa=2.8e5, bulk_ratio=1e3, contact=ContactSettings(), held=held
+    )
+    pattern = system.pattern
+    factor = make_factor(pattern.indptr, pattern.indices, groups=pattern.free // 3, solver=solver)
+    return Newton(system, factor, NewtonSettings(creep_iterations=100))
+
+
+@pytest.fixture(scope="module")
+def column(block: Mesh) -> tuple[SolidMesh, NDArray[np.bool_], State]:
+    """A slender column with clamped ends, shortened far beyond Euler's load, and straight."""
+    mesh = block((1, 1, 12))
+    held = np.zeros(mesh.nodes.shape, bool)
+    held[(mesh.nodes[:, 2] < 1e-9) | (mesh.nodes[:, 2] > 12e-3 - 1e-9)] = True
+    state = State.at_rest(mesh)
+    state.position[:, 2] *= 0.85
+    return mesh, held, state
+
+
+@pytest.mark.parametrize("solver", ["fronts", "fronts-double", "superlu"])
+def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
+    column: tuple[SolidMesh, NDArray[np.bool_], State], solver: str
+) -> None:
+    """Newton finds the unstable straight column; nothing real would stay there."""
+    mesh, held, start = column
+    straight, newton = start.copy(), newton_of(mesh, held, solver)
+    report, _ = newton.solve(straight, None, volume=None)
+    assert report.converged
+    newton.factor.factorise(newton.system.tangent_values())
+    assert newton.factor.negative > 0
+    middle = np.abs(mesh.nodes[:, 2] - 6e-3) < 1e-9
+    axis = straight.position[middle].mean(axis=0)
+    assert np.abs(axis[:2] - 0.5e-3).max() < 1e-9
+
+    bent = start.copy()
+    bent.position[middle, 0] += 1e-6  # the least disturbance: creeping follows it, not the column
+    report, balance = newton.solve(bent, None, volume=None, creep=True)
+    assert report.converged, report.residuals
+    assert bent.position[middle, 0].mean() - 0.5e-3 > 0.5e-3
+    newton.system.balance(bent, None)
+    newton.factor.factorise(newton.system.tangent_values())
+    assert newton.factor.negative == 0
+    # An equilibrium of the column itself: plain Newton has nothing to do there.
+    report, plain = newton.solve(bent.copy(), None, volume=None)
+    assert report.iterations == 0
+    assert plain.residual == balance.residual
+
+
+def test_creeping_arrives_where_plain_steps_do(finger: Fingertip) -> None:
+    low = finger.nodes[:, 2].min()
+    answers = []
+    for creep in (False, True):
+        state = finger.state.copy()
+        press = Press(BALL, np.array([0.0, 0.0, low + 0.4e-3, 1.0, 0.0, 0.0, 0.0]), 0.0)
+        finger.newton.forget()
+        report, balance = finger.equilibrium(state, press, finger.cavity, None, creep=creep)
+        assert report.converged
+        answers.append((state.position, balance.indenter.sum(axis=0)))
+    np.testing.assert_allclose(answers[0][0], answers[1][0], atol=1e-8)
+    np.testing.assert_allclose(answers[0][1], answers[1][1], atol=1e-5)
+
+
+def test_a_point_that_lets_go_does_so_at_once(finger: Fingertip) -> None:
+    """However short the step: half of a pressure again and again is never none."""
+    low = finger.nodes[:, 2].min()
+    state = finger.state.copy()
+    deep = np.array([0.0, 0.0, low + 0.4e-3, 1.0, 0.0, 0.0, 0.0])
+    press = Press(BALL, deep, 0.3)
+    assert finger.equilibrium(state, press, finger.cavity, None)[0].converged
+    touching = state.indenter_pressure > 0.0
+    assert touching.sum() > 4
+    short = Newton(
+        finger.system, finger.newton.factor, NewtonSettings(iterations=1, largest_move_m=1e-6)
+    )
+    away = press.at(deep - np.array([0.0, 0.0, 0.3e-3, 0.0, 0.0, 0.0, 0.0]))
+    short.solve(state, away, volume=finger.cavity)
+    gone = touching & (state.indenter_pressure <= 0.0)
+    assert gone.any()
+    assert not state.traction[gone].any()
+    assert (state.indenter_pressure >= 0.0).all()
+
+
+def test_a_snap_ends_the_trajectory_before_it(fill: Fill) -> None:
+    """Where only creeping finds an answer, and one that bears much less."""
+    finger = fill()
+    finger.newton.settings = NewtonSettings(iterations=1)
+    low = finger.nodes[:, 2].min()
+    path = np.array([[0.0, 0.0, low + depth, 1.0, 0.0, 0.0, 0.0] for depth in (-2e-6, 0.2e-3)])
+    run = Indentation(finger, BALL, path, None, None)
+    report, balance = run.increment(path[1], 1.0)
+    assert report.converged
+    force = float(np.linalg.norm(balance.indenter.sum(axis=0)))
+    assert run.force == pytest.approx(force)
+
+    run = Indentation(finger, BALL, path, None, None)
+    run.force, before = 2.0 * force, run.state.copy()
+    report, _ = run.increment(path[1], 1.0)
+    assert not report.converged
+    assert run.outcome is Outcome.DIVERGED
+    assert run.reason == f"the skin snaps: {2 * force:.1f} N fall to {force:.1f} N"
+    np.testing.assert_array_equal(run.state.position, before.position)
