@@ -16,12 +16,13 @@ from scipy.optimize import least_squares
 from palpate.fem.electrodes.circuit import FULL_SCALE
 from palpate.fem.electrodes.gap import Gap
 from palpate.fem.electrodes.sensor import Electrodes, Response
-from palpate.fem.electrodes.table import MIRROR, POSITIONS, SENSING
+from palpate.fem.electrodes.table import SENSING
 from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.mesh.nvlabs import read_nvlabs
 from palpate.fem.mesh.parametric import biotac
 from palpate.fem.mesh.surface import node_areas
 from palpate.fem.result import Step
+from palpate.protos.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ def dented(sensor: Electrodes) -> Callable[[float, float], Floats]:
     nodes = sensor.geometry.mesh.nodes
 
     def dent(depth_m: float, y: float = 0.3e-3) -> Floats:
-        away = np.linalg.norm(nodes - [POSITIONS[E18, 0], y, -6.7e-3], axis=1)
+        away = np.linalg.norm(nodes - [ELECTRODE_POSITIONS[E18, 0], y, -6.7e-3], axis=1)
         push = depth_m * np.exp(-((away / 3e-3) ** 2))
         return np.asarray(nodes + push[:, None] * np.array([0.0, 0.0, 1.0]))
 
@@ -74,7 +75,7 @@ def test_mirrored_states_give_permuted_counts(
 ) -> None:
     left, right = (sensor.respond(dented(1e-3, y)).counts for y in (1.5e-3, -1.5e-3))
     # Triangles of the film and the split of the skin's quads are not mirrored.
-    np.testing.assert_allclose(left[MIRROR], right, atol=4.0)
+    np.testing.assert_allclose(left[ELECTRODE_MIRROR], right, atol=4.0)
     assert np.abs(left - right).max() > 30
 
 
@@ -125,7 +126,7 @@ def closed(sensor: Electrodes, film_m: float, pressure_pa: float = 0.0) -> tuple
     """Tared counts over full scale where a 4 mm disc about E18 is closed, fluid spread out."""
     film = sensor.film
     rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
-    foot = film.nodes[np.linalg.norm(film.nodes - POSITIONS[E18], axis=1).argmin()]
+    foot = film.nodes[np.linalg.norm(film.nodes - ELECTRODE_POSITIONS[E18], axis=1).argmin()]
     away = np.linalg.norm(film.nodes - foot, axis=1)
     inside = 1 / (1 + np.exp((away - 4e-3) / 0.2e-3))
     gap = rest.gap * (1 - inside) + np.minimum(rest.gap, film_m) * inside

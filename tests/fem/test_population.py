@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from palpate.fem.electrodes.gap import Gap
 from palpate.fem.electrodes.sensor import Electrodes
-from palpate.fem.electrodes.table import POSITIONS
 from palpate.fem.electrodes.unit import UnitParameters
 from palpate.fem.mesh.parametric import biotac
 from palpate.fem.population.answers import Extremes
@@ -30,6 +29,7 @@ from palpate.fem.population.member import (
 )
 from palpate.fem.population.mount import clear_steps
 from palpate.fem.result import Step, Trajectory
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
 from palpate.protos.errors import ConfigError, DatasetError
 
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ def states(sensor: Electrodes) -> tuple[list[Gap], Gap]:
     """Presses over single electrodes: closed there, open elsewhere; and the untouched finger."""
     rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
     pressed = []
-    for centre in POSITIONS[[0, 1, 3, 8, 16, 17]]:
+    for centre in ELECTRODE_POSITIONS[[0, 1, 3, 8, 16, 17]]:
         away = np.linalg.norm(sensor.film.nodes - centre, axis=1)
         inside = np.exp(-((away / 2.5e-3) ** 2))
         gap = rest.gap * (1 - inside) + 0.2e-3 * (1 - inside)

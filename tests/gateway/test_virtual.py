@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway import virtual_geometry as geometry
 from palpate.gateway.device import Device
 from palpate.gateway.drivers import make_device
 from palpate.gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
 from palpate.gateway.virtual_physics import Unit, contact, electrode_counts, films
 from palpate.gateway.virtual_trajectory import touch
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
 
 
 def collect(**options: Any) -> dict[str, Any]:
@@ -115,8 +115,8 @@ def test_counts_fall_under_the_contact_and_rise_beside_it(run: dict[str, Any]) -
     tared = run["electrodes"] - run["electrodes"][:100].mean(axis=0)
     pressed = np.flatnonzero(np.linalg.norm(run["force"], axis=1) > 3.0)
     strongest = np.argmin(tared[pressed], axis=1)
-    distance = np.linalg.norm(geometry.ELECTRODES_M[strongest] - run["tip"][pressed], axis=1)
-    every = np.linalg.norm(geometry.ELECTRODES_M[None] - run["tip"][pressed, None], axis=2)
+    distance = np.linalg.norm(ELECTRODE_POSITIONS[strongest] - run["tip"][pressed], axis=1)
+    every = np.linalg.norm(ELECTRODE_POSITIONS[None] - run["tip"][pressed, None], axis=2)
     assert np.median(distance - every.min(axis=1)) < 2e-3
     assert tared[pressed].min() < -0.4 * 4095
     assert 0.01 * 4095 < tared[pressed].max() < 0.15 * 4095

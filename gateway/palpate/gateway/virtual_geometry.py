@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
+
 Array = npt.NDArray[np.float64]
 
 OUTER_RADIUS_M = 7.0e-3
@@ -22,41 +24,15 @@ AXIS_Z_M = -1.31e-3
 TIP_X_M = -0.35e-3
 """Centre of the spherical tip [m]."""
 
-# Electrode centres E1..E19 [mm], published table (learning reference 5.2).
-_ELECTRODES_MM = (
-    (0.993, -4.855, -1.116),
-    (-2.700, -3.513, -3.670),
-    (-6.200, -3.513, -3.670),
-    (-8.000, -4.956, -1.116),
-    (-10.500, -3.513, -3.670),
-    (-13.400, -4.956, -1.116),
-    (4.763, 0.0, -2.330),
-    (3.031, -1.950, -3.330),
-    (3.031, 1.950, -3.330),
-    (1.299, 0.0, -4.330),
-    (0.993, 4.855, -1.116),
-    (-2.700, 3.513, -3.670),
-    (-6.200, 3.513, -3.670),
-    (-8.000, 4.956, -1.116),
-    (-10.500, 3.513, -3.670),
-    (-13.400, 4.956, -1.116),
-    (-2.800, 0.0, -5.080),
-    (-9.800, 0.0, -5.080),
-    (-13.600, 0.0, -5.080),
-)
-
-ELECTRODES_M: Array = np.array(_ELECTRODES_MM) * 1e-3
-"""Electrode centres [m], shape ``(19, 3)``."""
-
 _NEAREST_ON_AXIS = np.stack(
     [
-        np.minimum(ELECTRODES_M[:, 0], TIP_X_M),
-        np.zeros(len(ELECTRODES_M)),
-        np.full(len(ELECTRODES_M), AXIS_Z_M),
+        np.minimum(ELECTRODE_POSITIONS[:, 0], TIP_X_M),
+        np.zeros(len(ELECTRODE_POSITIONS)),
+        np.full(len(ELECTRODE_POSITIONS), AXIS_Z_M),
     ],
     axis=1,
 )
-_FROM_AXIS = ELECTRODES_M - _NEAREST_ON_AXIS
+_FROM_AXIS = ELECTRODE_POSITIONS - _NEAREST_ON_AXIS
 _DISTANCE = np.linalg.norm(_FROM_AXIS, axis=1)
 
 SKIN_NORMALS: Array = _FROM_AXIS / _DISTANCE[:, None]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.gateway.virtual_geometry import ELECTRODES_M, Array
+from palpate.gateway.virtual_geometry import Array
 from palpate.gateway.virtual_signals import (
     PAC_HIGH_PASS_S,
     PAC_NOISE,
@@ -26,6 +26,7 @@ from palpate.gateway.virtual_signals import (
     SLOW_NOISE,
     converted,
 )
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
 from palpate.protos.messages import COUNTS_MAX, PAC_SAMPLES, CountArray
 from palpate.protos.tape import TapeUnit
 
@@ -165,6 +166,6 @@ def _spatial_modes() -> Array:
 
     Of zero mean and unit mean square, so that ``gradient_sd`` is what an electrode sees.
     """
-    raw = np.stack([ELECTRODES_M[:, 0], np.abs(ELECTRODES_M[:, 1])])
+    raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
     raw = raw - raw.mean(axis=1, keepdims=True)
     return np.asarray(raw / raw.std(axis=1, keepdims=True))

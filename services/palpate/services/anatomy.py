@@ -1,9 +1,7 @@
-"""A BioTac-like body for pictures: where the electrodes sit, how core and skin look around them.
+"""A BioTac-like body for pictures: how core and skin look around the electrodes.
 
-Positions are the published electrode table of the BioTac in the sensor frame (Lin et al.): origin
-between the two foremost electrode pairs, +x to the finger tip, -z to the pad. Core and skin are a
-cylinder with a spherical tip, good enough to see on which side something touches; no estimate
-depends on them.
+Core and skin are a cylinder with a spherical tip, good enough to see on which side something
+touches; no estimate depends on them.
 """
 
 from __future__ import annotations
@@ -11,32 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from palpate.protos.messages import FloatArray
-
-ELECTRODE_POSITIONS: FloatArray = 1e-3 * np.array(
-    [
-        [0.993, -4.855, -1.116],
-        [-2.700, -3.513, -3.670],
-        [-6.200, -3.513, -3.670],
-        [-8.000, -4.956, -1.116],
-        [-10.500, -3.513, -3.670],
-        [-13.400, -4.956, -1.116],
-        [4.763, 0.000, -2.330],
-        [3.031, -1.950, -3.330],
-        [3.031, 1.950, -3.330],
-        [1.299, 0.000, -4.330],
-        [0.993, 4.855, -1.116],
-        [-2.700, 3.513, -3.670],
-        [-6.200, 3.513, -3.670],
-        [-8.000, 4.956, -1.116],
-        [-10.500, 3.513, -3.670],
-        [-13.400, 4.956, -1.116],
-        [-2.800, 0.000, -5.080],
-        [-9.800, 0.000, -5.080],
-        [-13.600, 0.000, -5.080],
-    ],
-    dtype=np.float32,
-)
-"""Electrodes E1..E19 on the core [m], shape ``(19, 3)``, sensor frame."""
 
 CORE_RADIUS_M = 0.0049
 """Just below the electrodes, which sit at 5.08 mm, so that they stand out."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
 from palpate.protos.extras import require
 from palpate.services import anatomy
 
@@ -35,12 +36,12 @@ MAX_SENSORS = 8
 
 def electrode_names() -> list[str]:
     """E1..E19."""
-    return [f"E{at + 1}" for at in range(len(anatomy.ELECTRODE_POSITIONS))]
+    return [f"E{at + 1}" for at in range(len(ELECTRODE_POSITIONS))]
 
 
 def electrode_colours() -> list[tuple[int, int, int]]:
     """One colour an electrode, in order around the colour circle."""
-    count = len(anatomy.ELECTRODE_POSITIONS)
+    count = len(ELECTRODE_POSITIONS)
     wheel = (colorsys.hls_to_rgb(at / count, 0.62, 0.65) for at in range(count))
     return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
 
@@ -171,7 +172,7 @@ def fixtures() -> Iterator[tuple[str, Any]]:
     )
     skin = rr.LineStrips3D(anatomy.skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
     yield "finger/skin", skin
-    yield "finger/electrodes", rr.Points3D(anatomy.ELECTRODE_POSITIONS, radii=[7.5e-4])
+    yield "finger/electrodes", rr.Points3D(ELECTRODE_POSITIONS, radii=[7.5e-4])
     for name, colour, point_m, arrow_m in (
         ("truth", TRUTH_COLOUR, 7e-4, 2.4e-4),
         ("estimate", ESTIMATE_COLOUR, 9e-4, 3e-4),

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.training.anatomy import POSITIONS
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
 from palpate.training.dataset import Provenance
 from palpate.training.fields.fit import FitConfig
 from palpate.training.twin.content import (
@@ -94,7 +94,7 @@ def make_mixed() -> Callable[..., MixedDataset]:
         for unit, press in presses:
             centre, shear = centres[press], shears[press]
             fields.append(dent(mesh.nodes, centre, depth, shear))
-            closing = np.linalg.norm(dent(POSITIONS * 1.26, centre, depth, shear), axis=2)
+            closing = np.linalg.norm(dent(ELECTRODE_POSITIONS * 1.26, centre, depth, shear), axis=2)
             drop = -gains[unit] * 0.5 * np.tanh(closing / 0.8e-3)
             tared.append(drop + rng.normal(0, 5e-4, drop.shape))
             normal = -centre / np.linalg.norm(centre)

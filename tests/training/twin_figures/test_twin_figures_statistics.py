@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
@@ -15,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.protos.errors import DatasetError
-from palpate.training.anatomy import MIRROR, NORMALS, POSITIONS, X_POSITIONS
 from palpate.training.twin.content import ExperimentDataset, MixedDataset
 from palpate.training.twin_figures.boxes import box_of
 from palpate.training.twin_figures.contact import final_rows
@@ -146,17 +143,6 @@ def test_fence_stops_at_a_value_and_leaves_the_far_one() -> None:
     assert (box.low, box.high) == (0.0, 6.9)
     with pytest.raises(DatasetError, match="0 values"):
         box_of(np.empty(0))
-
-
-def test_electrode_table_is_the_documented_one(root: Path) -> None:
-    page = (root / "docs" / "conventions.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| E\d+ \|((?: -?\d+\.\d+ \|){6})$", page, flags=re.MULTILINE)
-    table = np.array([[float(value) for value in row.split("|")[:-1]] for row in rows])
-    np.testing.assert_allclose(1e3 * POSITIONS, table[:, :3], atol=1e-9)
-    np.testing.assert_allclose(NORMALS, table[:, 3:], atol=1e-3)  # three printed digits
-    np.testing.assert_allclose(np.linalg.norm(NORMALS, axis=1), 1)
-    np.testing.assert_array_equal(POSITIONS[MIRROR], POSITIONS * [1, -1, 1])
-    np.testing.assert_array_equal(X_POSITIONS[[2, 3]], X_POSITIONS[:2] * [1, -1, 1])
 
 
 @given(st.floats(-15e-3, -1e-6), st.floats(-1.7, 1.7))

@@ -8,14 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
-from palpate.fem.electrodes.table import (
-    DISC_DIAMETER_M,
-    DISC_TERMINAL,
-    POSITIONS,
-    X_POSITIONS,
-)
+from palpate.fem.electrodes.table import DISC_DIAMETER_M, DISC_TERMINAL
 from palpate.fem.mesh.core import Core
 from palpate.fem.mesh.surface import face_vectors, open_edges
+from palpate.protos.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.protos.errors import ConfigError
 
 Floats = NDArray[np.float64]
@@ -103,7 +99,7 @@ def film_mesh(
         low, high = LIMITS[name]
         if not low <= value <= high:
             raise ConfigError(f"{name} = {value} is not within [{low:g}, {high:g}]", remedy="in m")
-    centres = onto(core, np.concatenate([POSITIONS, X_POSITIONS]), -recess_m)[0]
+    centres = onto(core, np.concatenate([ELECTRODE_POSITIONS, EXCITATION_POSITIONS]), -recess_m)[0]
     radius = disc_diameter_m / 2
     points, disc, about = _disc_points(core, centres, radius, recess_m)
     # Where discs stand close, a ring's node that comes near to another disc is left out.

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.fem.electrodes.circuit import Counts, convert, counts_slope, impedance_of
-from palpate.fem.electrodes.table import POSITIONS, SENSING
+from palpate.fem.electrodes.table import SENSING
 from palpate.fem.electrodes.unit import UnitParameters
+from palpate.protos.anatomy import ELECTRODE_POSITIONS
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ def spatial_modes() -> Floats:
 
     Of zero mean and unit mean square, so that `gradient_sd` is what an electrode sees.
     """
-    raw = np.stack([POSITIONS[:, 0], np.abs(POSITIONS[:, 1])])
+    raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
     raw = raw - raw.mean(axis=1, keepdims=True)
     return np.asarray(raw / raw.std(axis=1, keepdims=True))
 

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from palpate.protos.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.protos.errors import DatasetError
-from palpate.training.anatomy import POSITIONS, X_POSITIONS
 from palpate.training.twin.content import SkinMesh
 
 Floats = npt.NDArray[np.float64]
 FloatArray = npt.NDArray[np.float32]
 
-SITES: Floats = np.vstack([POSITIONS, X_POSITIONS])
+SITES: Floats = np.vstack([ELECTRODE_POSITIONS, EXCITATION_POSITIONS])
 """Centres of E1..E19 and of the excitation electrodes X1..X4 [m], shape (23, 3), sensor frame."""
 
 RADII_M = (1.25e-3, 2.5e-3, 5e-3)

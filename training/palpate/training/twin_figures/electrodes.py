@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from palpate.protos.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.protos.extras import require
-from palpate.training.anatomy import POSITIONS, X_POSITIONS
 from palpate.training.twin.content import ExperimentDataset
 from palpate.training.twin_figures.boxes import box_of, draw_boxes
 from palpate.training.twin_figures.outline import unwrap, unwrapped
@@ -24,7 +24,8 @@ from palpate.training.twin_figures.style import (
     unit_legend,
 )
 
-ELECTRODE_NAMES = tuple(f"E{i}" for i in range(1, len(POSITIONS) + 1))
+ELECTRODE_NAMES = tuple(f"E{i}" for i in range(1, len(ELECTRODE_POSITIONS) + 1))
+EXCITATION_NAMES = tuple(f"X{i}" for i in range(1, len(EXCITATION_POSITIONS) + 1))
 
 _DISC_RADIUS_MM = 1.25  # discs of 2.5 mm (learning notes, section 4.3)
 _ELECTRODE = "#2563a6"
@@ -77,8 +78,8 @@ def draw_map(axes: Any) -> None:
     """The unwrapped electrode map, seen from below: distal to the right, y down."""
     axes.fill(*(MM * unwrapped()).T, facecolor=SKIN_LIGHT, edgecolor=CORE_EDGE, lw=1.2, alpha=0.6)
     kinds = (
-        (POSITIONS, ELECTRODE_NAMES, _ELECTRODE, "white"),
-        (X_POSITIONS, [f"X{i}" for i in range(1, len(X_POSITIONS) + 1)], "white", INK),
+        (ELECTRODE_POSITIONS, ELECTRODE_NAMES, _ELECTRODE, "white"),
+        (EXCITATION_POSITIONS, EXCITATION_NAMES, "white", INK),
     )
     for positions, names, fill, ink in kinds:
         for place, name in zip(MM * unwrap(positions), names, strict=True):

@@ -1,0 +1,35 @@
+"""The table of electrodes is the documented one, and what follows from it fits it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from palpate.protos.anatomy import (
+    ELECTRODE_MIRROR,
+    ELECTRODE_NORMALS,
+    ELECTRODE_POSITIONS,
+    EXCITATION_NORMALS,
+    EXCITATION_POSITIONS,
+)
+
+
+def test_the_table_is_the_one_of_the_conventions(root: Path) -> None:
+    text = (root / "docs/conventions.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| E(\d+) \|(.+)\|$", text, re.MULTILINE)
+    assert [int(number) for number, _ in rows] == list(range(1, 20))
+    numbers = np.array([[float(cell) for cell in row.split("|")] for _, row in rows])
+    np.testing.assert_allclose(ELECTRODE_POSITIONS, 1e-3 * numbers[:, :3], atol=1e-12)
+    np.testing.assert_allclose(ELECTRODE_NORMALS, numbers[:, 3:], atol=1e-3)  # three printed digits
+    for normals in (ELECTRODE_NORMALS, EXCITATION_NORMALS):
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, rtol=1e-12)
+
+
+def test_the_table_is_mirror_symmetric() -> None:
+    flip = np.array([1.0, -1.0, 1.0])
+    for table in (ELECTRODE_POSITIONS, ELECTRODE_NORMALS):
+        np.testing.assert_array_equal(table[ELECTRODE_MIRROR], table * flip)
+    for table in (EXCITATION_POSITIONS, EXCITATION_NORMALS):
+        np.testing.assert_array_equal(table[[2, 3, 0, 1]], table * flip)
