@@ -9,11 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from palpate.protos.config import LinkConfig
 from palpate.protos.session import run_router
 
 ROOT = Path(__file__).resolve().parents[1]
+
+# No example has a time limit: first calls import and compile, and machines here are noisy.
+settings.register_profile("palpate", deadline=None)
+settings.load_profile("palpate")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

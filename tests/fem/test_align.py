@@ -126,7 +126,7 @@ def test_a_trajectory_that_stopped_early_has_the_travel_of_its_steps() -> None:
     assert len(curve(path, np.zeros((0, 3))).travel_m) == 0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     shift_um=st.floats(-150, 150), scale=st.floats(0.5, 3.0), step_um=st.sampled_from([50, 70, 100])
 )

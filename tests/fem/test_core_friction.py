@@ -29,7 +29,7 @@ def test_normal_law_pushes_and_never_pulls() -> None:
     start=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
     complement=st.floats(1e7, 8e8),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_friction_iterates_to_a_spring_capped_by_coulomb(
     pressure: float,
     arm: tuple[float, float, float],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -32,7 +32,6 @@ def angle(a: Floats, b: Floats) -> float:
     return float(4.0 * np.arcsin(min(1.0, min(apart) / 2.0)))
 
 
-@settings(deadline=None)
 @given(a=poses(), b=poses(), share=SHARE)
 def test_between_poses_the_tip_goes_straight_and_turns_evenly(
     a: Floats, b: Floats, share: float
@@ -46,7 +45,6 @@ def test_between_poses_the_tip_goes_straight_and_turns_evenly(
         assert angle(pose, b) == pytest.approx((1 - share) * whole, abs=1e-6)
 
 
-@settings(deadline=None)
 @given(a=poses(), b=poses(), share=SHARE)
 def test_interpolation_begins_ends_reverses_and_knows_both_signs(
     a: Floats, b: Floats, share: float
@@ -63,7 +61,6 @@ def test_interpolation_begins_ends_reverses_and_knows_both_signs(
         np.testing.assert_allclose(turned[0], turned[1], atol=1e-9)
 
 
-@settings(deadline=None)
 @given(corners=st.lists(st.tuples(*[COORDINATE] * 3), min_size=2, max_size=8))
 def test_lengths_of_a_path_add_up(corners: list[tuple[float, float, float]]) -> None:
     path = np.array([[*corner, 1.0, 0.0, 0.0, 0.0] for corner in corners])

@@ -46,7 +46,7 @@ def symmetric_cells(random: np.random.Generator, cells: Ints) -> Floats:
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.0), corners=st.sampled_from([8, 6]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_equals_dense_assembly(
     block: Callable[..., SolidMesh], assembled: Assembled, seed: int, share: float, corners: int
 ) -> None:
@@ -76,7 +76,7 @@ def test_equals_dense_assembly(
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_is_a_sorted_upper_triangle_with_its_whole_diagonal(
     block: Callable[..., SolidMesh], seed: int, share: float
 ) -> None:

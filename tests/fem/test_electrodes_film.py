@@ -150,7 +150,7 @@ def test_a_skin_that_is_not_there_is_refused(shell: Shell) -> None:
         GapFinder(film, skin)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     gap=st.floats(-5e-6, 2e-3),
     pressure=st.floats(0, 2e6),

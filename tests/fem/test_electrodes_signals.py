@@ -47,7 +47,7 @@ def test_divider_is_that_of_the_notes(electrode: str) -> None:
     assert ideal_counts(np.full(19, impedance), UNIT)[0] == pytest.approx(counts, abs=2.5)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10**6), size=st.floats(1e2, 1e6))
 def test_counts_and_impedances_are_inverse(seed: int, size: float) -> None:
     unit = drawn(seed)
@@ -174,7 +174,7 @@ def test_creep_comes_late_and_goes_late() -> None:
     np.testing.assert_array_equal(coarse.read(pressed, 10.0), last)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(pressure=st.floats(-20e3, 60e3), temperature=st.floats(5.0, 70.0))
 def test_static_channels_are_inverse(pressure: float, temperature: float) -> None:
     pdc = channels.pdc_of(np.array(pressure), UNIT)

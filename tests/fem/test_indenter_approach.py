@@ -79,7 +79,7 @@ def test_faces_count_not_only_their_corners() -> None:
     assert travel == pytest.approx(0.0, abs=2e-6)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     name=st.sampled_from(indenter_names()),
     direction=DIRECTION,
@@ -125,7 +125,7 @@ def test_inside_a_large_finger_is_not_clear_although_no_skin_is_near() -> None:
     assert check_clear(make_indenter("ring"), pose - np.eye(7)[2] * 60e-3, ball(40e-3)) > 0.0
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(direction=DIRECTION)
 def test_facing_turns_z_there_by_the_shortest_way(direction: Direction) -> None:
     quaternion, there = facing(direction), unit(direction)

@@ -131,7 +131,7 @@ def test_outside_the_foot_of_the_normal_lies_on_the_surface(name: str) -> None:
 
 
 @EVERY
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(a=POINT, b=POINT)
 def test_the_gap_changes_no_more_than_the_point_moves(
     name: str, a: tuple[float, float, float], b: tuple[float, float, float]
@@ -142,7 +142,7 @@ def test_the_gap_changes_no_more_than_the_point_moves(
 
 
 @EVERY
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     position=POINT,
     turn=st.tuples(*4 * [st.floats(-1, 1)]).filter(lambda q: np.linalg.norm(q) > 0.1),

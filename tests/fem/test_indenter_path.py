@@ -57,7 +57,7 @@ def test_a_wrong_path_is_refused_with_the_reason(path: Any, problem: str) -> Non
     assert caught.value.remedy
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     positions=st.lists(st.tuples(*3 * [st.floats(-0.2, 0.2)]), min_size=2, max_size=5),
     turn=st.tuples(*4 * [st.floats(-1, 1)]).filter(lambda q: np.linalg.norm(q) > 0.1),

@@ -58,7 +58,7 @@ def test_derivatives_are_those_of_the_value(grid: DistanceGrid) -> None:
         np.testing.assert_allclose(slope, hessian[:, i], atol=1e-5 * np.abs(hessian).max())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.floats(-1, 1), min_size=27, max_size=27))
 def test_a_cubic_in_the_middle_of_a_grid_is_reproduced(weights: list[float]) -> None:
     # Quadratic in each axis: the spline's mirror at the border reaches no further than a few cells.
@@ -105,7 +105,7 @@ def to_cube(points: Floats) -> Floats:
     return np.asarray(outside + np.minimum(over.max(axis=-1), 0))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_distance_to_triangles_is_exact_at_faces_edges_and_corners(seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-2 * SMALL, 2 * SMALL, (200, 3))

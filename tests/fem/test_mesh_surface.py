@@ -207,7 +207,7 @@ def test_the_hash_tells_meshes_apart_and_is_the_same_for_the_same() -> None:
     assert len({mesh.sha256 for mesh in [shell(), *others]}) == 4
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(2, 9), st.integers(1, 6), st.integers(1, 8))
 def test_a_bag_is_closed_and_symmetric_for_all_sizes(rings: int, half: int, flank: int) -> None:
     sheet = bag(rings, 2 * half, flank)

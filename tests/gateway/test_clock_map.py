@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.gateway.clock_map import FileClock, LiveClock, PacedClock
@@ -32,7 +32,6 @@ def test_live_clock_follows_a_slow_device() -> None:
     assert abs(mapped - host_s * 1e9) < 0.1e6
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 0.1), st.integers(0, 10**8)), min_size=1, max_size=50))
 def test_live_clock_never_goes_back_nor_ahead_of_arrival(steps: list[tuple[float, int]]) -> None:
     live, time_s, last = LiveClock(), 0.0, 0

@@ -46,7 +46,7 @@ def test_decodes_by_channel_id(start: str) -> None:
     assert assembler.counters["samples"] == 44
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.permutations(range(44)), st.integers(1, 100))
 def test_order_and_blocks_do_not_matter(order: list[int], block: int) -> None:
     first, second = slots_of(1), slots_of(2)
@@ -146,7 +146,7 @@ slot_strategy = st.builds(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(slot_strategy, max_size=120), st.integers(1, 50))
 def test_any_slots_are_accounted_for(slots: list[Slot], block: int) -> None:
     readings, assembler = assemble(slots, block)
