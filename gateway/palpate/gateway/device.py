@@ -33,7 +33,8 @@ class DeviceInfo:
 
     Attributes:
         driver: Name in the driver table.
-        sensor_type: Kind of tactile sensor, which fixes the number of electrodes.
+        sensor_type: Kind of tactile sensor, which fixes the number of electrodes; None = no tactile
+            sensor, but one of force and torque.
         model: One line for people.
         rate_hz: Nominal frame rate [Hz].
         live: The device sets the pace; False = a file or a simulation that waits for its reader.
@@ -42,7 +43,7 @@ class DeviceInfo:
     """
 
     driver: str
-    sensor_type: SensorType
+    sensor_type: SensorType | None
     model: str
     rate_hz: float
     live: bool

@@ -173,10 +173,13 @@ class Pipeline:
         stamp, due_ns = self._stamps.stamp(
             ELECTRODES.name, reading, arrival_ns, reading.missed_before
         )
+        kind = self._info.sensor_type
+        if kind is None:
+            raise RuntimeError(f"driver {self._info.driver!r} has electrodes and no sensor type")
         frame = ElectrodeFrame(
             stamp,
             self._serial,
-            self._info.sensor_type,
+            kind,
             reading.electrodes,
             reading.pdc,
             reading.pac,

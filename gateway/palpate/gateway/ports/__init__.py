@@ -1,0 +1,1 @@
+"""Serial lines, sockets and CAN buses: bytes in and out, with typed errors, and nothing else."""

@@ -1,0 +1,295 @@
+"""Robotous RFT force/torque sensors: the data bytes, whatever line carries them.
+
+A request has 8 data bytes, an answer 16 (D1..D16, D1 names the command); ``robotous_framing`` takes
+them off the serial line and the CAN bus. The sensor sends neither a counter nor a time (hardware
+reference 3.5). Where the page leaves the place of a setting inside a reply open, it is that of the
+maker's own packet class ``RFT_IF_PACKET`` (one source).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+REQUEST_BYTES = 8
+REPLY_BYTES = 16
+
+AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+
+_COUNTS = struct.Struct(">6h")
+
+
+class Command(IntEnum):
+    """First data byte of requests and replies."""
+
+    MODEL = 1
+    SERIAL = 2
+    FIRMWARE = 3
+    SET_CAN_IDS = 4
+    GET_CAN_IDS = 5
+    SET_BAUD = 6
+    GET_BAUD = 7
+    SET_FILTER = 8
+    GET_FILTER = 9
+    SAMPLE = 10
+    START = 11
+    STOP = 12
+    SET_RATE = 15
+    GET_RATE = 16
+    BIAS = 17
+    OVERLOADS = 18
+
+
+class FilterOrder(Enum):
+    """How cutoffs are numbered; the sources conflict (hardware reference 6).
+
+    Both manuals count down from 500 Hz, the maker's sample header up from 1 Hz.
+    """
+
+    MANUALS = "manuals"
+    SAMPLE_HEADER = "sample_header"
+
+
+RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
+"""Rate [Hz] to code. Code 0 is 200 Hz too; code 6 is 300 Hz in the maker's header: measure it."""
+
+BAUD_CODES = {115200: 0, 921600: 1, 460800: 2, 230400: 3, 57600: 5}
+"""Baud to code. Code 4 is 115200 too."""
+
+HIGHEST_RATE_HZ = {57600: 200, 115200: 333, 230400: 500, 460800: 500, 921600: 1000}
+"""Highest rate [Hz] at a baud of the serial line; CAN at 1 Mbit/s carries all (manual 1.7)."""
+
+CUTOFFS_HZ = (500, 300, 200, 150, 100, 50, 40, 30, 20, 10, 5, 3, 2, 1)
+"""Cutoffs of the first-order low-pass [Hz] in the manuals' order: codes 1 to 14."""
+
+ERRORS = {1: "unsupported", 2: "out of range", 3: "failed"}
+"""Meaning of the error code of a refused setting."""
+
+_COMMANDS = {int(command): command for command in Command}
+_TEXTS = (Command.MODEL, Command.SERIAL, Command.FIRMWARE)
+_SETTINGS = (Command.SET_CAN_IDS, Command.SET_BAUD, Command.SET_FILTER, Command.SET_RATE)
+_VALUES = {
+    Command.GET_CAN_IDS: 6,
+    Command.GET_BAUD: 2,
+    Command.GET_FILTER: 2,
+    Command.GET_RATE: 1,
+    Command.OVERLOADS: 6,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RobotousData:
+    """One wrench, raw.
+
+    Attributes:
+        command: ``START`` for a streamed one, ``SAMPLE`` for one asked for.
+        counts: Fx Fy Fz Tx Ty Tz as sent.
+        overload: Status byte; bit 5 Fx ... bit 0 Tz set where a load passes 120 % of its rating.
+    """
+
+    command: Command
+    counts: tuple[int, ...]
+    overload: int
+
+
+@dataclass(frozen=True, slots=True)
+class RobotousText:
+    """Model, serial number or firmware version."""
+
+    command: Command
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotousResult:
+    """Answer to a set request.
+
+    Attributes:
+        command: The request that is answered.
+        ok: The setting was taken.
+        error: Error code, see ``ERRORS``; 0 if none.
+    """
+
+    command: Command
+    ok: bool
+    error: int
+
+
+@dataclass(frozen=True, slots=True)
+class RobotousValues:
+    """Answer to a get request.
+
+    Attributes:
+        command: The request that is answered.
+        values: CAN ids: request, first, second now, then the same three after restart. Baud: code
+            now, code after restart. Filter: type, code. Rate: code. Overloads: count of each axis.
+    """
+
+    command: Command
+    values: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotousUnknown:
+    """An answer that is none of the above, kept as it came."""
+
+    payload: bytes
+
+
+RobotousRecord = RobotousData | RobotousText | RobotousResult | RobotousValues | RobotousUnknown
+
+
+def decode(payload: bytes) -> RobotousRecord:
+    """Read the data bytes D1..D16 of one answer; what cannot be read is ``RobotousUnknown``."""
+    command = _COMMANDS.get(payload[0]) if len(payload) == REPLY_BYTES else None
+    if command is None:
+        return RobotousUnknown(payload)
+    if command in (Command.SAMPLE, Command.START):
+        return RobotousData(command, _COUNTS.unpack_from(payload, 1), payload[13])
+    if command in _TEXTS:
+        text = payload[1:].split(b"\0")[0].decode("ascii", "replace")
+        return RobotousText(command, text.strip())
+    if command in _SETTINGS:
+        ok = payload[1] == 1
+        return RobotousResult(command, ok, 0 if ok else payload[2])
+    if command in _VALUES:
+        return RobotousValues(command, tuple(payload[1 : 1 + _VALUES[command]]))
+    return RobotousUnknown(payload)  # stop and bias have no answer
+
+
+def overloaded_axes(overload: int) -> tuple[str, ...]:
+    """Names of the axes whose bit is set in the status byte."""
+    return tuple(axis for at, axis in enumerate(AXES) if overload & 0x20 >> at)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotousScale:
+    """Counts per unit of one model.
+
+    Attributes:
+        force_divisor: Counts per newton.
+        torque_divisor: Counts per newton metre.
+    """
+
+    force_divisor: float
+    torque_divisor: float
+
+    def wrench(self, counts: Sequence[int]) -> tuple[float, ...]:
+        """Fx Fy Fz [N] Tx Ty Tz [N m] of the six counts."""
+        force = tuple(count / self.force_divisor for count in counts[:3])
+        return force + tuple(count / self.torque_divisor for count in counts[3:])
+
+
+FORCE_DIVISOR = 50.0
+"""Counts per newton, the same for all models."""
+
+TORQUE_DIVISORS: dict[str, float] = {
+    "RFT40-SA01": 2000.0,
+    "RFT44-SB01": 2000.0,
+    "RFT60-HA01": 2000.0,
+    "RFT64-SB01": 2000.0,
+    "RFT76-HA01": 2000.0,
+    "RFT80-6A01": 1000.0,
+    "RFT82-HA02": 1000.0,
+}
+"""Counts per newton metre by model."""
+
+
+def scale_of(model: str, *, torque_divisor: float | None = None) -> RobotousScale:
+    """Scale of a model.
+
+    Args:
+        model: Name as the sensor tells it, e.g. ``"RFT40-SA01-C"``: a suffix does not matter.
+        torque_divisor: Counts per newton metre where the table is not to be followed (the maker's
+            ROS 2 driver ships 1000 for all).
+
+    Raises:
+        ValueError: The model is not in the table and no divisor is given, or it is not positive.
+    """
+    if torque_divisor is None:
+        known = [name for name in TORQUE_DIVISORS if model.strip().upper().startswith(name)]
+        if not known:
+            names = ", ".join(TORQUE_DIVISORS)
+            raise ValueError(f"model {model!r} is not in {names}: give the torque divisor")
+        torque_divisor = TORQUE_DIVISORS[known[0]]
+    if not 0 < torque_divisor < float("inf"):
+        raise ValueError(f"torque divisor {torque_divisor} is not above 0")
+    return RobotousScale(FORCE_DIVISOR, torque_divisor)
+
+
+def cutoff_hz_of(code: int, order: FilterOrder = FilterOrder.MANUALS) -> int | None:
+    """Cutoff [Hz] of a filter code; None if the code names none."""
+    if not 1 <= code <= len(CUTOFFS_HZ):
+        return None
+    return CUTOFFS_HZ[code - 1 if order is FilterOrder.MANUALS else -code]
+
+
+def start_request() -> bytes:
+    """Stream data; while it streams, the sensor takes only stop and bias."""
+    return _request(Command.START)
+
+
+def stop_request() -> bytes:
+    """Stop the stream; there is no answer."""
+    return _request(Command.STOP)
+
+
+def sample_request() -> bytes:
+    """Send one wrench."""
+    return _request(Command.SAMPLE)
+
+
+def bias_request(on: bool = True) -> bytes:
+    """Take the present load as zero, or forget that zero; there is no answer."""
+    return _request(Command.BIAS, int(on))
+
+
+def get_request(command: Command) -> bytes:
+    """Ask for an identity, a setting or the overload counts."""
+    if command not in _TEXTS and command not in _VALUES:
+        asks = ", ".join(one.name for one in (*_TEXTS, *_VALUES))
+        raise ValueError(f"command {command!r} is none of {asks}")
+    return _request(command)
+
+
+def rate_request(rate_hz: int) -> bytes:
+    """Set the stream's rate [Hz], one of ``RATE_CODES``; serial lines: ``HIGHEST_RATE_HZ``."""
+    return _request(Command.SET_RATE, _code(RATE_CODES, rate_hz, "rate [Hz]"))
+
+
+def baud_request(baud: int) -> bytes:
+    """Set the baud of the serial line, one of ``BAUD_CODES``."""
+    return _request(Command.SET_BAUD, _code(BAUD_CODES, baud, "baud"))
+
+
+def filter_request(cutoff_hz: int | None, *, order: FilterOrder = FilterOrder.MANUALS) -> bytes:
+    """Set the low-pass.
+
+    Args:
+        cutoff_hz: One of ``CUTOFFS_HZ``; None for no filter.
+        order: How the sensor numbers cutoffs. Confirm it by the noise level.
+    """
+    if cutoff_hz is None:
+        return _request(Command.SET_FILTER, 0, 0)
+    codes = {cutoff_hz_of(code, order) or 0: code for code in range(1, len(CUTOFFS_HZ) + 1)}
+    return _request(Command.SET_FILTER, 1, _code(codes, cutoff_hz, "cutoff [Hz]"))
+
+
+def can_ids_request(request_id: int, first_id: int, second_id: int) -> bytes:
+    """Set the ids of requests and of both halves of an answer, 1..255; valid after a restart."""
+    ids = (request_id, first_id, second_id)
+    if any(not 1 <= one <= 255 for one in ids) or len(set(ids)) < 3:
+        raise ValueError(f"CAN ids {ids} are not three different ones in 1..255")
+    return _request(Command.SET_CAN_IDS, *ids)
+
+
+def _request(command: Command, *parameters: int) -> bytes:
+    return bytes((command, *parameters)).ljust(REQUEST_BYTES, b"\0")
+
+
+def _code(codes: dict[int, int], value: int, name: str) -> int:
+    if value not in codes:
+        raise ValueError(f"{name} {value} is not one of {', '.join(map(str, sorted(codes)))}")
+    return codes[value]

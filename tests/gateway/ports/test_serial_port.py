@@ -1,0 +1,113 @@
+"""A serial line over a pseudo terminal: bytes, silence, unplugging, and what cannot be opened."""
+
+from __future__ import annotations
+
+import os
+import pty
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from palpate.gateway.ports.serial_port import SerialPort, settle
+from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
+
+pytest.importorskip("serial")
+
+
+class Plug:
+    """The device's end of a line."""
+
+    def __init__(self) -> None:
+        self.device, host = pty.openpty()
+        tty.setraw(self.device)
+        tty.setraw(host)
+        self.name = os.ttyname(host)
+        self._host: int | None = host
+
+    def pull(self) -> None:
+        """Both ends are closed, as by an unplugged adapter."""
+        for end in (self.device, self._host):
+            if end is not None:
+                os.close(end)
+        self.device, self._host = -1, None
+
+
+@pytest.fixture
+def plug() -> Iterator[Plug]:
+    made = Plug()
+    yield made
+    if made.device >= 0:
+        made.pull()
+
+
+def test_bytes_go_both_ways(plug: Plug) -> None:
+    with SerialPort(plug.name, 230400) as port:
+        os.write(plug.device, b"\x00\xff\r\n\x11\x13hello")
+        assert port.read(1.0) == b"\x00\xff\r\n\x11\x13hello"
+        port.write(b"\x00abc\n")
+        assert os.read(plug.device, 100) == b"\x00abc\n"
+
+
+def test_the_first_byte_ends_the_wait(plug: Plug) -> None:
+    with SerialPort(plug.name, 230400) as port:
+        later = threading.Timer(0.05, os.write, (plug.device, b"now"))
+        later.start()
+        got = b""
+        while len(got) < 3:
+            got += port.read(10.0)
+        later.join()
+    assert got == b"now"
+
+
+def test_silence_is_a_timeout_and_reading_goes_on(plug: Plug) -> None:
+    with SerialPort(plug.name, 230400) as port:
+        with pytest.raises(DeviceTimeout, match=r"nothing came within 0\.01 s"):
+            port.read(0.01)
+        os.write(plug.device, b"x")
+        assert port.read(1.0) == b"x"
+
+
+def test_unplugging_is_told_and_another_line_may_be_opened(plug: Plug) -> None:
+    port = SerialPort(plug.name, 230400)
+    port.open()
+    plug.pull()
+    with pytest.raises(DeviceLost, match="is gone"):
+        port.read(0.2)
+    port.close()
+    port.close()
+    with pytest.raises(DeviceError, match="not open"):
+        port.read(0.1)
+
+
+def test_a_line_that_is_not_there_says_what_to_do(tmp_path: Path) -> None:
+    port = SerialPort(str(tmp_path / "ttyUSB9"), 115200)
+    with pytest.raises(DeviceError, match=r"ttyUSB9: cannot be opened.*-> plug it in"):
+        port.open()
+
+
+def test_a_line_is_for_one_program(plug: Plug) -> None:
+    with SerialPort(plug.name, 230400), pytest.raises(DeviceError, match="another program"):
+        SerialPort(plug.name, 230400).open()
+
+
+def test_settling_ends_on_a_line_that_never_rests(plug: Plug) -> None:
+    stop = threading.Event()
+
+    def talk() -> None:
+        while not stop.is_set():
+            os.write(plug.device, b"noise")
+            time.sleep(0.005)
+
+    talker = threading.Thread(target=talk)
+    with SerialPort(plug.name, 230400) as port:
+        talker.start()
+        assert settle(port, quiet_s=0.5, longest_s=0.2) > 0
+        stop.set()
+        talker.join()
+        settle(port, quiet_s=0.05, longest_s=5.0)
+        with pytest.raises(DeviceTimeout):
+            port.read(0.01)
