@@ -22,6 +22,7 @@ DRIVERS: dict[str, str] = {
     "virtual": "palpate.gateway.virtual:Virtual",
     "text_log": "palpate.gateway.text_log:TextLog",
     "record": "palpate.gateway.record_device:Record",
+    "biotac_can": "palpate.gateway.biotac_can:BiotacCan",
 }
 """Built-in drivers, ``module:Class``."""
 
