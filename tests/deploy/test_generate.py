@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -159,6 +162,47 @@ def test_processes_answer_every_task_and_hand_errors_on() -> None:
             list(pool.run(os._exit, [1]))
     finally:
         pool.close()
+
+
+KILLED = """
+import os, signal, time
+from palpate.deploy.generate.spread import Processes
+
+if __name__ == "__main__":
+    pool = Processes(1)
+    pool._pool.submit(time.sleep, 600)
+    while not pool._pool._processes:
+        time.sleep(0.01)
+    (worker,) = pool._pool._processes
+    while "spawn_main" not in open(f"/proc/{worker}/cmdline").read():
+        time.sleep(0.01)
+    time.sleep(3)
+    print(worker, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_workers_do_not_outlive_a_command_that_is_killed(tmp_path: Path) -> None:
+    """Nothing catches SIGKILL, and a worker may be in the middle of its task."""
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED, encoding="utf-8")
+    told = tmp_path / "worker"
+    with told.open(
+        "w", encoding="ascii"
+    ) as file:  # no pipe: a worker that lives would hold it open
+        subprocess.run([sys.executable, str(script)], stdout=file, check=False, timeout=60)
+    worker = int(told.read_text(encoding="ascii"))
+    deadline = time.monotonic() + 20.0
+    while Path(f"/proc/{worker}").exists() and _state(worker) != "Z":
+        assert time.monotonic() < deadline, "the worker lives on"
+        time.sleep(0.05)
+
+
+def _state(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return "Z"
 
 
 def test_ray_that_is_not_there_is_said() -> None:

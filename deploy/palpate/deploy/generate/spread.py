@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any, Protocol, TypeVar
 
 from palpate.protos.errors import ErrorCode, LinkError, PalpateError
@@ -40,13 +42,27 @@ class Spread(Protocol):
         ...
 
 
+def _end_with_parent() -> None:
+    """Let a worker not outlive a command that was killed: the pool would wait for ever."""
+    parent = parent_process()
+    assert parent is not None
+
+    def wait_for_end() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait_for_end, name="parent", daemon=True).start()
+
+
 class Processes:
     """Worker processes of this host."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
         # Spawned: forked children would share locks of threads that they do not have.
-        self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+        self._pool = ProcessPoolExecutor(
+            workers, mp_context=get_context("spawn"), initializer=_end_with_parent
+        )
 
     def run(
         self, function: Callable[[Task], Answer], tasks: Iterable[Task]
