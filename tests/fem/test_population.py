@@ -139,9 +139,9 @@ def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
 
 
 def test_shipped_units_have_the_published_ranges() -> None:
-    """What was found when they were fitted, on the whole generated set.
+    """What was found when they were fitted, on all simulations.
 
-    Spheres pinch the skin at 17 N, where finite elements diverge; 23.4 N were measured.
+    Of the third unit's largest force 20.2 % too much is simulated and 19.5 % too much in its rows.
     """
     members = read_population()
     assert [member.unit.name for member in members] == [wanted.name for wanted in PAPER]
@@ -149,7 +149,7 @@ def test_shipped_units_have_the_published_ranges() -> None:
         assert member.wanted == wanted
         assert member.found["low"] == pytest.approx(wanted.low, abs=0.03)
         assert member.found["high"] == pytest.approx(wanted.high, abs=0.03)
-        assert member.found["max_force_n"] == pytest.approx(wanted.max_force_n, rel=0.3)
+        assert member.found["max_force_n"] == pytest.approx(wanted.max_force_n, rel=0.21)
 
 
 def test_a_trajectory_counts_until_it_bears_on_the_mount() -> None:
