@@ -23,7 +23,8 @@ class WrenchOptions(StrictConfig):
     Attributes:
         mount: Where the sensor sits.
         serial: Serial number to publish; empty = the device's own, or its address.
-        zero_at_start: Take the load at opening as zero; only if nothing touches the BioTac then.
+        zero_at_start: Take the load at the first opening as zero; only if nothing touches the
+            BioTac then. A sensor that was lost and comes back is not zeroed: it may be pressed.
     """
 
     mount: MountOptions = MountOptions()
@@ -90,6 +91,7 @@ class WrenchDevice(Device):
             told = self._connect()
             if self._zero_at_start:
                 self.zero()
+                self._zero_at_start = False
         except BaseException:
             self._close()
             raise
@@ -130,7 +132,7 @@ class WrenchDevice(Device):
         if not np.isfinite(values).all():
             self._counts["not_finite"] += 1
             return None
-        force, torque = self._mount.on_biotac(values[:3], values[3:])
+        force, torque = self._mount.on_biotac(values)
         self._tick = self._tick + 1 if tick is None else tick
         if overload:
             self._counts["overloads"] += 1

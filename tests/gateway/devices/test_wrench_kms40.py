@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate.gateway.emulators.emulator import Wrench
 from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.readings import WrenchReading
 from palpate.gateway.wrench_kms40 import Kms40Options, WrenchKms40
 from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.protos.errors import ConfigError, DeviceError, DeviceLost
 
-PATIENCE_S = 20.0
-CONSTANT = (1.5, -0.25, 1.0, 0.02, -0.01, 0.005)
-
-
-def wave(t: float) -> Wrench:
-    """All axes follow the first, so that a wrench that was never felt gives itself away."""
-    return along(3.0 * math.sin(6.0 * t))
-
-
-def along(fx: float) -> Wrench:
-    return (fx, -0.5 * fx, 5.0 + 0.25 * fx, 0.1 * fx, 0.05 * fx - 0.02, 0.3)
-
-
-def assert_felt(readings: list[WrenchReading]) -> None:
-    for reading in readings:
-        told = np.concatenate([reading.force, reading.torque])
-        assert abs(told[0]) <= 3.001
-        # Lines have four decimals, and the first axis is rounded too.
-        np.testing.assert_allclose(told, along(float(told[0])), atol=1.01e-4)
+fakes: Any = importlib.import_module("wrench_fakes")
 
 
 def device_at(emulator: Kms40Emulator, **options: Any) -> WrenchKms40:
@@ -44,46 +24,9 @@ def device_at(emulator: Kms40Emulator, **options: Any) -> WrenchKms40:
     return WrenchKms40(parse_config(Kms40Options, values, where="test"))
 
 
-def take(device: WrenchKms40, count: int, timeout_s: float = 5.0) -> list[WrenchReading]:
-    readings: list[WrenchReading] = []
-    deadline = time.monotonic() + PATIENCE_S
-    while len(readings) < count:
-        assert time.monotonic() < deadline
-        readings += [r for r in device.read(timeout_s) if isinstance(r, WrenchReading)]
-    return readings
-
-
-def read_until(
-    device: WrenchKms40, reached: Callable[[list[WrenchReading]], bool]
-) -> list[WrenchReading]:
-    """All that is published until something is true; every bit of it was felt."""
-    readings: list[WrenchReading] = []
-    deadline = time.monotonic() + PATIENCE_S
-    while not reached(readings):
-        assert time.monotonic() < deadline, device.counters
-        try:
-            readings += [r for r in device.read(0.2) if isinstance(r, WrenchReading)]
-        except DeviceTimeout:
-            continue
-    assert_felt(readings)
-    return readings
-
-
-def open_again(device: WrenchKms40) -> None:
-    """As the worker does."""
-    device.close()
-    deadline = time.monotonic() + PATIENCE_S
-    while not device.is_open:
-        assert time.monotonic() < deadline
-        try:
-            device.open()
-        except DeviceError:
-            time.sleep(0.05)
-
-
 @pytest.fixture
 def emulator() -> Iterator[Kms40Emulator]:
-    with Kms40Emulator(wave) as running:
+    with Kms40Emulator(fakes.wave) as running:
         yield running
 
 
@@ -94,8 +37,8 @@ def device(emulator: Kms40Emulator) -> Iterator[WrenchKms40]:
 
 
 def test_wrenches_are_those_that_were_felt(device: WrenchKms40) -> None:
-    readings = take(device, 200)
-    assert_felt(readings)
+    readings = fakes.take(device, 200)
+    fakes.assert_felt(readings)
     assert max(r.force[0] for r in readings) - min(r.force[0] for r in readings) > 0.1
     assert [r.tick for r in readings] == list(range(1, len(readings) + 1))
     times = [r.time_s for r in readings]
@@ -105,13 +48,13 @@ def test_wrenches_are_those_that_were_felt(device: WrenchKms40) -> None:
     counters = device.counters
     assert counters["samples"] == len(readings)
     assert counters["replies"] > 10
-    for name in ("junk_bytes", "refusals", "invalid_samples", "streams_restarted"):
+    for name in ("junk_bytes", "refusals", "invalid_samples"):
         assert not counters.get(name)
 
 
 def test_without_the_devices_time_it_is_the_same() -> None:
-    with Kms40Emulator(wave, stamped=False) as emulator, device_at(emulator) as device:
-        assert_felt(take(device, 20))
+    with Kms40Emulator(fakes.wave, stamped=False) as emulator, device_at(emulator) as device:
+        fakes.assert_felt(fakes.take(device, 20))
         assert device.counters["untimed_lines"] >= 20
 
 
@@ -123,10 +66,10 @@ def test_the_mount_turns_and_shifts() -> None:
         "origin_m": (0.0, 0.0, 0.01),
     }
     with (
-        Kms40Emulator(lambda t: CONSTANT) as emulator,
+        Kms40Emulator(fakes.constant) as emulator,
         device_at(emulator, mount=mount) as device,
     ):
-        reading = take(device, 1)[0]
+        reading = fakes.take(device, 1)[0]
     # x of the sensor is y of the BioTac; the reaction has the other sign.
     force = np.array([-0.25, -1.5, -1.0])
     torque = np.array([-0.01, -0.02, -0.005]) + np.cross([0.0, 0.0, 0.01], force)
@@ -140,7 +83,7 @@ def test_rate_and_filter_are_set(emulator: Kms40Emulator) -> None:
         assert emulator.answer("FLT()") == "FLT=3"
         assert device.info.rate_hz == 125.0
         assert device.identity.serial == "mine"
-        assert_felt(take(device, 5))
+        fakes.assert_felt(fakes.take(device, 5))
 
 
 def test_a_rate_that_it_has_not_names_the_nearest() -> None:
@@ -152,26 +95,28 @@ def test_a_rate_that_it_has_not_names_the_nearest() -> None:
 
 @pytest.mark.parametrize("at_start", [False, True])
 def test_zero_is_the_devices_own(at_start: bool) -> None:
-    with Kms40Emulator(lambda t: CONSTANT) as emulator:
+    with Kms40Emulator(fakes.constant) as emulator:
         with device_at(emulator, zero_at_start=at_start) as device:
             if not at_start:
-                np.testing.assert_allclose(take(device, 1)[0].force, CONSTANT[:3], atol=1e-6)
+                np.testing.assert_allclose(
+                    fakes.take(device, 1)[0].force, fakes.CONSTANT[:3], atol=1e-6
+                )
                 device.zero()
-            for reading in take(device, 20):
+            for reading in fakes.take(device, 20):
                 np.testing.assert_array_equal(reading.force, 0.0)
                 np.testing.assert_array_equal(reading.torque, 0.0)
         # The device keeps it.
         with device_at(emulator) as device:
-            np.testing.assert_array_equal(take(device, 1)[0].force, 0.0)
+            np.testing.assert_array_equal(fakes.take(device, 1)[0].force, 0.0)
 
 
 def test_it_stops_the_stream_when_it_leaves_and_finds_an_old_one(emulator: Kms40Emulator) -> None:
     with device_at(emulator) as device:
-        take(device, 1)
+        fakes.take(device, 1)
     assert not emulator.streaming
     emulator.answer("L1()")
     with device_at(emulator) as device:
-        assert_felt(take(device, 50))
+        fakes.assert_felt(fakes.take(device, 50))
         assert not device.counters["junk_bytes"]
 
 
@@ -186,7 +131,7 @@ def test_it_stops_the_stream_when_it_leaves_and_finds_an_old_one(emulator: Kms40
 def test_bad_lines_are_counted_and_passed_over(
     emulator: Kms40Emulator, device: WrenchKms40, fault: str, counters: set[str]
 ) -> None:
-    take(device, 5)
+    fakes.take(device, 5)
 
     def seen() -> int:
         return sum(device.counters[name] for name in counters)
@@ -195,58 +140,57 @@ def test_bad_lines_are_counted_and_passed_over(
         before = seen()
         emulator.inject(fault)
         while seen() == before:
-            read_until(device, lambda readings: len(readings) > 0)
-    read_until(device, lambda readings: len(readings) >= 50)
+            fakes.read_until(device, lambda readings: len(readings) > 0)
+    fakes.read_until(device, lambda readings: len(readings) >= 50)
 
 
 def test_silence_is_a_timeout_and_ends(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    take(device, 5)
-    emulator.inject("silence", 0.6)
-    said = ""
-    while not said:
-        try:
-            assert_felt(take(device, 1, timeout_s=0.1))
-        except DeviceTimeout as error:
-            said = str(error)
-    assert "nothing came within 0.1 s" in said
-    read_until(device, lambda readings: len(readings) >= 50)
-    assert device.counters["flags_unanswered"] >= 1
+    fakes.take(device, 5)
+    emulator.inject("silence", 100.0)
+    assert "nothing came within 0.1 s" in fakes.wait_for_timeout(device)
+    while not device.counters.get("flags_unanswered"):
+        fakes.wait_for_timeout(device)
+    fakes.end(emulator, "silence")
+    fakes.read_until(device, lambda readings: len(readings) >= 50)
 
 
 def test_a_stream_that_ends_is_started_again(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    take(device, 5)
+    fakes.take(device, 5)
     emulator.inject("stopped")
-    read_until(device, lambda _: device.counters.get("streams_restarted", 0) >= 1)
-    read_until(device, lambda readings: len(readings) >= 50)
+    fakes.read_until(device, lambda _: device.counters.get("streams_restarted", 0) >= 1)
+    fakes.read_until(device, lambda readings: len(readings) >= 50)
     assert emulator.streaming
 
 
 @pytest.mark.parametrize("fault", ["restart", "unplug"])
 def test_a_lost_connection_is_found_and_opened_again(emulator: Kms40Emulator, fault: str) -> None:
     with device_at(emulator, rate_hz=250.0) as device:
-        take(device, 5)
-        emulator.inject(fault, 0.3 if fault == "unplug" else 0.0)
+        fakes.take(device, 5)
+        emulator.inject(fault, 100.0 if fault == "unplug" else 0.0)
         with pytest.raises(DeviceLost, match="is gone"):
-            read_until(device, lambda _: False)
-        open_again(device)
-        read_until(device, lambda readings: len(readings) >= 50)
+            fakes.read_until(device, lambda _: False)
+        fakes.end(emulator, fault)
+        fakes.open_again(device)
+        fakes.read_until(device, lambda readings: len(readings) >= 50)
         assert emulator.divider == 2
 
 
 def test_overload_is_flagged_while_it_lasts(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    take(device, 5)
-    emulator.inject("overload", 0.3)
-    read_until(device, lambda readings: bool(readings) and readings[-1].overload)
-    read_until(device, lambda readings: bool(readings) and not readings[-1].overload)
+    fakes.take(device, 5)
+    emulator.inject("overload", 100.0)
+    fakes.read_until(device, lambda readings: bool(readings) and readings[-1].overload)
+    fakes.end(emulator, "overload")
+    fakes.read_until(device, lambda readings: bool(readings) and not readings[-1].overload)
     assert device.counters["overloads"] > 0
     assert device.counters["status_over_range_fz"] >= 1
 
 
 def test_with_a_fault_nothing_is_published(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    take(device, 5)
-    emulator.inject("error", 0.3)
-    read_until(device, lambda _: device.counters.get("invalid_samples", 0) > 0)
-    read_until(device, lambda readings: len(readings) >= 50)
+    fakes.take(device, 5)
+    emulator.inject("error", 100.0)
+    fakes.read_until(device, lambda _: device.counters.get("invalid_samples", 0) > 0)
+    fakes.end(emulator, "error")
+    fakes.read_until(device, lambda readings: len(readings) >= 50)
     assert device.counters["status_calibration_fault"] >= 1
     assert device.counters["status_calibration_not_valid"] >= 1
 
@@ -257,7 +201,7 @@ def test_with_a_fault_it_is_not_opened(emulator: Kms40Emulator) -> None:
         device_at(emulator).open()
     # Whoever does not ask does not know.
     with device_at(emulator, flags_every_s=0.0) as device:
-        assert_felt(take(device, 20))
+        fakes.assert_felt(fakes.take(device, 20))
         assert "flags_unanswered" not in device.counters
 
 
@@ -265,7 +209,7 @@ class Contrary(Kms40Emulator):
     """Answers one request otherwise."""
 
     def __init__(self, request: str, reply: str) -> None:
-        super().__init__(wave)
+        super().__init__(fakes.wave)
         self._other = (request, reply)
 
     def answer(self, line: str) -> str:
@@ -294,7 +238,7 @@ def test_a_refused_zero_leaves_the_stream_on() -> None:
     with Contrary("TARE(1)", "ERROR(18)") as emulator, device_at(emulator) as device:
         with pytest.raises(DeviceError, match=r"TARE\(1\) was refused: command failed"):
             device.zero()
-        assert len(take(device, 20)) >= 20
+        assert len(fakes.take(device, 20)) >= 20
 
 
 def test_flags_that_are_no_number_are_counted() -> None:
@@ -302,7 +246,7 @@ def test_flags_that_are_no_number_are_counted() -> None:
         Contrary("FLAGS()", "FLAGS=none") as emulator,
         device_at(emulator, flags_every_s=0.02) as device,
     ):
-        read_until(device, lambda readings: device.counters["bad_flags"] >= 3)
+        fakes.read_until(device, lambda readings: device.counters["bad_flags"] >= 3)
 
 
 def test_nobody_there_says_what_to_do(emulator: Kms40Emulator) -> None:

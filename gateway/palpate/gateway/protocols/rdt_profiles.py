@@ -51,7 +51,7 @@ class RdtProfile:
         status_mask: Bits of the status word that are conditions of the device.
         bit_names: Name of each known bit.
         harmless: Bits that leave the data good.
-        overload: Bits that say a range is exceeded; the data is invalid then too.
+        overload: Bits that say a range is exceeded: to be published with that flag.
         latch_sets_summary: A latched threshold sets the summary bit as an error does.
         bias_count: Count field of the request that takes the present load as zero.
         clear_bias_count: The same for undoing it; None = the product cannot.
