@@ -20,7 +20,7 @@ def mount(**options: Any) -> Mount:
 
 def test_as_measured_where_nothing_is_said() -> None:
     force, torque = mount().on_biotac(np.concatenate([FORCE, TORQUE]))
-    assert (force.dtype, torque.dtype) == (np.float32, np.float32)
+    assert force.dtype == torque.dtype == np.float32
     np.testing.assert_allclose(force, FORCE)
     np.testing.assert_allclose(torque, TORQUE)
 

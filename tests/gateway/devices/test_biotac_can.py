@@ -136,7 +136,8 @@ def test_a_fault_is_counted_and_nothing_wrong_comes_out(
     before = device.counters[counter]
     for times in (1, 2, 3):
         emulator.inject(fault)
-        readings += read(device, lambda _, n=times: device.counters[counter] >= before + n)
+        wanted = before + times
+        readings += read(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
     readings += read(device, lambda got: got and got[-1].validity == ALL_VALID)
     assert device.counters[counter] >= before + 3
     assert_right(readings, 0)
