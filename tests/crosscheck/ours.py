@@ -42,6 +42,7 @@ def _mesh(
 
 
 def _system(mesh: SolidMesh, mu: float, bulk_ratio: float, held: Bools) -> System:
+    # The other codes have no barrier against a pinch, and a punch's edges come to it.
     return System(
         mesh,
         None,
@@ -49,6 +50,7 @@ def _system(mesh: SolidMesh, mu: float, bulk_ratio: float, held: Bools) -> Syste
         bulk_ratio=bulk_ratio,
         contact=ContactSettings(),
         held=held,
+        volume_barrier=0.0,
     )
 
 

@@ -282,13 +282,13 @@ def test_a_mirrored_press_gives_the_mirror_image(finger: Fingertip) -> None:
         assert abs(step.force[1]) > 1e-4
         np.testing.assert_allclose(other.force, ACROSS * step.force, atol=2e-6)
         image = ACROSS * step.displacement[mirror]
-        np.testing.assert_allclose(other.displacement, image, atol=5e-9)
+        np.testing.assert_allclose(other.displacement, image, atol=1e-8)
         np.testing.assert_allclose(other.torque, -ACROSS * step.torque, atol=2e-8)
 
 
 def test_a_press_in_the_plane_of_symmetry_stays_in_it(pressed: Pressed) -> None:
     for step in pressed.trajectory.steps:
-        assert abs(step.force[1]) < 1e-7
+        assert abs(step.force[1]) < 2e-7
         assert np.abs(step.torque[[0, 2]]).max() < 1e-9
 
 
