@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import sys
 import threading
@@ -91,6 +92,25 @@ def test_a_finger_that_restarts_is_opened_again(bus: Any, tape_path: Callable[..
     assert len({frame.sensor_serial for frame in frames}) == 1
     assert now.counters["device_lost"] == 1
     assert now.counters["fault_restart_frames"] == 1
+
+
+def test_a_silent_finger_is_told_at_once_and_read_on(
+    bus: Any, tape_path: Callable[..., Path]
+) -> None:
+    options = {
+        "tape": str(tape_path()),
+        "rate_hz": 200,
+        "untouched_s": 60,
+        "faults": [{"kind": "silence", "at_s": 1.0, "for_s": 1.0}],
+    }
+    with bus.gateway({"sensors": [{"driver": "virtual", "options": options}]}):
+        now = bus.state(ServiceState.DEGRADED)
+        assert now.last_error is not None
+        assert re.fullmatch(r"sensor 'finger' is lost: silent for \d+ ms", now.last_error.message)
+        now = bus.state(ServiceState.READY)
+    assert now.counters["silences"] >= 1  # a starved machine may be silent once more
+    assert now.counters.get("device_lost", 0) == 0
+    assert now.counters["fault_silence_frames"] == 200
 
 
 def test_tare_on_demand(bus: Any) -> None:

@@ -144,7 +144,8 @@ def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> No
         return
     if all(worker.serving or worker.ended.is_set() for worker in workers):
         presence.ready()
-        if health.state is not ServiceState.READY and not any(worker.error for worker in workers):
+        fine = not any(worker.error or worker.silent for worker in workers)
+        if fine and health.state is not ServiceState.READY:
             health.set_state(ServiceState.READY, "all sensors deliver")
     else:
         presence.not_ready()

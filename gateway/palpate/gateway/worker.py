@@ -30,9 +30,12 @@ _log = logging.getLogger(__name__)
 BACKOFF_S = (0.2, 1.0)
 """First and longest wait before a lost device is opened again [s]."""
 
+LOST_S = 0.05
+"""A live sensor that is silent for longer, and for three of its frames, is said to be lost [s]."""
+
 _READ_S = 0.5
-_SILENT_READS = 4
-"""A live device that is silent for this many reads is taken for lost."""
+_GONE_S = 2.0
+"""A live device that has been silent for so long is closed and opened again."""
 
 _ENCODERS_DECIDE = "the frame was not published; this is a defect of the device driver"
 
@@ -70,6 +73,8 @@ class SensorWorker:
         """A defect that ended the thread."""
         self.serving = False
         """Whether the device is open and has delivered."""
+        self.silent = False
+        """Whether it has stopped to deliver, for longer than ``LOST_S``."""
         self.ended = threading.Event()
         """Set when the thread has nothing more to do."""
         self._publishers = publishers
@@ -159,7 +164,7 @@ class SensorWorker:
                     raise
                 if self.serving:
                     backoff_s = BACKOFF_S[0]
-                self.serving = False
+                self.serving = self.silent = False
                 self._counters["device_lost"] += 1
                 self._health.fail(error)
                 _log.warning(
@@ -180,20 +185,25 @@ class SensorWorker:
 
     def _pump(self) -> bool:
         """Read and publish; True when a finite source has ended or ``stop`` is set."""
-        silent = 0
+        info = self.device.info
+        lost_s = max(LOST_S, 3.0 / info.rate_hz)
+        read_s = lost_s / 2.0 if info.live else _READ_S
+        heard_s = time.monotonic()
         while not self._stop.is_set():
             try:
-                readings = self.device.read(_READ_S)
+                readings = self.device.read(read_s)
             except DeviceTimeout as error:
-                self._counters["timeouts"] += 1
-                silent += 1
-                if silent >= _SILENT_READS and self.device.info.live:
+                silent_s = time.monotonic() - heard_s
+                if info.live and silent_s >= _GONE_S:
                     raise DeviceLost(
-                        f"sensor {self.name!r} has been silent for {silent * _READ_S:g} s",
+                        f"sensor {self.name!r} has been silent for {silent_s:.1f} s",
                         remedy="check its power and cable; it is opened again by itself",
                     ) from error
+                if info.live and silent_s >= lost_s:
+                    self._note_silence(silent_s)
                 continue
-            silent = 0
+            heard_s = time.monotonic()
+            self.silent = False
             if not readings:
                 self._publish(self.pipeline.finish())
                 self._note_tare()
@@ -202,6 +212,19 @@ class SensorWorker:
             self._note_tare()
             self.serving = True
         return True
+
+    def _note_silence(self, silent_s: float) -> None:
+        """Tell once of a silence."""
+        if self.silent or not self.serving:
+            return
+        self.silent = True
+        self._counters["silences"] += 1
+        self._health.fail(
+            DeviceTimeout(
+                f"sensor {self.name!r} is lost: silent for {1e3 * silent_s:.0f} ms",
+                remedy="check its power and cable; it is read on by itself",
+            )
+        )
 
     def _publish(self, items: list[Outgoing]) -> None:
         for item in items:
