@@ -25,6 +25,8 @@ from palpate.deploy.options import (
     example,
 )
 from palpate.fem.cli.app import fem_app
+from palpate.gateway.cli.app import gateway_app
+from palpate.gateway.cli.emulate_app import emulate_app
 
 app = typer.Typer(
     cls=PalpateGroup,
@@ -40,6 +42,8 @@ app.add_typer(cli_bundle.bundle_app, name="bundle")
 app.add_typer(cli_bench.app, name="bench")
 cli_files.register(app)
 app.add_typer(fem_app, name="fem")
+app.add_typer(gateway_app, name="gateway")
+app.add_typer(emulate_app, name="emulate")
 app.add_typer(training.train, name="train")
 app.add_typer(training.data, name="data")
 

@@ -1,0 +1,1 @@
+"""Commands of the gateway: what is there, whether it answers, and devices in software."""

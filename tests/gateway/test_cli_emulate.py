@@ -1,0 +1,192 @@
+"""``palpate emulate`` as a program of its own, read by ``palpate gateway probe``."""
+
+from __future__ import annotations
+
+import json
+import random
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from palpate.deploy.cli import app
+from palpate.gateway.config import GatewayConfig
+from palpate.gateway.drivers import make_device
+from palpate.gateway.emulators.kms40 import Kms40Emulator
+from palpate.protos.config import parse_config
+
+PATIENCE_S = 30.0
+PALPATE = [sys.executable, "-m", "palpate.deploy"]
+
+Emulate = Callable[..., "Program"]
+
+
+class Program:
+    """An emulator that runs; what it said of itself."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [*PALPATE, "emulate", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.said = ""
+        # Its last line is the command that tries it.
+        for line in self.process.stdout:
+            self.said += line
+            if line.startswith("# palpate gateway probe "):
+                self.probe = shlex.split(line[2:])[1:]
+                return
+        raise AssertionError(self.process.communicate(timeout=PATIENCE_S)[1])
+
+    @property
+    def sensors(self) -> list[dict[str, Any]]:
+        """The tables that it prints, as the gateway reads them."""
+        tables = tomllib.loads(self.said)["gateway"]
+        config = parse_config(GatewayConfig, tables, where="its snippet")
+        return [sensor.model_dump() for sensor in config.sensors]
+
+    def interrupt(self) -> str:
+        """Ctrl-C; what it says at its end."""
+        self.process.send_signal(signal.SIGINT)
+        _, errors = self.process.communicate(timeout=PATIENCE_S)
+        assert self.process.returncode == 0, errors
+        assert "Traceback" not in errors
+        return errors
+
+
+@pytest.fixture
+def emulate() -> Iterator[Emulate]:
+    running: list[Program] = []
+
+    def start(*arguments: str) -> Program:
+        running.append(Program(*arguments))
+        return running[-1]
+
+    yield start
+    for program in running:
+        if program.process.poll() is None:
+            program.process.kill()
+            program.process.communicate()
+
+
+def gateway(*arguments: str) -> Any:
+    return CliRunner().invoke(app, ["gateway", *arguments])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["kms40"],
+        ["rdt", "--product", "ati_axia"],
+        ["rdt", "--product", "onrobot_hex"],
+        ["robotous", "--link", "./rft"],
+        ["bota"],
+    ],
+    ids=" ".join,
+)
+def test_what_an_emulator_prints_is_what_reads_it(
+    arguments: list[str], emulate: Emulate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    program = emulate(*arguments)
+    (sensor,) = program.sensors
+    assert make_device(sensor["driver"], sensor["options"])
+    assert program.probe[:3] == ["gateway", "probe", sensor["driver"]]
+    result = gateway(*program.probe[1:], "--seconds", "0.4", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["streams"]["wrench"]["readings"] > 5
+    assert "samples sent" in program.interrupt()
+    assert not (tmp_path / "rft").is_symlink()
+
+
+@pytest.mark.parametrize("kind", ["biotac-can", "robotous"])
+def test_can_between_processes(kind: str, emulate: Emulate) -> None:
+    pytest.importorskip("msgpack", reason="palpate[gateway] is not installed")
+    # A group of our own: whoever tests beside us shall not be heard.
+    group = f"239.74.{random.randint(1, 254)}.{random.randint(1, 254)}"
+    words = ["--interface", "udp_multicast", "--channel", group]
+    if kind == "biotac-can":
+        words += ["--slot-rate-hz", "1100", "--fingers", "2"]
+    program = emulate(kind, *words)
+    result = gateway(*program.probe[1:], "--seconds", "0.5", "--json")
+    assert result.exit_code == 0, result.output
+    (stream,) = json.loads(result.output)["streams"].values()
+    assert stream["readings"] > 3
+    if kind == "biotac-can":
+        assert [sensor["options"]["port"] for sensor in program.sensors] == [1, 2]
+        assert stream["first"]["electrodes"][:2] == [2000, 2050]
+
+
+def test_faults_come_when_they_should(emulate: Emulate) -> None:
+    program = emulate("kms40", "--fault", "error@0.1+60", "--seconds", "20")
+    time.sleep(0.5)
+    result = gateway(*program.probe[1:], "--seconds", "0.3")
+    assert result.exit_code == 1
+    assert "calibration fault" in result.stderr
+    assert "error for 60 s" in program.interrupt()
+
+
+def test_sigterm_ends_it_too(emulate: Emulate) -> None:
+    program = emulate("rdt")
+    program.process.terminate()
+    assert program.process.wait(PATIENCE_S) == 0
+
+
+def test_an_emulator_ends_by_itself(emulate: Emulate) -> None:
+    program = emulate("bota", "--seconds", "0.2")
+    assert program.process.wait(PATIENCE_S) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["kms40", "--fault", "fire@1"], "its faults: cut, error, junk"),
+        (["bota", "--baud", "1"], "one of 57600, 115200"),
+        (["robotous", "--model", "RFT"], "one of RFT40-SA01"),
+        (["robotous", "--link", "a-file"], "a file of this name is there"),
+        (["bota", "--link", "nowhere/line"], "there is no folder nowhere"),
+        (["biotac-can", "--bus", "port"], "KEY=VALUE"),
+    ],
+)
+def test_wrong_words_for_emulators(
+    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a-file").write_text("precious")
+    result = CliRunner().invoke(app, ["emulate", *arguments])
+    assert result.exit_code == 2
+    assert told in result.stderr
+    assert (tmp_path / "a-file").read_text() == "precious"
+
+
+def test_an_address_that_is_taken() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        result = CliRunner().invoke(app, ["emulate", "kms40", "--port", port])
+    assert result.exit_code == 1
+    assert "no device can be put there" in result.stderr
+    result = CliRunner().invoke(app, ["emulate", "biotac-can", "--interface", "nonsense"])
+    assert result.exit_code == 1
+    assert "no device can be put there" in result.stderr
+
+
+def test_an_emulator_that_dies_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(self: Kms40Emulator) -> None:
+        raise RuntimeError("no more")
+
+    monkeypatch.setattr(Kms40Emulator, "_serve", die)
+    result = CliRunner().invoke(app, ["emulate", "kms40"])
+    assert result.exit_code == 3
+    assert "no more" in result.stderr
