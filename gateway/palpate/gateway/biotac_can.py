@@ -77,7 +77,8 @@ class CanSource(SlotSource):
                 continue
             place = self._clock.place(words.channel, message.arrival_ns * 1e-9)
             if place is not None:
-                out.append(PlacedSlot(words, place))
+                ends = place.position == len(self._clock.sequence) - 1
+                out.append(PlacedSlot(words, place, ends))
         return out
 
     def serial(self, finger: int) -> str:

@@ -31,10 +31,17 @@ _READ_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class PlacedSlot:
-    """A slot of all fingers with its place in the stream."""
+    """A slot of all fingers with its place in the stream.
+
+    Attributes:
+        words: What the fingers answered.
+        place: Where it belongs.
+        ends_frame: Whether it is the last of its frame.
+    """
 
     words: SlotWords
     place: Place
+    ends_frame: bool
 
 
 class SlotSource(ABC):
@@ -70,6 +77,7 @@ class Finger:
     def __init__(self, link: SlotLink, index: int) -> None:
         self._link, self.index = link, index
         self._slots: deque[Slot] = deque(maxlen=KEPT)
+        self._ready = False
         self._error: DeviceError | None = None
         self.dropped = 0
         self.absent = 0
@@ -81,15 +89,18 @@ class Finger:
         return self._link.source
 
     def take(self, timeout_s: float) -> list[Slot]:
-        """All slots that wait, at least one.
+        """All slots that wait, among them the end of a frame.
+
+        A thread that woke for each of 4400 slots a second would do little else.
 
         Raises:
             DeviceTimeout: None came.
             DeviceError: The line is gone.
         """
         with self._link.news:
-            self._link.news.wait_for(lambda: self._slots or self._error, timeout_s)
-            if self._slots:
+            self._link.news.wait_for(lambda: self._ready or self._error, timeout_s)
+            if self._ready:
+                self._ready = False
                 taken = list(self._slots)
                 self._slots.clear()
                 return taken
@@ -100,8 +111,9 @@ class Finger:
             remedy="check the line and the sender's power",
         )
 
-    def put(self, slots: Sequence[Slot]) -> None:
-        """Keep slots; called by the link, which holds its lock."""
+    def put(self, slots: Sequence[Slot], *, ready: bool) -> None:
+        """Keep slots; whether a frame has ended. Called by the link, which holds its lock."""
+        self._ready |= ready
         self.dropped += max(0, len(self._slots) + len(slots) - KEPT)
         self._slots.extend(slots)
 
@@ -126,6 +138,7 @@ class SlotLink:
         self._fingers: dict[int, Finger] = {}
         self._stop = threading.Event()
         self._failed = False
+        self._frame: tuple[int, int] | None = None  # run and number of the last slot's
         self._thread = threading.Thread(target=self._run, name=f"line {key}", daemon=True)
 
     @classmethod
@@ -207,10 +220,15 @@ class SlotLink:
     def _share(self, slots: Sequence[PlacedSlot]) -> None:
         if not slots:
             return
+        last = (slots[-1].place.run, slots[-1].place.frame)
+        # The next frame ends one whose last slot was lost.
+        ready = last != self._frame or any(slot.ends_frame for slot in slots)
+        self._frame = last
         with self.news:
             for finger in self._fingers.values():
-                finger.put([self._of(finger, slot) for slot in slots])
-            self.news.notify_all()
+                finger.put([self._of(finger, slot) for slot in slots], ready=ready)
+            if ready:
+                self.news.notify_all()
 
     @staticmethod
     def _of(finger: Finger, slot: PlacedSlot) -> Slot:
