@@ -21,7 +21,9 @@ def test_built_in_drivers() -> None:
 def test_unknown_driver_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match="unknown driver 'virtul' -> did you mean 'virtual'"):
         drivers.make_device("virtul")
-    with pytest.raises(ConfigError, match="known drivers: biotac_can, record, text_log, virtual, "):
+    with pytest.raises(
+        ConfigError, match="known drivers: biotac_bridge, biotac_can, biotac_pic32, record, "
+    ):
         drivers.make_device("zzzzzz")
 
 

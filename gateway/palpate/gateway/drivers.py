@@ -23,6 +23,8 @@ DRIVERS: dict[str, str] = {
     "text_log": "palpate.gateway.text_log:TextLog",
     "record": "palpate.gateway.record_device:Record",
     "biotac_can": "palpate.gateway.biotac_can:BiotacCan",
+    "biotac_bridge": "palpate.gateway.biotac_bridge:BiotacBridge",
+    "biotac_pic32": "palpate.gateway.biotac_pic32:BiotacPic32",
     "wrench_kms40": "palpate.gateway.wrench_kms40:WrenchKms40",
     "wrench_rdt": "palpate.gateway.wrench_rdt:WrenchRdt",
     "wrench_robotous": "palpate.gateway.wrench_robotous:WrenchRobotous",
