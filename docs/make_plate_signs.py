@@ -21,7 +21,7 @@ from palpate.fem.mesh.parametric import biotac
 from palpate.fem.population.answers import Population
 from palpate.fem.population.member import read_population
 from palpate.fem.service.biotac import BiotacTip
-from palpate.gateway.conversions import BIOTAC
+from palpate.gateway.biotac.conversions import BIOTAC
 from palpate.training.twin_figures.plate import (
     TOUCHED_COUNTS,
     VENTRAL_COS,

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.gateway.clock_map import FileClock
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Pipeline
+from palpate.gateway.timing.clock_map import FileClock
 from palpate.protos.bundle import read_bundle
 from palpate.protos.codec import FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
 from palpate.protos.messages import (

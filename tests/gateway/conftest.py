@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 
 from palpate.gateway import node
-from palpate.gateway.clock_map import FileClock
 from palpate.gateway.config import GatewayConfig
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Pipeline
+from palpate.gateway.timing.clock_map import FileClock
 from palpate.protos.codec import SERVICE_REQUEST, STATUS, TARE, TARE_REQUEST
 from palpate.protos.config import LinkConfig, parse_config
 from palpate.protos.errors import PalpateError

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from palpate.gateway import drivers
-from palpate.gateway.virtual import Virtual
+from palpate.gateway.virtual.finger import Virtual
 from palpate.protos.errors import ConfigError, MissingExtraError
 
 
@@ -37,7 +37,7 @@ def test_unknown_option_names_the_nearest() -> None:
 
 
 def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("mine", "palpate.gateway.virtual:Virtual", drivers.ENTRY_POINTS)
+    point = EntryPoint("mine", "palpate.gateway.virtual.finger:Virtual", drivers.ENTRY_POINTS)
 
     def fake(**query: Any) -> EntryPoints:
         return EntryPoints([point]).select(**query)
@@ -51,8 +51,8 @@ def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
     ("target", "error", "message"),
     [
         ("palpate.gateway.nothing:X", ConfigError, "module 'palpate.gateway.nothing'"),
-        ("palpate.gateway.virtual:Nothing", ConfigError, "no device class"),
-        ("palpate.gateway.virtual:math", ConfigError, "no device class"),
+        ("palpate.gateway.virtual.finger:Nothing", ConfigError, "no device class"),
+        ("palpate.gateway.virtual.finger:math", ConfigError, "no device class"),
     ],
 )
 def test_broken_table_entry(
@@ -76,6 +76,9 @@ def test_missing_extra_gives_the_install_line(
 def test_table_is_lazy() -> None:
     import subprocess
 
-    code = "import sys, palpate.gateway.drivers; print('palpate.gateway.virtual' in sys.modules)"
+    code = (
+        "import sys, palpate.gateway.drivers; "
+        "print('palpate.gateway.virtual.finger' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -14,7 +14,7 @@ import pytest
 
 from palpate.gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
 from palpate.gateway.protocols.can_slots import SEQUENCES
-from palpate.gateway.spi import channel_of_command, encode_word
+from palpate.gateway.protocols.spi import channel_of_command, encode_word
 
 FIRMWARE = Path(__file__).parents[2] / "deploy" / "firmware" / "bridge"
 

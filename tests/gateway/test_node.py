@@ -13,10 +13,11 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway import node, virtual
+from palpate.gateway import node
 from palpate.gateway.config import GatewayConfig
 from palpate.gateway.drivers import DRIVERS
 from palpate.gateway.readings import Reading
+from palpate.gateway.virtual import finger as virtual
 from palpate.protos.config import LinkConfig, parse_config
 from palpate.protos.errors import ConfigError, DeviceLost, ErrorCode, LinkError, RemoteError
 from palpate.protos.messages import Origin, ServiceState

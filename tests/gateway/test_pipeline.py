@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.clock_map import FileClock, LiveClock, PacedClock
 from palpate.gateway.device import DeviceIdentity, DeviceInfo
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Outgoing, Pipeline
 from palpate.gateway.readings import ElectrodeReading, FieldReading, Reading, RecordedMessage
+from palpate.gateway.timing.clock_map import FileClock, LiveClock, PacedClock
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.errors import DeviceError
 from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.gateway.channels import ALL_VALID, TDC_BIT
+from palpate.gateway.protocols.channels import ALL_VALID, TDC_BIT
 from palpate.gateway.tare import TareCollector, TareLedger
 from palpate.protos.errors import DeviceError, ErrorCode, RemoteError
 from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Stamp, Tare

@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.gateway.emulators.emulator import Emulator
 from palpate.gateway.readings import WrenchReading
-from palpate.gateway.wrench_device import WrenchDevice
+from palpate.gateway.wrench.device import WrenchDevice
 from palpate.protos.errors import DeviceError, DeviceTimeout
 
 PATIENCE_S = 20.0

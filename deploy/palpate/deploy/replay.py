@@ -96,7 +96,7 @@ def sensors_of(file: Path) -> list[dict[str, Any]]:
         head = stream.read(len(_MCAP_MAGIC))
     path = str(file.absolute())
     if head.startswith(_MCAP_MAGIC):
-        from palpate.gateway.record_device import recorded_sensors
+        from palpate.gateway.recordings.record import recorded_sensors
 
         try:
             names = recorded_sensors(file)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from palpate.gateway.clock_map import FileClock
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Outgoing, Pipeline
+from palpate.gateway.timing.clock_map import FileClock
 from palpate.protos.record import RecordWriter
 from palpate.protos.topics import ELECTRODES, TOPICS, sensor_key
 

@@ -19,16 +19,16 @@ from palpate.protos.errors import ConfigError, MissingExtraError
 ENTRY_POINTS = "palpate.devices"
 
 DRIVERS: dict[str, str] = {
-    "virtual": "palpate.gateway.virtual:Virtual",
-    "text_log": "palpate.gateway.text_log:TextLog",
-    "record": "palpate.gateway.record_device:Record",
-    "biotac_can": "palpate.gateway.biotac_can:BiotacCan",
-    "biotac_bridge": "palpate.gateway.biotac_bridge:BiotacBridge",
-    "biotac_pic32": "palpate.gateway.biotac_pic32:BiotacPic32",
-    "wrench_kms40": "palpate.gateway.wrench_kms40:WrenchKms40",
-    "wrench_rdt": "palpate.gateway.wrench_rdt:WrenchRdt",
-    "wrench_robotous": "palpate.gateway.wrench_robotous:WrenchRobotous",
-    "wrench_bota": "palpate.gateway.wrench_bota:WrenchBota",
+    "virtual": "palpate.gateway.virtual.finger:Virtual",
+    "text_log": "palpate.gateway.recordings.text_log:TextLog",
+    "record": "palpate.gateway.recordings.record:Record",
+    "biotac_can": "palpate.gateway.biotac.can:BiotacCan",
+    "biotac_bridge": "palpate.gateway.biotac.bridge:BiotacBridge",
+    "biotac_pic32": "palpate.gateway.biotac.pic32:BiotacPic32",
+    "wrench_kms40": "palpate.gateway.wrench.kms40:WrenchKms40",
+    "wrench_rdt": "palpate.gateway.wrench.rdt:WrenchRdt",
+    "wrench_robotous": "palpate.gateway.wrench.robotous:WrenchRobotous",
+    "wrench_bota": "palpate.gateway.wrench.bota:WrenchBota",
 }
 """Built-in drivers, ``module:Class``."""
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
-from palpate.gateway.clock_map import ClockMap
 from palpate.gateway.device import DeviceIdentity, DeviceInfo
 from palpate.gateway.readings import (
     ElectrodeReading,
@@ -17,8 +16,9 @@ from palpate.gateway.readings import (
     RecordedMessage,
     WrenchReading,
 )
-from palpate.gateway.stamps import Stamps
 from palpate.gateway.tare import MAX_SD_COUNTS, TARE_FRAMES, TareCollector, TareLedger
+from palpate.gateway.timing.clock_map import ClockMap
+from palpate.gateway.timing.stamps import Stamps
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.codec import TARE as TARE_CODEC
 from palpate.protos.errors import DeviceError, PalpateError, WireError

@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from palpate.gateway.channels import ALL_VALID, bit_name
+from palpate.gateway.protocols.channels import ALL_VALID, bit_name
 from palpate.protos.errors import DeviceError, ErrorCode, RemoteError
 from palpate.protos.messages import NO_TARE, ElectrodeFrame, Tare
 

@@ -8,9 +8,9 @@ import time
 from collections import Counter
 from typing import Any, Literal
 
-from palpate.gateway.clock_map import ClockMap, FileClock, LiveClock, PacedClock
 from palpate.gateway.device import Device
 from palpate.gateway.pipeline import Outgoing, Pipeline
+from palpate.gateway.timing.clock_map import ClockMap, FileClock, LiveClock, PacedClock
 from palpate.protos.errors import (
     DeviceError,
     DeviceLost,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway import spi
+from palpate.gateway.protocols import spi
 from palpate.gateway.protocols.bridge import (
     Body,
     BridgeDecoder,

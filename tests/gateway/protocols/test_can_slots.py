@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway import channels as ch
-from palpate.gateway import spi
+from palpate.gateway.protocols import channels as ch
+from palpate.gateway.protocols import spi
 from palpate.gateway.protocols.can_slots import CanSlotDecoder, SlotDecoder, learn_order
-from palpate.gateway.spi import Word, WordKind
+from palpate.gateway.protocols.spi import Word, WordKind
 
 # Vectors of the hardware reference, 2.1.
 PAC_2040 = bytes.fromhex("80 7F C1 7F C1 7F C1")

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.gateway.protocols.can_slots import SEQUENCES
 from palpate.gateway.protocols.slot_clock import Place, SlotClock
-from palpate.gateway.text_log import TextLogReader
+from palpate.gateway.recordings.text_log import TextLogReader
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]
 PERIOD_S = 1 / 4400

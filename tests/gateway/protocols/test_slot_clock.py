@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway import channels as ch
-from palpate.gateway.frames import FrameAssembler
+from palpate.gateway.biotac.frames import FrameAssembler
+from palpate.gateway.biotac.slots import Slot, slot_block
+from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols.can_slots import SEQUENCES, SlotOrder
 from palpate.gateway.protocols.slot_clock import Place, SlotClock
-from palpate.gateway.slots import Slot, slot_block
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]
 PERIOD_S = 1 / 4400

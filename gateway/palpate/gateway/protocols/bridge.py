@@ -20,7 +20,7 @@ from palpate.gateway.protocols.bridge_track import PacketTrack
 from palpate.gateway.protocols.can_slots import FINGERS_MAX
 from palpate.gateway.protocols.checksums import crc16_x25
 from palpate.gateway.protocols.cobs import Packet, PacketSplitter, encode_packet
-from palpate.gateway.spi import printable_prefix
+from palpate.gateway.protocols.spi import printable_prefix
 
 VERSION = 1
 

@@ -11,8 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from palpate.gateway import channels as ch
-from palpate.gateway.spi import ERROR_WORDS, Word, WordKind, channel_of_command, decode_word
+from palpate.gateway.protocols import channels as ch
+from palpate.gateway.protocols.spi import (
+    ERROR_WORDS,
+    Word,
+    WordKind,
+    channel_of_command,
+    decode_word,
+)
 
 CAN_FINGERS_MAX = 3
 """Words that fit a classic CAN frame behind the command."""

@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass
 from enum import StrEnum
 
-from palpate.gateway.channels import ELECTRODES
+from palpate.gateway.protocols.channels import ELECTRODES
 from palpate.protos.messages import COUNTS_MAX
 
 BAUD = 230400

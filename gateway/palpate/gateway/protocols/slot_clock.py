@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from palpate.gateway import channels as ch
+from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols.can_slots import SlotOrder, learn_order
 from palpate.gateway.protocols.silences import Silences
 

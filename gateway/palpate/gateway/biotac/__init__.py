@@ -1,0 +1,1 @@
+"""BioTacs: slots to frames, and the lines that bring the slots."""

@@ -1,0 +1,142 @@
+"""A BioTac at one port of a line that several fingers may share."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Mapping
+
+from pydantic import Field
+
+from palpate.gateway.biotac.frames import FrameAssembler
+from palpate.gateway.biotac.slot_link import Finger, SlotLink, SlotSource
+from palpate.gateway.biotac.slots import Slot, slot_block
+from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate.gateway.protocols import channels as ch
+from palpate.gateway.readings import Reading
+from palpate.protos.config import StrictConfig
+from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.protos.messages import Origin, SensorType
+
+ABSENT_SLOTS = ch.SLOTS_PER_FRAME
+"""After a whole frame of words that say "no finger here" there is none."""
+
+_FIRST_S = 2.0
+"""How long a line may take to bring the first word of a finger [s]."""
+
+
+class FingerOptions(StrictConfig):
+    """Options of every driver of a BioTac on a shared line.
+
+    Attributes:
+        port: Which finger of the line, from 1.
+        serial: Serial number to publish; empty = what the line tells, else line and port.
+    """
+
+    port: int = Field(default=1, ge=1, le=5)
+    serial: str = ""
+
+
+class FingerDevice(Device):
+    """A live BioTac whose slots come over a shared line. Subclasses say which.
+
+    Args:
+        driver: Name in the driver table.
+        model: One line for people.
+        options: Port and serial.
+    """
+
+    def __init__(self, driver: str, model: str, options: FingerOptions) -> None:
+        super().__init__(
+            DeviceInfo(
+                driver=driver,
+                sensor_type=SensorType.BIOTAC,
+                model=f"{model}, port {options.port}",
+                rate_hz=ch.SLOT_RATE_HZ / ch.SLOTS_PER_FRAME,
+                live=True,
+                finite=False,
+                origin=Origin.LIVE,
+            )
+        )
+        self._options = options
+        self._finger: Finger | None = None
+        self._early: list[Slot] = []
+        self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)
+
+    @abstractmethod
+    def _line(self) -> tuple[object, object, SlotSource, int]:
+        """Key and settings of the line, the line itself for the first that opens it, its ports."""
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Counters of frames, of the line, and of what this process was too slow to take."""
+        finger = self._finger
+        if finger is None:
+            return self._assembler.counters
+        line = finger.source.counters(finger.index)
+        return {**line, **self._assembler.counters, "dropped_slots": finger.dropped}
+
+    def _open(self) -> DeviceIdentity:
+        key, settings, source, ports = self._line()
+        port = self._options.port
+        if port > ports:
+            raise ConfigError(
+                f"{self.info.model}: the line has {ports} ports", remedy="correct port or fingers"
+            )
+        self._assembler = FrameAssembler(source.slot_period_s)
+        self._finger = finger = SlotLink.join(key, settings, source, port - 1)
+        try:
+            self._early = self._wait_for_words(finger)
+        except BaseException:
+            self._close()
+            raise
+        told = finger.source.serial(port - 1)
+        name = "-".join(str(part) for part in key) if isinstance(key, tuple) else str(key)
+        return DeviceIdentity(
+            self._options.serial or told or f"{name}-port{port}", finger.source.slot_period_s
+        )
+
+    def _close(self) -> None:
+        finger, self._finger = self._finger, None
+        if finger is not None:
+            finger.leave()
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        finger = self._finger
+        assert finger is not None
+        until = time.monotonic() + timeout_s
+        while True:
+            slots, self._early = self._early, []
+            slots = slots or finger.take(max(0.0, until - time.monotonic()))
+            self._check_there(finger)
+            readings = self._assembler.push(slot_block(slots))
+            if readings:
+                return list(readings)
+            if time.monotonic() >= until:
+                raise DeviceTimeout(
+                    f"{self.info.model}: no whole frame within {timeout_s:g} s",
+                    remedy="slots come, but no frame: check the order of sampling",
+                )
+
+    def _wait_for_words(self, finger: Finger) -> list[Slot]:
+        """Wait until the finger has answered, so that an empty port is not taken for a sensor."""
+        came: list[Slot] = []
+        until = time.monotonic() + _FIRST_S
+        while True:
+            try:
+                came += finger.take(max(0.0, until - time.monotonic()))
+            except DeviceTimeout as error:
+                raise DeviceError(
+                    f"{self.info.model}: no slot within {_FIRST_S:g} s",
+                    remedy="check power, wiring and bit rate, and that the sender is on",
+                ) from error
+            if any(slot.good for slot in came):
+                return came
+            self._check_there(finger)
+
+    def _check_there(self, finger: Finger) -> None:
+        if finger.absent >= ABSENT_SLOTS:
+            raise DeviceLost(
+                f"{self.info.model}: no finger answers (every word is 00 00 or FF FF)",
+                remedy="check its plug and cable; it is looked for again by itself",
+            )

@@ -1,0 +1,1 @@
+"""Force/torque sensors: where they sit, and a driver for each protocol."""

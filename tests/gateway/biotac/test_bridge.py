@@ -1,0 +1,251 @@
+"""BioTacs behind a bridge, against the emulator, over a pseudo terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.gateway.biotac.bridge import BiotacBridge, BridgeOptions
+from palpate.gateway.device import Device
+from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
+from palpate.gateway.emulators.biotac_can import idle_counts
+from palpate.gateway.protocols.channels import ALL_VALID
+from palpate.gateway.readings import ElectrodeReading
+from palpate.protos.config import parse_config
+from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+
+pytest.importorskip("serial")
+PATIENCE_S = 20.0
+
+Emulate = Callable[..., BiotacBridgeEmulator]
+Finger = Callable[..., BiotacBridge]
+
+
+@pytest.fixture
+def emulate() -> Iterator[Emulate]:
+    running: list[BiotacBridgeEmulator] = []
+
+    def start(**options: Any) -> BiotacBridgeEmulator:
+        emulator = BiotacBridgeEmulator(**{"hello_s": 0.2, "status_s": 0.1, **options})
+        emulator.start()
+        running.append(emulator)
+        return emulator
+
+    yield start
+    for emulator in running:
+        emulator.stop()
+
+
+@pytest.fixture
+def finger() -> Iterator[Finger]:
+    made: list[BiotacBridge] = []
+
+    def make(line: str, **options: Any) -> BiotacBridge:
+        given = parse_config(BridgeOptions, {"line": line, **options}, where="test")
+        made.append(BiotacBridge(given))
+        return made[-1]
+
+    yield make
+    for device in made:
+        device.close()
+
+
+def read(device: Device, until: Callable[[list[ElectrodeReading]], Any]) -> list[ElectrodeReading]:
+    """Readings until a condition holds."""
+    got: list[ElectrodeReading] = []
+    deadline = time.monotonic() + PATIENCE_S
+    while not until(got):
+        assert time.monotonic() < deadline, device.counters
+        try:
+            got += device.read(0.5)  # type: ignore[arg-type]
+        except DeviceTimeout:
+            continue
+    return got
+
+
+def open_again(device: Device) -> None:
+    device.close()
+    deadline = time.monotonic() + PATIENCE_S
+    while not device.is_open:
+        assert time.monotonic() < deadline
+        try:
+            device.open()
+        except DeviceError:
+            time.sleep(0.05)
+
+
+def assert_right(readings: list[ElectrodeReading], index: int) -> None:
+    """Every valid electrode of every reading is what the finger measured."""
+    assert readings
+    for reading in readings:
+        good = np.array([reading.validity >> k & 1 for k in range(19)], bool)
+        right = np.array(idle_counts(0.0, index)[:19])
+        np.testing.assert_array_equal(reading.electrodes[good], right[good])
+
+
+def test_the_sums_of_the_emulator() -> None:
+    assert crc16_x25(b"123456789") == 0x906E
+    assert stuffed(b"") == b"\x01\x00"
+    assert stuffed(b"\x11\x00\x22") == b"\x02\x11\x02\x22\x00"
+    assert stuffed(bytes(range(1, 255)) + b"\0")[:1] == b"\xff"
+
+
+@pytest.mark.parametrize(("pac_first", "slots"), [(False, 44), (True, 22)])
+def test_three_fingers_of_one_line(
+    emulate: Emulate, finger: Finger, pac_first: bool, slots: int
+) -> None:
+    emulator = emulate(
+        pac_first=pac_first, slots_per_packet=slots, sequence=65530, clock_us=2**32 - 300_000
+    )
+    for index in range(3):
+        device = finger(emulator.address, port=index + 1)
+        device.open()
+        assert device.identity.serial == f"BT-EMU-{index + 1}"
+        readings = read(device, lambda got: len(got) > 20)
+        assert_right(readings, index)
+        whole = [one for one in readings if one.validity == ALL_VALID]
+        assert len(whole) >= len(readings) - 3
+        assert whole[-1].pdc == 2600 + index
+        assert set(np.concatenate([one.pac for one in whole])) == set(range(2040, 2045))
+        times = np.diff([one.time_s for one in readings])
+        assert np.median(times) == pytest.approx(0.01, abs=1e-6)
+        assert times.min() > 0.0
+
+
+def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: Finger) -> None:
+    device = finger(emulate(slot_rate_hz=2200.0, fingers=1).address)
+    device.open()
+    assert device.identity.slot_period_s == pytest.approx(1 / 2200)
+    times = np.diff([one.time_s for one in read(device, lambda got: len(got) > 10)])
+    assert np.median(times) == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        ("parity", "parity_errors"),
+        ("parity", "bridge_parity_errors"),
+        ("error_word", "device_error_too_little_sampling_delay"),
+        ("error_word", "bridge_error_words"),
+        ("crc", "crc_errors"),
+        ("cut", "lost_packets"),
+        ("junk", "junk_bytes"),
+        ("lost", "lost_packets"),
+        ("lost", "missing_frames"),
+        ("repeated", "repeated_packets"),
+        ("saturated", "saturated_samples"),
+    ],
+)
+def test_a_fault_is_counted_and_nothing_wrong_comes_out(
+    emulate: Emulate, finger: Finger, fault: str, counter: str
+) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    # A STATUS has come by then: what the bridge counts is told from the first one on.
+    readings = read(device, lambda got: len(got) > 15)
+    for _ in range(3):
+        wanted = device.counters[counter] + 1
+        emulator.inject(fault)
+        readings += read(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
+    readings += read(device, lambda got: got and got[-1].validity == ALL_VALID)
+    if fault != "saturated":
+        assert_right(readings, 0)
+
+
+def test_stuck_fingers_come_out_stuck(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    emulator.inject("stuck", 30.0)
+    read(device, lambda got: got and len(set(got[-1].pac)) == 1)
+
+
+def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate()
+    emulator.inject("clock_drift", 30.0)
+    device = finger(emulator.address)
+    device.open()
+    readings = read(device, lambda got: len(got) > 60)
+    assert_right(readings, 0)
+    assert device.counters["lost_slots"] == device.counters["restarts"] == 0
+
+
+def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    read(device, lambda got: len(got) > 5)
+    emulator.inject("silence", 0.6)
+    silent = False
+    deadline = time.monotonic() + PATIENCE_S
+    while not silent:
+        assert time.monotonic() < deadline
+        try:
+            device.read(0.2)
+        except DeviceTimeout:
+            silent = True
+    readings = read(device, lambda got: sum(one.missed_before for one in got) > 0)
+    assert 45 <= sum(one.missed_before for one in readings) <= 80
+    assert_right(read(device, lambda got: len(got) > 5), 0)
+
+
+@pytest.mark.parametrize(("fault", "message"), [("restart", "restarted"), ("unplug", "is gone")])
+def test_a_bridge_that_begins_anew_is_lost_and_found(
+    emulate: Emulate, finger: Finger, fault: str, message: str
+) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    read(device, lambda got: len(got) > 5)
+    emulator.inject(fault, 0.0 if fault == "restart" else 0.5)
+    with pytest.raises(DeviceLost, match=message):
+        read(device, lambda _: False)
+    open_again(device)
+    assert_right(read(device, lambda got: len(got) > 5), 0)
+
+
+def test_an_empty_port_is_no_sensor(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate(fingers=2)
+    emulator.inject("absent", 30.0)
+    with pytest.raises(DeviceLost, match="no finger answers"):
+        finger(emulator.address, port=2).open()
+    with pytest.raises(DeviceError, match="samples 2 fingers only"):
+        finger(emulator.address, port=3).open()
+    there = finger(emulator.address, port=1)
+    there.open()
+    assert_right(read(there, lambda got: len(got) > 5), 0)
+
+
+def test_the_source_must_be_the_one_that_was_named(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate(source=9)
+    with pytest.raises(DeviceError, match=r"no packet of source 8 .* correct source"):
+        finger(emulator.address, source=8).open()
+    device = finger(emulator.address, source=9)
+    device.open()
+    assert_right(read(device, lambda got: len(got) > 3), 0)
+
+
+def test_the_wrong_speed_is_told(emulate: Emulate, finger: Finger) -> None:
+    with pytest.raises(DeviceError, match="check baud"):
+        finger(emulate().address, baud=115200).open()
+
+
+def test_without_hello_the_line_names_the_finger(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate(hello_s=3600.0)
+    time.sleep(0.1)  # the first one goes to nobody
+    device = finger(emulator.address, hello_s=0.0)
+    device.open()
+    assert device.identity.serial.endswith("port1")
+    assert_right(read(device, lambda got: len(got) > 3), 0)
+
+
+def test_each_port_once(emulate: Emulate, finger: Finger) -> None:
+    emulator = emulate()
+    finger(emulator.address).open()
+    with pytest.raises(ConfigError, match="is configured twice"):
+        finger(emulator.address).open()

@@ -1,0 +1,189 @@
+"""BioTacs on CAN against the emulator, on python-can's virtual bus."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.gateway.device import Device
+from palpate.gateway.drivers import make_device
+from palpate.gateway.emulators.biotac_can import BiotacCanEmulator, idle_counts
+from palpate.gateway.protocols.channels import ALL_VALID
+from palpate.gateway.readings import ElectrodeReading
+from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+
+pytest.importorskip("can")
+PATIENCE_S = 20.0
+
+Emulate = Callable[..., BiotacCanEmulator]
+
+
+@pytest.fixture
+def emulate(request: pytest.FixtureRequest) -> Iterator[Emulate]:
+    running: list[BiotacCanEmulator] = []
+
+    def start(**options: Any) -> BiotacCanEmulator:
+        emulator = BiotacCanEmulator("virtual", request.node.name, **options)
+        emulator.start()
+        running.append(emulator)
+        return emulator
+
+    yield start
+    for emulator in running:
+        emulator.stop()
+
+
+@pytest.fixture
+def finger(request: pytest.FixtureRequest) -> Iterator[Callable[..., Device]]:
+    made: list[Device] = []
+
+    def make(**options: Any) -> Device:
+        given = {"interface": "virtual", "channel": request.node.name, **options}
+        made.append(make_device("biotac_can", given))
+        return made[-1]
+
+    yield make
+    for device in made:
+        device.close()
+
+
+def read(device: Device, until: Callable[[list[ElectrodeReading]], Any]) -> list[ElectrodeReading]:
+    """Readings until a condition holds."""
+    got: list[ElectrodeReading] = []
+    deadline = time.monotonic() + PATIENCE_S
+    while not until(got):
+        assert time.monotonic() < deadline, device.counters
+        try:
+            got += device.read(0.5)  # type: ignore[arg-type]
+        except DeviceTimeout:
+            continue
+    return got
+
+
+def of_finger(index: int) -> np.ndarray:
+    return np.array(idle_counts(0.0, index)[:19])
+
+
+def assert_right(readings: list[ElectrodeReading], index: int) -> None:
+    """Every valid electrode of every reading is what the finger measured."""
+    for reading in readings:
+        good = np.array([reading.validity >> k & 1 for k in range(19)], bool)
+        np.testing.assert_array_equal(reading.electrodes[good], of_finger(index)[good])
+
+
+@pytest.mark.parametrize("pac_first", [False, True])
+def test_three_fingers_of_one_bus(emulate: Emulate, finger: Any, pac_first: bool) -> None:
+    emulate(pac_first=pac_first)
+    devices = [finger(port=port) for port in (1, 2, 3)]
+    for index, device in enumerate(devices):
+        device.open()
+        readings = read(device, lambda got: len(got) > 20)
+        whole = [one for one in readings if one.validity == ALL_VALID]
+        assert len(whole) >= len(readings) - 2
+        assert_right(readings, index)
+        assert whole[0].pdc == 2600 + index
+        assert (whole[0].tac, whole[0].tdc) == (2045, 1914)
+        assert set(np.concatenate([one.pac for one in whole])) == set(range(2040, 2045))
+        # A starved emulator stalls now and then, which looks like frames that are gone.
+        times = np.diff([one.time_s for one in readings])
+        assert np.median(times) == pytest.approx(0.01)
+        assert times.min() > 0.0
+    assert devices[1].identity.serial.endswith("port2")
+
+
+def test_an_empty_port_is_no_sensor_and_a_pulled_one_is_lost(emulate: Emulate, finger: Any) -> None:
+    emulator = emulate(fingers=2)
+    emulator.inject("absent", 3.0)
+    with pytest.raises(DeviceLost, match="no finger answers"):
+        finger(fingers=2, port=2).open()
+    there = finger(fingers=2, port=1)
+    there.open()
+    assert_right(read(there, lambda got: len(got) > 5), 0)
+    back = finger(fingers=2, port=2)
+    deadline = time.monotonic() + PATIENCE_S
+    while not back.is_open:
+        assert time.monotonic() < deadline
+        try:
+            back.open()
+        except DeviceError:
+            time.sleep(0.1)
+    emulator.inject("absent", 1.0)
+    with pytest.raises(DeviceLost, match="no finger answers"):
+        read(back, lambda _: False)
+    assert_right(read(there, lambda got: len(got) > 5), 0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        ("parity", "parity_errors"),
+        ("error_word", "device_error_too_little_sampling_delay"),
+        ("foreign", "bad_commands"),
+        ("short", "short_slots"),
+        ("lost", "lost_slots"),
+    ],
+)
+def test_a_fault_is_counted_and_nothing_wrong_comes_out(
+    emulate: Emulate, finger: Any, fault: str, counter: str
+) -> None:
+    emulator, device = emulate(), finger()
+    device.open()
+    readings = read(device, lambda got: len(got) > 5)
+    before = device.counters[counter]
+    for times in (1, 2, 3):
+        emulator.inject(fault)
+        wanted = before + times
+        readings += read(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
+    readings += read(device, lambda got: got and got[-1].validity == ALL_VALID)
+    assert device.counters[counter] >= before + 3
+    assert_right(readings, 0)
+
+
+def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Any) -> None:
+    emulator, device = emulate(), finger()
+    device.open()
+    read(device, lambda got: len(got) > 20)
+    emulator.inject("silence", 0.8)
+    silent = False
+    deadline = time.monotonic() + PATIENCE_S
+    while not silent:
+        assert time.monotonic() < deadline
+        try:
+            device.read(0.2)
+        except DeviceTimeout:
+            silent = True
+    readings = read(device, lambda got: sum(one.missed_before for one in got) > 0)
+    assert_right(readings, 0)
+    missed = sum(one.missed_before for one in readings)
+    assert 60 <= missed <= 90
+    assert_right(read(device, lambda got: len(got) > 10), 0)
+
+
+def test_nobody_on_the_bus_is_told(finger: Any) -> None:
+    with pytest.raises(DeviceError, match="no slot within 2 s"):
+        finger().open()
+
+
+def test_one_line_is_configured_alike_and_each_port_once(emulate: Emulate, finger: Any) -> None:
+    emulate()
+    finger(port=1).open()
+    with pytest.raises(ConfigError, match=r"port 1 of .* is configured twice"):
+        finger(port=1).open()
+    with pytest.raises(ConfigError, match="configured differently"):
+        finger(port=2, slot_rate_hz=3000.0).open()
+    with pytest.raises(ConfigError, match="the line has 2 ports"):
+        finger(port=3, fingers=2).open()
+
+
+def test_opens_again_after_closing(emulate: Emulate, finger: Any) -> None:
+    emulate()
+    device = finger()
+    for _ in range(2):
+        device.open()
+        assert_right(read(device, lambda got: len(got) > 3), 0)
+        device.close()
+        device.close()

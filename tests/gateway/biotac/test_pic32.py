@@ -1,0 +1,171 @@
+"""The PIC32 driver against its emulator, over a pseudo terminal."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.gateway.biotac.pic32 import VALIDITY, BiotacPic32, Pic32Options
+from palpate.gateway.emulators.biotac_can import idle_counts
+from palpate.gateway.emulators.biotac_pic32 import BiotacPic32Emulator
+from palpate.gateway.readings import ElectrodeReading
+from palpate.protos.config import parse_config
+from palpate.protos.errors import DeviceError, DeviceTimeout
+
+pytest.importorskip("serial")
+PATIENCE_S = 20.0
+
+
+class Follower:
+    """Reads a device as the gateway's worker does: when it is lost, it is opened again."""
+
+    def __init__(self, device: BiotacPic32) -> None:
+        self.device = device
+        self.readings: list[ElectrodeReading] = []
+        self.errors: list[DeviceError] = []
+        self._counts: Counter[str] = Counter()
+
+    def until(self, true: Callable[[], Any]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not true():
+            assert time.monotonic() < deadline, (self.errors, self.counts())
+            try:
+                self.device.open()
+                self.readings += self.device.read(0.1)  # type: ignore[arg-type]
+            except DeviceTimeout:
+                pass
+            except DeviceError as error:
+                self.errors.append(error)
+                self._counts += Counter(self.device.counters)
+                self.device.close()
+                time.sleep(0.02)
+
+    def more(self, count: int = 10) -> list[ElectrodeReading]:
+        """The next readings."""
+        had = len(self.readings)
+        self.until(lambda: len(self.readings) >= had + count)
+        return self.readings[had:]
+
+    def counts(self) -> Counter[str]:
+        return self._counts + Counter(self.device.counters)
+
+    def assert_right(self) -> None:
+        """Every reading is what the finger measured."""
+        right = idle_counts(0.0, 0)
+        for one in self.readings:
+            np.testing.assert_array_equal(one.electrodes, right[:19])
+            assert (one.pdc, one.tac, one.tdc) == tuple(right[19:22])
+            assert 2040 <= one.pac[0] < 2045
+            assert not one.pac[1:].any()
+            assert one.validity == VALIDITY
+
+
+@pytest.fixture
+def board() -> Iterator[BiotacPic32Emulator]:
+    # Its timer wraps during the test.
+    with BiotacPic32Emulator(ticks=2**32 - 40_000_000, load_g=(120, 118)) as emulator:
+        yield emulator
+
+
+def make(board: BiotacPic32Emulator, **options: Any) -> BiotacPic32:
+    values = {"port": board.address, **options}
+    return BiotacPic32(parse_config(Pic32Options, values, where="test"))
+
+
+@pytest.fixture
+def follower(board: BiotacPic32Emulator) -> Iterator[Follower]:
+    device = make(board)
+    yield Follower(device)
+    device.close()
+
+
+def test_one_frame_each_tick(follower: Follower) -> None:
+    readings = follower.more(150)
+    follower.assert_right()
+    assert not follower.errors
+    ticks = np.diff([one.tick for one in readings])
+    assert ticks.min() >= 1
+    assert [one.missed_before for one in readings[1:]] == list(ticks - 1)
+    times = np.diff([one.time_s for one in readings])
+    assert np.median(times) == pytest.approx(0.01, abs=1e-5)
+    assert VALIDITY.bit_count() == 23
+
+
+def test_the_older_firmware() -> None:
+    with BiotacPic32Emulator(electrodes_first=True) as board:
+        follower = Follower(make(board, layout="electrodes_first", serial="BT-7"))
+        follower.more()
+        follower.assert_right()
+        assert follower.device.identity.serial == "BT-7"
+        follower.device.close()
+        follower.device.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        ("cut", "realigned"),
+        ("junk", "realigned"),
+        ("high_bits", "misaligned"),
+        ("lost", "lost_samples"),
+        ("repeated", "repeated_samples"),
+        ("end", "end_records"),
+    ],
+)
+def test_a_fault_is_counted_and_nothing_wrong_comes_out(
+    board: BiotacPic32Emulator, follower: Follower, fault: str, counter: str
+) -> None:
+    follower.more()
+    for _ in range(3):
+        before = follower.counts()[counter]
+        board.inject(fault)
+        follower.until(lambda: follower.counts()[counter] > before)  # noqa: B023
+        follower.more(5)
+    follower.assert_right()
+
+
+@pytest.mark.parametrize("fault", ["restart", "unplug", "silence"])
+def test_a_board_that_is_gone_is_found_again(
+    board: BiotacPic32Emulator, follower: Follower, fault: str
+) -> None:
+    follower.more()
+    board.inject(fault, 0.0 if fault == "restart" else 0.8)
+    follower.until(lambda: follower.errors)
+    follower.more()
+    follower.assert_right()
+
+
+def test_saturated_stuck_and_drifting_come_out_as_they_are(
+    board: BiotacPic32Emulator, follower: Follower
+) -> None:
+    follower.more()
+    board.inject("clock_drift", 1.0)
+    board.inject("saturated", 0.3)
+    follower.until(lambda: follower.readings[-1].pac[0] == 4095)
+    follower.until(lambda: follower.readings[-1].pac[0] != 4095)
+    board.inject("stuck", 20.0)
+    follower.until(lambda: len({int(one.pac[0]) for one in follower.more(8)}) == 1)
+    assert not follower.errors
+
+
+def test_a_stream_that_runs_already_is_stopped_first(board: BiotacPic32Emulator) -> None:
+    first = Follower(make(board))
+    first.more()
+    first.device._port.close()  # as a process that is killed
+    second = Follower(make(board))
+    second.more()
+    second.assert_right()
+    assert not second.errors
+    second.device.close()
+
+
+def test_nobody_there_and_the_wrong_speed_are_told(board: BiotacPic32Emulator) -> None:
+    with pytest.raises(DeviceError, match="no record within 1 s of command 'r'"):
+        make(board, baud=115200).open()
+    with pytest.raises(DeviceError, match="cannot be opened"):
+        make(board, port=board.address + "-none").open()

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from palpate.gateway.drivers import make_device
+from palpate.gateway.readings import RecordedMessage
+from palpate.gateway.recordings.record import recorded_sensors
+from palpate.protos.errors import ConfigError, RecordingError
+from palpate.protos.record import RecordWriter, read_record
+from palpate.protos.topics import FEATURES, sensor_key
+
+
+def messages(path: Path, sensor: str = "") -> list[RecordedMessage]:
+    out: list[RecordedMessage] = []
+    with make_device("record", {"path": path, "sensor": sensor}) as device:
+        while got := device.read(1.0):
+            out += [r for r in got if isinstance(r, RecordedMessage)]
+    return out
+
+
+def test_payloads_and_order_are_unchanged(record: Callable[..., Path]) -> None:
+    path = record(60)
+    wanted = [(item.address.topic, item.payload) for item in read_record(path)]
+    assert [(m.topic, m.payload) for m in messages(path)] == wanted
+    assert {topic for topic, _ in wanted} == {"electrodes", "wrench", "pose", "tare"}
+
+
+def test_estimates_are_not_replayed(record: Callable[..., Path], tmp_path: Path) -> None:
+    other = tmp_path / "more.mcap"
+    with RecordWriter(other) as writer:
+        for item in read_record(record(60)):
+            writer.write(item.key, item.schema, item.payload, log_time_ns=item.log_time_ns)
+        writer.write(
+            sensor_key("lab", "finger", FEATURES.name), FEATURES.codec.schema, b"x", log_time_ns=1
+        )
+    assert "features" not in {m.topic for m in messages(other)}
+
+
+def test_one_of_several_sensors(record: Callable[..., Path]) -> None:
+    path = record(60, sensors=("index", "thumb"))
+    assert recorded_sensors(path) == ["index", "thumb"]
+    with pytest.raises(ConfigError, match="2 sensors: index, thumb -> choose one with the option"):
+        messages(path)
+    assert messages(path, "thumb") != messages(path, "index")
+    with pytest.raises(RecordingError, match="no electrode frames of sensor 'ring'"):
+        messages(path, "ring")
+
+
+def test_cut_record_delivers_and_then_says_so(record: Callable[..., Path]) -> None:
+    path = record(60)
+    whole = messages(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    out: list[RecordedMessage] = []
+
+    def drain() -> None:
+        while got := device.read(1.0):
+            out.extend(r for r in got if isinstance(r, RecordedMessage))
+
+    with make_device("record", {"path": path}) as device:
+        with pytest.raises(RecordingError, match="damaged or cut off after"):
+            drain()
+        assert device.read(1.0) == []
+    assert out == whole
+
+
+def test_not_a_record(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"hello")
+    with pytest.raises(RecordingError, match=r"a\.mcap is damaged or cut off"):
+        messages(path)
+    with pytest.raises(RecordingError, match="does not exist"):
+        messages(tmp_path / "no.mcap")

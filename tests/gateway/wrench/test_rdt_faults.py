@@ -1,0 +1,188 @@
+"""The RDT driver when sensors misbehave, against sensors in software on loopback."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.gateway.emulators.emulator import Wrench
+from palpate.gateway.emulators.rdt import RdtEmulator
+from palpate.gateway.wrench.rdt import WrenchRdt
+from palpate.gateway.wrench.rdt_options import RdtOptions
+from palpate.protos.config import parse_config
+from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
+
+fakes: Any = importlib.import_module("wrench_fakes")
+PRODUCTS = {"ati_net_ft": "netft", "ati_axia": "axia", "schunk_ftn": "axia", "onrobot_hex": "hex"}
+
+
+def device_at(emulator: RdtEmulator, product: str = "ati_net_ft", **options: Any) -> WrenchRdt:
+    host, _, port = emulator.address.partition(":")
+    values = {"product": product, "host": host, "port": int(port), **options}
+    values.setdefault("http_port", emulator.page.port)
+    return WrenchRdt(parse_config(RdtOptions, values, where="test"))
+
+
+@contextmanager
+def running(
+    product: str = "ati_net_ft", source: Callable[[float], Wrench] = fakes.wave, **options: Any
+) -> Iterator[tuple[RdtEmulator, WrenchRdt]]:
+    with (
+        RdtEmulator(PRODUCTS[product], source) as emulator,
+        device_at(emulator, product, **options) as device,
+    ):
+        yield emulator, device
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        ("cut", "bad_lengths"),
+        ("junk", "bad_lengths"),
+        ("lost", "lost_samples"),
+        ("repeated", "repeated_records"),
+        ("late", "late_records"),
+    ],
+)
+def test_bad_datagrams_are_counted_and_passed_over(fault: str, counter: str) -> None:
+    with running() as (emulator, device):
+        for count in range(1, 6):
+            emulator.inject(fault)
+            fakes.read_until(device, lambda _, least=count: device.counters[counter] >= least)
+        fakes.read_until(device, lambda readings: len(readings) >= 50)
+
+
+def test_a_start_that_is_not_heard_is_repeated() -> None:
+    with RdtEmulator("hex", fakes.wave) as emulator:
+        emulator.inject("deaf", 0.25)
+        with device_at(emulator, "onrobot_hex", rate_hz=100.0) as device:
+            fakes.read_until(device, lambda readings: len(readings) >= 10)
+        emulator.inject("deaf", 100.0)
+        with pytest.raises(DeviceTimeout, match="no record came after 10 start requests"):
+            device_at(emulator, "onrobot_hex").open()
+
+
+def test_silence_is_a_timeout_and_ends() -> None:
+    with running() as (emulator, device):
+        fakes.take(device, 5)
+        emulator.inject("silence", 100.0)
+        assert "nothing came within 0.1 s" in fakes.wait_for_timeout(device)
+        while not device.counters.get("starts_repeated"):
+            fakes.wait_for_timeout(device)
+        fakes.end(emulator, "silence")
+        fakes.read_until(device, lambda readings: len(readings) >= 50)
+
+
+def test_a_restart_is_found_and_opened_again() -> None:
+    with running("onrobot_hex", rate_hz=200.0) as (emulator, device):
+        fakes.read_until(device, lambda readings: bool(readings) and readings[-1].time_s > 1.0)
+        emulator.inject("restart")
+        with pytest.raises(DeviceLost, match=r"it was restarted -> .* its zero is gone"):
+            fakes.read_until(device, lambda _: False)
+        fakes.open_again(device)
+        fakes.read_until(device, lambda readings: len(readings) >= 50)
+        assert emulator.rate_hz == 200.0
+
+
+def test_unplugged_it_is_found_and_opened_again() -> None:
+    with running() as (emulator, device):
+        fakes.take(device, 5)
+        emulator.inject("unplug", 100.0)
+        with pytest.raises(DeviceLost, match="is gone"):
+            fakes.read_until(device, lambda _: False)
+        fakes.end(emulator, "unplug")
+        fakes.open_again(device)
+        fakes.read_until(device, lambda readings: len(readings) >= 50)
+
+
+@pytest.mark.parametrize(
+    ("product", "counter"),
+    [
+        ("ati_net_ft", "status_transducer_saturated_or_converter_fault"),
+        ("ati_axia", "status_force_or_torque_out_of_range"),
+        ("onrobot_hex", "status_overload_on_some_axis"),
+    ],
+)
+def test_overload_is_flagged_while_it_lasts(product: str, counter: str) -> None:
+    with running(product) as (emulator, device):
+        emulator.inject("overload", 100.0)
+        fakes.read_until(device, lambda readings: bool(readings) and readings[-1].overload)
+        fakes.end(emulator, "overload")
+        fakes.read_until(device, lambda readings: bool(readings) and not readings[-1].overload)
+        assert device.counters["overloads"] == device.counters[counter] > 0
+        assert not device.counters.get("invalid_samples")
+
+
+@pytest.mark.parametrize(
+    ("product", "counter"),
+    [
+        ("ati_net_ft", "status_analogue_board_fault"),
+        ("ati_axia", "status_broken_gage"),
+        ("onrobot_hex", "status_sensor_not_detected"),
+    ],
+)
+def test_with_an_error_nothing_is_published(product: str, counter: str) -> None:
+    with running(product) as (emulator, device):
+        emulator.inject("error", 100.0)
+        fakes.read_until(device, lambda _: device.counters.get("invalid_samples", 0) > 0)
+        fakes.end(emulator, "error")
+        fakes.read_until(device, lambda readings: len(readings) >= 50)
+        assert device.counters["invalid_samples"] == device.counters[counter]
+
+
+def test_a_latched_threshold_leaves_the_data_good() -> None:
+    with running() as (emulator, device):
+        emulator.inject("latched")
+        fakes.read_until(
+            device, lambda _: device.counters.get("status_monitor_condition_latched", 0) > 9
+        )
+        assert not device.counters.get("invalid_samples")
+
+
+def test_a_drifting_clock_is_followed() -> None:
+    with running() as (emulator, device):
+        emulator.inject("clock_drift", 100.0)
+        readings = fakes.read_until(device, lambda readings: len(readings) >= 500)
+    times = np.array([r.time_s for r in readings])
+    assert (times[-1] - times[0]) / (len(times) - 1) == pytest.approx(1e-3, rel=1e-3)
+
+
+class SeveralSensors(RdtEmulator):
+    """A HEX converter whose records come from sensors 1 and 2 in turn."""
+
+    def _record(self) -> bytes:
+        whole = bytearray(super()._record())
+        number = 1 + self._sequence % 2
+        whole[11] |= 0b1000 | number
+        return bytes(whole) if number == 1 else bytes(whole[:12]) + bytes(24)
+
+
+def test_of_several_sensors_one_must_be_named() -> None:
+    with SeveralSensors("hex", fakes.wave) as emulator:
+        with pytest.raises(DeviceError, match=r"several sensors -> .*option 'sensor'"):
+            device_at(emulator, "onrobot_hex").open()
+        with device_at(emulator, "onrobot_hex", sensor=1) as device:
+            fakes.read_until(device, lambda readings: len(readings) >= 20)
+            assert device.counters["other_sensors"] >= 19
+
+
+def test_with_a_wrong_rate_it_is_opened_with_the_hosts_clock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("palpate.gateway.wrench.rdt_clock.CHECK_S", 0.2)
+    with (
+        RdtEmulator("netft", fakes.wave, counter_hz=3500.0) as emulator,
+        device_at(emulator) as device,
+    ):
+        with pytest.raises(DeviceLost, match="not 7000 Hz"):
+            fakes.read_until(device, lambda _: False)
+        fakes.open_again(device)
+        readings = fakes.read_until(device, lambda readings: len(readings) >= 50)
+        assert device.counters["counter_rate_wrong"] == 1
+        assert abs(readings[-1].time_s - time.monotonic()) < fakes.PATIENCE_S
