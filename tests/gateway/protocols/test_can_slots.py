@@ -7,13 +7,12 @@ from hypothesis import strategies as st
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols import spi
 from palpate.gateway.protocols.can_slots import CanSlotDecoder, SlotDecoder, learn_order
-from palpate.gateway.protocols.spi import Word, WordKind
+from palpate.gateway.protocols.spi import WordKind
 
 # Vectors of the hardware reference, 2.1.
 PAC_2040 = bytes.fromhex("80 7F C1 7F C1 7F C1")
 FINGER_2_ABSENT = bytes.fromhex("80 7F C1 00 00 7F C1")
 
-GOOD_2040 = Word(WordKind.GOOD, 2040, False, "")
 NO_ERRORS = {
     "parity_errors": 0,
     "absent": 0,
@@ -29,39 +28,47 @@ NO_ERRORS = {
 }
 
 
+Told = tuple[int, list[int], list[int]]
+
+
+def decode(decoder: SlotDecoder, *payloads: bytes) -> list[Told]:
+    """Channel, values and kinds of each slot."""
+    words = decoder.decode(payloads)
+    columns = words.channel.tolist(), words.value.tolist(), words.kind.tolist()
+    return list(zip(*columns, strict=True))
+
+
 def slot(channel: int, *words: str) -> bytes:
     return bytes((spi.command_byte(channel),)) + bytes.fromhex("".join(words))
 
 
 def test_vector_of_three_fingers() -> None:
     decoder = CanSlotDecoder(fingers=3)
-    record = decoder.feed(0x001, PAC_2040)
-    assert record is not None
-    assert (record.channel, record.words) == (ch.PAC, (GOOD_2040,) * 3)
+    assert decode(decoder, PAC_2040) == [(ch.PAC, [2040] * 3, [WordKind.GOOD] * 3)]
     assert decoder.finger_counters == (NO_ERRORS,) * 3
 
 
 def test_candump_line() -> None:
     line = "(1436509052.249713) can0 001#807FC17FC17FC1"
     can_id, data = line.split()[2].split("#")
-    record = CanSlotDecoder(fingers=3, can_id=0x001).feed(int(can_id, 16), bytes.fromhex(data))
-    assert record is not None
-    assert [word.value for word in record.words] == [2040] * 3
+    decoder = CanSlotDecoder(fingers=3, can_id=0x001)
+    assert decoder.is_ours(int(can_id, 16))
+    ((_, values, _),) = decode(decoder, bytes.fromhex(data))
+    assert values == [2040] * 3
 
 
 def test_an_absent_finger_keeps_the_others_in_place() -> None:
     decoder = CanSlotDecoder(fingers=3)
-    record = decoder.feed(0x001, FINGER_2_ABSENT)
-    assert record is not None
-    assert [word.kind for word in record.words] == [WordKind.GOOD, WordKind.ABSENT, WordKind.GOOD]
+    ((_, values, kinds),) = decode(decoder, FINGER_2_ABSENT)
+    assert kinds == [WordKind.GOOD, WordKind.ABSENT, WordKind.GOOD]
+    assert values == [2040, 0, 2040]
     assert decoder.finger_counters == (NO_ERRORS, NO_ERRORS | {"absent": 1}, NO_ERRORS)
 
 
 def test_words_are_counted_by_finger_and_kind() -> None:
     decoder = CanSlotDecoder(fingers=3)
-    decoder.feed(1, slot(17, "A52E", "7FC0", "0108"))
-    decoder.feed(1, slot(18, "A52D", "7FC1", "010D"))
-    decoder.feed(1, slot(18, "A52D", "A55A", "FFFF"))
+    decode(decoder, slot(17, "A52E", "7FC0", "0108"), slot(18, "A52D", "7FC1", "010D"))
+    decode(decoder, slot(18, "A52D", "A55A", "FFFF"))
     delay = {"device_error_too_little_delay": 1, "device_error_too_little_sampling_delay": 2}
     assert decoder.finger_counters == (
         NO_ERRORS | delay,
@@ -74,12 +81,27 @@ def test_words_are_counted_by_finger_and_kind() -> None:
 @pytest.mark.parametrize("letter", "E?.-X_RW")
 def test_every_error_word_has_its_counter(letter: str) -> None:
     decoder = CanSlotDecoder(fingers=1)
-    record = decoder.feed(1, slot(0, "A5", f"{ord(letter):02X}"))
-    assert record is not None
-    assert record.words[0].kind is WordKind.DEVICE_ERROR
+    told = decode(decoder, slot(0, "A5", f"{ord(letter):02X}"))
+    assert told == [(0, [0], [WordKind.DEVICE_ERROR])]
     counted = [key for key, count in decoder.finger_counters[0].items() if count]
-    assert len(counted) == 1
-    assert counted[0].startswith("device_error_")
+    assert counted == [
+        "device_error_" + spi.ERROR_WORDS[ord(letter)].replace(" ", "_").replace("-", "_")
+    ]
+
+
+def test_every_word_is_what_the_rule_says() -> None:
+    """All 65,536 of them, by the table and by the rule for one word."""
+    decoder = SlotDecoder(fingers=1)
+    command = bytes((spi.command_byte(17),))
+    payloads = [command + bytes(divmod(word, 256)) for word in range(1 << 16)]
+    told = decode(decoder, *payloads)
+    rules = [spi.decode_word(payload[1:]) for payload in payloads]
+    assert told == [(17, [rule.value], [rule.kind]) for rule in rules]
+    counts = decoder.finger_counters[0]
+    assert counts["absent"] == sum(rule.kind is WordKind.ABSENT for rule in rules)
+    assert counts["parity_errors"] == sum(rule.kind is WordKind.BIT_ERROR for rule in rules)
+    good = [rule for rule in rules if rule.kind is WordKind.GOOD]
+    assert counts["suspicious"] == sum(rule.suspicious for rule in good)
 
 
 @pytest.mark.parametrize(
@@ -95,23 +117,29 @@ def test_every_error_word_has_its_counter(letter: str) -> None:
 )
 def test_what_is_no_slot_is_counted(data: str, counter: str) -> None:
     decoder = CanSlotDecoder(fingers=2)
-    assert decoder.feed(1, bytes.fromhex(data)) is None
-    assert {key for key, count in decoder.counters.items() if count} == {counter}
+    good = slot(17, "0101", "0101")
+    words = decoder.decode([good, bytes.fromhex(data), good])
+    assert words.index.tolist() == [0, 2]
+    counted = {key: count for key, count in decoder.counters.items() if count}
+    assert counted == {counter: 1, "slots": 2}
+
+
+def test_nothing_makes_nothing() -> None:
+    words = SlotDecoder(fingers=2).decode([])
+    assert (words.value.shape, words.kind.shape, len(words)) == ((0, 2), (0, 2), 0)
 
 
 def test_longer_frames_are_taken() -> None:
-    record = CanSlotDecoder(fingers=2).feed(1, PAC_2040 + b"\x55")
-    assert record is not None
-    assert record.words == (GOOD_2040,) * 2
+    told = decode(CanSlotDecoder(fingers=2), PAC_2040 + b"\x55")
+    assert told == [(0, [2040] * 2, [WordKind.GOOD] * 2)]
 
 
 def test_identifier() -> None:
     decoder = CanSlotDecoder(fingers=3, can_id=0x123)
-    assert decoder.feed(0x124, PAC_2040) is None
-    assert decoder.feed(0x123, PAC_2040) is not None
-    assert (decoder.counters["other_ids"], decoder.counters["slots"]) == (1, 1)
+    assert [decoder.is_ours(0x124), decoder.is_ours(0x123)] == [False, True]
+    assert decoder.counters["other_ids"] == 1
     anything = CanSlotDecoder(fingers=3)
-    assert all(anything.feed(can_id, PAC_2040) for can_id in (0, 0x7FF, 0x1FFFFFFF))
+    assert all(anything.is_ours(can_id) for can_id in (0, 0x7FF, 0x1FFFFFFF))
 
 
 def test_fingers_in_range() -> None:
@@ -119,16 +147,22 @@ def test_fingers_in_range() -> None:
         CanSlotDecoder(fingers=4)
     with pytest.raises(ValueError, match=r"0 fingers are not in 1\.\.5"):
         SlotDecoder(fingers=0)
-    assert SlotDecoder(fingers=5).decode(slot(1, *["0101"] * 5)) is not None
+    assert decode(SlotDecoder(fingers=5), slot(1, *["0101"] * 5)) == [(1, [0] * 5, [0] * 5)]
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 5), st.binary(max_size=8)), max_size=30))
-def test_every_frame_is_accounted_for(frames: list[tuple[int, bytes]]) -> None:
-    decoder = CanSlotDecoder(fingers=2, can_id=3)
-    records = [decoder.feed(can_id, data) for can_id, data in frames]
+@given(st.lists(st.binary(max_size=8), max_size=30), st.integers(1, 5))
+def test_every_frame_is_accounted_for(frames: list[bytes], at_once: int) -> None:
+    decoder, alone = SlotDecoder(fingers=2), SlotDecoder(fingers=2)
+    told = [
+        one
+        for k in range(0, len(frames), at_once)
+        for one in decode(decoder, *frames[k : k + at_once])
+    ]
+    assert told == [one for frame in frames for one in decode(alone, frame)]
+    assert (decoder.counters, decoder.finger_counters) == (alone.counters, alone.finger_counters)
     assert sum(decoder.counters.values()) == len(frames)
-    assert decoder.counters["slots"] == sum(record is not None for record in records)
+    assert decoder.counters["slots"] == len(told)
 
 
 @settings(max_examples=100, deadline=None)
@@ -138,9 +172,7 @@ def test_every_frame_is_accounted_for(frames: list[tuple[int, bytes]]) -> None:
 )
 def test_words_of_a_finger_survive(channel: int, values: list[int]) -> None:
     data = slot(channel) + b"".join(map(spi.encode_word, values))
-    record = CanSlotDecoder(fingers=3).feed(0, data)
-    assert record is not None
-    assert (record.channel, [word.value for word in record.words]) == (channel, values)
+    assert decode(CanSlotDecoder(fingers=3), data) == [(channel, values, [WordKind.GOOD] * 3)]
 
 
 def test_no_order_in_noise_or_without_an_anchor() -> None:

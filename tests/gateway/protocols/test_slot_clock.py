@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -287,3 +288,53 @@ def test_scattered_loss_is_counted_exactly(gone: set[int], scatter_s: float) -> 
     places = place_all(clock, kept)
     assert clock.counters["lost_slots"] == len(gone)
     assert (places[-1].frame, places[-1].position) == (11, 43)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.sampled_from(sorted(SEQUENCES)),
+    st.booleans(),
+    st.booleans(),
+    st.sets(st.integers(0, 1500), max_size=12),
+    st.dictionaries(st.integers(0, 1500), st.sampled_from([2e-3, 8e-3, 0.03, 0.2]), max_size=3),
+    st.lists(st.floats(0, 1e-3), min_size=7, max_size=7),
+    st.lists(st.integers(1, 90), min_size=1, max_size=20),
+)
+def test_many_slots_find_the_places_that_each_finds_alone(
+    name: str,
+    learns: bool,
+    exact: bool,
+    gone: set[int],
+    stalls: dict[int, float],
+    jitter: list[float],
+    sizes: list[int],
+) -> None:
+    sequence = SEQUENCES[name]
+    slots = stream(sequence, frames=1500 // len(sequence))
+    for at, stall_s in stalls.items():
+        until_s = START_S + at * PERIOD_S + stall_s
+        slots = [*slots[:at], *((c, max(t, until_s)) for c, t in slots[at:])]
+    if not exact:
+        slots = [(c, t + j) for (c, t), j in zip(slots, itertools.cycle(jitter), strict=False)]
+    slots = [slot for k, slot in enumerate(slots) if k not in gone]
+    alone = SlotClock(sequence=None if learns else sequence, exact=exact)
+    expected = [
+        (k, place) for k, slot in enumerate(slots) if (place := alone.place(*slot)) is not None
+    ]
+    clock = SlotClock(sequence=None if learns else sequence, exact=exact)
+    told: list[tuple[int, Place]] = []
+    begin = 0
+    for size in itertools.cycle(sizes):
+        batch = slots[begin : begin + size]
+        if not batch:
+            break
+        channels, stamps_s = (np.array(column) for column in zip(*batch, strict=True))
+        places = clock.place_all(channels, stamps_s)
+        columns = (places.run, places.frame, places.position, places.time_s)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        kept = (begin + places.kept).tolist()
+        told += [(k, Place(*row)) for k, row in zip(kept, rows, strict=True)]
+        begin += size
+    assert told == expected
+    assert clock.counters == alone.counters
+    assert (clock.sequence, clock.measured_rate_hz) == (alone.sequence, alone.measured_rate_hz)

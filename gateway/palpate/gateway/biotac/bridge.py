@@ -7,13 +7,15 @@ in ``deploy/firmware/bridge``. What it says of itself tells the serial numbers a
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from palpate.gateway.biotac.device import FingerDevice, FingerOptions
-from palpate.gateway.biotac.slot_link import Finger, PlacedSlot, SlotSource
+from palpate.gateway.biotac.line_slots import LineSlots
+from palpate.gateway.biotac.slot_link import Finger, SlotSource
 from palpate.gateway.ports.serial_port import SerialPort
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
@@ -118,32 +120,33 @@ class BridgeSource(SlotSource):
         """See ``SlotSource``."""
         self._port.close()
 
-    def read(self, timeout_s: float) -> Sequence[PlacedSlot]:
+    def read(self, timeout_s: float) -> LineSlots | None:
         """See ``SlotSource``."""
         if self._end is not None:
             raise self._end
-        placed: list[PlacedSlot] = []
+        placed: list[LineSlots] = []
         for record in self._packets.feed(self._port.read(timeout_s)):
             try:
-                placed += self._take(record)
+                slots = self._take(record)
+                placed += [slots] if slots is not None else []
             except DeviceError as error:
                 # What came before it is delivered first.
                 self._end = error
                 break
         if self._end is not None and not placed:
             raise self._end
-        return placed
+        return LineSlots.joined(placed) if placed else None
 
-    def _take(self, record: BridgeRecord) -> list[PlacedSlot]:
+    def _take(self, record: BridgeRecord) -> LineSlots | None:
         if not self._is_ours(record):
-            return []
+            return None
         if isinstance(record.body, SlotGroup):
             return self._place(record.body, record.time_us)
         if isinstance(record.body, Hello):
             self._meet(record.body)
         else:
             self._status = (self._status[0] if self._status else record.body, record.body)
-        return []
+        return None
 
     def _is_ours(self, record: BridgeRecord) -> bool:
         source = record.header.source
@@ -181,20 +184,14 @@ class BridgeSource(SlotSource):
         if known is None:
             self.slot_period_s = 1.0 / hello.slot_rate_hz
 
-    def _place(self, group: SlotGroup, time_us: int) -> list[PlacedSlot]:
-        placed = []
+    def _place(self, group: SlotGroup, time_us: int) -> LineSlots | None:
         if self._hello is None:
             self.fingers = group.fingers
         rest = _ABSENT * (FINGERS_MAX - group.fingers)
-        for number, payload in enumerate(group.payloads):
-            words = self._slots.decode(payload + rest)
-            if words is None:
-                continue
-            place = self._clock.place(words.channel, 1e-6 * time_us + number * self.slot_period_s)
-            if place is not None:
-                ends = place.position == len(self._clock.sequence) - 1
-                placed.append(PlacedSlot(words, place, ends))
-        return placed
+        words = self._slots.decode([payload + rest for payload in group.payloads])
+        stamps_s = 1e-6 * time_us + words.index.astype(np.float64) * self.slot_period_s
+        places = self._clock.place_all(words.channel, stamps_s)
+        return LineSlots.placed(words, places, len(self._clock.sequence))
 
     def serial(self, finger: int) -> str:
         """See ``SlotSource``."""

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from palpate.gateway.biotac.frames import FrameAssembler
 from palpate.gateway.biotac.slot_link import Finger, SlotLink, SlotSource
-from palpate.gateway.biotac.slots import Slot, slot_block
+from palpate.gateway.biotac.slots import SlotBlock
 from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.readings import Reading
@@ -60,7 +60,7 @@ class FingerDevice(Device):
         )
         self._options = options
         self._finger: Finger | None = None
-        self._early: list[Slot] = []
+        self._early: SlotBlock | None = None
         self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)
 
     @abstractmethod
@@ -106,10 +106,11 @@ class FingerDevice(Device):
         assert finger is not None
         until = time.monotonic() + timeout_s
         while True:
-            slots, self._early = self._early, []
-            slots = slots or finger.take(max(0.0, until - time.monotonic()))
+            slots, self._early = self._early, None
+            if slots is None:
+                slots = finger.take(max(0.0, until - time.monotonic()))
             self._check_there(finger)
-            readings = self._assembler.push(slot_block(slots))
+            readings = self._assembler.push(slots)
             if readings:
                 return list(readings)
             if time.monotonic() >= until:
@@ -118,20 +119,20 @@ class FingerDevice(Device):
                     remedy="slots come, but no frame: check the order of sampling",
                 )
 
-    def _wait_for_words(self, finger: Finger) -> list[Slot]:
+    def _wait_for_words(self, finger: Finger) -> SlotBlock:
         """Wait until the finger has answered, so that an empty port is not taken for a sensor."""
-        came: list[Slot] = []
+        came: list[SlotBlock] = []
         until = time.monotonic() + _FIRST_S
         while True:
             try:
-                came += finger.take(max(0.0, until - time.monotonic()))
+                came.append(finger.take(max(0.0, until - time.monotonic())))
             except DeviceTimeout as error:
                 raise DeviceError(
                     f"{self.info.model}: no slot within {_FIRST_S:g} s",
                     remedy="check power, wiring and bit rate, and that the sender is on",
                 ) from error
-            if any(slot.good for slot in came):
-                return came
+            if came[-1].good.any():
+                return SlotBlock.joined(came)
             self._check_there(finger)
 
     def _check_there(self, finger: Finger) -> None:

@@ -11,13 +11,13 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping
 from typing import ClassVar
 
-from palpate.gateway.biotac.slots import Slot
-from palpate.gateway.protocols.can_slots import SlotWords
-from palpate.gateway.protocols.slot_clock import Place
+import numpy as np
+
+from palpate.gateway.biotac.line_slots import LineSlots
+from palpate.gateway.biotac.slots import SlotBlock
 from palpate.gateway.protocols.spi import WordKind
 from palpate.protos.errors import ConfigError, DeviceError, DeviceTimeout
 
@@ -27,21 +27,6 @@ KEPT = 8800
 """Slots that wait for a finger's thread: two seconds; older ones are dropped and counted."""
 
 _READ_S = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class PlacedSlot:
-    """A slot of all fingers with its place in the stream.
-
-    Attributes:
-        words: What the fingers answered.
-        place: Where it belongs.
-        ends_frame: Whether it is the last of its frame.
-    """
-
-    words: SlotWords
-    place: Place
-    ends_frame: bool
 
 
 class SlotSource(ABC):
@@ -59,8 +44,8 @@ class SlotSource(ABC):
         """Disconnect; never raises."""
 
     @abstractmethod
-    def read(self, timeout_s: float) -> Sequence[PlacedSlot]:
-        """Slots that came; may be none. Raises DeviceTimeout, DeviceLost."""
+    def read(self, timeout_s: float) -> LineSlots | None:
+        """Slots that came; None = none of them has a place. Raises DeviceTimeout, DeviceLost."""
 
     @abstractmethod
     def serial(self, finger: int) -> str:
@@ -76,8 +61,8 @@ class Finger:
 
     def __init__(self, link: SlotLink, index: int) -> None:
         self._link, self.index = link, index
-        self._slots: deque[Slot] = deque(maxlen=KEPT)
-        self._ready = False
+        self._blocks: deque[SlotBlock] = deque()
+        self._kept = 0
         self._error: DeviceError | None = None
         self.dropped = 0
         self.absent = 0
@@ -88,8 +73,8 @@ class Finger:
         """The line."""
         return self._link.source
 
-    def take(self, timeout_s: float) -> list[Slot]:
-        """All slots that wait, among them the end of a frame.
+    def take(self, timeout_s: float) -> SlotBlock:
+        """All frames that wait, one at least, with what is left of a frame that lost its end.
 
         A thread that woke for each of 4400 slots a second would do little else.
 
@@ -98,12 +83,11 @@ class Finger:
             DeviceError: The line is gone.
         """
         with self._link.news:
-            self._link.news.wait_for(lambda: self._ready or self._error, timeout_s)
-            if self._ready:
-                self._ready = False
-                taken = list(self._slots)
-                self._slots.clear()
-                return taken
+            self._link.news.wait_for(lambda: self._blocks or self._error, timeout_s)
+            if self._blocks:
+                blocks, self._kept = list(self._blocks), 0
+                self._blocks.clear()
+                return SlotBlock.joined(blocks)
             if self._error is not None:
                 raise self._error
         raise DeviceTimeout(
@@ -111,11 +95,18 @@ class Finger:
             remedy="check the line and the sender's power",
         )
 
-    def put(self, slots: Sequence[Slot], *, ready: bool) -> None:
-        """Keep slots; whether a frame has ended. Called by the link, which holds its lock."""
-        self._ready |= ready
-        self.dropped += max(0, len(self._slots) + len(slots) - KEPT)
-        self._slots.extend(slots)
+    def put(self, slots: LineSlots) -> None:
+        """Keep the finger's part. Called by the link, which holds its lock."""
+        absent = slots.kind[:, self.index] == WordKind.ABSENT
+        there = np.flatnonzero(~absent)
+        behind = len(slots) - 1 - int(there[-1]) if len(there) else self.absent + len(slots)
+        self.absent = behind
+        self._blocks.append(slots.of(self.index))
+        self._kept += len(slots)
+        while self._kept > KEPT:
+            oldest = self._blocks.popleft()
+            self._kept -= len(oldest)
+            self.dropped += len(oldest)
 
     def fail(self, error: DeviceError) -> None:
         """The line is gone; told after what came before it. Called by the link."""
@@ -138,7 +129,7 @@ class SlotLink:
         self._fingers: dict[int, Finger] = {}
         self._stop = threading.Event()
         self._failed = False
-        self._frame: tuple[int, int] | None = None  # run and number of the last slot's
+        self._begun: list[LineSlots] = []  # of the frame that is not over
         self._thread = threading.Thread(target=self._run, name=f"line {key}", daemon=True)
 
     @classmethod
@@ -217,22 +208,19 @@ class SlotLink:
                 finger.fail(error)
             self.news.notify_all()
 
-    def _share(self, slots: Sequence[PlacedSlot]) -> None:
-        if not slots:
+    def _share(self, slots: LineSlots | None) -> None:
+        """Hand on what is over: whole frames, and those that the next one ends."""
+        if slots is None:
             return
-        last = (slots[-1].place.run, slots[-1].place.frame)
-        # The next frame ends one whose last slot was lost.
-        ready = last != self._frame or any(slot.ends_frame for slot in slots)
-        self._frame = last
+        over = slots.over()
+        changed = bool(self._begun) and not self._begun[-1].goes_on_with(slots)
+        if not over and not changed:
+            self._begun.append(slots)
+            return
+        ready = [*self._begun, slots.part(0, over)] if over else self._begun
+        self._begun = [slots.part(over, len(slots))] if over < len(slots) else []
+        whole = LineSlots.joined(ready)
         with self.news:
             for finger in self._fingers.values():
-                finger.put([self._of(finger, slot) for slot in slots], ready=ready)
-            if ready:
-                self.news.notify_all()
-
-    @staticmethod
-    def _of(finger: Finger, slot: PlacedSlot) -> Slot:
-        word, place = slot.words.words[finger.index], slot.place
-        finger.absent = finger.absent + 1 if word.kind is WordKind.ABSENT else 0
-        good = word.kind is WordKind.GOOD
-        return Slot(slot.words.channel, word.value, good, place.time_s, place.run, place.frame)
+                finger.put(whole)
+            self.news.notify_all()

@@ -13,9 +13,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+UNKNOWN = -1
+"""Position of a slot whose source tells channels and frames only, e.g. a text log."""
+
 
 class Slot(NamedTuple):
-    """One sampled channel: id, raw counts, parity good, device time [s], batch and frame index."""
+    """One sampled channel: id, raw counts, parity good, device time [s], batch and frame index.
+
+    ``position`` is its place in the sampling round from 0; ``UNKNOWN`` if the source does not tell.
+    """
 
     channel: int
     value: int
@@ -23,6 +29,7 @@ class Slot(NamedTuple):
     time_s: float
     batch: int
     frame: int
+    position: int = UNKNOWN
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +43,9 @@ class SlotBlock:
         time_s: Device time [s], float64.
         batch: Batch index, int64.
         frame: Frame index, int64.
+        position: Place in the sampling round from 0, int64; ``UNKNOWN`` where the source does not
+            tell. Slots of one frame are either all told or all unknown. It places PAC, whose
+            samples look alike; all other channels are known by their id.
     """
 
     channel: npt.NDArray[np.int64]
@@ -44,6 +54,7 @@ class SlotBlock:
     time_s: npt.NDArray[np.float64]
     batch: npt.NDArray[np.int64]
     frame: npt.NDArray[np.int64]
+    position: npt.NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.channel)
@@ -58,23 +69,33 @@ class SlotBlock:
             self.time_s[cut],
             self.batch[cut],
             self.frame[cut],
+            self.position[cut],
         )
 
     def followed_by(self, other: SlotBlock) -> SlotBlock:
         """These slots and then those of another block."""
+        return SlotBlock.joined([self, other])
+
+    @staticmethod
+    def joined(blocks: Sequence[SlotBlock]) -> SlotBlock:
+        """Consecutive blocks, one at least, as one."""
+        blocks = [block for block in blocks if len(block)] or blocks[:1]
+        if len(blocks) == 1:
+            return blocks[0]
         return SlotBlock(
-            np.concatenate([self.channel, other.channel]),
-            np.concatenate([self.value, other.value]),
-            np.concatenate([self.good, other.good]),
-            np.concatenate([self.time_s, other.time_s]),
-            np.concatenate([self.batch, other.batch]),
-            np.concatenate([self.frame, other.frame]),
+            np.concatenate([block.channel for block in blocks]),
+            np.concatenate([block.value for block in blocks]),
+            np.concatenate([block.good for block in blocks]),
+            np.concatenate([block.time_s for block in blocks]),
+            np.concatenate([block.batch for block in blocks]),
+            np.concatenate([block.frame for block in blocks]),
+            np.concatenate([block.position for block in blocks]),
         )
 
 
 def slot_block(slots: Sequence[Slot]) -> SlotBlock:
     """Arrange single slots as a block."""
-    columns = list(zip(*slots, strict=True)) or [()] * 6
+    columns = list(zip(*slots, strict=True)) or [()] * 7
     return SlotBlock(
         np.array(columns[0], np.int64),
         np.array(columns[1], np.uint16),
@@ -82,4 +103,5 @@ def slot_block(slots: Sequence[Slot]) -> SlotBlock:
         np.array(columns[3], np.float64),
         np.array(columns[4], np.int64),
         np.array(columns[5], np.int64),
+        np.array(columns[6], np.int64),
     )

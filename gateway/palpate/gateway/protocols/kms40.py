@@ -35,6 +35,10 @@ _REPLY = re.compile(r"([A-Z][A-Z0-9_]*)=(.*)")
 _REFUSAL = re.compile(r"ERROR\(\s*(\d{1,9})\s*(?:,.*)?\)")
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?")
 _TICKS = re.compile(r"\d{1,20}")
+_SAMPLE = re.compile(
+    r"F=\{" + ",".join([rf" *({_NUMBER.pattern}) *"] * 6) + rf"\}}(?:, *({_TICKS.pattern}) *)?"
+)
+"""A sample as it should be, in one match: 500 come in a second."""
 _FLAGS = re.compile(r"\d{1,10}|0[xX][0-9a-fA-F]{1,8}")
 
 
@@ -224,6 +228,13 @@ def parse_line(line: bytes) -> KmsRecord | LineFault:
 
 
 def _parse_data(text: str) -> ForceLine | LineFault:
+    sample = _SAMPLE.fullmatch(text)
+    if sample is not None:
+        fx, fy, fz, mx, my, mz = map(float, sample.groups()[:6])
+        ticks = sample[7]
+        # Each of them is finite if their sum is; if not, see below.
+        if math.isfinite(fx + fy + fz + mx + my + mz):
+            return ForceLine((fx, fy, fz), (mx, my, mz), None if ticks is None else int(ticks))
     data = _DATA.fullmatch(text)
     if data is None:
         return LineFault.MALFORMED

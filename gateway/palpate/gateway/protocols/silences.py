@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from palpate.gateway.protocols.places import Floats
+
 _GAP_S = 5e-3
 """Silence that is worth a thought; stamps of a bus scatter by 1 ms (hardware reference 5.1) [s]."""
 
@@ -113,6 +115,26 @@ class Silences:
         frames = math.floor((late_s - usual_s) / self._frame_s + 0.5)
         self._begin(stamp_s, usual_s)
         return Loss(frames, late_s - usual_s - frames * self._frame_s)
+
+    def pass_over(self, stamps_s: Floats, delays_s: Floats) -> bool:
+        """Take slots of an unbroken order at once, if none of them is worth a thought.
+
+        Args:
+            stamps_s: Their stamps [s], one at least.
+            delays_s: Their stamps less their times on the grid [s].
+
+        Returns:
+            False if they must be judged one by one; then none was taken.
+        """
+        if self._gap is not None or stamps_s.max() >= self._lows_until_s:
+            return False
+        if stamps_s[0] - self._last_s >= self._worth_s:
+            return False
+        if len(stamps_s) > 1 and (stamps_s[1:] - stamps_s[:-1]).max() >= self._worth_s:
+            return False
+        self._last_s = float(stamps_s[-1])
+        self._lows[0] = min(self._lows[0], float(delays_s.min()))
+        return True
 
     def _begin(self, stamp_s: float, delay_s: float) -> None:
         self._gap = None

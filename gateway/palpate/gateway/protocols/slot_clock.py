@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+import numpy as np
 
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols.can_slots import SlotOrder, learn_order
+from palpate.gateway.protocols.places import Floats, Ints, Place, Places
 from palpate.gateway.protocols.silences import Silences
 
 _LEARNT_FROM = 128
@@ -20,24 +22,6 @@ _LEARNT_FROM = 128
 
 _SCATTER_S = 2e-3
 """No stamp is too early by more than this [s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where a slot belongs.
-
-    Attributes:
-        run: Counts connections and changes of the sequence, from 0.
-        frame: Frame number from 0, with those that were lost.
-        position: Place in the sequence.
-        time_s: When it was sampled [s], by the clock of the stamps: on the grid of slots, which
-            begins anew where frames were lost; the stamp itself if stamps are exact.
-    """
-
-    run: int
-    frame: int
-    position: int
-    time_s: float
 
 
 class SlotClock:
@@ -115,7 +99,7 @@ class SlotClock:
             return None
         if channel not in order.channels:
             self.counters["foreign"] += 1
-            self._doubt = self._learns
+            self._begin_doubt()
             return None
         if self._silences is None:
             if channel in order.anchors:
@@ -135,6 +119,65 @@ class SlotClock:
         time_s = stamp_s if self._exact else self._time_s(self._index)
         return Place(self._run, self._base + frame, position, time_s)
 
+    def place_all(self, channels: Ints, stamps_s: Floats) -> Places:
+        """Place slots, leaving out what has no place: the same as one by one, and faster.
+
+        Args:
+            channels: Their channel indices, int64, shape ``(N,)``.
+            stamps_s: When they came [s], shape ``(N,)``.
+        """
+        if len(channels) and (steady := self._steady(channels, stamps_s)) is not None:
+            return steady
+        stamped = zip(channels.tolist(), stamps_s.tolist(), strict=True)
+        places = [self.place(*slot) for slot in stamped]
+        kept = [number for number, place in enumerate(places) if place is not None]
+        told = [(p.run, p.frame, p.position) for p in places if p is not None]
+        run, frame, position = np.array(told, np.int64).reshape(-1, 3).T
+        times = np.array([p.time_s for p in places if p is not None], np.float64)
+        return Places(np.array(kept, np.int64), run, frame, position, times)
+
+    def _steady(self, channels: Ints, stamps_s: Floats) -> Places | None:
+        """Places of slots that are just the next ones, in order and in time; None if they are not.
+
+        One by one a slot costs 10 us; a hand brings 8800 a second.
+        """
+        order, silences = self._order, self._silences
+        if order is None or silences is None or self._doubt or self._index < 0:
+            return None
+        if self._index != self._sure[0] + self._since:  # PAC has run ahead
+            return None
+        size, number = len(order), len(channels)
+        index = np.arange(self._index + 1, self._index + 1 + number)
+        position = index % size
+        if not np.array_equal(channels, order.cycle[position]):
+            return None
+        times_s: Floats
+        if self._exact:
+            expected_s = self._last_s + (index - self._index) * self._period_s
+            if np.abs(stamps_s - expected_s).max() > 0.25 * self._period_s:
+                return None
+            times_s = stamps_s
+        else:
+            times_s = self._origin_s + index.astype(np.float64) * self._period_s
+            if not silences.pass_over(stamps_s, stamps_s - times_s):
+                return None
+        if self._learns:
+            self._seen.extend(channels.tolist())
+        self._index = int(index[-1])
+        self._last_s = float(stamps_s[-1])
+        sure = np.flatnonzero(order.is_anchor[position])
+        if len(sure):
+            last = int(sure[-1])
+            self._sure = (int(index[last]), float(stamps_s[last]))
+            self._since = number - 1 - last
+        else:
+            self._since += number
+        frame = index // size
+        self._frame = int(frame[-1])
+        self.counters["placed"] += number
+        run = np.full(number, self._run)
+        return Places(np.arange(number), run, self._base + frame, position, times_s)
+
     def reset(self) -> None:
         """The connection is new: a new run begins, and a learnt sequence is learnt again."""
         self._end_run()
@@ -152,11 +195,20 @@ class SlotClock:
             return
         order = learn_order(tuple(self._seen))
         if order is None:
+            # To compare again with each further slot would take more time than there is.
+            for _ in range(_LEARNT_FROM // 2):
+                self._seen.popleft()
             return
         self._doubt = False
         if self._order is None or order.channels != self._order.channels:
             self._end_run()
             self._order = order
+
+    def _begin_doubt(self) -> None:
+        """The order may have changed: 128 slots from here on say whether it has."""
+        if self._learns and not self._doubt:
+            self._doubt = True
+            self._seen.clear()
 
     def _begin(self, order: SlotOrder, position: int, stamp_s: float) -> None:
         frame_s = len(order) * self._period_s
@@ -211,7 +263,8 @@ class SlotClock:
             self._sure = (self._sure[0] + frames * len(order), self._sure[1])
         self.counters["lost_frames"] += frames
         self.counters["lost_slots"] += slots
-        self._doubt |= slots > 0 and self._learns
+        if slots > 0:
+            self._begin_doubt()
         return True
 
     def _target(self, order: SlotOrder, channel: int, stamp_s: float) -> int:

@@ -23,7 +23,8 @@ WRITE_PROPERTY = 0x40
 _SUSPICIOUS_BITS = 0b110
 """Bits 2 and 1 of byte 1, zero in every 12-bit word (a 14-bit variant is only hinted at)."""
 
-_ERROR_BYTE = 0xA5
+ERROR_BYTE = 0xA5
+"""First byte of an error word."""
 
 ERROR_WORDS: dict[int, str] = {
     ord("E"): "command parity wrong",
@@ -139,7 +140,7 @@ def decode_word(word: bytes) -> Word:
         return Word(WordKind.GOOD, (first >> 1) * 32 + (second >> 3), suspicious, "")
     if first == second and first in (0x00, 0xFF):
         return Word(WordKind.ABSENT, 0, False, "")
-    if first == _ERROR_BYTE and second in ERROR_WORDS:
+    if first == ERROR_BYTE and second in ERROR_WORDS:
         return Word(WordKind.DEVICE_ERROR, 0, False, ERROR_WORDS[second])
     return Word(WordKind.BIT_ERROR, 0, suspicious, "")
 
@@ -154,7 +155,7 @@ def decode_words(words: npt.NDArray[np.uint8]) -> Words:
     # Parity is per byte: a word with one bad byte in each half would pass a 16-bit parity.
     good = (np.bitwise_count(first) & np.bitwise_count(second) & 1).astype(np.bool_)
     absent = (first == second) & ((first == 0x00) | (first == 0xFF))
-    error = (first == _ERROR_BYTE) & np.isin(second, np.fromiter(ERROR_WORDS, np.uint8))
+    error = (first == ERROR_BYTE) & np.isin(second, np.fromiter(ERROR_WORDS, np.uint8))
     kind = np.full(len(words), WordKind.BIT_ERROR, np.uint8)
     kind[error] = WordKind.DEVICE_ERROR
     kind[absent] = WordKind.ABSENT
