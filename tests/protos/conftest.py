@@ -24,6 +24,7 @@ from palpate.protos.messages import (
     ModelMetadata,
     Origin,
     Pose,
+    RobotPoseFrame,
     SensorType,
     ServiceRequest,
     ServiceState,
@@ -44,6 +45,8 @@ from palpate.protos.messages import (
     TareRequest,
     TensorInfo,
     WrenchFrame,
+    WrenchZero,
+    WrenchZeroRequest,
 )
 from palpate.protos.session import Session
 
@@ -104,6 +107,9 @@ def examples() -> dict[str, Any]:
             np.array([0.5, 0.5, -0.5, 0.5]),
             True,
         ),
+        "RobotPoseFrame": RobotPoseFrame(
+            "left_arm", 41, 9_876_543_210, pose, 0xFACE, 1_763_719_200_123_456_789
+        ),
         "FieldFrame": FieldFrame(stamp, "BT000123", mesh, nodes),
         "FeatureEstimate": FeatureEstimate(
             stamp,
@@ -147,6 +153,18 @@ def examples() -> dict[str, Any]:
             50,
         ),
         "TareRequest": TareRequest(0xFEED, 50),
+        "WrenchZeroRequest": WrenchZeroRequest(100),
+        "WrenchZero": WrenchZero(
+            "FT-7",
+            "Weiss KMS 40 at 192.168.1.30",
+            9_876_543_210,
+            1_763_719_200_123_456_789,
+            _floats(0.5, -0.25, 4.0),
+            _floats(0.01, -0.02, 0.0),
+            _floats(0.0, 0.001, -0.002),
+            _floats(0.0, 0.0, 0.0001),
+            100,
+        ),
         "FieldRequest": FieldRequest("finger", frame),
         "ServiceRequest": ServiceRequest(),
         "Status": Status(

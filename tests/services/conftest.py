@@ -19,7 +19,6 @@ from palpate.protos import clock
 from palpate.protos.bundle import TASKS, Bundle, Manifest, read_bundle, write_bundle
 from palpate.protos.config import LinkConfig
 from palpate.protos.messages import (
-    PAC_SAMPLES,
     ElectrodeFrame,
     IndenterPoseFrame,
     Origin,
@@ -180,7 +179,7 @@ def make_frame() -> Callable[..., ElectrodeFrame]:
             sensor_type,
             np.clip(counts, 0, 4095).astype(np.uint16),
             1500 + round(press / 4),
-            (2000 + 50 * rng.normal(size=PAC_SAMPLES)).astype(np.uint16),
+            (2000 + 50 * rng.normal(size=sensor_type.layout.pac_samples)).astype(np.uint16),
             2100,
             1900,
             everything if validity is None else validity,
@@ -193,13 +192,14 @@ def make_frame() -> Callable[..., ElectrodeFrame]:
 
 @pytest.fixture
 def make_tare(make_frame: Callable[..., ElectrodeFrame]) -> Callable[..., Tare]:
-    def make(tare_id: int = 5) -> Tare:
+    def make(tare_id: int = 5, *, sensor_type: SensorType = SensorType.BIOTAC) -> Tare:
+        count = sensor_type.electrode_count
         return Tare(
             tare_id,
             make_frame().stamp,
             "BT-TEST",
-            np.full(19, BASELINE_COUNTS, np.float32),
-            np.full(19, 1.5, np.float32),
+            np.full(count, BASELINE_COUNTS, np.float32),
+            np.full(count, 1.5, np.float32),
             1500.0,
             2000.0,
             2100.0,

@@ -1,8 +1,13 @@
-"""Where the electrodes sit on the core of a BioTac; the one copy of the table in the code.
+"""Where the electrodes sit on the core of a BioTac; the one copy of the tables in the code.
 
 The 19 sensing electrodes are the table of Lin et al. (docs/conventions.md, which a test compares);
 the four excitation electrodes, tied together, were read off the published map to 0.1 mm. Sensor
 frame: +x to the fingertip, +y lateral, -z to the pad.
+
+Those of the BioTac SP have one source, a simulation model of it and no table of its maker's, and a
+frame of their own: the core frame of that model's CAD, with x along the finger, y lateral, -z to
+the pad. Its origin is not that of the sensor frame, and which end of x is the fingertip is not said
+there. Nothing that takes 19 electrodes takes these.
 """
 
 from __future__ import annotations
@@ -56,3 +61,30 @@ ELECTRODE_MIRROR: NDArray[np.int32] = (
     np.array([11, 12, 13, 14, 15, 16, 7, 9, 8, 10, 1, 2, 3, 4, 5, 6, 17, 18, 19], np.int32) - 1
 )
 """Index of the electrode at the mirror image (y -> -y) of each of E1..E19, shape (19,)."""
+
+_SP_SIDE = [  # E1..E10; E11..E20 are their mirror images
+    [9.815, -3.985, -2.768],
+    [8.101, -3.066, -5.208],
+    [2.219, -7.162, -3.265],
+    [2.131, -5.120, -5.992],
+    [-0.473, -2.411, -7.623],
+    [-2.334, -7.238, -3.059],
+    [-3.471, -4.753, -6.034],
+    [-5.676, -1.817, -6.875],
+    [-8.147, -3.245, -5.067],
+    [-10.082, -3.850, -2.541],
+]
+_SP_PAD = [[6.572, 0.0, -6.409], [4.322, -1.852, -6.970], [4.322, 1.852, -6.970]]
+_SP_PAD += [[1.913, 0.0, -7.571]]
+_SP_X = [[6.103, -5.493, -4.277], [-6.185, -5.774, -3.833]]
+
+SP_ELECTRODE_POSITIONS: Floats = 1e-3 * np.array(_SP_SIDE + _mirrored(_SP_SIDE) + _SP_PAD)
+"""Centres of E1..E24 of a BioTac SP [m], shape (24, 3), core frame of its model."""
+
+SP_EXCITATION_POSITIONS: Floats = 1e-3 * np.array(_SP_X + _mirrored(_SP_X))
+"""Centres of its X1 X2 X3 X4 [m], shape (4, 3), core frame; numbered by the manual's map."""
+
+SP_ELECTRODE_MIRROR: NDArray[np.int32] = (
+    np.array([*range(11, 21), *range(1, 11), 21, 23, 22, 24], np.int32) - 1
+)
+"""Index of the electrode at the mirror image (y -> -y) of each of E1..E24, shape (24,)."""

@@ -1,4 +1,4 @@
-"""What a robot uses: features and fields now, tare, who is alive.
+"""What a robot uses: features and fields now, tare, who is alive, telling its own pose.
 
 Five lines::
 
@@ -29,8 +29,10 @@ from palpate.protos.codec import (
     SYNTHESIS_ESTIMATE,
     TARE,
     TARE_REQUEST,
+    WRENCH_ZERO,
+    WRENCH_ZERO_REQUEST,
 )
-from palpate.protos.config import DEFAULT_ROUTER, LinkConfig
+from palpate.protos.config import DEFAULT_ROUTER, LinkConfig, TlsConfig
 from palpate.protos.errors import PalpateError, StaleError
 from palpate.protos.messages import (
     ElectrodeFrame,
@@ -47,8 +49,11 @@ from palpate.protos.messages import (
     SynthesisEstimate,
     Tare,
     TareRequest,
+    WrenchZero,
+    WrenchZeroRequest,
     as_field_frame,
 )
+from palpate.protos.robot_poses import RobotPosePublisher
 from palpate.protos.session import Alive, Delivery, Received, Session, Subscriber
 from palpate.protos.simulations import OnProgress, OnStep, ask_simulation
 from palpate.protos.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
@@ -63,17 +68,24 @@ class Client(Closing):
         connect: Endpoint of the router.
         station: Name of the station.
         timeout_s: How long joining the bus, and by default a question, may take [s].
+        tls: Certificates, for a router on another host.
 
     Raises:
         LinkError: No router at ``connect``.
     """
 
     def __init__(
-        self, connect: str = DEFAULT_ROUTER, *, station: str = "lab", timeout_s: float = 2.0
+        self,
+        connect: str = DEFAULT_ROUTER,
+        *,
+        station: str = "lab",
+        timeout_s: float = 2.0,
+        tls: TlsConfig | None = None,
     ) -> None:
         self._timeout_s = timeout_s
         self._subscribers: dict[tuple[str, str], Subscriber[Any]] = {}
-        link = LinkConfig(connect=(connect,), wait_for_router_s=timeout_s)
+        self._publishers: list[RobotPosePublisher] = []
+        link = LinkConfig(connect=(connect,), wait_for_router_s=timeout_s, tls=tls)
         self.session = Session.open(link, station=station)
 
     def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
@@ -156,6 +168,17 @@ class Client(Closing):
         """
         return self._subscriber(FEATURES, sensor).next(timeout_s)
 
+    def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
+        """Tell where the flange of a robot is: ``put`` it from the control loop.
+
+        A gateway with the driver ``pose_zenoh`` makes poses of the indenter of it.
+
+        Args:
+            robot: Name of the robot, as the gateway's option ``robot`` has it.
+        """
+        self._publishers.append(RobotPosePublisher(self.session, robot))
+        return self._publishers[-1]
+
     def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
         """Take the untouched finger as zero now.
 
@@ -173,6 +196,27 @@ class Client(Closing):
             request=TareRequest(frames=frames),
             request_codec=TARE_REQUEST,
             reply_codec=TARE,
+            timeout_s=timeout_s,
+        )
+
+    def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
+        """Take the present load of a force/torque sensor as zero.
+
+        Args:
+            sensor: Name of the sensor.
+            readings: How many to average before and after; 0 = the gateway's own number.
+            timeout_s: How long it may take [s].
+
+        Raises:
+            LinkError: Nobody serves a force/torque sensor of this name.
+            RemoteError: The gateway refuses, e.g. because the load is not still.
+        """
+        return self.session.query(
+            "zero",
+            sensor=sensor,
+            request=WrenchZeroRequest(readings=readings),
+            request_codec=WRENCH_ZERO_REQUEST,
+            reply_codec=WRENCH_ZERO,
             timeout_s=timeout_s,
         )
 
@@ -254,6 +298,8 @@ class Client(Closing):
 
     def close(self) -> None:
         """Leave the bus."""
+        for publisher in self._publishers:
+            publisher.close()
         self.session.close()
 
     def _subscriber(self, topic: Topic[M], sensor: str) -> Subscriber[M]:

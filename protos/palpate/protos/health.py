@@ -1,4 +1,7 @@
-"""Health: what a process counts, and telling it once a second and when asked."""
+"""Health: what a process counts and how its sensors do.
+
+Told once a second, at once when a state changes, and when asked.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,22 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 
 from palpate.protos import clock
 from palpate.protos.closing import Closing
 from palpate.protos.codec import SERVICE_REQUEST, STATUS
 from palpate.protos.errors import PalpateError
-from palpate.protos.messages import ErrorReply, ServiceState, Status
+from palpate.protos.messages import (
+    ChannelFault,
+    ErrorReply,
+    SensorState,
+    SensorStatus,
+    ServiceState,
+    Status,
+)
 from palpate.protos.session import Session
 from palpate.protos.session.query import error_reply
 from palpate.protos.topics import STATUS as STATUS_TOPIC
@@ -45,6 +56,7 @@ class Health:
         self._message = ""
         self._last_error: ErrorReply | None = None
         self._sensors: tuple[str, ...] = ()
+        self._sensor_states: dict[str, SensorStatus] = {}
         self._started = time.monotonic()
         self._version = palpate_version()
         self.changed = threading.Event()
@@ -99,6 +111,25 @@ class Health:
         with self._lock:
             self._sensors = sensors
 
+    def set_sensor_state(
+        self,
+        name: str,
+        state: SensorState,
+        *,
+        faults: Sequence[ChannelFault] = (),
+        message: str = "",
+    ) -> None:
+        """Say how a sensor does; a change of its state or faults is told at once."""
+        status = SensorStatus(name, state, time.monotonic_ns(), tuple(faults), message)
+        with self._lock:
+            before = self._sensor_states.get(name)
+            if before is not None and before.state is state:
+                status = replace(status, since_monotonic_ns=before.since_monotonic_ns)
+            self._sensor_states[name] = status
+            same = before is not None and before.state is state and before.faults == status.faults
+        if not same:
+            self.changed.set()
+
     def status(self) -> Status:
         """All of it as a message."""
         monotonic_ns, wall_ns = clock.now()
@@ -116,6 +147,7 @@ class Health:
                 self._sensors,
                 self._message,
                 self._last_error,
+                tuple(self._sensor_states.values()),
             )
 
 

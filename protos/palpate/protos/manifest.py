@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate.protos.errors import BundleError
 from palpate.protos.messages import SensorType, TensorInfo
-from palpate.protos.tasks import TaskContract, check_tensors
+from palpate.protos.tasks import SENSOR_TYPE, TaskContract, check_tensors
 
 BUNDLE_CONTRACT_VERSION = 1
 
@@ -68,8 +68,16 @@ def check_task(manifest: Manifest, where: str) -> TaskContract:
     """Check that inputs, outputs and mesh are those of the manifest's task.
 
     Raises:
-        BundleError: An unknown task, or tensors that differ from its contract.
+        BundleError: An unknown task, tensors that differ from its contract, or a type of sensor
+            that has other electrodes.
     """
+    if manifest.sensor_type in SensorType.__members__ and manifest.sensor_type != SENSOR_TYPE.name:
+        raise BundleError(
+            f"{where}: a model for the sensor type {manifest.sensor_type} has "
+            f"{SensorType[manifest.sensor_type].layout.electrodes} electrodes, the tasks of this "
+            f"contract have {SENSOR_TYPE.layout.electrodes}, those of a {SENSOR_TYPE.name}",
+            remedy=f"train a bundle for a {SENSOR_TYPE.name}; there is no contract for another yet",
+        )
     contract, _ = check_tensors(manifest.task, manifest.inputs, manifest.outputs, where)
     return contract
 

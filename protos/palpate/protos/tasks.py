@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from palpate.protos.errors import BundleError
-from palpate.protos.messages import TensorInfo
+from palpate.protos.messages import SensorType, TensorInfo
+
+SENSOR_TYPE = SensorType.BIOTAC
+"""Whose electrodes the tasks of this contract take and give; there is none for a BioTac SP."""
 
 BY_MESH = 0
 """Width of a tensor that has so many values for each node of the bundle's mesh."""
@@ -34,9 +37,11 @@ def _tensor(name: str, width: int, unit: str) -> TensorInfo:
     return TensorInfo(name, "float32", (-1, width), unit)
 
 
+_ELECTRODES = SENSOR_TYPE.layout.electrodes
+
 TASKS: dict[str, TaskContract] = {
     "features": TaskContract(
-        inputs=(_tensor("electrodes", 19, "tared counts"),),
+        inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
         outputs=(_tensor("force", 3, "N"), _tensor("force_sd", 3, "N")),
         optional=(
             _tensor("contact_location", 3, "m"),
@@ -44,7 +49,7 @@ TASKS: dict[str, TaskContract] = {
         ),
     ),
     "field": TaskContract(
-        inputs=(_tensor("electrodes", 19, "tared counts"),),
+        inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
         outputs=(_tensor("displacement", BY_MESH, "m"),),
         optional=(_tensor("displacement_sd", BY_MESH, "m"),),
         per_node={"displacement": 3, "displacement_sd": 1},
@@ -52,8 +57,8 @@ TASKS: dict[str, TaskContract] = {
     "synthesis": TaskContract(
         inputs=(_tensor("displacement", BY_MESH, "m"),),
         outputs=(
-            _tensor("tared_counts", 19, "tared counts"),
-            _tensor("tared_counts_sd", 19, "tared counts"),
+            _tensor("tared_counts", _ELECTRODES, "tared counts"),
+            _tensor("tared_counts_sd", _ELECTRODES, "tared counts"),
         ),
         per_node={"displacement": 3},
     ),

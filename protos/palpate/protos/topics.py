@@ -27,6 +27,7 @@ from palpate.protos.messages import (
     FieldEstimate,
     FieldFrame,
     IndenterPoseFrame,
+    RobotPoseFrame,
     SimulationProgress,
     Stamp,
     Status,
@@ -103,6 +104,15 @@ WRENCH: Topic[WrenchFrame] = Topic(
 POSE: Topic[IndenterPoseFrame] = Topic(
     "pose", codec.INDENTER_POSE_FRAME, 100, _RT, True, True, "where the indenter is"
 )
+ROBOT_POSE: Topic[RobotPoseFrame] = Topic(
+    "robot_pose",
+    codec.ROBOT_POSE_FRAME,
+    250,
+    _RT,
+    True,
+    False,
+    "where a robot's flange is, told by its program",
+)
 FIELD_TRUTH: Topic[FieldFrame] = Topic(
     "field_truth",
     codec.FIELD_FRAME,
@@ -156,6 +166,7 @@ TOPICS: dict[str, Topic[Any]] = {
         ELECTRODES,
         WRENCH,
         POSE,
+        ROBOT_POSE,
         FIELD_TRUTH,
         TARE,
         FEATURES,

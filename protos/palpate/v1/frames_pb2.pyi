@@ -48,16 +48,18 @@ class WrenchFrame(_message.Message):
     def __init__(self, stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., force: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., torque: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., overload: _Optional[bool] = ...) -> None: ...
 
 class IndenterPoseFrame(_message.Message):
-    __slots__ = ("stamp", "indenter", "pose_sensor_indenter", "in_contact")
+    __slots__ = ("stamp", "indenter", "pose_sensor_indenter", "in_contact", "contact_unknown")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     INDENTER_FIELD_NUMBER: _ClassVar[int]
     POSE_SENSOR_INDENTER_FIELD_NUMBER: _ClassVar[int]
     IN_CONTACT_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_UNKNOWN_FIELD_NUMBER: _ClassVar[int]
     stamp: _common_pb2.Stamp
     indenter: str
     pose_sensor_indenter: _common_pb2.Pose
     in_contact: bool
-    def __init__(self, stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., indenter: _Optional[str] = ..., pose_sensor_indenter: _Optional[_Union[_common_pb2.Pose, _Mapping]] = ..., in_contact: _Optional[bool] = ...) -> None: ...
+    contact_unknown: bool
+    def __init__(self, stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., indenter: _Optional[str] = ..., pose_sensor_indenter: _Optional[_Union[_common_pb2.Pose, _Mapping]] = ..., in_contact: _Optional[bool] = ..., contact_unknown: _Optional[bool] = ...) -> None: ...
 
 class FieldFrame(_message.Message):
     __slots__ = ("stamp", "sensor_serial", "mesh_sha256", "displacement")

@@ -18,6 +18,24 @@ class ServiceState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SERVICE_STATE_FINISHED: _ClassVar[ServiceState]
     SERVICE_STATE_STOPPING: _ClassVar[ServiceState]
 
+class SensorState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SENSOR_STATE_UNSPECIFIED: _ClassVar[SensorState]
+    SENSOR_STATE_STARTING: _ClassVar[SensorState]
+    SENSOR_STATE_LIVE: _ClassVar[SensorState]
+    SENSOR_STATE_WARMING: _ClassVar[SensorState]
+    SENSOR_STATE_ZERO_LOST: _ClassVar[SensorState]
+    SENSOR_STATE_LOST: _ClassVar[SensorState]
+    SENSOR_STATE_ENDED: _ClassVar[SensorState]
+
+class FaultKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    FAULT_KIND_UNSPECIFIED: _ClassVar[FaultKind]
+    FAULT_KIND_SATURATED: _ClassVar[FaultKind]
+    FAULT_KIND_DEAD: _ClassVar[FaultKind]
+    FAULT_KIND_STUCK: _ClassVar[FaultKind]
+    FAULT_KIND_ODD: _ClassVar[FaultKind]
+
 class ErrorCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     ERROR_CODE_UNSPECIFIED: _ClassVar[ErrorCode]
@@ -37,6 +55,18 @@ SERVICE_STATE_READY: ServiceState
 SERVICE_STATE_DEGRADED: ServiceState
 SERVICE_STATE_FINISHED: ServiceState
 SERVICE_STATE_STOPPING: ServiceState
+SENSOR_STATE_UNSPECIFIED: SensorState
+SENSOR_STATE_STARTING: SensorState
+SENSOR_STATE_LIVE: SensorState
+SENSOR_STATE_WARMING: SensorState
+SENSOR_STATE_ZERO_LOST: SensorState
+SENSOR_STATE_LOST: SensorState
+SENSOR_STATE_ENDED: SensorState
+FAULT_KIND_UNSPECIFIED: FaultKind
+FAULT_KIND_SATURATED: FaultKind
+FAULT_KIND_DEAD: FaultKind
+FAULT_KIND_STUCK: FaultKind
+FAULT_KIND_ODD: FaultKind
 ERROR_CODE_UNSPECIFIED: ErrorCode
 ERROR_CODE_INVALID_REQUEST: ErrorCode
 ERROR_CODE_NOT_FOUND: ErrorCode
@@ -81,12 +111,62 @@ class TareRequest(_message.Message):
     frames: int
     def __init__(self, tare_id: _Optional[int] = ..., frames: _Optional[int] = ...) -> None: ...
 
+class WrenchZeroRequest(_message.Message):
+    __slots__ = ("readings",)
+    READINGS_FIELD_NUMBER: _ClassVar[int]
+    readings: int
+    def __init__(self, readings: _Optional[int] = ...) -> None: ...
+
+class WrenchZero(_message.Message):
+    __slots__ = ("sensor_serial", "device", "monotonic_ns", "wall_ns", "force_before", "torque_before", "force_after", "torque_after", "readings_averaged")
+    SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+    WALL_NS_FIELD_NUMBER: _ClassVar[int]
+    FORCE_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    FORCE_AFTER_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_AFTER_FIELD_NUMBER: _ClassVar[int]
+    READINGS_AVERAGED_FIELD_NUMBER: _ClassVar[int]
+    sensor_serial: str
+    device: str
+    monotonic_ns: int
+    wall_ns: int
+    force_before: _common_pb2.Vector3
+    torque_before: _common_pb2.Vector3
+    force_after: _common_pb2.Vector3
+    torque_after: _common_pb2.Vector3
+    readings_averaged: int
+    def __init__(self, sensor_serial: _Optional[str] = ..., device: _Optional[str] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., force_before: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., torque_before: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., force_after: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., torque_after: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., readings_averaged: _Optional[int] = ...) -> None: ...
+
 class ServiceRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class ChannelFault(_message.Message):
+    __slots__ = ("kind", "channels")
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    kind: FaultKind
+    channels: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, kind: _Optional[_Union[FaultKind, str]] = ..., channels: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class SensorStatus(_message.Message):
+    __slots__ = ("name", "state", "since_monotonic_ns", "faults", "message")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    SINCE_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+    FAULTS_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    state: SensorState
+    since_monotonic_ns: int
+    faults: _containers.RepeatedCompositeFieldContainer[ChannelFault]
+    message: str
+    def __init__(self, name: _Optional[str] = ..., state: _Optional[_Union[SensorState, str]] = ..., since_monotonic_ns: _Optional[int] = ..., faults: _Optional[_Iterable[_Union[ChannelFault, _Mapping]]] = ..., message: _Optional[str] = ...) -> None: ...
+
 class Status(_message.Message):
-    __slots__ = ("service", "instance", "state", "monotonic_ns", "wall_ns", "uptime_s", "version", "counters", "gauges", "sensors", "message", "last_error")
+    __slots__ = ("service", "instance", "state", "monotonic_ns", "wall_ns", "uptime_s", "version", "counters", "gauges", "sensors", "message", "last_error", "sensor_states")
     class CountersEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -113,6 +193,7 @@ class Status(_message.Message):
     SENSORS_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     LAST_ERROR_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_STATES_FIELD_NUMBER: _ClassVar[int]
     service: str
     instance: str
     state: ServiceState
@@ -125,7 +206,8 @@ class Status(_message.Message):
     sensors: _containers.RepeatedScalarFieldContainer[str]
     message: str
     last_error: Error
-    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., state: _Optional[_Union[ServiceState, str]] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., version: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., sensors: _Optional[_Iterable[str]] = ..., message: _Optional[str] = ..., last_error: _Optional[_Union[Error, _Mapping]] = ...) -> None: ...
+    sensor_states: _containers.RepeatedCompositeFieldContainer[SensorStatus]
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., state: _Optional[_Union[ServiceState, str]] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., version: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., sensors: _Optional[_Iterable[str]] = ..., message: _Optional[str] = ..., last_error: _Optional[_Union[Error, _Mapping]] = ..., sensor_states: _Optional[_Iterable[_Union[SensorStatus, _Mapping]]] = ...) -> None: ...
 
 class TensorInfo(_message.Message):
     __slots__ = ("name", "dtype", "shape", "unit")

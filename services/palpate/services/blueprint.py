@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.protos.anatomy import ELECTRODE_POSITIONS
+from palpate.protos.anatomy import ELECTRODE_POSITIONS, SP_ELECTRODE_POSITIONS
 from palpate.protos.extras import require
+from palpate.protos.messages import SensorType
 from palpate.services import anatomy
 
 TIMELINE = "sensor_time"
@@ -34,14 +35,19 @@ MAX_SENSORS = 8
 """Tabs in one view; more sensors are recorded but not laid out."""
 
 
-def electrode_names() -> list[str]:
-    """E1..E19."""
-    return [f"E{at + 1}" for at in range(len(ELECTRODE_POSITIONS))]
+_POSITIONS = {
+    SensorType.BIOTAC: ELECTRODE_POSITIONS,
+    SensorType.BIOTAC_SP: SP_ELECTRODE_POSITIONS,
+}
 
 
-def electrode_colours() -> list[tuple[int, int, int]]:
+def electrode_names(count: int) -> list[str]:
+    """E1, E2, ..."""
+    return [f"E{at + 1}" for at in range(count)]
+
+
+def electrode_colours(count: int) -> list[tuple[int, int, int]]:
     """One colour an electrode, in order around the colour circle."""
-    count = len(ELECTRODE_POSITIONS)
     wheel = (colorsys.hls_to_rgb(at / count, 0.62, 0.65) for at in range(count))
     return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
 
@@ -50,10 +56,10 @@ def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
     """Colours of electrodes by their tared counts: cool where lowered, warm where raised.
 
     Args:
-        tared: Tared counts, shape ``(N, 19)``.
+        tared: Tared counts, shape ``(N, 19)`` (SP: 24).
 
     Returns:
-        Packed RGBA, uint32, shape ``(N, 19)``.
+        Packed RGBA, uint32, of the same shape.
     """
     strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
     rest = np.array([150.0, 156.0, 166.0])
@@ -64,16 +70,17 @@ def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
     return shades
 
 
-def blueprint(sensors: Sequence[str], *, with_fields: Collection[str] = ()) -> Any:
+def blueprint(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
     """Layout for these sensors: one tab each, fingertip left, signals right.
 
     Args:
-        sensors: Names of the sensors, in order of their tabs.
+        sensors: Types of the sensors by name, in order of their tabs.
         with_fields: Those of them that have fields, which get a row more.
     """
     rrb = require("rerun.blueprint", extra="services")
     tabs = [
-        _sensor_tab(rrb, sensor, fields=sensor in with_fields) for sensor in sensors[:MAX_SENSORS]
+        _sensor_tab(rrb, sensor, kind, fields=sensor in with_fields)
+        for sensor, kind in [*sensors.items()][:MAX_SENSORS]
     ]
     return rrb.Blueprint(
         tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs),
@@ -85,7 +92,7 @@ def blueprint(sensors: Sequence[str], *, with_fields: Collection[str] = ()) -> A
     )
 
 
-def _sensor_tab(rrb: Any, sensor: str, *, fields: bool) -> Any:
+def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any:
     def plot(origin: str, name: str, *, legend: bool = True) -> Any:
         return rrb.TimeSeriesView(
             origin=f"{sensor}/{origin}",
@@ -111,7 +118,7 @@ def _sensor_tab(rrb: Any, sensor: str, *, fields: bool) -> Any:
 
     finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
     signals = rrb.Vertical(
-        plot("electrodes", "Electrodes E1-E19 [counts]", legend=False),
+        plot("electrodes", f"Electrodes E1-E{kind.electrode_count} [counts]", legend=False),
         rrb.Horizontal(
             plot("pdc", "PDC, static pressure [counts]", legend=False),
             plot("pac", "PAC, vibration [counts]", legend=False),
@@ -141,14 +148,22 @@ def _sensor_tab(rrb: Any, sensor: str, *, fields: bool) -> Any:
     return rrb.Vertical(*rows, row_shares=[1] * len(rows), name=sensor)
 
 
-def fixtures() -> Iterator[tuple[str, Any]]:
-    """What never changes, as entity (below the sensor) and value: names, colours, the body."""
+def fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[str, Any]]:
+    """What never changes, as entity (below the sensor) and value: names, colours, the body.
+
+    The electrodes of a BioTac SP are drawn in the frame of their table and without a body, whose
+    shape no source tells.
+
+    Args:
+        kind: Type of the sensor.
+        again: Instead of those of another type: the finger was exchanged.
+    """
     rr = require("rerun", extra="services")
 
     def line(names: str | list[str], colours: Sequence[Any], width: float) -> Any:
         return rr.SeriesLines(names=names, colors=colours, widths=[width] * len(colours))
 
-    names, wheel = electrode_names(), electrode_colours()
+    names, wheel = electrode_names(kind.electrode_count), electrode_colours(kind.electrode_count)
     yield "electrodes/raw", line(names, wheel, 1.2)
     yield "electrodes/tared", line(names, wheel, 1.2)
     yield "synthesised", line(names, wheel, 1.2)
@@ -160,19 +175,12 @@ def fixtures() -> Iterator[tuple[str, Any]]:
         yield f"force/{axis}/estimate", line(f"{axis} estimate", [colour], 3.0)
     for what in ("force", "location"):
         yield f"error/{what}", line(f"{what} error", [ERROR_COLOUR], 1.2)
-    vertices, triangles, normals = anatomy.core_mesh()
-    yield (
-        "finger/core",
-        rr.Mesh3D(
-            vertex_positions=vertices,
-            triangle_indices=triangles,
-            vertex_normals=normals,
-            albedo_factor=(120, 130, 148),
-        ),
-    )
-    skin = rr.LineStrips3D(anatomy.skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
-    yield "finger/skin", skin
-    yield "finger/electrodes", rr.Points3D(ELECTRODE_POSITIONS, radii=[7.5e-4])
+    if kind is SensorType.BIOTAC:
+        yield from _body(rr)
+    elif again:
+        yield "finger/core", rr.Mesh3D.cleared()
+        yield "finger/skin", rr.LineStrips3D.cleared()
+    yield "finger/electrodes", rr.Points3D(_POSITIONS[kind], radii=[7.5e-4])
     for name, colour, point_m, arrow_m in (
         ("truth", TRUTH_COLOUR, 7e-4, 2.4e-4),
         ("estimate", ESTIMATE_COLOUR, 9e-4, 3e-4),
@@ -180,3 +188,16 @@ def fixtures() -> Iterator[tuple[str, Any]]:
         contact = rr.Points3D.from_fields(colors=[colour], radii=[point_m])
         yield f"finger/contact/{name}", contact
         yield f"finger/force/{name}", rr.Arrows3D.from_fields(colors=[colour], radii=[arrow_m])
+
+
+def _body(rr: Any) -> Iterator[tuple[str, Any]]:
+    vertices, triangles, normals = anatomy.core_mesh()
+    core = rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=triangles,
+        vertex_normals=normals,
+        albedo_factor=(120, 130, 148),
+    )
+    skin = rr.LineStrips3D(anatomy.skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
+    yield "finger/core", core
+    yield "finger/skin", skin

@@ -28,7 +28,8 @@ class Refusal(StrEnum):
     """Why a message got no estimate; the value is the name it is counted by."""
 
     UNTARED = "untared"
-    """The frame was taken before any tare, or the tare given is not the one it names."""
+    """The frame was taken before any tare, or the tare given is not the one it names or has another
+    number of electrodes."""
 
     INVALID_CHANNELS = "invalid_channels"
     """At least one electrode is marked bad."""
@@ -144,6 +145,8 @@ def _run_on_electrodes(
     if frame.sensor_type is not runtime.sensor_type:
         return Refusal.WRONG_SENSOR
     if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
+        return Refusal.UNTARED
+    if tare.electrodes.shape != frame.electrodes.shape:  # of the finger that was there before
         return Refusal.UNTARED
     if not frame.electrodes_valid:
         return Refusal.INVALID_CHANNELS

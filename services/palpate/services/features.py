@@ -40,8 +40,8 @@ def run(
     """
 
     def make(
-        session: Session, runtime: Runtime, _: Health
+        session: Session, runtime: Runtime, health: Health
     ) -> Answer[ElectrodeFrame, FeatureEstimate]:
-        return TaredFrames(session, config, runtime, estimate).answer
+        return TaredFrames(session, config, runtime, estimate, health).answer
 
     serve(LINE, config, link, station, stop, instance=instance, make=make)

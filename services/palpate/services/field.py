@@ -45,7 +45,7 @@ def run(
         session: Session, runtime: Runtime, health: Health
     ) -> Answer[ElectrodeFrame, FieldEstimate]:
         # Questions come in a thread of their own, and tares are looked up by one thread each.
-        asked = TaredFrames(session, config, runtime, estimate_field, any_age=True)
+        asked = TaredFrames(session, config, runtime, estimate_field, health, any_age=True)
 
         def handle(request: FieldRequest) -> FieldEstimate:
             return answered(asked.answer(request.sensor, request.frame), health)
@@ -58,6 +58,6 @@ def run(
             reply=FIELD_ESTIMATE,
             handler=handle,
         )
-        return TaredFrames(session, config, runtime, estimate_field).answer
+        return TaredFrames(session, config, runtime, estimate_field, health).answer
 
     serve(LINE, config, link, station, stop, instance=instance, make=make, rate_hz=config.rate_hz)

@@ -20,6 +20,7 @@ from palpate.protos.messages import (
     FieldEstimate,
     FieldFrame,
     IndenterPoseFrame,
+    SensorType,
     Stamp,
     SynthesisEstimate,
     Tare,
@@ -64,8 +65,9 @@ class Rows:
     """What has come since the last drawing.
 
     Attributes:
-        electrodes: Counts by ``raw`` or ``tared``, values of shape ``(19,)`` [counts].
-        pressure: PDC followed by the PAC samples [counts], shape ``(23,)``.
+        electrodes: Counts by ``raw`` or ``tared``, values of shape ``(19,)`` (SP: 24) [counts].
+        pressure: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28); NaN
+            where not valid, e.g. lost.
         force: Force by ``truth`` or ``estimate`` [N], shape ``(3,)``.
         arrow: The same where it is known whether and where it acts.
         location: Contact location likewise [m], shape ``(3,)`` or None.
@@ -151,6 +153,8 @@ class SensorScene:
         self._thinners = {"truth": FieldThinner(), "estimate": FieldThinner()}
         self.pending = False
         self.has_fields = False
+        self.sensor_type = SensorType.BIOTAC
+        """Type of the last frame; before the first that of most sensors."""
 
     def add(self, message: Any) -> None:
         """Take one decoded message."""
@@ -180,13 +184,18 @@ class SensorScene:
         return rows
 
     def _add_frame(self, frame: ElectrodeFrame) -> None:
+        self.sensor_type = frame.sensor_type
         tare = self._tares.get(frame.tare_id) if frame.tare_id != NO_TARE else None
-        if tare is None:
+        if tare is None or tare.electrodes.shape != frame.electrodes.shape:
             kind, counts = "raw", frame.electrodes.astype(np.float32)
         else:
             kind, counts = "tared", frame.electrodes - tare.electrodes
         self._rows.electrodes[kind].append(_row(frame.stamp, counts))
-        pressure = np.concatenate([[frame.pdc], frame.pac])
+        pressure = np.concatenate([[frame.pdc], frame.pac]).astype(np.float32)
+        layout = frame.sensor_type.layout
+        if frame.validity != layout.all_valid:
+            bits = (layout.pdc_bit, *range(layout.first_pac_bit, layout.slots))
+            pressure[[not frame.validity >> bit & 1 for bit in bits]] = np.nan
         stamp = frame.stamp
         self._rows.pressure.append(
             Row(stamp.wall_ns, stamp.sequence, pressure, slot_period_ns=frame.slot_period_ns)

@@ -18,7 +18,7 @@ import numpy as np
 
 from palpate.protos.errors import RecordingError
 from palpate.protos.extras import require
-from palpate.protos.messages import PAC_SAMPLES
+from palpate.protos.messages import SensorType
 from palpate.protos.record import read_record
 from palpate.protos.topics import TOPICS
 from palpate.services import blueprint
@@ -60,7 +60,7 @@ class View:
         self.full = False
         self._max_bytes = max_bytes
         self._scenes: dict[str, SensorScene] = {}
-        self._drawn: set[str] = set()
+        self._drawn: dict[str, SensorType] = {}
         self._with_fields: set[str] = set()
         self._stream = self._rr.RecordingStream(APPLICATION)
         library = MeshLibrary() if meshes is None else meshes
@@ -145,13 +145,16 @@ class View:
             self._open = False
 
     def _prepare(self, sensors: list[str]) -> None:
-        new = [sensor for sensor in sensors if sensor not in self._drawn]
+        kinds = {sensor: self._scenes[sensor].sensor_type for sensor in sensors}
+        new = [sensor for sensor in sensors if self._drawn.get(sensor) is not kinds[sensor]]
         with_fields = {sensor for sensor in sensors if self._scenes[sensor].has_fields}
         if not new and with_fields <= self._with_fields:
             return
-        self._drawn.update(new)
+        again = self._drawn.keys() & new
+        self._drawn.update(kinds)
         self._with_fields |= with_fields
-        layout = blueprint.blueprint(sorted(self._drawn), with_fields=self._with_fields)
+        drawn = dict(sorted(self._drawn.items()))
+        layout = blueprint.blueprint(drawn, with_fields=self._with_fields)
         if self._open:
             self._stream.send_blueprint(layout)
         else:
@@ -159,29 +162,27 @@ class View:
             self._stream.send_recording_name(self._title)
             self._open = True
         for sensor in new:
-            for entity, value in blueprint.fixtures():
+            for entity, value in blueprint.fixtures(kinds[sensor], again=sensor in again):
                 self._stream.log(f"{sensor}/{entity}", value, static=True)
 
     def _draw(self, sensor: str, scene: SensorScene) -> None:
         rr = self._rr
         rows = scene.take()
         for kind in ("raw", "tared"):
-            frames = rows.electrodes[kind]
-            if frames:
+            for frames in _of_one_width(rows.electrodes[kind]):
                 values = np.stack([frame.values for frame in frames])
                 self._send(
                     f"{sensor}/electrodes/{kind}", frames, rr.Scalars.columns(scalars=values)
                 )
-        tared = rows.electrodes["tared"]
-        if tared:
+        for tared in _of_one_width(rows.electrodes["tared"]):
             shades = blueprint.electrode_shades(np.stack([frame.values for frame in tared]))
             count = shades.shape[1]
             columns = rr.Points3D.columns(colors=shades.reshape(-1)).partition([count] * len(tared))
             self._send(f"{sensor}/finger/electrodes", tared, columns)
-        if rows.pressure:
-            pdc = np.array([row.values[0] for row in rows.pressure], np.float64)
-            self._send(f"{sensor}/pdc", rows.pressure, rr.Scalars.columns(scalars=pdc))
-            self._send_pac(f"{sensor}/pac", rows.pressure)
+        for pressure in _of_one_width(rows.pressure):
+            pdc = np.array([row.values[0] for row in pressure], np.float64)
+            self._send(f"{sensor}/pdc", pressure, rr.Scalars.columns(scalars=pdc))
+            self._send_pac(f"{sensor}/pac", pressure)
         for name in ("truth", "estimate"):
             self._draw_force(sensor, name, rows.force[name])
             self._draw_arrows(sensor, name, rows.arrow[name])
@@ -231,8 +232,8 @@ class View:
         self._send(f"{sensor}/finger/contact/{name}", rows, columns)
 
     def _send_pac(self, entity: str, rows: list[Row]) -> None:
-        """All PAC samples at their own times: electrode, PAC, electrode, PAC, ... in 44 slots."""
-        slots = 2 * np.arange(PAC_SAMPLES, dtype=np.int64) + 1
+        """All PAC samples at their own times: electrode, PAC, electrode, PAC, ..."""
+        slots = 2 * np.arange(len(rows[0].values) - 1, dtype=np.int64) + 1
         times = np.concatenate([row.time_ns + slots * row.slot_period_ns for row in rows])
         samples = np.concatenate([row.values[1:] for row in rows]).astype(np.float64)
         rr = self._rr
@@ -242,7 +243,7 @@ class View:
                 rr.TimeColumn(blueprint.TIMELINE, timestamp=times.astype("datetime64[ns]")),
                 rr.TimeColumn(
                     blueprint.SEQUENCE,
-                    sequence=np.repeat([row.sequence for row in rows], PAC_SAMPLES),
+                    sequence=np.repeat([row.sequence for row in rows], len(slots)),
                 ),
             ],
             rr.Scalars.columns(scalars=samples),
@@ -259,6 +260,12 @@ class View:
             ],
             columns,
         )
+
+
+def _of_one_width(rows: list[Row]) -> list[list[Row]]:
+    """Rows by how many values they have: two kinds where a finger was exchanged for an SP."""
+    widths = dict.fromkeys(len(row.values) for row in rows)
+    return [[row for row in rows if len(row.values) == width] for width in widths]
 
 
 def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = ()) -> Path:

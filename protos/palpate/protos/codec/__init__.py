@@ -8,6 +8,8 @@ from palpate.protos.codec.frames import (
     INDENTER_POSE_FRAME,
     WRENCH_FRAME,
 )
+from palpate.protos.codec.robot import ROBOT_POSE_FRAME
+from palpate.protos.codec.sensors import WRENCH_ZERO, WRENCH_ZERO_REQUEST
 from palpate.protos.codec.service import (
     ERROR,
     FIELD_REQUEST,
@@ -29,12 +31,15 @@ CODECS = (
     ELECTRODE_FRAME,
     WRENCH_FRAME,
     INDENTER_POSE_FRAME,
+    ROBOT_POSE_FRAME,
     FIELD_FRAME,
     FEATURE_ESTIMATE,
     FIELD_ESTIMATE,
     SYNTHESIS_ESTIMATE,
     TARE,
     TARE_REQUEST,
+    WRENCH_ZERO,
+    WRENCH_ZERO_REQUEST,
     FIELD_REQUEST,
     SERVICE_REQUEST,
     STATUS,
@@ -58,6 +63,7 @@ __all__ = [
     "FIELD_REQUEST",
     "INDENTER_POSE_FRAME",
     "MODEL_METADATA",
+    "ROBOT_POSE_FRAME",
     "SERVICE_REQUEST",
     "SIMULATION_CANCEL_REPLY",
     "SIMULATION_CANCEL_REQUEST",
@@ -69,5 +75,7 @@ __all__ = [
     "TARE",
     "TARE_REQUEST",
     "WRENCH_FRAME",
+    "WRENCH_ZERO",
+    "WRENCH_ZERO_REQUEST",
     "Codec",
 ]

@@ -13,9 +13,10 @@ from typing import NoReturn
 import numpy as np
 
 from palpate.protos.errors import WireError
-from palpate.protos.messages import FloatArray, Origin, Stamp
+from palpate.protos.messages import FloatArray, Origin, SensorType, Stamp
 from palpate.v1 import common_pb2
 
+_ELECTRODES = {kind.layout.electrodes: kind.name for kind in SensorType}
 _ORIGINS = {int(origin): origin for origin in Origin}
 _SENDER = "the sender breaks contract palpate.v1: fix or upgrade it"
 
@@ -146,6 +147,14 @@ def check_field(array: FloatArray, width: int, what: str, *, rows: int | None = 
     if not np.isfinite(array).all():
         bad = int(np.argwhere(~np.isfinite(array))[0][0])
         reject("non_finite", f"{what} is not finite at row {bad}")
+    return array
+
+
+def check_electrodes(array: FloatArray, what: str) -> FloatArray:
+    """A value for each electrode of some kind of sensor, shape ``(19,)`` or ``(24,)``."""
+    if array.shape[0] not in _ELECTRODES:
+        kinds = " or ".join(f"{count} ({name})" for count, name in _ELECTRODES.items())
+        reject("electrode_count", f"{what} has {array.shape[0]} values, not {kinds}")
     return array
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from palpate.protos.codec.base import Codec, codec_of
 from palpate.protos.codec.checks import (
     check_digest,
+    check_electrodes,
     check_field,
     check_serial,
     field_from_wire,
@@ -117,16 +118,8 @@ def _field_encode(estimate: FieldEstimate) -> bytes:
     return payload
 
 
-def _check_electrode_rows(array: FloatArray, what: str) -> FloatArray:
-    if array.shape[0] not in (19, 24):
-        reject("electrode_count", f"{what} has {array.shape[0]} values, not 19 (BioTac) or 24 (SP)")
-    return array
-
-
 def _synthesis_from_wire(msg: estimates_pb2.SynthesisEstimate) -> SynthesisEstimate:
-    counts = _check_electrode_rows(
-        field_from_wire(msg.tared_counts, 1, "tared_counts"), "tared_counts"
-    )
+    counts = check_electrodes(field_from_wire(msg.tared_counts, 1, "tared_counts"), "tared_counts")
     sd = None
     if msg.tared_counts_sd:
         sd = field_from_wire(msg.tared_counts_sd, 1, "tared_counts_sd", rows=counts.shape[0])
@@ -142,9 +135,7 @@ def _synthesis_from_wire(msg: estimates_pb2.SynthesisEstimate) -> SynthesisEstim
 
 
 def _synthesis_encode(estimate: SynthesisEstimate) -> bytes:
-    counts = _check_electrode_rows(
-        check_field(estimate.tared_counts, 1, "tared_counts"), "tared_counts"
-    )
+    counts = check_electrodes(check_field(estimate.tared_counts, 1, "tared_counts"), "tared_counts")
     msg = estimates_pb2.SynthesisEstimate(
         sensor_serial=check_serial(estimate.sensor_serial),
         bundle_sha256=check_digest(estimate.bundle_sha256, "bundle_sha256"),

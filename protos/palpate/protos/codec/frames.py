@@ -21,7 +21,6 @@ from palpate.protos.codec.checks import (
 from palpate.protos.errors import WireError
 from palpate.protos.messages import (
     COUNTS_MAX,
-    PAC_SAMPLES,
     ElectrodeFrame,
     FieldFrame,
     IndenterPoseFrame,
@@ -30,7 +29,10 @@ from palpate.protos.messages import (
 )
 from palpate.v1 import frames_pb2
 
-_SENSOR_TYPES = {int(kind): (kind, kind.electrode_count, kind.validity_bits) for kind in SensorType}
+_SENSOR_TYPES = {
+    int(kind): (kind, kind.layout.electrodes, kind.layout.pac_samples, kind.layout.slots)
+    for kind in SensorType
+}
 _HIGH = slice(1, None, 2)  # high bytes of little-endian uint16: >= 16 means more than 12 bits
 
 
@@ -47,10 +49,10 @@ def electrodes_from_wire(msg: frames_pb2.ElectrodeFrame) -> ElectrodeFrame:
     kind = _SENSOR_TYPES.get(msg.sensor_type)
     if kind is None:
         reject("sensor_type", f"sensor_type {msg.sensor_type} is not known")
-    sensor_type, count, bits = kind
+    sensor_type, count, pac_samples, bits = kind
     electrodes, pac = msg.electrodes, msg.pac
     _check_counts(electrodes, count, "electrode")
-    _check_counts(pac, PAC_SAMPLES, "pac")
+    _check_counts(pac, pac_samples, "pac")
     pdc, tac, tdc = msg.pdc, msg.tac, msg.tdc
     if pdc > COUNTS_MAX or tac > COUNTS_MAX or tdc > COUNTS_MAX:
         reject("counts_range", f"pdc {pdc}, tac {tac} or tdc {tdc} exceeds {COUNTS_MAX} counts")
@@ -75,13 +77,13 @@ def electrodes_from_wire(msg: frames_pb2.ElectrodeFrame) -> ElectrodeFrame:
 
 
 def _electrodes_encode(frame: ElectrodeFrame) -> bytes:
-    _, count, bits = _SENSOR_TYPES[frame.sensor_type]
+    _, count, pac_samples, bits = _SENSOR_TYPES[frame.sensor_type]
     electrodes, pac = frame.electrodes, frame.pac
     if electrodes.dtype != np.uint16 or pac.dtype != np.uint16:
         reject("dtype", f"electrodes {electrodes.dtype} and pac {pac.dtype} must be uint16")
     electrode_bytes, pac_bytes = electrodes.tobytes(), pac.tobytes()
     _check_counts(electrode_bytes, count, "electrode")
-    _check_counts(pac_bytes, PAC_SAMPLES, "pac")
+    _check_counts(pac_bytes, pac_samples, "pac")
     if frame.validity >> bits:
         reject("validity", f"validity {frame.validity:#x} has bits beyond the {bits} channels")
     if frame.slot_period_ns <= 0:
@@ -131,12 +133,14 @@ def _pose_from_wire(msg: frames_pb2.IndenterPoseFrame) -> IndenterPoseFrame:
     values = pose_values(
         (pose.px, pose.py, pose.pz, pose.qw, pose.qx, pose.qy, pose.qz), "pose_sensor_indenter"
     )
+    if msg.in_contact and msg.contact_unknown:
+        reject("contact", "in_contact is true and contact_unknown too")
     return IndenterPoseFrame(
         stamp_from_wire(msg.stamp),
         check_serial(msg.indenter, "indenter"),
         np.array(values[:3]),
         np.array(values[3:]),
-        msg.in_contact,
+        None if msg.contact_unknown else msg.in_contact,
     )
 
 
@@ -149,7 +153,9 @@ def _pose_encode(frame: IndenterPoseFrame) -> bytes:
         )
     values = pose_values((*frame.position.tolist(), *frame.orientation.tolist()), "pose")
     msg = frames_pb2.IndenterPoseFrame(
-        indenter=check_serial(frame.indenter, "indenter"), in_contact=frame.in_contact
+        indenter=check_serial(frame.indenter, "indenter"),
+        in_contact=bool(frame.in_contact),
+        contact_unknown=frame.in_contact is None,
     )
     stamp_to_wire(frame.stamp, msg.stamp)
     pose = msg.pose_sensor_indenter

@@ -9,6 +9,7 @@ import numpy as np
 from palpate.protos.codec.base import Codec, codec_of
 from palpate.protos.codec.checks import (
     check_digest,
+    check_electrodes,
     check_serial,
     delimited,
     field_from_wire,
@@ -17,6 +18,7 @@ from palpate.protos.codec.checks import (
     stamp_to_wire,
 )
 from palpate.protos.codec.frames import ELECTRODE_FRAME, electrodes_from_wire
+from palpate.protos.codec.sensors import sensor_states_to_wire, sensor_status_from_wire
 from palpate.protos.errors import ConfigError, ErrorCode
 from palpate.protos.messages import (
     NO_TARE,
@@ -45,9 +47,9 @@ def _check_text(text: str, what: str) -> str:
 
 
 def _tare_from_wire(msg: service_pb2.Tare) -> Tare:
-    electrodes = field_from_wire(msg.electrodes, 1, "electrodes")
-    if electrodes.shape[0] not in (19, 24):
-        reject("electrode_count", f"tare has {electrodes.shape[0]} electrodes, not 19 or 24")
+    electrodes = check_electrodes(
+        field_from_wire(msg.electrodes, 1, "electrodes"), "electrodes of the tare"
+    )
     if msg.tare_id == NO_TARE:
         reject("tare_id", "tare_id is 0, which means no tare")
     if not isfinite(msg.pdc + msg.pac + msg.tac + msg.tdc):
@@ -118,6 +120,7 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
         tuple(msg.sensors),
         _check_text(msg.message, "message"),
         _error_from_wire(msg.last_error) if msg.HasField("last_error") else None,
+        tuple(map(sensor_status_from_wire, msg.sensor_states)),
     )
 
 
@@ -134,6 +137,7 @@ def _status_encode(status: Status) -> bytes:
         gauges=dict(status.gauges),
         sensors=list(status.sensors),
         message=status.message[:_TEXT_MAX],
+        sensor_states=sensor_states_to_wire(status.sensor_states),
     )
     if status.last_error is not None:
         _fill_error(status.last_error, msg.last_error)

@@ -24,6 +24,16 @@ from palpate.protos.messages.frames import (
     Stamp,
     WrenchFrame,
 )
+from palpate.protos.messages.layout import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate.protos.messages.robot import RobotPoseFrame
+from palpate.protos.messages.sensors import (
+    ChannelFault,
+    FaultKind,
+    SensorState,
+    SensorStatus,
+    WrenchZero,
+    WrenchZeroRequest,
+)
 from palpate.protos.messages.service import (
     ErrorReply,
     FieldRequest,
@@ -51,22 +61,30 @@ from palpate.protos.messages.simulation import (
 )
 
 __all__ = [
+    "BIOTAC_LAYOUT",
+    "BIOTAC_SP_LAYOUT",
     "COUNTS_MAX",
     "NO_TARE",
     "PAC_SAMPLES",
+    "ChannelFault",
     "CountArray",
     "DoubleArray",
     "ElectrodeFrame",
     "ErrorReply",
+    "FaultKind",
     "FeatureEstimate",
     "FieldEstimate",
     "FieldFrame",
     "FieldRequest",
     "FloatArray",
+    "FrameLayout",
     "IndenterPoseFrame",
     "ModelMetadata",
     "Origin",
     "Pose",
+    "RobotPoseFrame",
+    "SensorState",
+    "SensorStatus",
     "SensorType",
     "ServiceRequest",
     "ServiceState",
@@ -87,5 +105,7 @@ __all__ = [
     "TareRequest",
     "TensorInfo",
     "WrenchFrame",
+    "WrenchZero",
+    "WrenchZeroRequest",
     "as_field_frame",
 ]

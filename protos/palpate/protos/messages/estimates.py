@@ -69,8 +69,8 @@ class SynthesisEstimate:
         sensor_serial: Serial number of the sensor that is imitated.
         bundle_sha256: Digest of the bundle's manifest, 32 bytes.
         mesh_sha256: Content hash of the mesh, 32 bytes.
-        tared_counts: E1..E19 minus baseline [counts], shape ``(19,)``.
-        tared_counts_sd: One standard deviation [counts], shape ``(19,)``, or None.
+        tared_counts: E1..E19 minus baseline [counts], shape ``(19,)`` (SP: 24).
+        tared_counts_sd: One standard deviation [counts], the same shape, or None.
     """
 
     source: Stamp

@@ -8,14 +8,16 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from palpate.protos.messages.layout import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+
 FloatArray = npt.NDArray[np.float32]
 CountArray = npt.NDArray[np.uint16]
 
 COUNTS_MAX = 4095
 """Full scale of the 12-bit ADC [counts]."""
 
-PAC_SAMPLES = 22
-"""PAC readings in one 44-slot frame (hardware manual: E1, PAC, E2, PAC, ...)."""
+PAC_SAMPLES = BIOTAC_LAYOUT.pac_samples
+"""PAC samples in one frame of a BioTac with 19 electrodes; of any sensor: ``SensorType.layout``."""
 
 NO_TARE = 0
 """``tare_id`` of a frame that was taken before any tare."""
@@ -36,14 +38,19 @@ class SensorType(IntEnum):
     BIOTAC_SP = 2
 
     @property
+    def layout(self) -> FrameLayout:
+        """Electrodes, PAC samples and validity bits of its frames."""
+        return BIOTAC_LAYOUT if self is SensorType.BIOTAC else BIOTAC_SP_LAYOUT
+
+    @property
     def electrode_count(self) -> int:
         """Number of sensing electrodes."""
-        return 19 if self is SensorType.BIOTAC else 24
+        return self.layout.electrodes
 
     @property
     def validity_bits(self) -> int:
         """Number of channels with a validity bit: electrodes, PDC, TAC, TDC, PAC samples."""
-        return self.electrode_count + 3 + PAC_SAMPLES
+        return self.layout.slots
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +83,15 @@ class ElectrodeFrame:
     Attributes:
         stamp: When.
         sensor_serial: Serial number of the sensor.
-        sensor_type: Fixes the number of electrodes.
-        electrodes: Raw counts E1..E19, uint16, shape ``(19,)`` (SP: 24).
+        sensor_type: Fixes the numbers of electrodes and PAC samples.
+        electrodes: Raw counts E1..E19, uint16, shape ``(19,)`` (SP: E1..E24, 24).
         pdc: Raw static pressure [counts].
-        pac: Raw dynamic pressure in order of sampling [counts], uint16, shape ``(22,)``.
+        pac: Raw dynamic pressure in order of sampling [counts], uint16, shape ``(22,)`` (SP: 27).
+            A sample that was lost leaves its place, invalid; the others keep theirs.
         tac: Raw dynamic temperature [counts].
         tdc: Raw static temperature [counts].
-        validity: Bit set = channel good. Electrodes from bit 0, then PDC, TAC, TDC, then PAC.
+        validity: Bit set = channel good, as ``sensor_type.layout`` numbers them: electrodes from
+            bit 0, then PDC, TAC, TDC, then PAC.
         slot_period_ns: Time between two slots [ns].
         tare_id: The tare in force; ``NO_TARE`` = none.
     """
@@ -102,7 +111,7 @@ class ElectrodeFrame:
     @property
     def electrodes_valid(self) -> bool:
         """Whether every electrode of this frame is good."""
-        mask = (1 << self.sensor_type.electrode_count) - 1
+        mask = self.sensor_type.layout.electrodes_valid
         return self.validity & mask == mask
 
 
@@ -134,14 +143,14 @@ class IndenterPoseFrame:
         indenter: Standard name, e.g. ``"sphere_3-5mm"``.
         position: Tip of the indenter [m], sensor frame, float64, shape ``(3,)``.
         orientation: Unit quaternion w x y z of the indenter in the sensor frame, shape ``(4,)``.
-        in_contact: Whether it touches the skin, where the source knows.
+        in_contact: Whether it touches the skin; None = the source cannot know (a robot's pose).
     """
 
     stamp: Stamp
     indenter: str
     position: npt.NDArray[np.float64]
     orientation: npt.NDArray[np.float64]
-    in_contact: bool = False
+    in_contact: bool | None = False
 
 
 @dataclass(frozen=True, slots=True)

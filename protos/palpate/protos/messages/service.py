@@ -8,6 +8,7 @@ from enum import IntEnum
 
 from palpate.protos.errors import ErrorCode
 from palpate.protos.messages.frames import NO_TARE, ElectrodeFrame, FloatArray, Stamp
+from palpate.protos.messages.sensors import SensorStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +19,8 @@ class Tare:
         tare_id: Unique per gateway run and sensor, never ``NO_TARE``.
         stamp: Stamp of the last frame averaged.
         sensor_serial: Serial number of the sensor.
-        electrodes: Mean raw counts (the baseline), float32, shape ``(19,)``.
-        electrodes_sd: Standard deviation of the averaged frames [counts], shape ``(19,)``.
+        electrodes: Mean raw counts (the baseline), float32, shape ``(19,)`` (SP: 24).
+        electrodes_sd: Standard deviation of the averaged frames [counts], the same shape.
         pdc: Mean raw PDC [counts].
         pac: Mean raw PAC [counts].
         tac: Mean raw TAC [counts].
@@ -94,7 +95,7 @@ class ErrorReply:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a process says of itself, once a second and when asked.
+    """What a process says of itself: once a second, when a state changes, and when asked.
 
     Attributes:
         service: ``gateway``, ``features``, ``recorder``, ...
@@ -109,6 +110,7 @@ class Status:
         sensors: Sensors it serves.
         message: One line for people.
         last_error: The last thing that went wrong, if any.
+        sensor_states: Of a gateway: each of its sensors.
     """
 
     service: str
@@ -123,6 +125,7 @@ class Status:
     sensors: Sequence[str] = ()
     message: str = ""
     last_error: ErrorReply | None = None
+    sensor_states: Sequence[SensorStatus] = ()
 
 
 @dataclass(frozen=True, slots=True)

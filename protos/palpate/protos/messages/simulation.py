@@ -16,7 +16,7 @@ DoubleArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position [m] and unit quaternion w x y z, sensor frame."""
+    """Position [m] and unit quaternion w x y z; sensor frame unless its name says another."""
 
     position: tuple[float, float, float]
     orientation: tuple[float, float, float, float]

@@ -1,0 +1,192 @@
+"""A BioTac SP at a station whose bundles are made for 19 electrodes: seen, recorded, refused."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.protos.bundle import read_bundle
+from palpate.protos.client import Client
+from palpate.protos.codec import TARE as TARE_CODEC
+from palpate.protos.codec import TARE_REQUEST
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import BundleError, ErrorCode, RemoteError
+from palpate.protos.health import Health
+from palpate.protos.messages import ElectrodeFrame, SensorType, ServiceState, Tare
+from palpate.protos.record import read_record
+from palpate.protos.session import Delivery, Sample, Session
+from palpate.protos.topics import ELECTRODES, FEATURES, TARE, TOPICS, sensor_key
+from palpate.services import features, field
+from palpate.services.config import FeaturesConfig, FieldConfig, RecorderConfig
+from palpate.services.estimator import Refusal, estimate, estimate_field
+from palpate.services.keeper import RecordKeeper
+from palpate.services.runtime import load
+
+bundles: Any = importlib.import_module("field_bundles")
+
+Frames = Callable[..., ElectrodeFrame]
+Tares = Callable[..., Tare]
+Until = Callable[[Callable[[], bool]], None]
+SP = SensorType.BIOTAC_SP
+
+
+@contextmanager
+def running(node: Callable[..., None], config: Any, link: LinkConfig) -> Iterator[None]:
+    stop = threading.Event()
+    thread = threading.Thread(target=node, args=(config, link, "lab", stop))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(timeout=10)
+    assert not thread.is_alive()
+
+
+def announce(session: Session, sensor: str, tare: Tare) -> None:
+    session.queryable(
+        "tare", sensor=sensor, request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
+    )
+    session.publisher(TARE, sensor=sensor, lossless=True).put(tare)
+
+
+@pytest.mark.parametrize("task", ["features", "field"])
+def test_no_estimate_from_an_sp(
+    task: str,
+    make_bundle: Callable[..., Path],
+    make_frame: Frames,
+    make_tare: Tares,
+    tmp_path: Path,
+) -> None:
+    folder = make_bundle() if task == "features" else bundles.write(tmp_path / "f", "field")
+    runtime = load(read_bundle(folder), task)
+    ask: Any = estimate if task == "features" else estimate_field
+    frame, tare = make_frame(sensor_type=SP), make_tare(sensor_type=SP)
+    assert ask(frame, tare, runtime) is Refusal.WRONG_SENSOR
+    # After a finger was exchanged: the frame is right, its tare is the other finger's.
+    assert ask(make_frame(), tare, runtime) is Refusal.UNTARED
+
+
+def test_a_bundle_that_claims_an_sp_is_refused(make_bundle: Callable[..., Path]) -> None:
+    with pytest.raises(BundleError, match=r"BIOTAC_SP has 24 electrodes, the tasks .* have 19"):
+        read_bundle(make_bundle(sensor_type="BIOTAC_SP"))
+
+
+def test_features_service_names_the_sensor_and_serves_the_others(
+    link: LinkConfig,
+    make_bundle: Callable[..., Path],
+    make_frame: Frames,
+    make_tare: Tares,
+    until: Until,
+) -> None:
+    config = FeaturesConfig(bundle=str(make_bundle()), max_age_s=10.0)
+    with running(features.run, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
+        until(lambda: any(one.ready for one in robot.alive()))
+        session = robot.session
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        announce(session, "thumb", make_tare(sensor_type=SP))
+        announce(session, "finger", make_tare())
+        thumb = session.publisher(ELECTRODES, sensor="thumb", lossless=True)
+        finger = session.publisher(ELECTRODES, sensor="finger", lossless=True)
+        for sequence in range(1, 4):
+            thumb.put(make_frame(sequence, sensor_type=SP))
+            finger.put(make_frame(sequence))
+            got = estimates.next(5.0)
+            assert (got.sensor, got.message.source.sequence) == ("finger", sequence)
+        until(lambda: robot.status()[0].counters.get("wrong_sensor") == 3)
+        (status,) = robot.status()
+        assert status.state is ServiceState.READY
+        assert status.sensors == ("finger",)
+        assert status.last_error is not None
+        assert "sensor 'thumb' is a BIOTAC_SP with 24 electrodes" in status.last_error.message
+        assert "is made for a BIOTAC" in status.last_error.message
+        assert status.last_error.code is ErrorCode.INVALID_REQUEST
+        # The client reads its frames as those of any other finger.
+        subscribed = robot.session.subscriber(ELECTRODES, sensor="thumb", delivery=Delivery.QUEUE)
+        thumb.put(make_frame(4, sensor_type=SP))
+        assert subscribed.next(5.0).message.electrodes.shape == (24,)
+
+
+def test_field_service_answers_by_an_error(
+    link: LinkConfig, make_frame: Frames, make_tare: Tares, until: Until, tmp_path: Path
+) -> None:
+    config = FieldConfig(bundle=str(bundles.write(tmp_path / "f", "field")))
+    with running(field.run, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
+        until(lambda: any(one.ready for one in robot.alive()))
+        announce(robot.session, "thumb", make_tare(sensor_type=SP))
+        with pytest.raises(RemoteError, match="made for another type of sensor") as caught:
+            robot.estimate_field("thumb", make_frame(sensor_type=SP))
+        assert caught.value.code is ErrorCode.INVALID_REQUEST
+
+
+def samples(sensor: str, messages: list[Any]) -> list[Sample]:
+    out = []
+    for message in messages:
+        topic = TOPICS["tare" if isinstance(message, Tare) else "electrodes"]
+        wall_ns = message.stamp.wall_ns
+        key = sensor_key("lab", sensor, topic.name)
+        payload = topic.codec.encode(message)
+        out.append(
+            Sample(topic.name, "lab", sensor, key, topic.encoding, payload, wall_ns, wall_ns)
+        )
+    return out
+
+
+def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path) -> None:
+    """Two fingers, of which one is exchanged for an SP while the recorder runs."""
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    from palpate.services.view import review
+
+    def frames(kind: SensorType, first: int) -> list[Any]:
+        sequences = range(first, first + 40)
+        return [
+            make_tare(kind, sensor_type=kind),
+            *[make_frame(n, sensor_type=kind, tare_id=int(kind)) for n in sequences],
+        ]
+
+    health = Health("recorder", "recorder")
+    keeper = RecordKeeper(RecorderConfig(out=tmp_path, min_free_bytes=0), "lab", health)
+    keeper.start()
+    came = samples("thumb", frames(SP, 1))
+    came += samples("finger", frames(SensorType.BIOTAC, 1) + frames(SP, 41))
+    for sample in came:
+        keeper.write(sample)
+    keeper.close()
+    assert health.counters["recorded_electrodes"] == 120
+    assert health.counters["recorded_tare"] == 3
+    assert "view_failed" not in health.counters
+    (record,) = tmp_path.glob("*.mcap")
+    assert [item.payload for item in read_record(record)] == [item.payload for item in came]
+    for view in (record.with_suffix(".rrd"), review(record, tmp_path / "again.rrd")):
+        rows: dict[str, int] = {}
+        for chunk in RrdReader(str(view)).stream():
+            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+        assert rows["/thumb/pac"] >= 40 * 27
+        assert rows["/finger/pac"] >= 40 * 22 + 40 * 27
+        assert rows["/thumb/electrodes/tared"] >= 40
+        assert rows["/finger/electrodes/tared"] >= 80
+
+
+def test_a_lost_pac_sample_is_a_gap_in_the_picture(make_frame: Frames) -> None:
+    from palpate.services.scene import SensorScene
+
+    layout = SP.layout
+    frame = make_frame(sensor_type=SP)
+    lost = layout.first_pac_bit + 5
+    frame = replace(frame, validity=frame.validity & ~(1 << lost))
+    scene = SensorScene()
+    scene.add(frame)
+    (row,) = scene.take().pressure
+    assert np.flatnonzero(np.isnan(row.values)).tolist() == [1 + 5]
+    assert row.values.shape == (28,)
+    assert scene.sensor_type is SP
