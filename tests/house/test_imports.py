@@ -25,8 +25,9 @@ FLOOR = "deploy/palpate/deploy/bench/floor.py"
 
 HOMES = {
     "zenoh": ("protos/palpate/protos/session/", FLOOR),
-    "serial": ("gateway/",),
-    "can": ("gateway/",),
+    # The bare reader of the benchmark must not use palpate's own ports.
+    "serial": ("gateway/", "deploy/palpate/deploy/bench/hand_parts.py"),
+    "can": ("gateway/", "deploy/palpate/deploy/bench/hand_parts.py"),
     "torch": ("training/",),
     "warp": ("fem/",),
     "onnxruntime": ("services/", "training/palpate/training/export.py", FLOOR),

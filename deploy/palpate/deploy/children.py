@@ -67,6 +67,10 @@ class Children:
         """Exit status of a process; None while it runs."""
         return self._running[name].poll()
 
+    def pid(self, name: str) -> int:
+        """Process id of a process."""
+        return self._running[name].pid
+
     def check(self, names: Iterable[str]) -> None:
         """Check that processes run.
 

@@ -128,12 +128,14 @@ def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) 
 @app.command(epilog=example("palpate tare finger"))
 def tare(
     sensor: Annotated[str, typer.Argument(help="Name of the sensor.")] = "finger",
-    frames: Annotated[int, typer.Option(help="Frames to average; 0 = the gateway's number.")] = 0,
+    frames: Annotated[
+        int, typer.Option(help="Frames, or readings, to average; 0 = the gateway's number.")
+    ] = 0,
     timeout_s: Annotated[float, typer.Option(help="How long it may take [s].")] = 5.0,
     connect: ConnectOption = DEFAULT_CONNECT,
     station: StationOption = DEFAULT_STATION,
 ) -> None:
-    """Take the untouched finger as zero now."""
+    """Take the untouched finger, or the present load of a force/torque sensor, as zero now."""
     from palpate.deploy.tare import take_tare
 
     take_tare(client_link(connect), station, sensor, frames=frames, timeout_s=timeout_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -38,6 +39,37 @@ def e2e(
         bundle=bundle,
         as_json=json_,
         save=save,
+    )
+
+
+@app.command(epilog=example("palpate bench hand --seconds 600"))
+def hand(
+    seconds: Annotated[float, typer.Option(min=2, help="Length of the measurement [s].")] = 60.0,
+    floor_seconds: Annotated[float, typer.Option(min=2, help="Length of the floor's [s].")] = 20.0,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Five BioTacs and two force/torque sensors through one gateway, beside bare readers."""
+    from palpate.deploy.bench.hand import run_hand
+
+    run_hand(seconds=seconds, floor_seconds=floor_seconds, as_json=json_, save=save)
+
+
+@app.command(epilog=example("palpate bench alignment --page docs/results/alignment.md"))
+def alignment(
+    seconds: Annotated[float, typer.Option(min=0.5, help="Length of the measurement [s].")] = 30.0,
+    settle_seconds: Annotated[
+        float, typer.Option(min=0, help="How long clocks are followed before it [s].")
+    ] = 10.0,
+    page: Annotated[Path | None, typer.Option(help="Write a page of the result.")] = None,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """How far off stamps are, and electrodes, wrenches and poses apart, against a known signal."""
+    from palpate.deploy.bench.alignment import run_alignment
+
+    run_alignment(
+        seconds=seconds, settle_seconds=settle_seconds, page=page, as_json=json_, save=save
     )
 
 

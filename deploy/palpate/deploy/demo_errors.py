@@ -99,7 +99,8 @@ class Comparison:
         if wrench is None:
             return
         pose = self._pose.get(estimate.source.monotonic_ns)
-        touched = pose is None or pose.in_contact
+        # Who cannot know whether it touches counts as one who does not say.
+        touched = pose is None or pose.in_contact is not False
         moment = Moment(
             force=estimate.force,
             true_force=wrench.force,

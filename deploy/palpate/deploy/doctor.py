@@ -111,6 +111,7 @@ def _all(profile_name: str) -> Iterator[Finding]:
     for look in looks:
         yield look(profile)
     yield _clock()
+    yield _wall(profile)
     yield _cpu()
 
 
@@ -255,6 +256,24 @@ def _clock() -> Finding:
     if worst > _LATE_WARN_S:
         return Finding("clock", "warn", found, "the host is busy: frames will be late or dropped")
     return Finding("clock", "ok", found)
+
+
+def _wall(profile: Profile) -> Finding:
+    from palpate.deploy.clock_text import wall_words
+    from palpate.gateway.timing.discipline import wall_discipline
+
+    kept = wall_discipline()
+    found = wall_words(kept)
+    ends = (*profile.router.listen, *profile.link.connect)
+    alone = all(is_loopback(endpoint_host_port(end)[0]) for end in ends)
+    if kept is None or kept.synchronised or alone:
+        return Finding("wall clock", "ok", found)
+    return Finding(
+        "wall clock",
+        "warn",
+        found,
+        "this profile is of several hosts: run chrony or ptp4l on each (docs/time.md)",
+    )
 
 
 def _cpu() -> Finding:

@@ -67,7 +67,10 @@ def _run_router(profile: Profile, stop: threading.Event) -> None:
 
 def _run_gateway(profile: Profile, stop: threading.Event) -> None:
     from palpate.gateway import node
+    from palpate.gateway.one_core import stay_on_one_core
 
+    if profile.gateway.pace != "fast":
+        stay_on_one_core(profile.gateway.core)
     node.run(profile.gateway, profile.link, profile.station, stop)
 
 

@@ -10,11 +10,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from palpate.deploy.clock_text import clock_lines
 from palpate.deploy.failure import FAILED
 from palpate.protos.codec import SERVICE_REQUEST, STATUS
 from palpate.protos.config import LinkConfig
 from palpate.protos.errors import PalpateError
-from palpate.protos.messages import ServiceRequest, ServiceState, Status
+from palpate.protos.messages import (
+    SensorState,
+    SensorStatus,
+    ServiceRequest,
+    ServiceState,
+    Status,
+)
 from palpate.protos.session import Alive, Session
 
 _ANSWER_S = 1.0
@@ -25,6 +32,15 @@ _COLOURS = {
     ServiceState.DEGRADED: "red",
     ServiceState.FINISHED: "cyan",
     ServiceState.STOPPING: "yellow",
+}
+
+_SENSOR_COLOURS = {
+    SensorState.LIVE: "green",
+    SensorState.WARMING: "yellow",
+    SensorState.STARTING: "yellow",
+    SensorState.ZERO_LOST: "red",
+    SensorState.LOST: "red",
+    SensorState.ENDED: "cyan",
 }
 
 # What a person wants to see of each process first; the rest is in --json.
@@ -40,7 +56,7 @@ TELLING_COUNTERS = (
 )
 _TROUBLE = (
     "lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown", "failed",
-    "wrong",
+    "wrong", "silences", "stuck", "dead",
 )  # fmt: skip
 
 
@@ -72,7 +88,11 @@ def show_status(link: LinkConfig, station: str, *, as_json: bool) -> int:
     if as_json:
         print(json.dumps(_as_json(station, router, present, answers), indent=2))
     else:
-        Console().print(_table(station, present, answers))
+        console = Console()
+        console.print(_table(station, present, answers))
+        for status in answers.values():
+            for line in clock_lines(status):
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
     degraded = any(s.state is ServiceState.DEGRADED for s in answers.values())
     silent = any((p.service, p.instance) not in answers for p in present)
     return FAILED if not present or degraded or silent else 0
@@ -123,13 +143,27 @@ def _table(station: str, present: Iterable[Alive], answers: dict[tuple[str, str]
             ready,
             state_text(status.state),
             duration_text(status.uptime_s),
-            " ".join(status.sensors),
+            _sensors(status),
             says,
             telling(status),
         )
     if not table.row_count:
         table.caption = f"nobody is alive at station {station!r}: start it with `palpate up`"
     return table
+
+
+def _sensors(status: Status) -> str:
+    """Each sensor with its state and what is to be said of it, as rich markup."""
+    if not status.sensor_states:
+        return " ".join(status.sensors)
+    return "\n".join(map(_sensor, status.sensor_states))
+
+
+def _sensor(sensor: SensorStatus) -> str:
+    state = sensor.state.name.lower().replace("_", " ")
+    colour = _SENSOR_COLOURS.get(sensor.state, "yellow")
+    said = f" [dim]({escape(sensor.message)})[/]" if sensor.message else ""
+    return f"{escape(sensor.name)} [{colour}]{state}[/]{said}"
 
 
 def _as_json(
@@ -153,6 +187,7 @@ def _as_json(
                 "uptime_s": round(status.uptime_s, 3),
                 "version": status.version,
                 "sensors": list(status.sensors),
+                "sensor_states": [_sensor_json(sensor) for sensor in status.sensor_states],
                 "message": status.message,
                 "counters": dict(status.counters),
                 "gauges": dict(status.gauges),
@@ -166,3 +201,13 @@ def _as_json(
             }
         processes.append(entry)
     return {"station": station, "router": router, "processes": processes}
+
+
+def _sensor_json(sensor: SensorStatus) -> dict[str, Any]:
+    return {
+        "name": sensor.name,
+        "state": sensor.state.name.lower(),
+        "since_monotonic_ns": sensor.since_monotonic_ns,
+        "faults": {fault.kind.name.lower(): list(fault.channels) for fault in sensor.faults},
+        "message": sensor.message,
+    }

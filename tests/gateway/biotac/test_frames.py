@@ -9,6 +9,7 @@ from palpate.gateway.biotac.frames import FrameAssembler
 from palpate.gateway.biotac.slots import Slot, slot_block
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.readings import ElectrodeReading
+from palpate.protos.messages import BIOTAC_LAYOUT
 
 PERIOD_S = 1 / 4400
 
@@ -69,7 +70,7 @@ def test_whole_frame_is_delivered_at_once() -> None:
 def test_missing_slots_are_invalid_not_fatal() -> None:
     slots = [s for s in slots_of(1) if s.channel not in (ch.PDC, 20)][:-2]
     readings, assembler = assemble(slots + slots_of(2))
-    bad = [ch.bit_name(b) for b in range(44) if not readings[0].validity >> b & 1]
+    bad = [BIOTAC_LAYOUT.bit_name(b) for b in range(44) if not readings[0].validity >> b & 1]
     # Two slots of the frame's end and two others are gone: TDC and one PAC, PDC and E4.
     assert bad == ["E4", "PDC", "TDC", "PAC[21]"]
     assert readings[0].electrodes[3] == 0
@@ -143,6 +144,7 @@ slot_strategy = st.builds(
     time_s=st.floats(0, 10),
     batch=st.integers(0, 3),
     frame=st.integers(0, 5),
+    position=st.integers(-1, 60),
 )
 
 
@@ -154,7 +156,16 @@ def test_any_slots_are_accounted_for(slots: list[Slot], block: int) -> None:
     assert counters["samples"] == len(slots)
     assert counters["frames"] == len(readings)
     present = sum(r.validity.bit_count() for r in readings)
-    refused = counters["unknown_channels"] + counters["ignored_slots"] + counters["duplicate_slots"]
+    refused = sum(
+        counters[name]
+        for name in (
+            "unknown_channels",
+            "ignored_slots",
+            "other_electrodes",
+            "duplicate_slots",
+            "unplaced_slots",
+        )
+    )
     assert present <= len(slots) - refused
     ticks = [r.tick for r in readings]
     assert ticks == sorted(set(ticks))

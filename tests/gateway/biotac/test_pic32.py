@@ -169,3 +169,25 @@ def test_nobody_there_and_the_wrong_speed_are_told(board: BiotacPic32Emulator) -
         make(board, baud=115200).open()
     with pytest.raises(DeviceError, match="cannot be opened"):
         make(board, port=board.address + "-none").open()
+
+
+def test_a_finger_that_was_pulled_is_told_and_not_delivered_as_zeros(
+    board: BiotacPic32Emulator, follower: Follower
+) -> None:
+    follower.more()
+    board.inject("absent", 60.0)
+    # Reading says so, and so does each attempt to open again.
+    follower.until(lambda: sum("no finger answers" in str(one) for one in follower.errors) > 1)
+    board.end("absent")
+    follower.more()
+    follower.assert_right()
+    assert follower.counts()["absent"] > 10
+
+
+def test_saturated_channels_are_counted_and_delivered(
+    board: BiotacPic32Emulator, follower: Follower
+) -> None:
+    follower.more()
+    board.inject("saturated", 60.0)
+    follower.until(lambda: follower.readings[-1].pac[0] == 4095)
+    assert follower.counts()["saturated_samples"] > 0

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
-from palpate.gateway.ports.can_bus import CanBus, CanMessage
+from palpate.gateway.ports.can_bus import CanBus
 from palpate.gateway.ports.can_frames import BUS_OFF
 from palpate.gateway.ports.datagrams import BATCH
 from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
@@ -46,12 +47,18 @@ def bus(where: dict[str, Any]) -> Iterator[CanBus]:
     with_name.close()
 
 
-def read(bus: CanBus, count: int, **how: float) -> list[CanMessage]:
-    out: list[CanMessage] = []
+class Message(NamedTuple):
+    can_id: int
+    data: bytes
+    arrival_ns: int
+
+
+def read(bus: CanBus, count: int, **how: float) -> list[Message]:
+    out: list[Message] = []
     deadline = time.monotonic() + 20.0
     while len(out) < count:
         assert time.monotonic() < deadline
-        out += bus.read(1.0, **how)
+        out += itertools.starmap(Message, bus.read(1.0, **how).messages())
     return out
 
 
@@ -59,7 +66,7 @@ def test_frames_come_in_order_in_batches(sender: Any, bus: CanBus) -> None:
     began = time.monotonic_ns()
     for k in range(BATCH + 10):
         sender.send(can.Message(arbitration_id=k % 7, data=[k % 256], is_extended_id=False))
-    first = bus.read(1.0, gather_s=0.02)
+    first = read(bus, 1, gather_s=0.02)
     assert len(first) > 1
     got = first + read(bus, BATCH + 10 - len(first))
     assert [m.data[0] for m in got] == [k % 256 for k in range(BATCH + 10)]
@@ -87,7 +94,7 @@ def test_what_is_no_data_frame_is_counted(sender: Any, bus: CanBus) -> None:
     sender.send(can.Message(arbitration_id=1, is_remote_frame=True, is_extended_id=False))
     sender.send(can.Message(is_error_frame=True))
     sender.send(can.Message(arbitration_id=5, data=b"\x01", is_extended_id=False))
-    assert [m.can_id for m in bus.read(1.0)] == [5]
+    assert [m.can_id for m in read(bus, 1)] == [5]
     assert bus.counters == {"error_frames": 1, "other_frames": 1}
 
 
@@ -178,3 +185,16 @@ def test_an_unknown_interface_is_named() -> None:
 def test_a_bus_that_is_not_there_says_what_to_do() -> None:
     with pytest.raises(DeviceError, match=r"socketcan:nocan0: cannot join.*-> bring it up"):
         CanBus("socketcan", "nocan0").open()
+
+
+def test_two_senders_of_one_bus_are_told_apart(where: dict[str, Any], bus: CanBus) -> None:
+    with can.Bus(**where) as one, can.Bus(**where) as other:
+        for k in range(20):
+            one.send(can.Message(arbitration_id=1, data=bytes([k] * 7), is_extended_id=False))
+            if k % 3 == 0:
+                other.send(can.Message(arbitration_id=0x1FFFF, data=bytes([k] * 2)))
+        got = read(bus, 27)
+    assert sorted(m.data for m in got if m.can_id == 1) == [bytes([k] * 7) for k in range(20)]
+    assert sorted(m.data for m in got if m.can_id == 0x1FFFF) == [
+        bytes([k] * 2) for k in range(0, 20, 3)
+    ]

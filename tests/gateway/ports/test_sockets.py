@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import sys
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -83,3 +85,41 @@ def test_input_can_be_thrown_away(server: socket.socket) -> None:
             device.sendall(b"more")
             first = port.read(1.0)
             assert port.discard_input() + len(first) == 4
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's stamps are Linux'")
+def test_what_waited_has_the_time_at_which_the_kernel_received_it(
+    peer: socket.socket, server: socket.socket
+) -> None:
+    with (
+        UdpPort("127.0.0.1", peer.getsockname()[1]) as udp,
+        TcpPort("127.0.0.1", server.getsockname()[1]) as tcp,
+    ):
+        udp.write(b"start")
+        _, host = peer.recvfrom(100)
+        device, _ = server.accept()
+        with device:
+            before_ns = time.monotonic_ns()
+            peer.sendto(b"one", host)
+            device.sendall(b"two")
+            time.sleep(0.02)
+            read_ns = time.monotonic_ns()
+            for port, data in ((udp, b"one"), (tcp, b"two")):
+                received = port.receive(1.0)
+                assert received.data == data
+                # Not more exactly than the two clocks can be read together.
+                assert before_ns - 1e6 < received.arrival_ns < read_ns
+
+
+def test_without_the_kernels_stamps_the_time_of_reading_counts(
+    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", "elsewhere")
+    with UdpPort("127.0.0.1", peer.getsockname()[1]) as port:
+        port.write(b"start")
+        _, host = peer.recvfrom(100)
+        peer.sendto(b"one", host)
+        before_ns = time.monotonic_ns()
+        received = port.receive(1.0)
+        assert received.data == b"one"
+        assert before_ns <= received.arrival_ns <= time.monotonic_ns()

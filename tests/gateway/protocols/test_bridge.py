@@ -21,7 +21,7 @@ from palpate.gateway.protocols.bridge import (
     decode_body,
     encode,
 )
-from palpate.gateway.protocols.can_slots import SEQUENCES, SlotDecoder
+from palpate.gateway.protocols.can_slots import SEQUENCES, SlotDecoder, payload_rows
 from palpate.gateway.protocols.checksums import crc16_x25
 from palpate.gateway.protocols.cobs import decode, encode_packet
 from palpate.gateway.protocols.slot_clock import SlotClock
@@ -84,7 +84,7 @@ def test_slots_are_read_as_those_of_a_bus() -> None:
     (record,) = BridgeDecoder().feed(packet(0, 0, SLOTS))
     assert isinstance(record.body, SlotGroup)
     slots = SlotDecoder(fingers=record.body.fingers)
-    assert slots.decode(record.body.payloads).channel.tolist() == [0, 17]
+    assert slots.decode(*payload_rows(record.body.payloads)).channel.tolist() == [0, 17]
     assert slots.finger_counters[1]["absent"] == 1
 
 
@@ -100,7 +100,7 @@ def test_bridge_times_place_slots_without_doubt(name: str) -> None:
     for number in [0, 1, 2, 5, 6]:
         for record in decoder.feed(packet(number, number * 10_000, group)):
             assert isinstance(record.body, SlotGroup)
-            decoded = SlotDecoder(fingers=1).decode(record.body.payloads)
+            decoded = SlotDecoder(fingers=1).decode(*payload_rows(record.body.payloads))
             stamps_s = record.time_us * 1e-6 + np.arange(len(decoded)) / 4400
             places.append(clock.place_all(decoded.channel, stamps_s))
     assert decoder.counters["lost_packets"] == 2

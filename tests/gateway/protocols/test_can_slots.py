@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols import spi
-from palpate.gateway.protocols.can_slots import CanSlotDecoder, SlotDecoder, learn_order
+from palpate.gateway.protocols.can_slots import (
+    CanSlotDecoder,
+    SlotDecoder,
+    learn_order,
+    payload_rows,
+)
 from palpate.gateway.protocols.spi import WordKind
 
 # Vectors of the hardware reference, 2.1.
@@ -33,7 +39,7 @@ Told = tuple[int, list[int], list[int]]
 
 def decode(decoder: SlotDecoder, *payloads: bytes) -> list[Told]:
     """Channel, values and kinds of each slot."""
-    words = decoder.decode(payloads)
+    words = decoder.decode(*payload_rows(payloads))
     columns = words.channel.tolist(), words.value.tolist(), words.kind.tolist()
     return list(zip(*columns, strict=True))
 
@@ -52,7 +58,7 @@ def test_candump_line() -> None:
     line = "(1436509052.249713) can0 001#807FC17FC17FC1"
     can_id, data = line.split()[2].split("#")
     decoder = CanSlotDecoder(fingers=3, can_id=0x001)
-    assert decoder.is_ours(int(can_id, 16))
+    assert decoder.ours(np.array([int(can_id, 16)])) is None
     ((_, values, _),) = decode(decoder, bytes.fromhex(data))
     assert values == [2040] * 3
 
@@ -118,14 +124,14 @@ def test_every_word_is_what_the_rule_says() -> None:
 def test_what_is_no_slot_is_counted(data: str, counter: str) -> None:
     decoder = CanSlotDecoder(fingers=2)
     good = slot(17, "0101", "0101")
-    words = decoder.decode([good, bytes.fromhex(data), good])
+    words = decoder.decode(*payload_rows([good, bytes.fromhex(data), good]))
     assert words.index.tolist() == [0, 2]
     counted = {key: count for key, count in decoder.counters.items() if count}
     assert counted == {counter: 1, "slots": 2}
 
 
 def test_nothing_makes_nothing() -> None:
-    words = SlotDecoder(fingers=2).decode([])
+    words = SlotDecoder(fingers=2).decode(*payload_rows([]))
     assert (words.value.shape, words.kind.shape, len(words)) == ((0, 2), (0, 2), 0)
 
 
@@ -136,10 +142,11 @@ def test_longer_frames_are_taken() -> None:
 
 def test_identifier() -> None:
     decoder = CanSlotDecoder(fingers=3, can_id=0x123)
-    assert [decoder.is_ours(0x124), decoder.is_ours(0x123)] == [False, True]
+    ours = decoder.ours(np.array([0x124, 0x123]))
+    assert ours is not None
+    assert ours.tolist() == [False, True]
     assert decoder.counters["other_ids"] == 1
-    anything = CanSlotDecoder(fingers=3)
-    assert all(anything.is_ours(can_id) for can_id in (0, 0x7FF, 0x1FFFFFFF))
+    assert CanSlotDecoder(fingers=3).ours(np.array([0, 0x7FF, 0x1FFFFFFF])) is None
 
 
 def test_fingers_in_range() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.gateway.protocols.can_slots import SEQUENCES
-from palpate.gateway.protocols.slot_clock import Place, SlotClock
+from palpate.gateway.protocols.places import Place
+from palpate.gateway.protocols.slot_clock import SlotClock
 from palpate.gateway.recordings.text_log import TextLogReader
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.gateway.protocols import channels, spi
+from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
 
 # Every vector of the hardware reference, sections 1.3 and 1.4.
 COMMANDS = {
@@ -71,9 +72,28 @@ def test_channel_names() -> None:
     assert channels.channel_name(17) == "E1"
     assert channels.channel_name(40) == "E24"
     assert channels.channel_name(50) == "channel 50"
-    assert [channels.bit_name(b) for b in (0, 18, 19, 20, 21, 22, 43)] == [
+    assert [BIOTAC_LAYOUT.bit_name(b) for b in (0, 18, 19, 20, 21, 22, 43)] == [
         "E1", "E19", "PDC", "TAC", "TDC", "PAC[0]", "PAC[21]",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", [BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT])
+def test_rounds(layout: FrameLayout) -> None:
+    """Hardware reference 1.7: PAC beside each of the electrodes, PDC, TAC and TDC."""
+    last = 16 + layout.electrodes
+    assert channels.channels_of(layout) == (*range(17, last + 1), 1, 2, 3)
+    e1_first = channels.interleaved(layout, pac_first=False)
+    assert e1_first[:4] == (17, 0, 18, 0)
+    assert e1_first[-8:] == (last, 0, 1, 0, 2, 0, 3, 0)
+    assert channels.interleaved(layout, pac_first=True) == (0, *e1_first[:-1])
+    assert len(e1_first) == layout.slots
+    assert e1_first.count(channels.PAC) == layout.pac_samples
+
+
+def test_frame_rates() -> None:
+    assert channels.frame_rate_hz(BIOTAC_LAYOUT) == 100.0
+    assert channels.frame_rate_hz(BIOTAC_SP_LAYOUT) == pytest.approx(81.48, abs=0.01)
+    assert channels.frame_rate_hz(BIOTAC_LAYOUT, 3000.0) == pytest.approx(68.2, abs=0.05)
 
 
 @pytest.mark.parametrize("channel", [-1, 64])

@@ -19,8 +19,9 @@ from palpate.gateway.biotac.slot_link import Finger, SlotSource
 from palpate.gateway.ports.serial_port import SerialPort
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
-from palpate.gateway.protocols.can_slots import FINGERS_MAX, SEQUENCES, SlotDecoder
+from palpate.gateway.protocols.can_slots import FINGERS_MAX, SEQUENCES, SlotDecoder, payload_rows
 from palpate.gateway.protocols.slot_clock import SlotClock
+from palpate.gateway.timing.clock_map import Heard
 from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
 
 _FIRST_S = 1.0
@@ -45,7 +46,9 @@ class BridgeOptions(FingerOptions):
     line: str = Field(min_length=1)
     baud: int = Field(default=460800, gt=0)
     source: int | None = Field(default=None, ge=0, le=0xFF)
-    sequence: Literal["learn", "biotac_e1_first", "biotac_pac_first"] = "learn"
+    sequence: Literal[
+        "learn", "biotac_e1_first", "biotac_pac_first", "biotac_sp_e1_first", "biotac_sp_pac_first"
+    ] = "learn"
     hello_s: float = Field(default=2.5, ge=0.0, le=60.0)
 
 
@@ -68,6 +71,7 @@ class BridgeSource(SlotSource):
         self._status: tuple[Status, Status] | None = None
         self._foreign = 0
         self._end: DeviceError | None = None
+        self._arrival_ns = 0
         self.fingers = 0
         """Fingers that the bridge samples; 0 while it is not known."""
 
@@ -125,7 +129,9 @@ class BridgeSource(SlotSource):
         if self._end is not None:
             raise self._end
         placed: list[LineSlots] = []
-        for record in self._packets.feed(self._port.read(timeout_s)):
+        data = self._port.read(timeout_s)
+        self._arrival_ns = time.monotonic_ns()
+        for record in self._packets.feed(data):
             try:
                 slots = self._take(record)
                 placed += [slots] if slots is not None else []
@@ -188,8 +194,11 @@ class BridgeSource(SlotSource):
         if self._hello is None:
             self.fingers = group.fingers
         rest = _ABSENT * (FINGERS_MAX - group.fingers)
-        words = self._slots.decode([payload + rest for payload in group.payloads])
+        words = self._slots.decode(*payload_rows([payload + rest for payload in group.payloads]))
         stamps_s = 1e-6 * time_us + words.index.astype(np.float64) * self.slot_period_s
+        if len(stamps_s):
+            # A packet leaves when its last slot has been sampled.
+            self.heard = Heard(float(stamps_s[-1]), self._arrival_ns)
         places = self._clock.place_all(words.channel, stamps_s)
         return LineSlots.placed(words, places, len(self._clock.sequence))
 

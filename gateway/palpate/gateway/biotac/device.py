@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 
 from pydantic import Field
 
 from palpate.gateway.biotac.frames import FrameAssembler
+from palpate.gateway.biotac.sensor_type import LEARNT_FROM, TypeOption, agreed_type
 from palpate.gateway.biotac.slot_link import Finger, SlotLink, SlotSource
 from palpate.gateway.biotac.slots import SlotBlock
-from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate.gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.readings import Reading
 from palpate.protos.config import StrictConfig
@@ -31,10 +33,14 @@ class FingerOptions(StrictConfig):
     Attributes:
         port: Which finger of the line, from 1.
         serial: Serial number to publish; empty = what the line tells, else line and port.
+        sensor_type: Kind of finger; ``auto`` = by the electrodes that answer, which takes 25 ms at
+            the start.
     """
 
     port: int = Field(default=1, ge=1, le=5)
-    serial: str = ""
+    serial: str = Field(default="", max_length=SERIAL_MAX, pattern=r"^[ -~]*$")
+    # No setting of the line, whose fingers may differ: left out of what they must agree on.
+    sensor_type: TypeOption = Field(default="auto", exclude=True)
 
 
 class FingerDevice(Device):
@@ -47,12 +53,14 @@ class FingerDevice(Device):
     """
 
     def __init__(self, driver: str, model: str, options: FingerOptions) -> None:
+        told = options.sensor_type
+        kind = SensorType.BIOTAC if told == "auto" else SensorType[told.upper()]
         super().__init__(
             DeviceInfo(
                 driver=driver,
-                sensor_type=SensorType.BIOTAC,
+                sensor_type=kind,
                 model=f"{model}, port {options.port}",
-                rate_hz=ch.SLOT_RATE_HZ / ch.SLOTS_PER_FRAME,
+                rate_hz=ch.frame_rate_hz(kind.layout),
                 live=True,
                 finite=False,
                 origin=Origin.LIVE,
@@ -83,17 +91,20 @@ class FingerDevice(Device):
             raise ConfigError(
                 f"{self.info.model}: the line has {ports} ports", remedy="correct port or fingers"
             )
-        self._assembler = FrameAssembler(source.slot_period_s)
         self._finger = finger = SlotLink.join(key, settings, source, port - 1)
         try:
             self._early = self._wait_for_words(finger)
+            kind = agreed_type(self._options.sensor_type, self._early, self.info.model)
         except BaseException:
             self._close()
             raise
+        self._assembler = FrameAssembler(finger.source.slot_period_s, kind.layout)
         told = finger.source.serial(port - 1)
         name = "-".join(str(part) for part in key) if isinstance(key, tuple) else str(key)
         return DeviceIdentity(
-            self._options.serial or told or f"{name}-port{port}", finger.source.slot_period_s
+            self._options.serial or told or f"{name}-port{port}",
+            finger.source.slot_period_s,
+            sensor_type=kind,
         )
 
     def _close(self) -> None:
@@ -104,6 +115,12 @@ class FingerDevice(Device):
     def _read(self, timeout_s: float) -> list[Reading]:
         finger = self._finger
         assert finger is not None
+        if self._assembler.counters["other_electrodes"]:
+            known = self._assembler.layout.electrodes
+            raise DeviceLost(
+                f"{self.info.model}: more than {known} electrodes answer",
+                remedy="another finger was plugged in; it is opened again by itself",
+            )
         until = time.monotonic() + timeout_s
         while True:
             slots, self._early = self._early, None
@@ -112,7 +129,8 @@ class FingerDevice(Device):
             self._check_there(finger)
             readings = self._assembler.push(slots)
             if readings:
-                return list(readings)
+                heard = finger.source.heard
+                return [replace(reading, heard=heard) for reading in readings]
             if time.monotonic() >= until:
                 raise DeviceTimeout(
                     f"{self.info.model}: no whole frame within {timeout_s:g} s",
@@ -120,18 +138,25 @@ class FingerDevice(Device):
                 )
 
     def _wait_for_words(self, finger: Finger) -> SlotBlock:
-        """Wait until the finger has answered, so that an empty port is not taken for a sensor."""
+        """Wait until the finger has answered, so that an empty port is not taken for a sensor.
+
+        And until all of its electrodes have been asked.
+        """
         came: list[SlotBlock] = []
+        answered = False
         until = time.monotonic() + _FIRST_S
         while True:
             try:
                 came.append(finger.take(max(0.0, until - time.monotonic())))
             except DeviceTimeout as error:
+                if answered:
+                    return SlotBlock.joined(came)
                 raise DeviceError(
                     f"{self.info.model}: no slot within {_FIRST_S:g} s",
                     remedy="check power, wiring and bit rate, and that the sender is on",
                 ) from error
-            if came[-1].good.any():
+            answered = answered or bool(came[-1].good.any())
+            if answered and sum(map(len, came)) >= LEARNT_FROM:
                 return SlotBlock.joined(came)
             self._check_there(finger)
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from palpate.gateway.biotac.slots import SlotBlock, slot_block
+from palpate.gateway.biotac.sampling_round import SURPLUS, UNPLACED, PacNumbers, holds_frame
+from palpate.gateway.biotac.slots import UNKNOWN, SlotBlock, slot_block
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.messages import COUNTS_MAX, PAC_SAMPLES
+from palpate.protos.messages import BIOTAC_LAYOUT, COUNTS_MAX, CountArray, FrameLayout
 
 TIME_JUMP_S = 1e-3
 """A slot later than its place on the slot grid by more than this is a time jump [s]."""
@@ -16,48 +17,61 @@ TIME_JUMP_S = 1e-3
 _BELIEVABLE_LOSS = 1_000_000
 """A frame counter that leaps further than this has restarted or is damaged [frames]."""
 
-# Column of each channel id among electrodes 0..18, PDC, TAC, TDC; -1 = another kind.
-_COLUMN = np.full(256, -1, np.int64)
-_COLUMN[ch.FIRST_ELECTRODE : ch.FIRST_ELECTRODE + ch.ELECTRODES] = np.arange(ch.ELECTRODES)
-_COLUMN[[ch.PDC, ch.TAC, ch.TDC]] = (ch.PDC_BIT, ch.TAC_BIT, ch.TDC_BIT)
 _KNOWN = np.zeros(256, np.bool_)
 _KNOWN[list(ch.CHANNEL_NAMES)] = True
-_BITS = np.uint64(1) << np.arange(ch.FIRST_PAC_BIT + PAC_SAMPLES, dtype=np.uint64)
+_NO_SLOTS = slot_block([])
+_COUNTERS = (
+    "samples",
+    "frames",
+    "incomplete_frames",
+    "missing_frames",
+    "counter_restarts",
+    "time_jumps",
+    "parity_errors",
+    "unknown_channels",
+    "ignored_slots",
+    "other_electrodes",
+    "duplicate_slots",
+    "unplaced_slots",
+    "saturated_samples",
+)
 
 
 class FrameAssembler:
     """Groups slots of equal (batch, frame) into readings.
 
     A frame is delivered when the next one begins, or at once when it is whole. Channels that are
-    absent or of bad parity keep their validity bit clear; an absent one holds 0.
+    absent or of bad parity keep their validity bit clear; an absent one holds 0. A PAC sample goes
+    where its position says, or else where the channels beside it say, by the order of sampling of
+    the last whole frame; one of which that is not certain is left out and counted.
+
+    ``counters["other_electrodes"]`` counts answers of electrodes that the layout does not have.
 
     Args:
         slot_period_s: Time between two slots [s].
+        layout: What a frame holds.
+        timed: The slots' times are the device's, so that they tell where a slot is lost; False =
+            they were made by counting.
     """
 
-    def __init__(self, slot_period_s: float) -> None:
+    def __init__(
+        self, slot_period_s: float, layout: FrameLayout = BIOTAC_LAYOUT, *, timed: bool = True
+    ) -> None:
         self._slot_period_s = slot_period_s
-        self._pending = slot_block([])
+        self.layout = layout
+        # Validity bit of each channel id; -1 = another kind.
+        self._column = np.full(256, -1, np.int64)
+        self._column[[*ch.channels_of(layout)]] = np.arange(layout.first_pac_bit)
+        self._bits = np.uint64(1) << np.arange(layout.slots, dtype=np.uint64)
+        self._positions = np.arange(layout.slots).tobytes()
+        self._unknown = np.full(layout.slots, UNKNOWN).tobytes()
+        self._pac_numbers = PacNumbers(layout, slot_period_s, timed=timed)
+        self._pending = _NO_SLOTS
         self._last_time_s: float | None = None
         self._last_key: tuple[int, int] | None = None
         self._last_ending: tuple[int, ...] | None = None
         self._tick = 0
-        self.counters: dict[str, int] = dict.fromkeys(
-            (
-                "samples",
-                "frames",
-                "incomplete_frames",
-                "missing_frames",
-                "counter_restarts",
-                "time_jumps",
-                "parity_errors",
-                "unknown_channels",
-                "ignored_slots",
-                "duplicate_slots",
-                "saturated_samples",
-            ),
-            0,
-        )
+        self.counters: dict[str, int] = dict.fromkeys(_COUNTERS, 0)
         self.parity_errors_by_channel: dict[str, int] = {}
 
     @property
@@ -71,7 +85,7 @@ class FrameAssembler:
 
         A frame that lost a slot on the way still ends as the others do.
         """
-        if not len(self._pending) or _is_whole(self._pending):
+        if not len(self._pending) or self._holds_frame(self._pending):
             return False
         return self._last_ending is None or self._last_ending != _ending(self._pending)
 
@@ -80,52 +94,90 @@ class FrameAssembler:
         if not len(block):
             return []
         self._count(block)
-        slots = self._without_late(self._pending.followed_by(block))
+        slots = self._pending.followed_by(block) if len(self._pending) else block
+        readings: list[ElectrodeReading] = []
+        at = self._take_usual(slots, readings)
+        slots = self._without_late(slots.part(at, len(slots)) if at else slots)
         if not len(slots):
-            self._pending = slots
-            return []
+            self._pending = _NO_SLOTS
+            return readings
         starts = _frame_starts(slots)
         tail = int(starts[-1])
-        if _is_whole(slots.part(tail, len(slots))):
+        if self._holds_frame(slots.part(tail, len(slots))):
             tail = len(slots)
         else:
             starts = starts[:-1]
         self._pending = slots.part(tail, len(slots))
-        return self._assemble(slots.part(0, tail), starts)
+        return readings + self._assemble(slots.part(0, tail), starts)
 
     def finish(self) -> list[ElectrodeReading]:
         """Deliver the frame that has begun, whole or not."""
-        slots, self._pending = self._pending, slot_block([])
+        slots, self._pending = self._pending, _NO_SLOTS
         return self._assemble(slots, _frame_starts(slots)) if len(slots) else []
 
     def discard_pending(self) -> int:
         """Drop the frame that has begun; return how many slots it had."""
         dropped = len(self._pending)
-        self._pending = slot_block([])
+        self._pending = _NO_SLOTS
         return dropped
 
     def _count(self, block: SlotBlock) -> None:
         counters = self.counters
         counters["samples"] += len(block)
-        times = block.time_s
-        if self._last_time_s is not None:
-            times = np.concatenate([[self._last_time_s], times])
-        self._last_time_s = float(times[-1])
-        step = np.diff(times)
+        before_s = block.time_s[0] if self._last_time_s is None else self._last_time_s
+        step = np.diff(block.time_s, prepend=before_s)
+        self._last_time_s = float(block.time_s[-1])
         late = (step > self._slot_period_s + TIME_JUMP_S) | (step < -TIME_JUMP_S)
         counters["time_jumps"] += int(np.count_nonzero(late))
-        bad = block.channel[~block.good]
-        counters["parity_errors"] += len(bad)
-        for channel, times_bad in zip(*np.unique(bad, return_counts=True), strict=True):
-            name = ch.channel_name(int(channel))
-            already = self.parity_errors_by_channel.get(name, 0)
-            self.parity_errors_by_channel[name] = already + int(times_bad)
-        ends = block.good & ((block.value == 0) | (block.value == COUNTS_MAX))
+        good = block.good
+        if not good.all():
+            bad = block.channel[~good]
+            counters["parity_errors"] += len(bad)
+            for channel, times_bad in zip(*np.unique(bad, return_counts=True), strict=True):
+                name = ch.channel_name(int(channel))
+                already = self.parity_errors_by_channel.get(name, 0)
+                self.parity_errors_by_channel[name] = already + int(times_bad)
+        ends = good & ((block.value == 0) | (block.value == COUNTS_MAX))
         counters["saturated_samples"] += int(np.count_nonzero(ends))
+
+    def _take_usual(self, slots: SlotBlock, readings: list[ElectrodeReading]) -> int:
+        """Deliver whole frames at the start, in the order of the last one; return their slots.
+
+        Of a live sensor nearly all frames are such; the longer way would take most of its time.
+        """
+        usual, size = self._pac_numbers.round, self.layout.slots
+        if usual is None or len(slots) < size or len(usual.channels) != size:
+            return 0
+        channel, position = slots.channel.tobytes(), slots.position.tobytes()
+        batches, frames = slots.batch.tobytes(), slots.frame.tobytes()
+        at = 0
+        for stop in range(size, len(slots) + 1, size):
+            cut = slice(8 * at, 8 * stop)
+            key = int(slots.batch[at]), int(slots.frame[at])
+            if (
+                key == self._last_key
+                or channel[cut] != usual.channel_bytes
+                or batches[cut] != batches[8 * at : 8 * at + 8] * size
+                or frames[cut] != frames[8 * at : 8 * at + 8] * size
+                or position[cut] not in (self._positions, self._unknown)
+            ):
+                break
+            good = slots.good[at:stop]
+            validity = self.layout.all_valid
+            if not good.all():
+                validity = int(self._bits[good[usual.places]].sum())
+            missed = self._advance(*key)
+            counts = slots.value[at:stop][usual.places]
+            time_s = float(slots.time_s[at])
+            readings.append(self._reading(counts, validity, time_s, missed))
+            self._last_ending = usual.ending
+            at = stop
+        self.counters["frames"] += len(readings)
+        return at
 
     def _without_late(self, slots: SlotBlock) -> SlotBlock:
         """Drop slots of the frame that was delivered because it was whole already."""
-        if self._last_key is None:
+        if self._last_key is None or not len(slots):
             return slots
         batch, frame = self._last_key
         late = (slots.batch == batch) & (slots.frame == frame)
@@ -134,7 +186,7 @@ class FrameAssembler:
         return slots.part(first, len(slots))
 
     def _assemble(self, slots: SlotBlock, starts: npt.NDArray[np.int64]) -> list[ElectrodeReading]:
-        frames = len(starts)
+        frames, layout, counters = len(starts), self.layout, self.counters
         if not frames:
             return []
         self._last_ending = _ending(slots)
@@ -145,53 +197,66 @@ class FrameAssembler:
 
         known = (slots.channel >= 0) & (slots.channel < len(_KNOWN))
         known[known] = _KNOWN[slots.channel[known]]
-        self.counters["unknown_channels"] += int(np.count_nonzero(~known))
-
-        column = np.where(known, _COLUMN[np.where(known, slots.channel, 255)], -1)
+        counters["unknown_channels"] += int(np.count_nonzero(~known))
+        column = np.where(known, self._column[np.where(known, slots.channel, 255)], -1)
         is_pac = known & (slots.channel == ch.PAC)
-        self.counters["ignored_slots"] += int(np.count_nonzero(known & (column < 0) & ~is_pac))
+        unused = known & (column < 0) & ~is_pac
+        others = int(np.count_nonzero(unused & slots.good & (slots.channel >= ch.FIRST_ELECTRODE)))
+        counters["other_electrodes"] += others
+        counters["ignored_slots"] += int(np.count_nonzero(unused)) - others
 
-        # PAC in order of sampling: its running number inside the frame.
-        running = np.cumsum(is_pac)
-        before = running[starts] - is_pac[starts]
-        column = np.where(is_pac, ch.FIRST_PAC_BIT + running - before[row] - 1, column)
-        usable = (column >= 0) & (column < ch.FIRST_PAC_BIT + PAC_SAMPLES)
-        extra_pac = int(np.count_nonzero(is_pac & ~usable))
+        number = self._pac_numbers.of(slots, starts)
+        column = np.where(number >= 0, layout.first_pac_bit + number, column)
+        usable = column >= 0
+        counters["unplaced_slots"] += int(np.count_nonzero(number == UNPLACED))
+        surplus = int(np.count_nonzero(number == SURPLUS))
 
         # np.unique gives the first slot of each channel in each frame: repetitions lose.
         cell, first = np.unique(row[usable] * 64 + column[usable], return_index=True)
         at = cell // 64, cell % 64
-        counts = np.zeros((frames, ch.FIRST_PAC_BIT + PAC_SAMPLES), np.uint16)
+        counts = np.zeros((frames, layout.slots), np.uint16)
         valid = np.zeros(counts.shape, np.bool_)
         seen = np.zeros(counts.shape, np.bool_)
         counts[at] = slots.value[usable][first]
         valid[at] = slots.good[usable][first]
         seen[at] = True
         present = np.count_nonzero(seen, axis=1)
-        self.counters["duplicate_slots"] += extra_pac + int(usable.sum()) - len(cell)
-        self.counters["incomplete_frames"] += int(np.count_nonzero(present < counts.shape[1]))
-        self.counters["frames"] += frames
+        counters["duplicate_slots"] += surplus + int(usable.sum()) - len(cell)
+        counters["incomplete_frames"] += int(np.count_nonzero(present < layout.slots))
+        counters["frames"] += frames
 
-        validity = np.where(valid, _BITS, np.uint64(0)).sum(axis=1, dtype=np.uint64)
+        validity = np.where(valid, self._bits, np.uint64(0)).sum(axis=1, dtype=np.uint64)
         readings = []
-        for k in range(frames):
-            start = int(starts[k])
+        for k, start in enumerate(starts.tolist()):
             missed = self._advance(int(slots.batch[start]), int(slots.frame[start]))
-            values = counts[k]
-            readings.append(
-                ElectrodeReading(
-                    tick=self._tick,
-                    time_s=float(slots.time_s[start]),
-                    missed_before=missed,
-                    electrodes=values[: ch.ELECTRODES],
-                    pdc=int(values[ch.PDC_BIT]),
-                    pac=values[ch.FIRST_PAC_BIT :],
-                    tac=int(values[ch.TAC_BIT]),
-                    tdc=int(values[ch.TDC_BIT]),
-                    validity=int(validity[k]),
-                )
-            )
+            # Of the first slot of the round, though that may be lost.
+            before = max(int(slots.position[start]), 0)
+            time_s = float(slots.time_s[start]) - before * self._slot_period_s
+            readings.append(self._reading(counts[k], int(validity[k]), time_s, missed))
         return readings
+
+    def _reading(
+        self, counts: CountArray, validity: int, time_s: float, missed: int
+    ) -> ElectrodeReading:
+        """A frame's counts in order of their validity bits as a reading."""
+        layout = self.layout
+        pdc, tac, tdc = counts[layout.pdc_bit : layout.first_pac_bit].tolist()
+        return ElectrodeReading(
+            tick=self._tick,
+            time_s=time_s,
+            missed_before=missed,
+            electrodes=counts[: layout.electrodes],
+            pdc=pdc,
+            pac=counts[layout.first_pac_bit :],
+            tac=tac,
+            tdc=tdc,
+            validity=validity,
+        )
+
+    def _holds_frame(self, slots: SlotBlock) -> bool:
+        """Whether one frame's slots hold all that it has."""
+        enough = len(slots) >= self.layout.slots
+        return enough and holds_frame(slots.channel.tolist(), self.layout)
 
     def _advance(self, batch: int, frame: int) -> int:
         """Move the unwrapped tick to this frame; return how many frames were lost before it."""
@@ -218,12 +283,3 @@ def _frame_starts(slots: SlotBlock) -> npt.NDArray[np.int64]:
 def _ending(slots: SlotBlock) -> tuple[int, ...]:
     """Channel ids of the last two slots: one alone is often PAC, which is every other slot."""
     return tuple(slots.channel[-2:].tolist())
-
-
-def _is_whole(slots: SlotBlock) -> bool:
-    """Whether one frame's slots hold every channel and 22 PAC samples."""
-    if len(slots) < ch.SLOTS_PER_FRAME:
-        return False
-    channels = slots.channel.tolist()
-    wanted = {ch.PDC, ch.TAC, ch.TDC, *range(ch.FIRST_ELECTRODE, ch.FIRST_ELECTRODE + 19)}
-    return wanted <= set(channels) and channels.count(ch.PAC) >= PAC_SAMPLES

@@ -15,16 +15,18 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import Field
 
+from palpate.gateway.biotac.sensor_type import TypeOption
 from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate.gateway.ports.serial_port import SerialPort, settle
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.protocols import pic32 as ask
 from palpate.gateway.protocols.pic32 import Layout, Pic32Decoder, Pic32Record, Pic32Sample
 from palpate.gateway.readings import ElectrodeReading, Reading
+from palpate.gateway.timing.clock_map import Heard
 from palpate.gateway.timing.sample_clock import SampleClock, Verdict
 from palpate.protos.config import StrictConfig
-from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
-from palpate.protos.messages import PAC_SAMPLES, Origin, SensorType
+from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.protos.messages import COUNTS_MAX, PAC_SAMPLES, Origin, SensorType
 
 VALIDITY = (1 << (ch.FIRST_PAC_BIT + 1)) - 1
 """Electrodes, PDC, TAC, TDC and the one PAC sample of a record."""
@@ -48,6 +50,7 @@ class Pic32Options(StrictConfig):
         layout: Order of the values, which changed between versions of the firmware and which
             nothing in the stream tells: older ones have ``electrodes_first``.
         serial: Serial number to publish, which the board does not tell; empty = the port.
+        sensor_type: Kind of finger; the board polls 19 electrodes only, so never ``biotac_sp``.
     """
 
     port: str = Field(min_length=1)
@@ -55,6 +58,7 @@ class Pic32Options(StrictConfig):
     rts_cts: bool = True
     layout: Layout = Layout.PAC_FIRST
     serial: str = ""
+    sensor_type: TypeOption = "auto"
 
 
 class BiotacPic32(Device):
@@ -68,6 +72,12 @@ class BiotacPic32(Device):
     options_class = Pic32Options
 
     def __init__(self, options: Pic32Options) -> None:
+        if options.sensor_type == "biotac_sp":
+            raise ConfigError(
+                f"BioTac on PIC32 {options.port}: its record holds 19 electrodes, a BioTac SP has "
+                f"{ch.ELECTRODES_SP}",
+                remedy="read an SP by biotac_can or biotac_bridge",
+            )
         super().__init__(
             DeviceInfo(
                 driver="biotac_pic32",
@@ -87,14 +97,20 @@ class BiotacPic32(Device):
         """Forget what an earlier connection told."""
         self._decoder = Pic32Decoder(self._options.layout)
         self._clock = SampleClock(1e6 / ask.RATE_HZ, _WRAP_US)
-        self._counts: Counter[str] = Counter(frames=0, realigned=0, doubted=0)
+        self._counts: Counter[str] = Counter(
+            frames=0, realigned=0, doubted=0, absent=0, saturated_samples=0
+        )
+        self._absent = False
         self._held: tuple[Pic32Sample, int, float] | None = None
         self._last_tick: int | None = None
         self._heard_s = time.monotonic()
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Events since it was opened last; ``doubted`` records were dropped to be sure."""
+        """Events since it was opened last.
+
+        ``doubted`` records were dropped to be sure, ``absent`` ones because nobody was there.
+        """
         return {**self._decoder.counters, **self._clock.counters, **self._counts}
 
     def _open(self) -> DeviceIdentity:
@@ -129,17 +145,24 @@ class BiotacPic32(Device):
         until = time.monotonic() + _FIRST_S
         while self._held is None:
             left_s = until - time.monotonic()
+            if left_s <= 0.0:
+                if self._absent:
+                    raise self._nobody()
+                raise DeviceError(
+                    f"{self.info.model}: no record within {_FIRST_S:g} s of command 'r' "
+                    f"({self._decoder.pending} bytes came)",
+                    remedy="check power, cable, baud and RTS/CTS",
+                )
             try:
-                if left_s > 0.0:
-                    self._receive(left_s)
-                    continue
+                self._receive(min(left_s, _SILENCE_S))
             except DeviceTimeout:
-                pass
-            raise DeviceError(
-                f"{self.info.model}: no record within {_FIRST_S:g} s of command 'r' "
-                f"({self._decoder.pending} bytes came)",
-                remedy="check power, cable, baud and RTS/CTS",
-            )
+                self._start()  # a board that is booting does not hear
+
+    def _nobody(self) -> DeviceLost:
+        return DeviceLost(
+            f"{self.info.model}: no finger answers (every value is 0)",
+            remedy="check its plug and cable; it is looked for again by itself",
+        )
 
     def _close(self) -> None:
         with contextlib.suppress(DeviceError):  # it may be gone
@@ -156,6 +179,8 @@ class BiotacPic32(Device):
             except DeviceTimeout:
                 if time.monotonic() - self._heard_s < _SILENCE_S:
                     raise
+                if self._absent:
+                    raise self._nobody() from None
                 raise DeviceLost(
                     f"{self.info.model}: no record for {_SILENCE_S:g} s",
                     remedy="check its power and cable; it is started again by itself",
@@ -187,13 +212,19 @@ class BiotacPic32(Device):
         verdict = self._clock.take(record.tick // _TICKS_PER_US % _WRAP_US, now_s)
         if verdict in (Verdict.DOUBTFUL, Verdict.RESTARTED):
             return False
-        self._heard_s = now_s
         if verdict is Verdict.NEW:
-            self._release(readings)
-            self._held = (record.sample, self._clock.tick, self._clock.time_s)
+            # The reading waited for this record, whose arrival tells the clock.
+            self._release(readings, Heard(self._clock.time_s, time.monotonic_ns()))
+            self._absent = _is_absent(record.sample)
+            self._counts["absent"] += self._absent
+            if not self._absent:
+                self._counts["saturated_samples"] += _saturated(record.sample)
+                self._held = (record.sample, self._clock.tick, self._clock.time_s)
+        if not self._absent:
+            self._heard_s = now_s
         return True
 
-    def _release(self, readings: list[Reading]) -> None:
+    def _release(self, readings: list[Reading], heard: Heard | None = None) -> None:
         if self._held is None:
             return
         (sample, tick, time_s), self._held = self._held, None
@@ -213,5 +244,20 @@ class BiotacPic32(Device):
                 tac=sample.tac,
                 tdc=sample.tdc,
                 validity=VALIDITY,
+                heard=heard,
             )
         )
+
+
+def _values(sample: Pic32Sample) -> tuple[int, ...]:
+    return (sample.pac, sample.pdc, sample.tac, sample.tdc, *sample.electrodes)
+
+
+def _is_absent(sample: Pic32Sample) -> bool:
+    """Whether no finger answered: its words are 00 00, and the board strips the wrong parity."""
+    return not any(_values(sample))
+
+
+def _saturated(sample: Pic32Sample) -> int:
+    """How many channels are at an end of their range."""
+    return sum(value in (0, COUNTS_MAX) for value in _values(sample))

@@ -19,6 +19,7 @@ import numpy as np
 from palpate.gateway.biotac.line_slots import LineSlots
 from palpate.gateway.biotac.slots import SlotBlock
 from palpate.gateway.protocols.spi import WordKind
+from palpate.gateway.timing.clock_map import Heard
 from palpate.protos.errors import ConfigError, DeviceError, DeviceTimeout
 
 _log = logging.getLogger(__name__)
@@ -34,6 +35,8 @@ class SlotSource(ABC):
 
     slot_period_s: float
     """Time between two slots [s]."""
+    heard: Heard | None = None
+    """The slot of the last ones that was least under way: its time, and when it arrived."""
 
     @abstractmethod
     def open(self) -> None:
@@ -95,18 +98,24 @@ class Finger:
             remedy="check the line and the sender's power",
         )
 
-    def put(self, slots: LineSlots) -> None:
-        """Keep the finger's part. Called by the link, which holds its lock."""
-        absent = slots.kind[:, self.index] == WordKind.ABSENT
-        there = np.flatnonzero(~absent)
-        behind = len(slots) - 1 - int(there[-1]) if len(there) else self.absent + len(slots)
-        self.absent = behind
+    def put(self, slots: LineSlots, *, all_there: bool) -> None:
+        """Keep the finger's part. Called by the link, which holds its lock.
+
+        Args:
+            slots: Of all fingers.
+            all_there: No word of any finger says that none is there.
+        """
+        self.absent = 0 if all_there else self._absent_behind(slots)
         self._blocks.append(slots.of(self.index))
         self._kept += len(slots)
         while self._kept > KEPT:
             oldest = self._blocks.popleft()
             self._kept -= len(oldest)
             self.dropped += len(oldest)
+
+    def _absent_behind(self, slots: LineSlots) -> int:
+        there = np.flatnonzero(slots.kind[:, self.index] != WordKind.ABSENT)
+        return len(slots) - 1 - int(there[-1]) if len(there) else self.absent + len(slots)
 
     def fail(self, error: DeviceError) -> None:
         """The line is gone; told after what came before it. Called by the link."""
@@ -220,7 +229,8 @@ class SlotLink:
         ready = [*self._begun, slots.part(0, over)] if over else self._begun
         self._begun = [slots.part(over, len(slots))] if over < len(slots) else []
         whole = LineSlots.joined(ready)
+        all_there = not (whole.kind == WordKind.ABSENT).any()
         with self.news:
             for finger in self._fingers.values():
-                finger.put(whole)
+                finger.put(whole, all_there=all_there)
             self.news.notify_all()

@@ -12,18 +12,24 @@ import os
 import select
 import socket
 import time
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from palpate.gateway.ports.can_frames import (
     BUS_OFF,
     CanFrame,
+    CanFrames,
     FrameKind,
+    MulticastReader,
     Reader,
     from_message,
     from_socketcan,
-    multicast_reader,
 )
-from palpate.gateway.ports.datagrams import BATCH, NO_STAMP, Datagrams, available
+from palpate.gateway.ports.datagrams import BATCH, Datagrams, available
 from palpate.gateway.ports.port import silent
 from palpate.gateway.timing.kernel_stamps import KernelStamps
 from palpate.protos.errors import ConfigError, DeviceError, DeviceLost
@@ -34,15 +40,30 @@ _BUFFER = 4 << 20
 after 60 ms of three BioTacs."""
 
 
-class CanMessage(NamedTuple):
-    """One data frame: identifier, data, and when it came by the host's monotonic clock [ns].
+@dataclass(frozen=True, slots=True)
+class CanBatch:
+    """Data frames in order of their coming, as arrays.
 
-    That is the kernel's time of reception where the bus tells one.
+    Attributes:
+        can_id: Identifiers, int64, shape ``(N,)``.
+        size: Bytes of data, int64, shape ``(N,)``.
+        data: Data, zeros behind them, uint8, shape ``(N, 8)``.
+        arrival_ns: When they came by the host's monotonic clock [ns], int64, shape ``(N,)``.
     """
 
-    can_id: int
-    data: bytes
-    arrival_ns: int
+    can_id: npt.NDArray[np.int64]
+    size: npt.NDArray[np.int64]
+    data: npt.NDArray[np.uint8]
+    arrival_ns: npt.NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.can_id)
+
+    def messages(self) -> Iterator[tuple[int, bytes, int]]:
+        """Identifier, data and time of arrival [ns] of each."""
+        rows = zip(self.data, self.size.tolist(), strict=True)
+        data = [row[:size].tobytes() for row, size in rows]
+        return zip(self.can_id.tolist(), data, self.arrival_ns.tolist(), strict=True)
 
 
 class CanBus:
@@ -104,14 +125,14 @@ class CanBus:
 
     def _find_socket(self) -> tuple[Datagrams, Reader] | None:
         """The bus's socket with a larger buffer, and how to read it; None if it must be asked."""
-        readers = {"socketcan": lambda: from_socketcan, "udp_multicast": multicast_reader}
-        reader = readers.get(str(self._arguments["interface"]))
-        if reader is None or self._arguments.get("fd") or not available():
+        kind = self._arguments["interface"]
+        known = kind in ("socketcan", "udp_multicast")
+        if not known or self._arguments.get("fd") or not available():
             return None
         descriptor = self._bus.fileno()
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as same:
             same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        return Datagrams(descriptor), reader()
+        return Datagrams(descriptor), from_socketcan if kind == "socketcan" else MulticastReader()
 
     def close(self) -> None:
         """Leave the bus; never raises."""
@@ -124,12 +145,12 @@ class CanBus:
             with contextlib.suppress(Exception):
                 bus.shutdown()
 
-    def read(self, timeout_s: float, *, gather_s: float = 0.0) -> list[CanMessage]:
+    def read(self, timeout_s: float, *, gather_s: float = 0.0) -> CanBatch:
         """At least one data frame, and those that came with it.
 
         Args:
             timeout_s: How long to wait for the first [s].
-            gather_s: How long to wait for more behind it [s]; the bus keeps them meanwhile.
+            gather_s: Let so much time pass first [s]; the bus keeps meanwhile what comes.
 
         Raises:
             DeviceTimeout: None came.
@@ -138,72 +159,64 @@ class CanBus:
         self._opened()
         if self._end is not None:
             raise self._end
+        if gather_s:
+            time.sleep(gather_s)
         until = time.monotonic() + timeout_s
         while True:
             try:
-                frames = self._frames(max(0.0, until - time.monotonic()), gather_s)
+                frames, arrivals_ns = self._frames(max(0.0, until - time.monotonic()))
             except (self._can.CanError, OSError, ValueError) as error:
                 raise self._lost(str(error)) from error
-            out = [
-                CanMessage(frame.can_id, frame.data, arrival_ns)
-                for frame, arrival_ns in frames
-                if frame.kind is FrameKind.DATA or self._note(frame)
-            ]
-            if out:
-                return out
+            kept = frames.kind == FrameKind.DATA
+            if not kept.all():
+                self._note(frames)
+                frames, arrivals_ns = frames.those(kept), arrivals_ns[kept]
+            if len(arrivals_ns):
+                return CanBatch(frames.can_id, frames.size, frames.data, arrivals_ns)
             if self._end is not None:
                 raise self._end
             if time.monotonic() >= until:
                 raise silent(self.name, timeout_s)
 
-    def _frames(self, wait_s: float, gather_s: float) -> list[tuple[CanFrame, int]]:
+    def _frames(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
         """Frames of any kind that came, with their times of arrival; none if none came."""
         if self._direct is None:
-            return self._asked(wait_s, gather_s)
+            return self._asked(wait_s)
         datagrams, reader = self._direct
         ready, _, _ = select.select([datagrams], [], [], wait_s)
         if not ready:
-            return []
-        if gather_s:
-            time.sleep(gather_s)
-        raw, stamps_ns = datagrams.take()
+            return CanFrames.of([]), np.zeros(0, np.int64)
+        waiting = datagrams.take()
         now_ns = time.monotonic_ns()
-        of = self._stamps.monotonic_of_ns
-        return [
-            (reader(one), now_ns if stamp_ns == NO_STAMP else of(stamp_ns, now_ns))
-            for one, stamp_ns in zip(raw, stamps_ns.tolist(), strict=True)
-        ]
+        return reader(waiting), self._stamps.monotonic_of_all(waiting.stamp_ns, now_ns)
 
-    def _asked(self, wait_s: float, gather_s: float) -> list[tuple[CanFrame, int]]:
-        out: list[tuple[CanFrame, int]] = []
-        while len(out) < BATCH:
+    def _asked(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
+        frames: list[CanFrame] = []
+        arrivals_ns: list[int] = []
+        while len(frames) < BATCH:
             try:
-                message = self._bus.recv(0.0 if out else wait_s)
+                message = self._bus.recv(0.0 if frames else wait_s)
             except (self._can.CanError, OSError, ValueError) as error:
-                if not out:
+                if not frames:
                     raise
                 # What came before it is delivered first.
                 self._end = self._lost(str(error))
-                return out
+                break
             if message is None:
                 break
             now_ns = time.monotonic_ns()
-            arrival_ns = self._stamps.monotonic_ns(message.timestamp, now_ns)
-            out.append((from_message(message), arrival_ns))
-            if gather_s and len(out) == 1:
-                time.sleep(gather_s)
-        return out
+            arrivals_ns.append(self._stamps.monotonic_ns(message.timestamp, now_ns))
+            frames.append(from_message(message))
+        return CanFrames.of(frames), np.array(arrivals_ns, np.int64)
 
-    def _note(self, frame: CanFrame) -> bool:
-        """Count a frame that holds no data; False."""
-        if frame.kind is not FrameKind.ERROR:
-            self.counters["other_frames"] += 1
-            return False
-        self.counters["error_frames"] += 1
-        if frame.can_id & BUS_OFF or self._is_off():
+    def _note(self, frames: CanFrames) -> None:
+        """Count frames that hold no data."""
+        errors = frames.kind == FrameKind.ERROR
+        self.counters["other_frames"] += int((frames.kind == FrameKind.OTHER).sum())
+        self.counters["error_frames"] += int(errors.sum())
+        if (frames.can_id[errors] & BUS_OFF).any() or (errors.any() and self._is_off()):
             # It says so once and is then silent for ever: it must be opened again.
             self._end = self._lost("it is off after too many errors (bus off)")
-        return False
 
     def _is_off(self) -> bool:
         with contextlib.suppress(NotImplementedError):

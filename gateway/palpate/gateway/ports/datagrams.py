@@ -13,6 +13,7 @@ import errno
 import os
 import socket
 import sys
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,9 @@ BATCH = 256
 NO_STAMP = -1
 """Where the kernel has told no time of reception."""
 
-_LARGEST = 512
+LARGEST = 512
+"""Larger datagrams are none of ours [bytes]."""
+
 _CONTROL = 64
 _MSG_DONTWAIT = 0x40
 _MSG_TRUNC = 0x20
@@ -51,6 +54,23 @@ def available() -> bool:
     )
 
 
+class Waiting(NamedTuple):
+    """Datagrams in order of their coming.
+
+    Attributes:
+        data: Their bytes, uint8, shape ``(N, LARGEST)``; overwritten by the next ``take``.
+        size: How many each has, shape ``(N,)``; 0 for one that is too large to be one of ours.
+        stamp_ns: When the kernel received each [ns since the Unix epoch], or ``NO_STAMP``.
+    """
+
+    data: npt.NDArray[np.uint8]
+    size: npt.NDArray[np.uint32]
+    stamp_ns: npt.NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+
 class Datagrams:
     """Takes batches from a socket that belongs to somebody else.
 
@@ -66,27 +86,24 @@ class Datagrams:
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._receive = ctypes.PyDLL(None, use_errno=True).recvmmsg
-        self._data = np.zeros((BATCH, _LARGEST), np.uint8)
+        self._data = np.zeros((BATCH, LARGEST), np.uint8)
         self._control = np.zeros((BATCH, _CONTROL // 8), np.int64)
         parts = np.zeros((BATCH, 2), np.uint64)  # struct iovec: address and size
-        parts[:, 0] = self._data.ctypes.data + _LARGEST * np.arange(BATCH)
-        parts[:, 1] = _LARGEST
+        parts[:, 0] = self._data.ctypes.data + LARGEST * np.arange(BATCH)
+        parts[:, 1] = LARGEST
         self._parts = parts  # the kernel reads it: it must live as long as this
         self._headers = np.zeros(BATCH, _HEADERS)
         self._headers["iov"] = parts.ctypes.data + 16 * np.arange(BATCH)
         self._headers["iov_count"] = 1
         self._headers["control"] = self._control.ctypes.data + _CONTROL * np.arange(BATCH)
         self._address = ctypes.c_void_p(self._headers.ctypes.data)
-        self._bytes = self._data.reshape(-1).data
 
     def fileno(self) -> int:
         """For ``select``."""
         return self._socket.fileno()
 
-    def take(self) -> tuple[list[bytes], npt.NDArray[np.int64]]:
-        """What waits, at most ``BATCH``, and when the kernel received it [ns since the Unix epoch].
-
-        A datagram of more than 512 bytes, too large to be one of ours, stands there empty.
+    def take(self) -> Waiting:
+        """What waits, at most ``BATCH``.
 
         Raises:
             OSError: The socket is gone.
@@ -96,20 +113,14 @@ class Datagrams:
         count = self._receive(self.fileno(), self._address, BATCH, _MSG_DONTWAIT, None)
         if count < 0:
             number = ctypes.get_errno()
-            if number in (errno.EAGAIN, errno.EINTR):
-                count = 0
-            else:
+            if number not in (errno.EAGAIN, errno.EINTR):
                 raise OSError(number, os.strerror(number))
-        taken = headers[:count]
-        control = self._control[:count]
+            count = 0
+        taken, control = headers[:count], self._control[:count]
         told = (taken["control_size"] >= _STAMP_SIZE) & (control[:, 1] == _STAMP_KIND)
         stamps_ns = np.where(told, control[:, 2] * 1_000_000_000 + control[:, 3], NO_STAMP)
-        begins = range(0, count * _LARGEST, _LARGEST)
-        sizes = taken["size"].tolist()
-        data = [bytes(self._bytes[at : at + n]) for at, n in zip(begins, sizes, strict=True)]
-        for cut in np.flatnonzero(taken["flags"] & _MSG_TRUNC).tolist():
-            data[cut] = b""
-        return data, stamps_ns
+        whole = (taken["flags"] & _MSG_TRUNC) == 0
+        return Waiting(self._data[:count], taken["size"] * whole, stamps_ns)
 
     def close(self) -> None:
         """Let go of the socket; never raises."""

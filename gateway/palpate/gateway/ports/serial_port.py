@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
+import select
 import time
 from typing import Any
 
@@ -36,6 +38,7 @@ class SerialPort(Port):
         self.name = name
         self._baud, self._rts_cts = baud, rts_cts
         self._line: Any = None
+        self._file = False
         self._broken: tuple[type[Exception], ...] = (OSError,)
 
     def open(self) -> None:
@@ -60,6 +63,7 @@ class SerialPort(Port):
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             line.set_low_latency_mode(True)
         self._line = line
+        self._file = os.name == "posix" and "://" not in self.name
 
     def close(self) -> None:
         """See ``Port``."""
@@ -72,21 +76,30 @@ class SerialPort(Port):
         """See ``Port``."""
         line = self._opened()
         try:
-            waiting = line.in_waiting
-            if not waiting:
-                # One byte wakes us; the rest of what came with it is taken along below.
-                line.timeout = timeout_s
-                first = line.read(1)
-                if not first:
-                    raise silent(self.name, timeout_s)
-                line.timeout = 0
-                return bytes(first + line.read(min(line.in_waiting, _AT_ONCE)))
-            line.timeout = 0
-            return bytes(line.read(min(waiting, _AT_ONCE)))
+            data = self._take(line, timeout_s)
         except self._broken as error:
             if isinstance(error, DeviceError):
                 raise
             raise self._lost(error) from error
+        if not data:
+            raise silent(self.name, timeout_s)
+        return data
+
+    def _take(self, line: Any, timeout_s: float) -> bytes:
+        """What has come, at least one byte; nothing if none came in time."""
+        if self._file:
+            # pyserial sets the whole line up anew for each other timeout: it stays 0.
+            ready, _, _ = select.select([line], [], [], timeout_s)
+            return bytes(line.read(_AT_ONCE)) if ready else b""
+        waiting = line.in_waiting
+        if waiting:
+            line.timeout = 0
+            return bytes(line.read(min(waiting, _AT_ONCE)))
+        # One byte wakes us; the rest of what came with it is taken along below.
+        line.timeout = timeout_s
+        first = line.read(1)
+        line.timeout = 0
+        return bytes(first + line.read(min(line.in_waiting, _AT_ONCE))) if first else b""
 
     def write(self, data: bytes) -> None:
         """See ``Port``."""

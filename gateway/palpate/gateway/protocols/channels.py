@@ -1,12 +1,12 @@
-"""Channels of a BioTac: ids on the wire, names, and their place in a 44-slot frame.
+"""Channels of a BioTac: ids on the wire, names, and their place in a frame.
 
 A slot is decoded by its channel id, never by its position: makers' tools start a frame with E1 or
-with PAC (hardware reference 1.7).
+with PAC (hardware reference 1.7). Which channels a frame holds is the layout of the sensor's type.
 """
 
 from __future__ import annotations
 
-from palpate.protos.messages import PAC_SAMPLES
+from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
 
 PAC = 0
 PDC = 1
@@ -18,24 +18,24 @@ HALL = 15
 FIRST_ELECTRODE = 17
 """Channel id of E1; electrode k has id 16 + k."""
 
-ELECTRODES = 19
+ELECTRODES = BIOTAC_LAYOUT.electrodes
 """Electrodes of the original BioTac."""
 
-ELECTRODES_SP = 24
+ELECTRODES_SP = BIOTAC_SP_LAYOUT.electrodes
 """Electrodes of the BioTac SP."""
 
-SLOTS_PER_FRAME = 44
+SLOTS_PER_FRAME = BIOTAC_LAYOUT.slots
 """E1, PAC, E2, PAC, ..., E19, PAC, PDC, PAC, TAC, PAC, TDC, PAC (hardware reference 1.7)."""
 
 SLOT_RATE_HZ = 4400.0
 """The maker's default slot rate (hardware reference 1.7)."""
 
-# Places of the channels in ElectrodeFrame.validity: electrodes from bit 0, PDC, TAC, TDC, PAC.
-PDC_BIT = ELECTRODES
-TAC_BIT = ELECTRODES + 1
-TDC_BIT = ELECTRODES + 2
-FIRST_PAC_BIT = ELECTRODES + 3
-ALL_VALID = (1 << (FIRST_PAC_BIT + PAC_SAMPLES)) - 1
+# Places of the original BioTac's channels in ElectrodeFrame.validity.
+PDC_BIT = BIOTAC_LAYOUT.pdc_bit
+TAC_BIT = BIOTAC_LAYOUT.tac_bit
+TDC_BIT = BIOTAC_LAYOUT.tdc_bit
+FIRST_PAC_BIT = BIOTAC_LAYOUT.first_pac_bit
+ALL_VALID = BIOTAC_LAYOUT.all_valid
 
 CHANNEL_NAMES: dict[int, str] = {
     PAC: "PAC",
@@ -53,10 +53,17 @@ def channel_name(channel: int) -> str:
     return CHANNEL_NAMES.get(channel, f"channel {channel}")
 
 
-def bit_name(bit: int) -> str:
-    """Name of the channel at a validity bit, e.g. ``"E1"`` or ``"PAC[3]"``."""
-    if bit < ELECTRODES:
-        return f"E{bit + 1}"
-    if bit < FIRST_PAC_BIT:
-        return ("PDC", "TAC", "TDC")[bit - PDC_BIT]
-    return f"PAC[{bit - FIRST_PAC_BIT}]"
+def channels_of(layout: FrameLayout) -> tuple[int, ...]:
+    """Channel ids of the electrodes, PDC, TAC and TDC, in order of their validity bits."""
+    return (*range(FIRST_ELECTRODE, FIRST_ELECTRODE + layout.electrodes), PDC, TAC, TDC)
+
+
+def interleaved(layout: FrameLayout, *, pac_first: bool) -> tuple[int, ...]:
+    """The maker's sampling round: PAC after each of the other channels, or before."""
+    pairs = ((PAC, one) if pac_first else (one, PAC) for one in channels_of(layout))
+    return tuple(channel for pair in pairs for channel in pair)
+
+
+def frame_rate_hz(layout: FrameLayout, slot_rate_hz: float = SLOT_RATE_HZ) -> float:
+    """Frames per second at a slot rate."""
+    return slot_rate_hz / layout.slots

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-_X25_REFLECTED = 0x8408
-"""Polynomial 0x1021 with its bits in reverse, for data that arrives lowest bit first."""
+import binascii
 
-
-def _x25_entry(byte: int) -> int:
-    for _ in range(8):
-        byte = byte >> 1 ^ _X25_REFLECTED if byte & 1 else byte >> 1
-    return byte
-
-
-_X25_TABLE = tuple(_x25_entry(byte) for byte in range(256))
+_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+"""Each byte with its bits in reverse."""
 
 
 def crc16_x25(data: bytes) -> int:
@@ -20,10 +13,9 @@ def crc16_x25(data: bytes) -> int:
 
     The ASCII digits ``123456789`` give 0x906E.
     """
-    crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _X25_TABLE[(crc ^ byte) & 0xFF]
-    return crc ^ 0xFFFF
+    # The standard library has the same polynomial for bits in the other order.
+    crc = binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF)
+    return (_REVERSED[crc & 0xFF] << 8 | _REVERSED[crc >> 8]) ^ 0xFFFF
 
 
 def sum8(data: bytes) -> int:

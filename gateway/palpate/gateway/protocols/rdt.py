@@ -22,6 +22,9 @@ U32 = 1 << 32
 LATE_WINDOW = 128
 """A record that is further behind than this is not late: the device has restarted [records]."""
 
+LATE_COUNTS = 8000
+"""Nor is one that was sampled earlier than by this: a second of the fastest counter [counts]."""
+
 BELIEVABLE_LOSS = 1_000_000
 """More is not taken for a loss where a restart is possible too [records]."""
 
@@ -160,14 +163,14 @@ class RdtSequence:
         sampled_behind = (last_ft - ft_sequence) % U32
         if ahead == 0 and (rdt_sequence != 1 or sampled_behind == 0):
             return self._drop("repeated_records")
-        in_order = ahead < U32 // 2 and (rdt_sequence > last or ahead <= BELIEVABLE_LOSS)
-        if ahead and in_order:
+        in_order = 0 < ahead < U32 // 2 and (rdt_sequence > last or ahead <= BELIEVABLE_LOSS)
+        if in_order and not 0 < sampled_behind < U32 // 2:
             return self._accept(rdt_sequence, ft_sequence, lost=ahead - 1, new_epoch=False)
-        sampled_before = 0 < sampled_behind < U32 // 2 or (
-            # A device may send faster than it samples; but no record is before the first.
-            sampled_behind == 0 and rdt_sequence != 1
-        )
-        if behind <= LATE_WINDOW and sampled_before:
+        # One that is ahead and was sampled before is late by the numbers of an earlier start. A
+        # device may send faster than it samples; but no record is before the first.
+        sampled_before = 0 < sampled_behind <= LATE_COUNTS
+        sampled_before |= sampled_behind == 0 and rdt_sequence != 1
+        if (in_order or behind <= LATE_WINDOW) and sampled_before:
             return self._drop("late_records")
         self.counters["restarts"] += 1
         lost = max(rdt_sequence - 1, 0)
@@ -210,18 +213,6 @@ def decode_records(datagram: bytes) -> npt.NDArray[np.void]:
     return np.frombuffer(datagram, RECORD_TYPE)
 
 
-def encode_record(record: RdtRecord) -> bytes:
-    """The 36 bytes that a device sends.
-
-    Raises:
-        ValueError: A field does not fit 32 bits.
-    """
-    try:
-        return _RECORD.pack(record.rdt_sequence, record.ft_sequence, record.status, *record.counts)
-    except struct.error as error:
-        raise ValueError(f"{record} does not fit a record: {error}") from error
-
-
 def encode_request(command: int, count: int = 0) -> bytes:
     """The 8 bytes of a request.
 
@@ -237,11 +228,3 @@ def encode_request(command: int, count: int = 0) -> bytes:
     if not 0 <= count < U32:
         raise ValueError(f"count {count} is not in 0..{U32 - 1}")
     return _REQUEST.pack(_REQUEST_HEADER, command, count)
-
-
-def decode_request(datagram: bytes) -> tuple[int, int] | None:
-    """Command and count of a request, as a device's stand-in reads it; None if it is none."""
-    if len(datagram) != _REQUEST.size:
-        return None
-    header, command, count = _REQUEST.unpack(datagram)
-    return (command, count) if header == _REQUEST_HEADER else None

@@ -1,0 +1,308 @@
+"""``palpate bench hand``: five BioTacs and two force/torque sensors through one gateway.
+
+Emulators play the twin at full rate: three fingers on one CAN bus and two on another (4400 slots a
+second each), a KMS 40 over TCP (500 Hz) and a Bota over a serial line (1000 Hz). Nothing may be
+lost. The floor is a program that reads the same devices with python-can, sockets and pyserial and
+does nothing with what it reads.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from palpate.deploy.bench.e2e import wait_ready
+from palpate.deploy.bench.results import append_history, machine
+from palpate.deploy.children import Children
+from palpate.deploy.ports import free_endpoint
+from palpate.deploy.processes import command_line
+from palpate.deploy.profile import Profile, changed, load_profile
+from palpate.deploy.run_folder import write_profile
+from palpate.deploy.status import ask_status
+from palpate.protos.config import LinkConfig
+from palpate.protos.errors import LinkError
+from palpate.protos.session import Session
+
+CORE_GOAL = 0.5
+"""Share of a core that the gateway may use."""
+
+_BUSES = ({"channel": "239.74.163.2", "fingers": 3}, {"channel": "239.74.163.3", "fingers": 2})
+_SETTLE_S = 4.0
+_LOSSES = ("lost", "missing", "dropped", "parity", "overflow", "incomplete", "silences", "device_l")
+
+
+@dataclass(frozen=True, slots=True)
+class HandResult:
+    """What became of the hand's frames.
+
+    Attributes:
+        seconds: Length of the measurement [s].
+        core: Share of one core that the gateway used.
+        worst_core: The same in its worst tenth.
+        frames: Electrode and wrench frames in the client.
+        lost: Frames that sequence numbers, the devices' own account or invalid channels miss.
+        counters: The gateway's counters of losses that are not zero.
+        p50_s: Median of: last sample of an electrode frame to the client's hands [s].
+        p99_s: 99th percentile [s].
+        wrench_p99_s: The same of the wrenches [s].
+        floor_core: Share of one core that the bare reader used.
+        floor_p50_s: Median of: kernel's stamp of a slot to the bare reader's hands [s].
+        floor_p99_s: 99th percentile [s].
+    """
+
+    seconds: float
+    core: float
+    worst_core: float
+    frames: int
+    lost: int
+    counters: dict[str, int]
+    p50_s: float
+    p99_s: float
+    wrench_p99_s: float
+    floor_core: float
+    floor_p50_s: float
+    floor_p99_s: float
+
+
+def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool) -> None:
+    """Measure, print, and on request keep.
+
+    Args:
+        seconds: Length of the measurement [s].
+        floor_seconds: Length of the floor's [s].
+        as_json: Print JSON.
+        save: Append to the history.
+    """
+    columns = (TextColumn("{task.description:32}"), BarColumn(), TimeElapsedColumn())
+    quiet = Console(stderr=True)
+    with Progress(*columns, console=quiet, disable=not sys.stderr.isatty()) as bar:
+        result = measure_hand(seconds, floor_seconds, bar)
+    values = {
+        "hand": asdict(result),
+        "hand.core_goal_met": result.core <= CORE_GOAL,
+        "hand.loss_goal_met": result.lost == 0,
+        "hand.p99_ratio": round(result.p99_s / result.floor_p99_s, 2),
+    }
+    if as_json:
+        print(json.dumps({**values, "machine": machine()}, indent=2))
+    else:
+        _print(result)
+    if save:
+        append_history("hand", values)
+
+
+def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandResult:
+    """Start everything, measure the gateway, then the floor.
+
+    Raises:
+        ProcessEnded: A process of the benchmark ended early.
+        LinkError: They did not find one another in time.
+    """
+    with Children("bench-hand") as children:
+        buses, wrenches = _start_emulators(children)
+        rows_file, floor_file = children.folder / "client.npz", children.folder / "floor.npz"
+        profile = _start_gateway(children, buses, wrenches, rows_file)
+        task = bar.add_task("gateway", total=10)
+        time.sleep(_SETTLE_S)
+        pid = children.pid("gateway")
+        before = _counters(profile)
+        begin_ns, used_s, shares = time.monotonic_ns(), _cpu_s(pid), []
+        for _ in range(10):
+            part_s, part_used_s = time.monotonic(), _cpu_s(pid)
+            time.sleep(seconds / 10)
+            shares.append((_cpu_s(pid) - part_used_s) / (time.monotonic() - part_s))
+            children.check(["gateway", "client", *(f"emulator-{n}" for n in range(4))])
+            bar.advance(task)
+        end_ns = time.monotonic_ns()
+        core = (_cpu_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
+        after = _counters(profile)
+        children.stop_one("client")
+        children.stop_one("gateway")
+        task = bar.add_task("floor", total=1)
+        plan = {
+            "seconds": floor_seconds,
+            "buses": buses,
+            "sockets": [[wrenches["kms40"]["host"], wrenches["kms40"]["port"]]],
+            "lines": [[wrenches["bota"]["port"], wrenches["bota"]["baud"]]],
+        }
+        part = [sys.executable, "-m", "palpate.deploy.bench.hand_parts"]
+        children.start("floor", [*part, "floor", str(floor_file), json.dumps(plan)])
+        if children.wait("floor", floor_seconds + 20.0) != 0:
+            raise children.ended("floor", -1)
+        bar.advance(task)
+        return _account(rows_file, floor_file, begin_ns, end_ns, core, max(shares), before, after)
+
+
+def _start_emulators(
+    children: Children,
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Start them; python-can's options of the buses, and the addresses of the wrench sensors."""
+    emulate = [sys.executable, "-m", "palpate.deploy", "emulate"]
+    buses: list[dict[str, Any]] = []
+    for number, bus in enumerate(_BUSES):
+        port = _free_port()
+        words = ["--channel", str(bus["channel"]), "--bus", f"port={port}"]
+        words += ["--fingers", str(bus["fingers"]), "--seed", str(10 * number)]
+        children.start(f"emulator-{number}", [*emulate, "biotac-can", *words])
+        buses.append({"interface": "udp_multicast", "channel": bus["channel"], "port": port})
+    tcp, line = _free_port(), children.folder / "bota"
+    children.start("emulator-2", [*emulate, "kms40", "--port", str(tcp)])
+    children.start("emulator-3", [*emulate, "bota", "--link", str(line), "--baud", "460800"])
+    deadline = time.monotonic() + 30.0
+    names = [f"emulator-{number}" for number in range(4)]
+    while not all("palpate gateway probe" in children.log(n).read_text("utf-8") for n in names):
+        children.check(names)
+        if time.monotonic() > deadline:
+            raise LinkError("an emulator does not start", remedy=f"see {children.folder / 'logs'}")
+        time.sleep(0.1)
+    return buses, {
+        "kms40": {"host": "127.0.0.1", "port": tcp},
+        "bota": {"port": str(line), "baud": 460800, "rate_hz": 1000.0},
+    }
+
+
+def _start_gateway(
+    children: Children,
+    buses: list[dict[str, Any]],
+    wrenches: dict[str, dict[str, Any]],
+    rows_file: Path,
+) -> Profile:
+    sensors = [
+        {
+            "name": f"finger{number}{port}",
+            "driver": "biotac_can",
+            "options": {
+                "interface": options["interface"],
+                "channel": options["channel"],
+                "bus_options": {"port": options["port"]},
+                "fingers": bus["fingers"],
+                "port": port,
+            },
+        }
+        for number, (bus, options) in enumerate(zip(_BUSES, buses, strict=True))
+        for port in range(1, int(str(bus["fingers"])) + 1)
+    ]
+    sensors += [
+        {"name": name, "driver": f"wrench_{name}", "options": options}
+        for name, options in wrenches.items()
+    ]
+    endpoint = free_endpoint()
+    profile = changed(
+        load_profile("bench").model_copy(update={"processes": ("router",)}),
+        router={"listen": (endpoint,)},
+        link={"connect": (endpoint,)},
+        gateway={"sensors": sensors},
+        log={"level": "warning"},
+    )
+    children.start_profile(profile)
+    part = [sys.executable, "-m", "palpate.deploy.bench.hand_parts"]
+    children.start("client", [*part, "client", endpoint, profile.station, str(rows_file)])
+    wait_ready(profile, {"client"})
+    children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
+    wait_ready(profile, {"gateway"})
+    return profile
+
+
+def _free_port() -> int:
+    return int(free_endpoint().rpartition(":")[2])
+
+
+def _cpu_s(pid: int) -> float:
+    """User and system time of a process so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _counters(profile: Profile) -> dict[str, int]:
+    link = LinkConfig(connect=profile.link.connect, wait_for_router_s=10)
+    with Session.open(link, station=profile.station) as session:
+        for _ in range(5):
+            for status in ask_status(session):
+                if status.service == "gateway":
+                    return dict(status.counters)
+            time.sleep(0.5)
+    raise LinkError("the gateway does not answer", remedy="see the logs in the run's folder")
+
+
+def _account(
+    rows_file: Path,
+    floor_file: Path,
+    begin_ns: int,
+    end_ns: int,
+    core: float,
+    worst_core: float,
+    before: dict[str, int],
+    after: dict[str, int],
+) -> HandResult:
+    with np.load(rows_file, allow_pickle=False) as archive:
+        names, rows, lost = archive["sensors"], archive["rows"], int(archive["dropped"])
+    rows = rows[(rows[:, 4] >= begin_ns) & (rows[:, 4] < end_ns)]
+    of_finger = np.array([str(name).startswith("finger") for name in names])
+    for number in range(len(names)):
+        mine = rows[rows[:, 0] == number]
+        lost += int((np.diff(mine[:, 1]) - 1).sum())
+    lost += int(rows[:, 2].sum()) + int(rows[:, 5].sum())
+    silent = 7 - len(np.unique(rows[:, 0]))
+    late_s = (rows[:, 4] - rows[:, 3]) * 1e-9
+    electrodes = late_s[of_finger[rows[:, 0]]]
+    p50, p99 = np.percentile(electrodes, (50, 99))
+    with np.load(floor_file, allow_pickle=False) as archive:
+        floor_p50, floor_p99 = np.percentile(archive["late_s"], (50, 99))
+        floor_core = float(archive["core"])
+    told = {
+        name: value - before.get(name, 0)
+        for name, value in after.items()
+        if any(word in name for word in _LOSSES) and value > before.get(name, 0)
+    }
+    return HandResult(
+        seconds=(end_ns - begin_ns) * 1e-9,
+        core=core,
+        worst_core=worst_core,
+        frames=len(rows),
+        lost=lost + silent,
+        counters=told,
+        p50_s=float(p50),
+        p99_s=float(p99),
+        wrench_p99_s=float(np.percentile(late_s[~of_finger[rows[:, 0]]], 99)),
+        floor_core=floor_core,
+        floor_p50_s=float(floor_p50),
+        floor_p99_s=float(floor_p99),
+    )
+
+
+def _print(result: HandResult) -> None:
+    console = Console()
+    table = Table(
+        title=f"five BioTacs on CAN, a KMS 40 and a Bota, {result.seconds:.0f} s",
+        title_justify="left",
+    )
+    for column in ("", "gateway", "bare reader", "ratio"):
+        table.add_column(column, justify="right" if column else "left")
+    pairs = (
+        ("share of a core", result.core, result.floor_core, "{:.1%}"),
+        ("last slot to client, p50", result.p50_s * 1e3, result.floor_p50_s * 1e3, "{:.2f} ms"),
+        ("last slot to client, p99", result.p99_s * 1e3, result.floor_p99_s * 1e3, "{:.2f} ms"),
+    )
+    for name, ours, bare, form in pairs:
+        table.add_row(name, form.format(ours), form.format(bare), f"{ours / bare:.2f}")
+    console.print(table)
+    console.print(
+        f"{result.frames:,} frames in the client, {result.lost} lost; in its worst tenth the "
+        f"gateway used {result.worst_core:.1%} of a core (goal {CORE_GOAL:.0%}); wrenches p99 "
+        f"{result.wrench_p99_s * 1e3:.2f} ms",
+        soft_wrap=True,
+        highlight=False,
+    )
+    if result.counters:
+        told = ", ".join(f"{name} {count}" for name, count in result.counters.items())
+        console.print(f"counted by the gateway: {told}", soft_wrap=True, highlight=False)
