@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import shlex
 import signal
 import socket
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -22,12 +24,24 @@ from palpate.deploy.cli import app
 from palpate.gateway.config import GatewayConfig
 from palpate.gateway.drivers import make_device
 from palpate.gateway.emulators.kms40 import Kms40Emulator
+from palpate.gateway.emulators.twin import loop_options, make_loop
 from palpate.protos.config import parse_config
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 PALPATE = [sys.executable, "-m", "palpate.deploy"]
 
 Emulate = Callable[..., "Program"]
+
+EMULATORS = {
+    "kms40": [""],
+    "rdt": [""],
+    "robotous": ["", "--interface virtual --channel faults"],
+    "bota": [""],
+    "biotac-can": ["--interface virtual --channel faults"],
+    "biotac-bridge": [""],
+    "biotac-pic32": [""],
+}
+"""Commands, and the words without which not all of them can run anywhere."""
 
 
 class Program:
@@ -93,6 +107,8 @@ def gateway(*arguments: str) -> Any:
         ["rdt", "--product", "onrobot_hex"],
         ["robotous", "--link", "./rft"],
         ["bota"],
+        ["biotac-bridge", "--fingers", "1", "--play", "idle"],
+        ["biotac-pic32", "--electrodes-first", "--play", "press"],
     ],
     ids=" ".join,
 )
@@ -106,7 +122,8 @@ def test_what_an_emulator_prints_is_what_reads_it(
     assert program.probe[:3] == ["gateway", "probe", sensor["driver"]]
     result = gateway(*program.probe[1:], "--seconds", "0.4", "--json")
     assert result.exit_code == 0, result.output
-    assert json.loads(result.output)["streams"]["wrench"]["readings"] > 5
+    (stream,) = json.loads(result.output)["streams"].values()
+    assert stream["readings"] > 5
     assert "samples sent" in program.interrupt()
     assert not (tmp_path / "rft").is_symlink()
 
@@ -114,11 +131,12 @@ def test_what_an_emulator_prints_is_what_reads_it(
 @pytest.mark.parametrize("kind", ["biotac-can", "robotous"])
 def test_can_between_processes(kind: str, emulate: Emulate) -> None:
     pytest.importorskip("msgpack", reason="palpate[gateway] is not installed")
-    # A group of our own: whoever tests beside us shall not be heard.
+    # A group of our own, and a port: groups of one port are heard by all that listen at it.
     group = f"239.74.{random.randint(1, 254)}.{random.randint(1, 254)}"
     words = ["--interface", "udp_multicast", "--channel", group]
     if kind == "biotac-can":
-        words += ["--slot-rate-hz", "1100", "--fingers", "2"]
+        words += ["--slot-rate-hz", "1100", "--fingers", "2", "--play", "idle"]
+        words += ["--bus", f"port={random.randint(20_000, 30_000)}"]
     program = emulate(kind, *words)
     result = gateway(*program.probe[1:], "--seconds", "0.5", "--json")
     assert result.exit_code == 0, result.output
@@ -127,6 +145,40 @@ def test_can_between_processes(kind: str, emulate: Emulate) -> None:
     if kind == "biotac-can":
         assert [sensor["options"]["port"] for sensor in program.sensors] == [1, 2]
         assert stream["first"]["electrodes"][:2] == [2000, 2050]
+
+
+def test_what_is_played_is_the_twin(emulate: Emulate) -> None:
+    scene = ["--seed", "4", "--trajectory", "cube/00/normal", "--epoch", str(time.time() - 4.0)]
+    finger = emulate("biotac-bridge", "--fingers", "1", *scene)
+    wrench = emulate("kms40", *scene)
+    loop = make_loop(loop_options(seed=4, trajectories=["cube/00/normal"]))
+    told = [json.loads(gateway(*one.probe[1:], "--json").output) for one in (finger, wrench)]
+    # Each first reading is one of the loop; between two of its frames all runs straight.
+    electrodes = told[0]["streams"]["electrodes"]["first"]["electrodes"]
+    assert np.abs(loop.frames[:, :19] - electrodes).max(axis=1).min() <= 8
+    force = told[1]["streams"]["wrench"]["first"]["force_n"]
+    assert np.linalg.norm(np.array(loop.wrench)[:, :3] - force, axis=1).min() < 0.05
+
+
+@pytest.mark.parametrize(("name", "lines"), EMULATORS.items())
+def test_all_faults_that_the_help_names_can_be_had(
+    name: str, lines: list[str], tmp_path: Path
+) -> None:
+    told = CliRunner().invoke(app, ["emulate", name, "--help"]).output
+    named = " ".join(told.partition("Faults: ")[2].partition(". Example")[0].split())
+    for more in lines:
+        kind = more.split() if more else []
+        faults = set(re.findall(r"\w+", named.partition(";")[0]))
+        if "--interface" in kind:
+            faults = faults - {"crc"} | {"busoff"}
+        words = [word for fault in sorted(faults) for word in ("--fault", f"{fault}@0")]
+        ran = ["emulate", name, *kind, "--play", "idle", "--seconds", "0.3", *words]
+        result = CliRunner().invoke(app, ran)
+        assert result.exit_code == 0, result.output
+        assert result.stderr.count(" once") == len(faults) > 9
+        # And there are no others.
+        result = CliRunner().invoke(app, ["emulate", name, *kind, "--fault", "fire@1"])
+        assert set(result.stderr.partition("its faults: ")[2].replace(",", "").split()) == faults
 
 
 def test_faults_come_when_they_should(emulate: Emulate) -> None:
@@ -152,7 +204,10 @@ def test_an_emulator_ends_by_itself(emulate: Emulate) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["kms40", "--fault", "fire@1"], "its faults: cut, error, junk"),
+        (["kms40", "--fault", "fire@1"], "its faults: clock_drift, cut, error, junk"),
+        (["biotac-bridge", "--baud", "7"], "one of 50, 75, 110"),
+        (["biotac-can", "--unit", "none"], "take a number from 1 to 3"),
+        (["bota", "--trajectory", "cube/00/norml"], "did you mean 'cube/00/normal'"),
         (["bota", "--baud", "1"], "one of 57600, 115200"),
         (["robotous", "--model", "RFT"], "one of RFT40-SA01"),
         (["robotous", "--link", "a-file"], "a file of this name is there"),

@@ -176,5 +176,5 @@ def test_silence_stopped_overload_and_error(emulator: Kms40Emulator) -> None:
 
 
 def test_only_its_own_faults() -> None:
-    with pytest.raises(ValueError, match="fault 'crc' is none of cut, error"):
+    with pytest.raises(ValueError, match="fault 'crc' is none of clock_drift, cut, error"):
         Kms40Emulator().inject("crc")

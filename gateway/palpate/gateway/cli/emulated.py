@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from palpate.gateway.cli.key_values import parse_key_values
-from palpate.gateway.emulators.emulator import Emulator
+from palpate.gateway.emulators.emulator import Emulator, WrenchSource
 from palpate.protos.errors import ConfigError
 from palpate.protos.extras import require
+
+if TYPE_CHECKING:
+    from palpate.gateway.emulators.biotac_slots import CountSource
 
 Options = dict[str, Any]
 
@@ -35,11 +38,11 @@ class Emulated:
     failures: tuple[type[Exception], ...] = (OSError,)
 
 
-def kms40(host: str, port: int, serial: int) -> Emulated:
+def kms40(source: WrenchSource, *, host: str, port: int, serial: int, drift_ppm: float) -> Emulated:
     """A KMS 40 over TCP."""
     from palpate.gateway.emulators.kms40 import Kms40Emulator
 
-    emulator = Kms40Emulator(host=host, port=port, serial=serial)
+    emulator = Kms40Emulator(source, host=host, port=port, serial=serial, drift_ppm=drift_ppm)
     return Emulated(
         "kms40",
         emulator,
@@ -48,26 +51,26 @@ def kms40(host: str, port: int, serial: int) -> Emulated:
     )
 
 
-def rdt(product: str, host: str, port: int, http_port: int, rate_hz: float) -> Emulated:
-    """One of the products that speak RDT, by the driver's name."""
+def rdt(source: WrenchSource, product: str, **options: Any) -> Emulated:
+    """One of the products that speak RDT, by the driver's name; options of its emulator."""
     from palpate.gateway.emulators.rdt import RdtEmulator
 
     kinds = {"ati_net_ft": "netft", "ati_axia": "axia", "schunk_ftn": "axia", "onrobot_hex": "hex"}
-    emulator = RdtEmulator(
-        kinds[product], rate_hz=rate_hz, host=host, port=port, http_port=http_port
-    )
+    emulator = RdtEmulator(kinds[product], source, **options)
 
     def sensors() -> list[tuple[str, Options]]:
-        options: Options = {"product": product, **_host_port(emulator)}
+        told: Options = {"product": product, **_host_port(emulator)}
         if product != "onrobot_hex":
-            options["http_port"] = emulator.page.port
-        return [("wrench", {**options, "rate_hz": emulator.rate_hz})]
+            told["http_port"] = emulator.page.port
+        return [("wrench", {**told, "rate_hz": emulator.rate_hz})]
 
     return Emulated("rdt", emulator, "wrench_rdt", sensors)
 
 
-def robotous_serial(link: Path | None, baud: int, model: str, serial: str) -> Emulated:
-    """An RFT on a serial line.
+def robotous_serial(
+    source: WrenchSource, link: Path | None, baud: int, *, model: str, **options: Any
+) -> Emulated:
+    """An RFT on a serial line; options of its emulator.
 
     Raises:
         ConfigError: There is no such model or speed, or the link cannot be made.
@@ -76,7 +79,7 @@ def robotous_serial(link: Path | None, baud: int, model: str, serial: str) -> Em
 
     _check_model(model)
     _check_baud(baud, (921600, 460800, 230400, 115200, 57600))
-    emulator = RobotousSerial(baud=baud, path=_checked_link(link), model=model, serial=serial)
+    emulator = RobotousSerial(source, baud, _checked_link(link), model=model, **options)
     return Emulated(
         "robotous",
         emulator,
@@ -85,8 +88,10 @@ def robotous_serial(link: Path | None, baud: int, model: str, serial: str) -> Em
     )
 
 
-def robotous_can(interface: str, channel: str, model: str, serial: str) -> Emulated:
-    """An RFT on CAN.
+def robotous_can(
+    source: WrenchSource, interface: str, channel: str, *, model: str, **options: Any
+) -> Emulated:
+    """An RFT on CAN; options of its emulator.
 
     Raises:
         ConfigError: There is no such model.
@@ -95,7 +100,7 @@ def robotous_can(interface: str, channel: str, model: str, serial: str) -> Emula
     from palpate.gateway.emulators.robotous import RobotousCan
 
     _check_model(model)
-    emulator = RobotousCan(interface=interface, channel=channel, model=model, serial=serial)
+    emulator = RobotousCan(source, interface=interface, channel=channel, model=model, **options)
     return Emulated(
         "robotous",
         emulator,
@@ -105,7 +110,7 @@ def robotous_can(interface: str, channel: str, model: str, serial: str) -> Emula
     )
 
 
-def bota(link: Path | None, baud: int) -> Emulated:
+def bota(source: WrenchSource, link: Path | None, baud: int, *, drift_ppm: float) -> Emulated:
     """A SensONE on a serial line.
 
     Raises:
@@ -115,7 +120,7 @@ def bota(link: Path | None, baud: int) -> Emulated:
 
     # At the slowest of its speeds not even its lowest rate gets through.
     _check_baud(baud, [one for one in BAUDS if one > 9600])
-    emulator = Bota(baud=baud, path=_checked_link(link))
+    emulator = Bota(source, baud=baud, path=_checked_link(link), drift_ppm=drift_ppm)
     rate_hz = 400.0 if baud >= 230400 else 100.0
     return Emulated(
         "bota",
@@ -126,6 +131,7 @@ def bota(link: Path | None, baud: int) -> Emulated:
 
 
 def biotac_can(
+    source: CountSource,
     interface: str,
     channel: str,
     bus: Sequence[str],
@@ -134,6 +140,8 @@ def biotac_can(
     can_id: int,
     slot_rate_hz: float,
     pac_first: bool,
+    electrodes: int,
+    drift_ppm: float,
 ) -> Emulated:
     """BioTacs at a CAN interface.
 
@@ -148,24 +156,104 @@ def biotac_can(
         interface,
         channel,
         fingers=fingers,
+        counts=source,
         can_id=can_id,
         slot_rate_hz=slot_rate_hz,
         pac_first=pac_first,
+        electrodes=electrodes,
+        drift_ppm=drift_ppm,
         options=options,
     )
     shared: Options = {"interface": interface, "channel": channel}
     if options:
         shared["bus_options"] = options
     shared |= {"can_id": can_id, "fingers": fingers, "slot_rate_hz": slot_rate_hz}
-    if pac_first:
-        shared["sequence"] = "biotac_pac_first"
+    shared |= _sequence(electrodes, pac_first=pac_first)
     return Emulated(
-        "biotac-can",
-        emulator,
-        "biotac_can",
-        lambda: [(f"finger{port}", {**shared, "port": port}) for port in range(1, fingers + 1)],
-        _can_failures(),
+        "biotac-can", emulator, "biotac_can", lambda: _ports(shared, fingers), _can_failures()
     )
+
+
+def biotac_bridge(
+    source: CountSource,
+    link: Path | None,
+    baud: int,
+    *,
+    fingers: int,
+    source_id: int,
+    pac_first: bool,
+    electrodes: int,
+    **options: Any,
+) -> Emulated:
+    """BioTacs behind a bridge; options of its emulator.
+
+    Raises:
+        ConfigError: A terminal knows no such speed, or the link cannot be made.
+    """
+    from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator
+    from palpate.gateway.emulators.serial_line import speeds
+
+    _check_baud(baud, speeds())
+    emulator = BiotacBridgeEmulator(
+        fingers=fingers,
+        counts=source,
+        source=source_id,
+        baud=baud,
+        path=_checked_link(link),
+        pac_first=pac_first,
+        electrodes=electrodes,
+        **options,
+    )
+
+    def sensors() -> list[tuple[str, Options]]:
+        shared: Options = {"line": emulator.address, "baud": baud, "source": source_id}
+        return _ports(shared | _sequence(electrodes, pac_first=pac_first), fingers)
+
+    return Emulated("biotac-bridge", emulator, "biotac_bridge", sensors)
+
+
+def biotac_pic32(
+    source: CountSource,
+    link: Path | None,
+    baud: int,
+    *,
+    electrodes_first: bool,
+    drift_ppm: float,
+) -> Emulated:
+    """A BioTac at a PIC32 board.
+
+    Raises:
+        ConfigError: A terminal knows no such speed, or the link cannot be made.
+    """
+    from palpate.gateway.emulators.biotac_pic32 import BiotacPic32Emulator
+    from palpate.gateway.emulators.serial_line import speeds
+
+    _check_baud(baud, speeds())
+    emulator = BiotacPic32Emulator(
+        counts=source,
+        electrodes_first=electrodes_first,
+        baud=baud,
+        path=_checked_link(link),
+        drift_ppm=drift_ppm,
+    )
+    layout = "electrodes_first" if electrodes_first else "pac_first"
+    return Emulated(
+        "biotac-pic32",
+        emulator,
+        "biotac_pic32",
+        lambda: [("finger", {"port": emulator.address, "baud": baud, "layout": layout})],
+    )
+
+
+def _ports(shared: Options, fingers: int) -> list[tuple[str, Options]]:
+    """Each finger of a line is a sensor."""
+    return [(f"finger{port}", {**shared, "port": port}) for port in range(1, fingers + 1)]
+
+
+def _sequence(electrodes: int, *, pac_first: bool) -> Options:
+    """The order of sampling, where it is not the one that most have."""
+    kind = {19: "biotac", 24: "biotac_sp"}[electrodes]
+    return {"sequence": f"{kind}_pac_first"} if pac_first else {}
 
 
 def _host_port(emulator: Emulator) -> Options:

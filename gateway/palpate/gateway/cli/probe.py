@@ -17,7 +17,7 @@ from palpate.protos.errors import DeviceError
 
 _FAILED = 1
 _RATE_TOLERANCE = 0.05
-_OF_NOMINAL_RATE = ("electrodes", "wrench")
+_OF_NOMINAL_RATE = ("electrodes", "wrench", "pose")
 """Streams that come at a device's rate; a virtual finger's others may be slower."""
 
 

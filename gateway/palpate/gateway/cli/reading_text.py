@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,10 @@ from palpate.gateway.readings import (
     RecordedMessage,
     WrenchReading,
 )
+from palpate.protos.messages import FrameLayout
+
+_A_LINE = 10
+_NAMED = 6
 
 
 def stream_of(reading: Reading) -> str:
@@ -53,7 +58,7 @@ def values_of(reading: Reading) -> dict[str, Any]:
             "indenter": reading.indenter,
             "position_m": _rounded(reading.position),
             "orientation_wxyz": _rounded(reading.orientation),
-            "in_contact": bool(reading.in_contact),
+            "in_contact": None if reading.in_contact is None else bool(reading.in_contact),
         }
     largest = float(np.linalg.norm(reading.displacement, axis=1).max(initial=0.0))
     return place | {"nodes": len(reading.displacement), "largest_m": largest}
@@ -63,22 +68,62 @@ def text_of(reading: Reading) -> list[str]:
     """Its values in lines."""
     values = values_of(reading)
     if isinstance(reading, ElectrodeReading):
-        counts = values["electrodes"]
-        pac = values["pac"]
-        return [
-            "E1..E10  " + " ".join(f"{count:4d}" for count in counts[:10]),
-            "E11..E19 " + " ".join(f"{count:4d}" for count in counts[10:]),
-            f"PDC {values['pdc']}  TAC {values['tac']}  TDC {values['tdc']}"
-            f"  PAC {min(pac)}..{max(pac)} [counts]",
-        ]
+        return _electrode_lines(reading)
     if isinstance(reading, WrenchReading):
         lines = [
             "force  " + " ".join(f"{value:+8.3f}" for value in values["force_n"]) + " N",
             "torque " + " ".join(f"{value:+8.4f}" for value in values["torque_n_m"]) + " N m",
         ]
         return [*lines, "OVERLOAD: its range is exceeded"] if reading.overload else lines
+    if isinstance(reading, PoseReading):
+        return _pose_lines(reading)
     shown = {key: value for key, value in values.items() if key not in ("tick", "time_s")}
     return ["  ".join(f"{key} {value}" for key, value in shown.items())]
+
+
+def _electrode_lines(reading: ElectrodeReading) -> list[str]:
+    """Ten electrodes a line, the other channels, and which of all are not valid."""
+    counts = reading.electrodes.tolist()
+    layout = FrameLayout(len(counts))
+    lines = []
+    for first in range(0, len(counts), _A_LINE):
+        some = counts[first : first + _A_LINE]
+        name = f"E{first + 1}..E{first + len(some)}"
+        lines.append(f"{name:8} " + " ".join(f"{count:4d}" for count in some))
+    bad = [bit for bit in range(layout.slots) if not reading.validity >> bit & 1]
+    pac = [
+        count
+        for number, count in enumerate(reading.pac.tolist())
+        if layout.first_pac_bit + number not in bad
+    ]
+    told = f"{min(pac)}..{max(pac)}" if pac else "none"
+    lines.append(f"PDC {reading.pdc}  TAC {reading.tac}  TDC {reading.tdc}  PAC {told} [counts]")
+    if bad:
+        more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
+        names = ", ".join(layout.bit_name(bit) for bit in bad[:_NAMED])
+        lines.append(f"not valid: {names}{more}")
+    return lines
+
+
+def _pose_lines(reading: PoseReading) -> list[str]:
+    """Where the tip is, in the words of the sensor frame, and where the indenter presses."""
+    x, y, z = (1e3 * float(value) for value in reading.position)
+    along = "distal" if x >= 0.0 else "proximal"
+    above = "dorsal" if z >= 0.0 else "ventral"
+    side = "+y" if y >= 0.0 else "-y"
+    w, qx, qy, qz = (float(part) for part in reading.orientation)
+    presses = (2 * (qx * qz + w * qy), 2 * (qy * qz - w * qx), 1 - 2 * (qx * qx + qy * qy))
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, presses[2]))))
+    contact = {None: "contact not known", True: "touches", False: "does not touch"}
+    touching = None if reading.in_contact is None else bool(reading.in_contact)
+    return [
+        f"tip     {x:+8.2f} {y:+8.2f} {z:+8.2f} mm: {abs(x):.1f} {along}, {abs(y):.1f} to {side}, "
+        f"{abs(z):.1f} {above} of the sensor frame's origin",
+        "presses "
+        + " ".join(f"{round(part, 3) + 0.0:+8.3f}" for part in presses)
+        + f": {tilt:.1f} deg from +z",
+        f"{reading.indenter}, {contact[touching]}",
+    ]
 
 
 def _rounded(values: Any) -> list[float]:

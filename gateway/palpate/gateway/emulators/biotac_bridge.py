@@ -2,7 +2,7 @@
 
 Written from the page and the byte table of the format, with a COBS and a CRC of its own. What they
 leave open is decided here: one sequence counts the packets of all types; a HELLO and a STATUS carry
-the time of the next slot; silence and unplugging lose packets that were counted.
+the time of the next slot; what is not sent has been counted.
 """
 
 from __future__ import annotations
@@ -13,9 +13,19 @@ import time
 from collections.abc import Sequence
 from typing import ClassVar
 
-from palpate.gateway.emulators.biotac_can import COMMANDS, PAC_COMMAND, CountSource, idle_counts
-from palpate.gateway.emulators.emulator import Emulator
+from palpate.gateway.emulators.biotac_slots import (
+    ELECTRODES,
+    WORD_FAULTS,
+    CountSource,
+    SlotBlocks,
+    idle_counts,
+    round_of,
+)
+from palpate.gateway.emulators.crc16 import crc16_x25
+from palpate.gateway.emulators.emulator import Emulator, tell_lead
 from palpate.gateway.emulators.serial_line import SerialLine
+
+__all__ = ["HELLO", "SLOTS", "STATUS", "BiotacBridgeEmulator", "crc16_x25", "stuffed"]
 
 HELLO, SLOTS, STATUS = 1, 2, 3
 """Types of packets."""
@@ -24,12 +34,25 @@ SLOTS_PER_PACKET = (22, 44)
 """Fewest and most slots of a packet: 5 to 10 ms."""
 
 _VERSION = 1
-_DRIFT = 200e-6
-_WORD_FAULTS = ("parity", "absent", "error_word", "saturated", "stuck")
+_TICK_S = 1e-3
+_STOPPED_S = 1.0
 
 
 class BiotacBridgeEmulator(Emulator):
     """The bridge and its fingers.
+
+    Faults of words: ``SlotBlocks.with_faults``; the first two are also counted in the next STATUS.
+    Faults of packets with slots, and of the line:
+
+    * ``crc``: one bit of each packet is wrong;
+    * ``cut``: packets come without their ends, and take the next one with them;
+    * ``junk``: noise comes before each;
+    * ``lost``: they do not come; ``overrun``: the same, and the next STATUS counts their slots;
+    * ``repeated``: each comes twice;
+    * ``silence``: nothing comes, and the sampling goes on;
+    * ``unplug``: the line is gone; when it is back, numbers and times have gone on;
+    * ``restart``: nothing comes, then all of it begins anew: numbers, time, the round, HELLO;
+    * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
 
     Args:
         fingers: Fingers that it samples.
@@ -41,15 +64,17 @@ class BiotacBridgeEmulator(Emulator):
         slot_rate_hz: Slots each second.
         slots_per_packet: Slots of a packet, 22..44.
         pac_first: Whether a sampling round begins with PAC.
+        electrodes: 19, or 24 of the BioTac SP.
         hello_s: Time between two HELLOs [s].
         status_s: Time between two STATUSes [s].
         sequence: Number of the first packet after the start.
         clock_us: Its clock at the start [us].
+        drift_ppm: How much too fast its clock is while it drifts [1e-6].
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
-        "crc cut junk lost repeated silence restart unplug clock_drift".split()
-    ) | frozenset(_WORD_FAULTS)
+        "crc cut junk lost overrun repeated silence restart unplug clock_drift".split()
+    ) | frozenset(WORD_FAULTS)
 
     def __init__(
         self,
@@ -63,10 +88,12 @@ class BiotacBridgeEmulator(Emulator):
         slot_rate_hz: float = 4400.0,
         slots_per_packet: int = 44,
         pac_first: bool = False,
+        electrodes: int = ELECTRODES,
         hello_s: float = 2.0,
         status_s: float = 1.0,
         sequence: int = 0,
         clock_us: int = 0,
+        drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(slot_rate_hz)
         fewest, most = SLOTS_PER_PACKET
@@ -75,13 +102,14 @@ class BiotacBridgeEmulator(Emulator):
         self._fingers, self._counts, self._source = fingers, counts, source
         self._serials = serials or [f"BT-EMU-{finger + 1}" for finger in range(fingers)]
         self._line = SerialLine(baud, path)
-        self._order = _order(pac_first=pac_first)
+        order = round_of(electrodes, pac_first=pac_first)
+        self._round, self._slots = len(order), SlotBlocks(counts, fingers, order)
         self._together = slots_per_packet
         self._hello_slots = max(1, round(hello_s * slot_rate_hz))
         self._status_slots = max(1, round(status_s * slot_rate_hz))
+        self._drift = drift_ppm * 1e-6
         self._random = random.Random(4)
-        self.parity_errors = [0] * fingers
-        self.error_words = 0
+        self._began_s = self._due_s = 0.0
         self._boot()
         self._sequence, self._clock_us = sequence, float(clock_us)
 
@@ -93,11 +121,9 @@ class BiotacBridgeEmulator(Emulator):
     def _boot(self) -> None:
         self._slot = self._sequence = 0
         self._clock_us = 0.0
-        self._began_s = time.monotonic()
         self.parity_errors = [0] * self._fingers
-        self.error_words = 0
-        self._next_hello = 0
-        self._next_status = self._status_slots
+        self.error_words = self.overruns = 0
+        self._next_hello, self._next_status = 0, self._status_slots
 
     def _listen(self) -> None:
         self._line.plug()
@@ -106,106 +132,107 @@ class BiotacBridgeEmulator(Emulator):
         self._line.close()
 
     def _serve(self) -> None:
-        self._began_s = time.monotonic()
-        self._line.write(b"\0")  # ends whatever noise the start has made
+        # The next slot is sampled at this time.
+        self._began_s = self._due_s = time.monotonic()
+        tell_lead(self._counts, self._began_s)
+        starts = True
         while not self._stop.is_set():
             self._line.keep_plugged(not self.faulty("unplug"))
+            now_s = time.monotonic()
             if self.faulty("restart"):
                 self._boot()
-                self._line.write(b"\0")
-            due = int((time.monotonic() - self._began_s) * self.rate_hz)
-            if due - self._slot > self.rate_hz:  # the process was stopped for more than a second
-                self._began_s += (due - self._slot) / self.rate_hz
-            while self._slot + self._together <= due and not self._stop.is_set():
+                self._due_s, starts = now_s, True
+                self._stop.wait(_TICK_S)
+                continue
+            if starts:
+                self._line.write(b"\0")  # ends whatever noise the start has made
+                starts = False
+            drift = self._drift if self.faulty("clock_drift") else 0.0
+            step_s = 1.0 / (self.rate_hz * (1.0 + drift))
+            if now_s - self._due_s > _STOPPED_S:  # this process stood still
+                self._due_s = now_s
+            while now_s - self._due_s >= self._together * step_s and not self._stop.is_set():
                 self._announce()
-                self._sample()
-            self._stop.wait(1e-3)
+                self._sample(step_s)
+            self._stop.wait(_TICK_S)
 
     def _announce(self) -> None:
         """Send what is due besides slots."""
         if self._slot >= self._next_hello:
             self._next_hello = self._slot + self._hello_slots
-            body = struct.pack("<BHB", self._fingers, round(self.rate_hz), len(self._order))
+            body = struct.pack("<BHB", self._fingers, round(self.rate_hz), self._round)
             for serial in self._serials:
                 body += struct.pack("<16s4s", serial.encode("ascii"), b"0203")
-            self._send(HELLO, body)
+            self._tell(HELLO, body)
         if self._slot >= self._next_status:
             self._next_status = self._slot + self._status_slots
-            numbers = (*self.parity_errors, self.error_words, self._line.overrun)
-            self._send(STATUS, struct.pack(f"<B{len(numbers)}I", self._fingers, *numbers))
+            numbers = (*self.parity_errors, self.error_words, self.overruns)
+            self._tell(STATUS, struct.pack(f"<B{len(numbers)}I", self._fingers, *numbers))
 
-    def _sample(self) -> None:
-        clock_us = self._clock_us
-        body = bytearray([self._together, self._fingers])
-        for _ in range(self._together):
-            command, index = self._order[self._slot % len(self._order)]
-            body.append(command)
-            faults = {fault for fault in _WORD_FAULTS if self.faulty(fault)}
-            for finger in range(self._fingers):
-                body += self._word(finger, index, faults)
-            drift = _DRIFT if self.faulty("clock_drift") else 0.0
-            self._clock_us += 1e6 / self.rate_hz * (1.0 + drift)
-            self._slot += 1
-        self._send(SLOTS, bytes(body), clock_us)
-
-    def _word(self, finger: int, index: int, faults: set[str]) -> bytes:
-        """What a finger answers. The first has the faults of words, the last may be absent."""
-        time_s = 0.0 if "stuck" in faults else self._slot / self.rate_hz
-        value = self._counts(time_s, finger)[index]
-        if "absent" in faults and finger == self._fingers - 1:
-            return b"\x00\x00"
-        if "saturated" in faults:
-            value = 4095
-        first, second = _odd((value >> 5) << 1), _odd((value & 0x1F) << 3)
-        if "error_word" in faults and finger == 0:
-            self.error_words += 1
-            return b"\xa5\x2d"  # too little sampling delay
-        if "parity" in faults and finger == 0:
-            self.parity_errors[finger] += 1
-            first ^= 0x10
-        return bytes([first, second])
-
-    def _send(self, kind: int, body: bytes, clock_us: float | None = None) -> None:
-        sequence, self._sequence = self._sequence, (self._sequence + 1) % 2**16
-        ticks = round(self._clock_us if clock_us is None else clock_us) % 2**32
-        packet = struct.pack("<4BHI", _VERSION, kind, self._source, 0, sequence, ticks) + body
-        packet += struct.pack("<H", crc16_x25(packet))
-        if kind != SLOTS:
-            if not self.faulty("silence"):
-                self._line.write(stuffed(packet))
-            return
-        if self.faulty("silence") or self.faulty("lost"):
-            return
-        if self.faulty("crc"):
-            wrong = bytearray(packet)
-            wrong[self._random.randrange(len(wrong))] ^= 1 << self._random.randrange(8)
-            self._line.write(stuffed(bytes(wrong)))
-        elif self.faulty("cut"):
-            # Without its end it takes the next packet with it.
-            self._line.write(stuffed(packet)[: self._random.randrange(1, len(packet))])
-        elif self.faulty("junk"):
-            noise = self._random.randbytes(self._random.randint(1, 60)) + b"\0"
-            self._line.write(noise + stuffed(packet))
-            self.sent += self._together
-        else:
+    def _tell(self, kind: int, body: bytes) -> None:
+        packet = self._packet(kind, body)
+        if not self.faulty("silence"):
             self._line.write(stuffed(packet))
-            self.sent += self._together
+
+    def _sample(self, step_s: float) -> None:
+        time_s = self._due_s - self._began_s
+        payloads = self._slots.block(self._slot, self._together, time_s, step_s)
+        if not self.sound:
+            for k in range(self._together):
+                wrong = {fault for fault in WORD_FAULTS if self.faulty(fault)}
+                if wrong:
+                    self._count(wrong)
+                    at_s = time_s + k * step_s
+                    payloads[k] = self._slots.with_faults(self._slot + k, at_s, wrong)
+        body = bytes([self._together, self._fingers]) + b"".join(payloads)
+        self._send(self._packet(SLOTS, body))
+        self._slot += self._together
+        self._due_s += self._together * step_s
+        self._clock_us += 1e6 * self._together / self.rate_hz
+
+    def _count(self, wrong: set[str]) -> None:
+        """What the bridge sees of wrong words."""
+        if "absent" in wrong and self._fingers == 1:
+            return
+        if "error_word" in wrong:
+            self.error_words += 1
+        elif "parity" in wrong:
+            self.parity_errors[0] += 1
+
+    def _packet(self, kind: int, body: bytes) -> bytes:
+        sequence, self._sequence = self._sequence, (self._sequence + 1) % 2**16
+        ticks = round(self._clock_us) % 2**32
+        packet = struct.pack("<4BHI", _VERSION, kind, self._source, 0, sequence, ticks) + body
+        return packet + struct.pack("<H", crc16_x25(packet))
+
+    def _send(self, packet: bytes) -> None:
+        """A packet with slots."""
+        wire = stuffed(packet)
+        if not self.sound:
+            if self.faulty("silence") or self.faulty("lost"):
+                return
+            if self.faulty("overrun"):
+                self.overruns += self._together
+                return
+            if self.faulty("crc"):
+                wrong = bytearray(packet)
+                wrong[self._random.randrange(len(wrong))] ^= 1 << self._random.randrange(8)
+                self._line.write(stuffed(bytes(wrong)))
+                return
+            if self.faulty("cut"):
+                self._line.write(wire[: self._random.randrange(1, len(packet))])
+                return
+            if self.faulty("junk"):
+                noise = self._random.randbytes(self._random.randint(1, 60))
+                self._line.write(noise + b"\0")
             if self.faulty("repeated"):
-                self._line.write(stuffed(packet))
-
-
-def _odd(upper: int) -> int:
-    """A byte with an odd number of ones: the lowest bit makes it so."""
-    return upper | (upper.bit_count() + 1) % 2
-
-
-def _order(*, pac_first: bool) -> list[tuple[int, int]]:
-    """Command and place among the counts of each slot of a round."""
-    order = []
-    for index, command in enumerate(COMMANDS):
-        pair = [(command, index), (PAC_COMMAND, len(COMMANDS))]
-        order += pair[::-1] if pac_first else pair
-    return order
+                self._line.write(wire)
+        before = self._line.overrun
+        self._line.write(wire)
+        if self._line.overrun > before:
+            self.overruns += self._together
+        else:
+            self.sent += self._together
 
 
 def stuffed(packet: bytes) -> bytes:
@@ -221,13 +248,3 @@ def stuffed(packet: bytes) -> bytes:
             rest = rest[254:]
         out += bytes([len(rest) + 1]) + rest
     return bytes(out) + b"\0"
-
-
-def crc16_x25(data: bytes) -> int:
-    """CRC-16/X-25, bit by bit as it is defined: "123456789" gives 906E."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
-    return crc ^ 0xFFFF

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import random
 import struct
+import time
 from typing import ClassVar
 
-from palpate.gateway.emulators.biotac_can import CountSource, idle_counts
-from palpate.gateway.emulators.emulator import Emulator, Pace
+from palpate.gateway.emulators.biotac_slots import CountSource, idle_counts
+from palpate.gateway.emulators.emulator import Emulator, Pace, tell_lead
 from palpate.gateway.emulators.serial_line import SerialLine
 
 TICK_HZ = 40e6
@@ -21,13 +22,28 @@ TICK_HZ = 40e6
 RECORD_BYTES = 58
 """Length of a record of a run."""
 
-_DRIFT = 200e-6
 _IDLE_S = 0.02
 _LONGEST_LINE = 64
 
 
 class BiotacPic32Emulator(Emulator):
     """The board, its BioTac and its load cell.
+
+    Its format has neither a checksum nor a number, and the words have lost their parity on the
+    board: a wrong bit below 4096 cannot be seen by anybody, so there is no such fault. There are:
+
+    * ``cut``: the end of each record is missing;
+    * ``junk``: up to 57 bytes come before each;
+    * ``high_bits``: a channel of each has a number above 4095;
+    * ``lost``: records are sampled and do not come;
+    * ``repeated``: each comes twice;
+    * ``end``: the board ends the run by itself, with the all-zero record;
+    * ``silence``: nothing comes, and the clock goes on;
+    * ``unplug``: the line is gone; the run goes on;
+    * ``restart``: the board forgets the run, and its clock begins anew;
+    * ``saturated``: all channels are 4095; ``absent``: all are 0, as without a finger;
+    * ``stuck``: all channels are what they were when it began;
+    * ``clock_drift``: the core timer runs at another speed.
 
     Args:
         counts: What the finger measures.
@@ -37,11 +53,12 @@ class BiotacPic32Emulator(Emulator):
         rate_hz: Polls of all channels each second.
         ticks: Its core timer at the start.
         load_g: Load cell and reference [g].
+        drift_ppm: How much too fast its clock is while it drifts [1e-6].
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
         "cut junk lost repeated silence restart unplug clock_drift".split()
-    ) | frozenset({"high_bits", "saturated", "stuck", "end"})
+    ) | frozenset({"high_bits", "saturated", "absent", "stuck", "end"})
 
     def __init__(
         self,
@@ -53,11 +70,12 @@ class BiotacPic32Emulator(Emulator):
         rate_hz: float = 100.0,
         ticks: int = 0,
         load_g: tuple[int, int] = (0, 0),
+        drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(rate_hz)
         self._counts, self._electrodes_first = counts, electrodes_first
         self._line = SerialLine(baud, path)
-        self._load_g = load_g
+        self._load_g, self._drift = load_g, drift_ppm * 1e-6
         self._random = random.Random(32)
         self._boot()
         self._ticks = float(ticks)
@@ -84,9 +102,11 @@ class BiotacPic32Emulator(Emulator):
             self._line.keep_plugged(not self.faulty("unplug"))
             if self.faulty("restart"):
                 self._boot()
+            due_s = time.monotonic()
             if self.running:
-                pace.wait()
+                due_s = pace.wait()
                 self._pass_time(1.0 / self.rate_hz)
+            tell_lead(self._counts, due_s - self._time_s)
             self._came += self._line.read(0.0 if self.running else _IDLE_S)
             *lines, rest = self._came.split(b"\n")
             self._came = rest[-_LONGEST_LINE:]
@@ -101,7 +121,7 @@ class BiotacPic32Emulator(Emulator):
 
     def _pass_time(self, time_s: float) -> None:
         self._time_s += time_s
-        drift = _DRIFT if self.faulty("clock_drift") else 0.0
+        drift = self._drift if self.faulty("clock_drift") else 0.0
         self._ticks += time_s * TICK_HZ * (1.0 + drift)
 
     def _obey(self, line: bytes) -> None:
@@ -120,10 +140,12 @@ class BiotacPic32Emulator(Emulator):
 
     def _channels(self) -> bytes:
         """The 46 bytes of all channels."""
-        values = list(self._counts(0.0 if self.faulty("stuck") else self._time_s, 0))
-        electrodes, (pdc, tac, tdc, pac) = values[:19], values[19:]
+        values = list(self._counts(self.held(self._time_s), 0))
         if self.faulty("saturated"):
-            pac = 4095
+            values = [4095] * len(values)
+        if self.faulty("absent"):
+            values = [0] * len(values)
+        electrodes, (pdc, tac, tdc, pac) = values[:19], values[19:]
         rest = [pac, pdc, tac, tdc]
         record = [*electrodes, *rest] if self._electrodes_first else [*rest, *electrodes]
         return struct.pack("<23H", *record)

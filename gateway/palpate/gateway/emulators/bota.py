@@ -15,8 +15,11 @@ import time
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press
+from palpate.gateway.emulators.crc16 import crc16_x25
+from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press, tell_lead
 from palpate.gateway.emulators.serial_line import SerialLine
+
+__all__ = ["BAUDS", "SINCS", "Bota", "Settings", "crc16_x25"]
 
 BAUDS = (9600, 57600, 115200, 230400, 460800)
 """Speeds [bit/s] by their code."""
@@ -25,7 +28,6 @@ SINCS = (51, 64, 128, 205, 256, 512)
 """Lengths of the filter."""
 
 _SINC_PERIOD_US = 19.53125
-_DRIFT = 200e-6
 _IDLE_S = 0.02
 _STATUS = {"late": 1, "overload": 2, "error": 4, "raw": 8}
 _COMMAND = re.compile(
@@ -57,6 +59,18 @@ class Settings:
 class Bota(Emulator):
     """The sensor.
 
+    Faults:
+
+    * ``crc``: one bit of each frame is wrong; ``cut``: its end is missing; ``junk``: noise comes
+      before it; ``lost``: it does not come; ``repeated``: it comes twice;
+    * ``silence``: nothing comes, and its clock goes on;
+    * ``restart``: it boots, with its text and with its clock from 0;
+    * ``unplug``: the line is gone, and the sensor goes on;
+    * ``late``, ``overload``, ``error``, ``raw``: a bit of the status; with the last two the values
+      are wrong;
+    * ``nan``: Fz is no number; ``stuck``: frames repeat what was felt when it began;
+    * ``clock_drift``: its clock runs at another speed than its converter.
+
     Args:
         source: The load.
         baud: Its speed [bit/s].
@@ -64,10 +78,11 @@ class Bota(Emulator):
         runs_after_boot: It streams after a start; else it waits to be asked.
         boot_s: How long a start takes [s].
         clock_us: Its clock at the first sample [us].
+        drift_ppm: How much too fast its clock is while it drifts [1e-6].
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
-        "crc cut junk lost repeated silence restart unplug clock_drift nan".split()
+        "crc cut junk lost repeated silence restart unplug clock_drift nan stuck".split()
     ) | frozenset(_STATUS)
 
     def __init__(
@@ -79,9 +94,10 @@ class Bota(Emulator):
         runs_after_boot: bool = True,
         boot_s: float = 0.05,
         clock_us: int = 0,
+        drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(1e6 / (_SINC_PERIOD_US * 512))
-        self._source = source
+        self._source, self._drift = source, drift_ppm * 1e-6
         self._line = SerialLine(baud, path)
         self._runs_after_boot, self._boot_s = runs_after_boot, boot_s
         self._random = random.Random(6)
@@ -119,8 +135,7 @@ class Bota(Emulator):
             self._line.keep_plugged(not self.faulty("unplug"))
             if self.faulty("restart"):
                 self._boot()
-            if self.mode == "run":
-                self._pace.wait()
+            due_s = self._pace.wait() if self.mode == "run" else 0.0
             data = self._line.read(0.0 if self.mode == "run" else _IDLE_S)
             if self.mode == "boot":
                 self._end_boot()
@@ -130,7 +145,7 @@ class Bota(Emulator):
                 self.mode, self._came = "config", b""
                 self._say("r,0,C,0")
             elif self.mode == "run":
-                self._sample()
+                self._sample(due_s)
 
     def _end_boot(self) -> None:
         if time.monotonic() >= self._ready_s:
@@ -198,10 +213,11 @@ class Bota(Emulator):
             self.settings = replace(self.settings, offsets=numbers)
         self._say(f"r,0,{command},0")
 
-    def _sample(self) -> None:
+    def _sample(self, due_s: float) -> None:
         period_us = 1e6 / self.rate_hz
         self._time_s += period_us * 1e-6
-        self._clock_us += period_us * (1.0 + _DRIFT if self.faulty("clock_drift") else 1.0)
+        tell_lead(self._source, due_s - self._time_s)
+        self._clock_us += period_us * (1.0 + self._drift if self.faulty("clock_drift") else 1.0)
         frame = self._frame()
         if self.faulty("silence") or self.faulty("lost"):
             return
@@ -221,10 +237,8 @@ class Bota(Emulator):
 
     def _frame(self) -> bytes:
         """The present sample."""
-        values = [
-            load + offset
-            for load, offset in zip(self._source(self._time_s), self.settings.offsets, strict=True)
-        ]
+        felt = self._source(self.held(self._time_s))
+        values = [a + b for a, b in zip(felt, self.settings.offsets, strict=True)]
         status = sum(bit for name, bit in _STATUS.items() if self.faulty(name))
         if not self.settings.calibrated:
             status |= _STATUS["raw"]
@@ -237,13 +251,3 @@ class Bota(Emulator):
             return (",".join(f"{value:.6f}" for value in values) + f",{ticks},25.5\r\n").encode()
         body = struct.pack("<H6fIf", status, *values, ticks, 25.5)
         return b"\xaa" + body + struct.pack("<H", crc16_x25(body))
-
-
-def crc16_x25(data: bytes) -> int:
-    """CRC-16/X-25, bit by bit as it is defined."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
-    return crc ^ 0xFFFF

@@ -17,7 +17,17 @@ Wrench = tuple[float, float, float, float, float, float]
 """Fx Fy Fz [N] Tx Ty Tz [N m]."""
 
 WrenchSource = Callable[[float], Sequence[float]]
-"""Wrench at a time since the start [s]."""
+"""Wrench at a time of the emulator's own [s], which counts from its start."""
+
+
+class HostTimed:
+    """A source that goes by the host's clock, so that several emulators play one scene.
+
+    Attributes:
+        lead_s: The host's monotonic time less the emulator's own [s], as its emulator tells it.
+    """
+
+    lead_s = 0.0
 
 
 class Emulator(ABC):
@@ -37,6 +47,7 @@ class Emulator(ABC):
         self.sent = 0
         """Samples that were sent whole and right."""
         self._until: dict[str, float] = {}
+        self._held_s: float | None = None
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -52,8 +63,7 @@ class Emulator(ABC):
         Raises:
             ValueError: It has no such fault.
         """
-        if fault not in self.faults:
-            raise ValueError(f"fault {fault!r} is none of {', '.join(sorted(self.faults))}")
+        self._check(fault)
         with self._lock:
             self._until[fault] = time.monotonic() + duration_s if duration_s > 0.0 else 0.0
 
@@ -66,6 +76,34 @@ class Emulator(ABC):
             if until == 0.0 or time.monotonic() >= until:
                 del self._until[fault]
             return until == 0.0 or time.monotonic() < until
+
+    def end(self, fault: str) -> None:
+        """End a fault now, or take it back if it has not come yet.
+
+        Raises:
+            ValueError: It has no such fault.
+        """
+        self._check(fault)
+        with self._lock:
+            self._until.pop(fault, None)
+
+    @property
+    def sound(self) -> bool:
+        """Whether it has no fault now, and none to come; cheap, for it is asked at each sample."""
+        return not self._until
+
+    def held(self, t: float) -> float:
+        """When to measure: now, or while the fault ``stuck`` lasts, when it began."""
+        if self.sound or not self.faulty("stuck"):
+            self._held_s = None
+            return t
+        if self._held_s is None:
+            self._held_s = t
+        return self._held_s
+
+    def _check(self, fault: str) -> None:
+        if fault not in self.faults:
+            raise ValueError(f"fault {fault!r} is none of {', '.join(sorted(self.faults))}")
 
     def start(self) -> None:
         """Begin to serve; the address is valid afterwards."""
@@ -101,6 +139,17 @@ class Emulator(ABC):
         self.stop()
 
 
+def tell_lead(source: object, lead_s: float) -> None:
+    """Tell a source that goes by the host's clock how far that is ahead of the emulator's [s]."""
+    if isinstance(source, HostTimed):
+        source.lead_s = lead_s
+
+
+def no_load(t: float) -> Wrench:
+    """Nothing is felt."""
+    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 def slow_press(t: float) -> Wrench:
     """A wrench that changes slowly: a press of 4 N every five seconds, with some shear."""
     share = max(0.0, 1.0 - abs(t % 5.0 - 2.5) / 1.5)
@@ -117,13 +166,16 @@ class Pace:
 
     def __init__(self, rate_hz: float, stop: threading.Event) -> None:
         self._period_s, self._stop = 1.0 / rate_hz, stop
+        self.fast = 0.0
+        """Share by which it is faster than its rate."""
         self._next_s = time.monotonic()
 
-    def wait(self) -> None:
-        """Until the next tick, or until told to stop."""
-        self._next_s += self._period_s
+    def wait(self) -> float:
+        """Until the next tick, or until told to stop; when it was due [s, monotonic]."""
+        self._next_s += self._period_s / (1.0 + self.fast)
         left_s = self._next_s - time.monotonic()
         if left_s > 0.0:
             self._stop.wait(left_s)
         elif left_s < -0.5:
             self._next_s = time.monotonic()
+        return self._next_s

@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press
+from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press, tell_lead
 
 _CALL = re.compile(r"([A-Z][A-Z0-9]*)\((.*)\)")
 _AT_ONCE = 4096
@@ -35,17 +35,29 @@ _RANGE = np.array([120.0] * 3 + [3.0] * 3)
 class Kms40Emulator(Emulator):
     """Serves one client at a time; as in the device, what is set outlives a connection.
 
+    Faults:
+
+    * ``cut``: the second half of each line is missing, its end too; ``junk``: noise before it;
+    * ``lost``: lines do not come; ``repeated``: each comes twice;
+    * ``nan``: the values are no numbers; ``stuck``: they repeat what was felt when it began;
+    * ``silence``: nothing comes, no answer either; ``stopped``: it streams no more until asked;
+    * ``restart``: the connection is reset, and nothing that was set is remembered;
+    * ``unplug``: nobody listens at its address;
+    * ``overload``, ``error``: a flag says so: the range of Fz, a fault of the calibration;
+    * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
+
     Args:
         source: What it feels.
         host: Address to listen at.
         port: 0 = any free one.
         serial: Its serial number.
         stamped: Data lines end with the device's time.
+        drift_ppm: How much too fast its clock is while it drifts [1e-6].
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
-        {"cut", "junk", "silence", "stopped", "restart", "unplug", "overload", "error", "nan"}
-    )
+        "cut junk lost repeated nan stuck silence stopped restart unplug overload error".split()
+    ) | {"clock_drift"}
 
     def __init__(
         self,
@@ -55,10 +67,11 @@ class Kms40Emulator(Emulator):
         port: int = 0,
         serial: int = 310042,
         stamped: bool = True,
+        drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(rate_hz=500.0)
         self._source, self._serial, self._stamped = source, serial, stamped
-        self._host, self._port = host, port
+        self._host, self._port, self._drift = host, port, drift_ppm * 1e-6
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
         self._incoming = b""
@@ -106,8 +119,10 @@ class Kms40Emulator(Emulator):
     def _serve(self) -> None:
         pace = Pace(self.rate_hz, self._stop)
         while not self._stop.is_set():
-            pace.wait()
+            pace.fast = self._drift if self.faulty("clock_drift") else 0.0
+            due_s = pace.wait()
             self._ticks += 1
+            tell_lead(self._source, due_s - self._ticks / self.rate_hz)
             if self.faulty("restart"):
                 self._restart()
             if self.faulty("unplug"):
@@ -162,7 +177,7 @@ class Kms40Emulator(Emulator):
             client.sendall(self.answer(line.decode("latin-1").strip()).encode("ascii") + b"\n")
 
     def _stream(self, client: socket.socket) -> None:
-        if self.faulty("silence"):
+        if self.faulty("silence") or self.faulty("lost"):
             return
         line = self._data_line().encode("ascii")
         if self.faulty("cut"):
@@ -175,6 +190,8 @@ class Kms40Emulator(Emulator):
             return
         client.sendall(line + b"\n")
         self.sent += 1
+        if self.faulty("repeated"):
+            client.sendall(line + b"\n")
 
     def answer(self, line: str) -> str:
         """The reply to one request, both without their line ends."""
@@ -230,7 +247,7 @@ class Kms40Emulator(Emulator):
         return f"{name}={{{values}}}" if name == "LMASK" else f"{name}={values}"
 
     def _felt(self) -> np.ndarray:
-        return np.asarray(self._source(self._ticks / self.rate_hz), np.float64)
+        return np.asarray(self._source(self.held(self._ticks / self.rate_hz)), np.float64)
 
     def _data_line(self) -> str:
         values = self._felt() - (0.0 if self._tare is None else self._tare)

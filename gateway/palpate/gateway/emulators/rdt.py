@@ -12,68 +12,22 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press
+from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press, tell_lead
+from palpate.gateway.emulators.rdt_products import LATCHED, PRODUCTS, page
 from palpate.gateway.emulators.web_page import WebPage
 
-_STOP, _START_ONE, _START, _START_MANY = 0x0000, 0x0001, 0x0002, 0x0003
+__all__ = ["LATCHED", "RdtEmulator", "record"]
+
+_STOP, _START_MANY = 0x0000, 0x0003
 _RESET_LATCH, _BIAS, _FILTER, _PERIOD = 0x0041, 0x0042, 0x0081, 0x0082
 _HEADER = 0x1234
 _REQUEST = struct.Struct(">HHI")
 _RECORD = struct.Struct(">IIIiiiiii")
-_FAST = 1.0 + 200e-6
 _MOST_REQUESTS = 64
-
-
-@dataclass(frozen=True, slots=True)
-class _Product:
-    """How one product differs from the others."""
-
-    name: str
-    rate_hz: float
-    counter_hz: float
-    starts: tuple[int, ...]
-    overload: int
-    error: int
-    has_page: bool = True
-
-
-_ANY_ERROR = 1 << 31
-
-_PRODUCTS = {
-    "netft": _Product(
-        "Net F/T",
-        rate_hz=1000.0,
-        counter_hz=7000.0,
-        starts=(_START, _START_MANY),
-        overload=_ANY_ERROR | 1 << 17,
-        error=_ANY_ERROR | 1 << 28,
-    ),
-    "axia": _Product(
-        "Ethernet Axia",
-        rate_hz=1000.0,
-        counter_hz=7912.0,
-        starts=(_START_ONE, _START, _START_MANY),
-        overload=_ANY_ERROR | 1 << 30,
-        error=_ANY_ERROR | 1 << 2,
-    ),
-    "hex": _Product(
-        "HEX",
-        rate_hz=100.0,
-        counter_hz=1000.0,
-        starts=(_START,),
-        overload=1 << 6,
-        error=1 << 10,
-        has_page=False,
-    ),
-}
-
-LATCHED = _ANY_ERROR | 1 << 16
-"""Status of a Net F/T whose threshold was passed once; the data is good."""
 
 
 def record(rdt_sequence: int, ft_sequence: int, status: int, counts: Sequence[int]) -> bytes:
@@ -85,6 +39,19 @@ def record(rdt_sequence: int, ft_sequence: int, status: int, counts: Sequence[in
 
 class RdtEmulator(Emulator):
     """Sends to whoever asked last.
+
+    Faults:
+
+    * ``lost``: records do not come, and their numbers are missing; ``repeated``: each datagram
+      comes twice; ``late``: records are held back until one comes after them;
+    * ``cut``: datagrams come halved; ``junk``: others of odd lengths come before them;
+    * ``silence``: nothing comes, and nobody is heard; ``deaf``: only the latter;
+    * ``restart``: the stream, the zero and the counter are forgotten;
+    * ``unplug``: nobody listens at its address; the stream goes on afterwards;
+    * ``overload``, ``error``: bits of the status, the latter with all loads zero; ``latched``: the
+      status of a threshold that was passed, until it is reset;
+    * ``stuck``: records repeat what was felt when it began;
+    * ``clock_drift``: the internal counter runs at another speed than the records.
 
     Args:
         product: ``netft``, ``axia`` or ``hex``.
@@ -98,12 +65,13 @@ class RdtEmulator(Emulator):
         units: Force and torque unit on the page, each with its worth [N] and [N m].
         together: Records in a datagram where the start request asks for several.
         first_counter: The internal counter at power-up.
+        drift_ppm: How much too fast the counter is while it drifts [1e-6].
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
         {
             *("cut", "junk", "lost", "repeated", "late", "silence", "deaf", "restart", "unplug"),
-            *("overload", "error", "latched", "clock_drift"),
+            *("overload", "error", "latched", "stuck", "clock_drift"),
         }
     )
 
@@ -121,15 +89,16 @@ class RdtEmulator(Emulator):
         units: tuple[tuple[str, float], tuple[str, float]] = (("N", 1.0), ("Nm", 1.0)),
         together: int = 10,
         first_counter: int = 0,
+        drift_ppm: float = 200.0,
     ) -> None:
-        self._product = _PRODUCTS[product]
+        self._product = PRODUCTS[product]
         super().__init__(rate_hz or self._product.rate_hz)
         self._counter_hz = counter_hz or self._product.counter_hz
         self._source, self._together, self._first_counter = source, together, first_counter
-        self._host, self._port = host, port
+        self._host, self._port, self._drift = host, port, drift_ppm * 1e-6
         self.page = WebPage(host, http_port, "/netftapi2.xml")
         if self._product.has_page:
-            self.page.content = _page(self._product.name, counts_per, (units[0][0], units[1][0]))
+            self.page.content = page(self._product.name, counts_per, (units[0][0], units[1][0]))
             force, torque = counts_per[0] / units[0][1], counts_per[1] / units[1][1]
         else:
             force, torque = 10_000.0, 100_000.0
@@ -181,14 +150,15 @@ class RdtEmulator(Emulator):
         self._set_rate(self.rate_hz)
         began_s = time.monotonic()
         while not self._stop.is_set():
-            self._pace.wait()
+            due_s = self._pace.wait()
             step_s = 1.0 / self.rate_hz
             behind_s = time.monotonic() - began_s - self._elapsed_s
             if behind_s > 0.6:
                 # This process stood still; a device's clock would not have.
                 step_s = behind_s
             self._elapsed_s += step_s
-            self._counter_s += step_s * (_FAST if self.faulty("clock_drift") else 1.0)
+            tell_lead(self._source, due_s - self._elapsed_s)
+            self._counter_s += step_s * (1.0 + self._drift * self.faulty("clock_drift"))
             if self.faulty("restart"):
                 self._power_up()
             if self.faulty("unplug"):
@@ -278,17 +248,4 @@ class RdtEmulator(Emulator):
         return record(self._sequence, ticks, status, [int(count) for count in counts])
 
     def _felt(self) -> np.ndarray:
-        return np.asarray(self._source(self._elapsed_s), np.float64)
-
-
-def _page(product: str, counts_per: tuple[float, float], units: tuple[str, str]) -> bytes:
-    """The device's facts as its own web server tells them; only the tags that the reference has."""
-    tags = {
-        "prodname": product,
-        "cfgcpf": f"{counts_per[0]:.10g}",
-        "cfgcpt": f"{counts_per[1]:.10g}",
-        "scfgfu": units[0],
-        "scfgtu": units[1],
-    }
-    inside = "\n".join(f"<{tag}>{value}</{tag}>" for tag, value in tags.items())
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n<netft>\n{inside}\n</netft>\n'.encode()
+        return np.asarray(self._source(self.held(self._elapsed_s)), np.float64)

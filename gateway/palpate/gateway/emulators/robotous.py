@@ -1,193 +1,42 @@
-"""A Robotous RFT in software, on a serial line or on CAN (hardware reference 3.5).
-
-What the page leaves open is decided here: requests that the page does not name, and requests with
-a wrong sum, get no answer; settings other than speed and identifiers return to their defaults at a
-restart; request 4 and the reply to 5 carry the three identifiers in D2, D3 and D4.
-"""
+"""A Robotous RFT in software, on a serial line or on CAN (hardware reference 3.5)."""
 
 from __future__ import annotations
 
-import random
-from abc import abstractmethod
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from palpate.gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press
+from palpate.gateway.emulators.can_errors import BUS_OFF, RESTARTED, error_frame
+from palpate.gateway.emulators.emulator import WrenchSource, slow_press
+from palpate.gateway.emulators.robotous_sensor import BAUDS, MOST_HZ, TORQUE_DIVISORS, Robotous
 from palpate.gateway.emulators.serial_line import SerialLine
 from palpate.protos.extras import require
 
-FORCE_DIVISOR = 50.0
-"""Counts per N, all models."""
-
-TORQUE_DIVISORS = {
-    **dict.fromkeys(("RFT40-SA01", "RFT44-SB01", "RFT60-HA01", "RFT64-SB01", "RFT76-HA01"), 2000.0),
-    **dict.fromkeys(("RFT80-6A01", "RFT82-HA02"), 1000.0),
-}
-"""Counts per N m."""
-
-_RATES_HZ = (200, 10, 20, 50, 100, 200, 333, 500, 1000)
-_BAUDS = (115200, 921600, 460800, 230400, 115200, 57600)
-_MOST_HZ = {921600: 1000, 460800: 500, 230400: 500, 115200: 333, 57600: 200}
-_OK, _OUT_OF_RANGE = b"\x01", b"\x00\x02"
-_FX_OVERLOADED = 0b100000
-_NO_LOAD: Sequence[float] = (0.0,) * 6
-_IDLE_S = 0.02
-
-
-class Robotous(Emulator):
-    """What both kinds of line share: the requests, the settings, the samples.
-
-    Args:
-        source: The load.
-        model: One of ``TORQUE_DIVISORS``, which is also what it answers.
-        serial: Its serial number.
-    """
-
-    def __init__(
-        self, source: WrenchSource = slow_press, model: str = "RFT64-SB01", serial: str = "RFT-1"
-    ) -> None:
-        super().__init__(_RATES_HZ[0])
-        self._source, self._model, self._serial = source, model, serial
-        self._scale = 3 * (FORCE_DIVISOR,) + 3 * (TORQUE_DIVISORS[model],)
-        self._time_s = 0.0
-        self._random = random.Random(5)
-        self.ids = self._new_ids = (0x64, 0x01, 0x02)
-        """CAN identifiers: of requests, of the first and of the second half of answers."""
-        self.baud_code = 0
-        self._most_hz = 1000
-        self._power_up()
-
-    def _power_up(self) -> None:
-        """The state after power came; silent until asked."""
-        self.running = False
-        self.filter_code = (0, 0)
-        self.ids = self._new_ids
-        self._bias = _NO_LOAD
-        self._overloads = [0] * 6
-        self._set_rate(0)
-
-    def _set_rate(self, code: int) -> None:
-        self.rate_code, self.rate_hz = code, float(_RATES_HZ[code])
-        self._pace = Pace(self.rate_hz, self._stop)
-
-    def _serve(self) -> None:
-        while not self._stop.is_set():
-            if self.running:
-                self._pace.wait()
-            requests = self._requests(0.0 if self.running else _IDLE_S)
-            if self.faulty("restart"):
-                self._power_up()
-                continue
-            for request in requests:
-                self._answer(request)
-            self._time_s += 1.0 / self.rate_hz if self.running else _IDLE_S
-            if self.running:
-                self._sample()
-
-    def _answer(self, request: bytes) -> None:
-        command, value, more = request[0], request[1], request[2]
-        if self.running and command not in (12, 16, 17):
-            return
-        if command == 10:
-            self._send(self._data(command))
-        elif command in (11, 12):
-            self.running = command == 11
-            self._pace = Pace(self.rate_hz, self._stop)
-        elif command == 17:
-            self._bias = self._source(self._time_s) if value == 1 else _NO_LOAD
-        else:
-            told = self._told(command)
-            if command in (4, 6, 8, 15):
-                told = _OK if self._set(command, value, more, request[3]) else _OUT_OF_RANGE
-            if told is not None:
-                self._send(bytes([command]) + told[:15].ljust(15, b"\0"))
-
-    def _told(self, command: int) -> bytes | None:
-        """The answer to a request that only asks."""
-        return {
-            1: self._model.encode("ascii"),
-            2: self._serial.encode("ascii"),
-            3: b"1.7",
-            5: bytes(self.ids),
-            7: bytes([self.baud_code]),
-            9: bytes(self.filter_code),
-            16: bytes([self.rate_code]),
-            18: bytes(min(count, 255) for count in self._overloads),
-        }.get(command)
-
-    def _set(self, command: int, value: int, more: int, most: int) -> bool:
-        """Take a setting; whether it is in its range."""
-        if command == 4 and value and more and most:
-            self._new_ids = (value, more, most)
-        elif command == 6 and value < len(_BAUDS):
-            self.baud_code = value
-        elif command == 8 and value <= 1 and value <= more <= 14:
-            self.filter_code = (value, more)
-        elif command == 15 and value < len(_RATES_HZ) and _RATES_HZ[value] <= self._most_hz:
-            self._set_rate(value)
-        else:
-            return False
-        return True
-
-    def _data(self, command: int) -> bytes:
-        """D1..D16 of a data frame."""
-        status = _FX_OVERLOADED if self.faulty("overload") else 0
-        self._overloads[0] += status == _FX_OVERLOADED
-        loads = zip(self._source(self._time_s), self._bias, self._scale, strict=True)
-        counts = [round((load - bias) * scale) for load, bias, scale in loads]
-        limited = [min(max(count, -0x8000), 0x7FFF) for count in counts]
-        fields = b"".join(count.to_bytes(2, "big", signed=True) for count in limited)
-        return bytes([command]) + fields + bytes([status, 0, 0])
-
-    def _sample(self) -> None:
-        data = self._data(11)
-        if self.faulty("silence") or self.faulty("lost"):
-            return
-        if self.faulty("junk"):
-            self._spoil("junk", data)
-        for fault in ("cut", "crc", "busoff"):
-            if fault in self.faults and self.faulty(fault):
-                self._spoil(fault, data)
-                return
-        self._send(data)
-        self.sent += 1
-        if self.faulty("repeated"):
-            self._send(data)
-
-    @abstractmethod
-    def _requests(self, timeout_s: float) -> list[bytes]:
-        """D1..D8 of the requests that came."""
-
-    @abstractmethod
-    def _send(self, data: bytes) -> None:
-        """Send D1..D16."""
-
-    @abstractmethod
-    def _spoil(self, fault: str, data: bytes) -> None:
-        """Send what a fault makes of D1..D16, or before them."""
+__all__ = ["TORQUE_DIVISORS", "Robotous", "RobotousCan", "RobotousSerial"]
 
 
 class RobotousSerial(Robotous):
     """An RFT with a UART.
 
+    Besides the faults of every ``Robotous``: ``crc``, one bit of each frame is wrong, and
+    ``unplug``, the line is gone while the sensor goes on.
+
     Args:
         source: The load.
         baud: Its speed [bit/s].
         path: Name of the line; "" = a new one.
-        identity: Model and serial number.
+        more: Model, serial number, drift.
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
-        "crc cut junk lost repeated silence restart unplug overload".split()
+        "crc cut junk lost repeated silence restart unplug overload stuck clock_drift".split()
     )
 
     def __init__(
-        self, source: WrenchSource = slow_press, baud: int = 115200, path: str = "", **identity: str
+        self, source: WrenchSource = slow_press, baud: int = 115200, path: str = "", **more: Any
     ) -> None:
         self._line = SerialLine(baud, path)
         self._came = b""
-        super().__init__(source, **identity)
-        self.baud_code = _BAUDS.index(baud)
+        super().__init__(source, **more)
+        self.baud_code = BAUDS.index(baud)
         self._power_up()
 
     @property
@@ -204,8 +53,8 @@ class RobotousSerial(Robotous):
     def _power_up(self) -> None:
         super()._power_up()
         self._came = b""
-        self._line.baud = _BAUDS[self.baud_code]
-        self._most_hz = _MOST_HZ[self._line.baud]
+        self._line.baud = BAUDS[self.baud_code]
+        self._most_hz = MOST_HZ[self._line.baud]
 
     def _requests(self, timeout_s: float) -> list[bytes]:
         self._line.keep_plugged(not self.faulty("unplug"))
@@ -235,15 +84,20 @@ class RobotousSerial(Robotous):
 class RobotousCan(Robotous):
     """An RFT on CAN.
 
+    Besides the faults of every ``Robotous``: ``busoff``, an error frame says that the controller is
+    off the bus, then nothing is heard or said, and at the end another says that it was started
+    again, and the sensor has gone on; ``unplug``: the same without a word, but its supply is gone,
+    too, and it has to be asked again.
+
     Args:
         source: The load.
         interface: python-can's kind of bus.
         channel: The bus.
-        identity: Model and serial number.
+        more: Model, serial number, drift.
     """
 
     faults: ClassVar[frozenset[str]] = frozenset(
-        "cut junk lost repeated silence restart overload busoff".split()
+        "cut junk lost repeated silence restart unplug overload stuck clock_drift busoff".split()
     )
 
     def __init__(
@@ -252,9 +106,10 @@ class RobotousCan(Robotous):
         *,
         interface: str = "virtual",
         channel: str = "robotous",
-        **identity: str,
+        **more: Any,
     ) -> None:
-        super().__init__(source, **identity)
+        super().__init__(source, **more)
+        self._off = False
         self._where = {"interface": interface, "channel": channel}
         self._can: Any = require("can", extra="gateway")
         self._bus: Any = None
@@ -271,10 +126,19 @@ class RobotousCan(Robotous):
         self._bus.shutdown()
 
     def _requests(self, timeout_s: float) -> list[bytes]:
+        off, self._off = self._off, self.faulty("busoff")
+        if off != self._off:
+            self._bus.send(error_frame(self._can, BUS_OFF if self._off else RESTARTED))
+        unplugged = self.faulty("unplug")
+        if unplugged:
+            self._power_up()
+        self._away = self._off or unplugged
         out = []
         message = self._bus.recv(timeout_s)
         while message is not None:
-            if message.arbitration_id == self.ids[0] and len(message.data) == 8:
+            if self._away:
+                pass
+            elif message.arbitration_id == self.ids[0] and len(message.data) == 8:
                 out.append(bytes(message.data))
             message = self._bus.recv(0.0)
         return out
@@ -284,10 +148,7 @@ class RobotousCan(Robotous):
         self._put(self.ids[2], data[8:])
 
     def _spoil(self, fault: str, data: bytes) -> None:
-        if fault == "busoff":
-            # A controller tells its host once, then nothing gets through.
-            self._bus.send(self._can.Message(is_error_frame=True))
-        elif fault == "junk":
+        if fault == "junk":
             # Frames of others, and one of a wrong length with an identifier of ours.
             self._put(self._random.randint(0x100, 0x7FF), self._random.randbytes(8))
             self._put(self.ids[1], self._random.randbytes(self._random.randint(0, 7)))

@@ -27,6 +27,11 @@ _SPEEDS = {
 """Speeds [bit/s] by the code that a terminal's settings hold."""
 
 
+def speeds() -> list[int]:
+    """Speeds that a line can have [bit/s]."""
+    return sorted(set(_SPEEDS.values()) - {0})
+
+
 class SerialLine:
     """A line to one host.
 
