@@ -1,0 +1,110 @@
+"""Robot poses in a palpate record, made into poses of the tip anew."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.gateway.drivers import make_device
+from palpate.gateway.readings import PoseReading
+from palpate.protos.errors import ConfigError, RecordingError
+from palpate.protos.messages import RobotPoseFrame
+from palpate.protos.record import RecordWriter
+from palpate.protos.topics import ROBOT_POSE, sensor_key
+
+fakes: Any = importlib.import_module("pose_fakes")
+WALL_NS = 1_700_000_000_000_000_000
+
+
+def write(path: Path, frames: Iterable[RobotPoseFrame], *, period_ns: int = 4_000_000) -> Path:
+    """A record in which each pose was received after a period, with a delay of 1 ms."""
+    with RecordWriter(path) as writer:
+        for number, frame in enumerate(frames):
+            writer.write(
+                sensor_key("lab", frame.robot, ROBOT_POSE.name),
+                ROBOT_POSE.codec.schema,
+                ROBOT_POSE.codec.encode(frame),
+                log_time_ns=WALL_NS + 1_000_000 + period_ns * number,
+            )
+            if number % 50 == 49:
+                writer.flush()  # as time does it
+    return path
+
+
+def drain(path: Path, **options: Any) -> tuple[list[PoseReading], dict[str, int], int | None]:
+    with make_device("pose_file", {"path": path, **fakes.BENCH, **options}) as device:
+        readings: list[PoseReading] = []
+        while got := device.read(1.0):
+            readings += [r for r in got if isinstance(r, PoseReading)]
+        counters = {name: n for name, n in device.counters.items() if n}
+        return readings, counters, device.identity.start_wall_ns
+
+
+def test_recorded_poses_become_the_tip(tmp_path: Path) -> None:
+    frames = [fakes.frame(n, wall_ns=WALL_NS + n) for n in range(1, 201) if n != 100]
+    readings, counters, start_wall_ns = drain(write(tmp_path / "a.mcap", frames))
+    assert fakes.numbers(readings) == [n for n in range(1, 201) if n != 100]
+    assert counters == {"samples": 199, "lost_poses": 1}
+    assert [r.missed_before for r in readings if r.missed_before] == [1]
+    np.testing.assert_allclose(np.diff([r.time_s for r in readings[:99]]), 0.004, atol=1e-9)
+    assert readings[99].tick == 101
+    assert start_wall_ns == WALL_NS + 1, "by the robot's clock, not by the recorder's"
+
+
+def test_another_placement_moves_the_tip(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [fakes.frame(n) for n in range(1, 11)])
+    nearer = {**fakes.BENCH["base_sensor"]}
+    before, _, start_wall_ns = drain(path)
+    x, y, z = nearer["position_m"]
+    after, _, _ = drain(path, base_sensor={**nearer, "position_m": (x, y, z + 0.001)})
+    moved = [np.linalg.norm(b.position - a.position) for a, b in zip(before, after, strict=True)]
+    np.testing.assert_allclose(moved, 0.001, atol=1e-12)
+    assert start_wall_ns == WALL_NS + 1_000_000, "the recorder's, where the robot tells none"
+
+
+def test_a_program_that_began_anew_goes_on_by_the_recorders_clock(tmp_path: Path) -> None:
+    frames = [fakes.frame(n) for n in range(1, 11)]
+    frames += [fakes.frame(n, run_id=8, time_ns=4_000_000 * n) for n in range(1, 11)]
+    readings, counters, _ = drain(write(tmp_path / "a.mcap", frames))
+    assert counters == {"samples": 20, "restarts": 1}
+    times = [reading.time_s for reading in readings]
+    np.testing.assert_allclose(times, 0.004 * np.arange(20), atol=1e-9)
+
+
+def test_one_of_several_robots(tmp_path: Path) -> None:
+    frames = [fakes.frame(n, robot=robot) for n in range(1, 6) for robot in ("left", "right")]
+    path = write(tmp_path / "a.mcap", frames)
+    with pytest.raises(ConfigError, match="holds 2 robots: left, right -> choose one"):
+        drain(path)
+    readings, _, _ = drain(path, robot="right")
+    assert len(readings) == 5
+    with pytest.raises(RecordingError, match="holds no poses of a robot"):
+        drain(path, robot="middle")
+
+
+def test_a_record_of_something_else(tmp_path: Path) -> None:
+    with RecordWriter(tmp_path / "a.mcap") as writer:
+        writer.write("palpate/@v1/lab/x/tare", "palpate.v1.Tare", b"", log_time_ns=1)
+    with pytest.raises(RecordingError, match="played by the driver record"):
+        drain(tmp_path / "a.mcap")
+    (tmp_path / "b.mcap").write_bytes(b"no record")
+    with pytest.raises(RecordingError, match="damaged"):
+        drain(tmp_path / "b.mcap")
+
+
+def test_a_cut_record_delivers_what_is_whole(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [fakes.frame(n) for n in range(1, 501)])
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    readings: list[Any] = []
+    with make_device("pose_file", {"path": path, **fakes.BENCH}) as device:
+        error = fakes.read_to_damage(device, readings)
+        assert device.read(1.0) == []
+    assert "damaged or cut off after" in error.problem
+    assert readings
+    assert fakes.numbers(readings) == list(range(1, len(readings) + 1))
