@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from palpate.gateway.timing.clock_map import ClockMap, HostTime
+from palpate.gateway.timing.clock_map import ClockMap, Heard, HostTime
 from palpate.protos.messages import Origin, Stamp
 
 
@@ -19,6 +19,11 @@ class Timed(Protocol):
     @property
     def time_s(self) -> float:
         """The device's time [s]."""
+        ...
+
+    @property
+    def heard(self) -> Heard | None:
+        """What arrived last of the device; None = this."""
         ...
 
 
@@ -38,10 +43,12 @@ class Stamps:
         """The device was opened, or opened again: another clock, the same sequences."""
         self._clock = clock
 
-    def times(self, time_s: float, arrival_ns: int) -> tuple[HostTime, int]:
+    def times(
+        self, time_s: float, arrival_ns: int, heard: Heard | None = None
+    ) -> tuple[HostTime, int]:
         """Host time of a device time [s], and when it is to be published [ns]; 0 = at once."""
         clock = self._begun()
-        times = clock.map(time_s, arrival_ns)
+        times = clock.map(time_s, arrival_ns, heard)
         return times, times.monotonic_ns if clock.paced else 0
 
     def stamp(
@@ -55,7 +62,7 @@ class Stamps:
             arrival_ns: Host monotonic clock when it arrived [ns].
             missed_before: Frames lost directly before it.
         """
-        times, due_ns = self.times(reading.time_s, arrival_ns)
+        times, due_ns = self.times(reading.time_s, arrival_ns, reading.heard)
         sequence = self._sequences.get(topic, 0) + 1
         self._sequences[topic] = sequence
         stamp = Stamp(
