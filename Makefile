@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo test check bench docs fmt proto bundle build clean
+.PHONY: help setup demo test check bench fuzz docs fmt proto bundle build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -42,6 +42,10 @@ check: $(VENV)/.dev  ## format, lint, types, borders, wire contract, house tests
 bench: $(VENV)/.dev  ## latency and throughput beside their bare floor | 2-5 min
 	$(BIN)/palpate bench e2e
 	@for bench in $(wildcard tests/benchmarks/bench_*.py); do echo "$$bench"; $(BIN)/python "$$bench"; done
+
+fuzz: $(VENV)/.dev  ## fuzz the gateway's decoders: make fuzz DECODER=kms40 SECONDS=600 | 10 min each, Linux only
+	@$(pip_install) -e '.[fuzz]' | $(show)
+	$(BIN)/python -m tests.fuzz.run $(or $(DECODER),all) --seconds $(or $(SECONDS),600)
 
 docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links | 20 s
 	$(BIN)/python docs/make_messages.py

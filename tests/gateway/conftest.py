@@ -46,7 +46,7 @@ def sequence(start: str, electrodes: list[int]) -> list[int]:
 def value_of(channel: int, frame: int, slot: int) -> int:
     """A value from which channel and frame can be told."""
     if channel == 0:
-        return 2000 + slot % 44
+        return 2000 + slot
     return 1000 + 20 * channel + frame % 10
 
 
@@ -81,10 +81,11 @@ def make_log(
 ) -> Log:
     """A log of one finger; the other ports are empty (value 0, parity bad)."""
     numbers = frame_numbers or list(range(100, 100 + frames))
+    channels = sequence(start, electrodes or ELECTRODE_IDS)
     lines = []
     for k, number in enumerate(numbers):
-        for slot, channel in enumerate(sequence(start, electrodes or ELECTRODE_IDS)):
-            time_s = (k * 44 + slot) / 4400 if style == "btd" else 0.0
+        for slot, channel in enumerate(channels):
+            time_s = (k * len(channels) + slot) / 4400 if style == "btd" else 0.0
             pairs = ["0 1"] * ports
             pairs[port - 1] = f"{value_of(channel, number, slot)} 0"
             lines.append(f"{time_s:.6f} {k // 4} {number} {channel} {' '.join(pairs)}")
@@ -154,7 +155,7 @@ def tape_path(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-PATIENCE_S = 10.0
+PATIENCE_S = 20.0
 
 
 class Running:

@@ -19,7 +19,17 @@ PAGES = sorted((ROOT / "docs" / "devices").glob("*.md"))
 SOURCES = "\n".join(
     path.read_text(encoding="utf-8") for path in (ROOT / "gateway" / "palpate").rglob("*.py")
 )
-OF_STATIONS = {"wrench_bota", "wrench_kms40", "wrench_rdt", "wrench_robotous", "biotac_can"}
+OF_STATIONS = {
+    "biotac_bridge",
+    "biotac_can",
+    "biotac_pic32",
+    "pose_file",
+    "pose_zenoh",
+    "wrench_bota",
+    "wrench_kms40",
+    "wrench_rdt",
+    "wrench_robotous",
+}
 
 pytestmark = pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 

@@ -22,7 +22,7 @@ def test_unknown_driver_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match="unknown driver 'virtul' -> did you mean 'virtual'"):
         drivers.make_device("virtul")
     with pytest.raises(
-        ConfigError, match="known drivers: biotac_bridge, biotac_can, biotac_pic32, record, "
+        ConfigError, match="known drivers: biotac_bridge, biotac_can, biotac_pic32, pose_file, "
     ):
         drivers.make_device("zzzzzz")
 

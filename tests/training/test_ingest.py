@@ -175,6 +175,25 @@ def test_record_aligns_and_numbers_presses(record: Record) -> None:
     assert data.sensor_names == ("finger",)
 
 
+def test_where_a_robot_cannot_know_whether_it_touches_the_force_says_so(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0))
+    record.add(ELECTRODES, *(frame(i + 1) for i in range(100)))
+    pressing = [20 <= i < 40 or 60 <= i < 80 for i in range(100)]
+    wrenches = [replace(wrench(i + 1), force=np.zeros(3, np.float32)) for i in range(100)]
+    pressed = np.array([0.1, 0.0, 0.5], np.float32)
+    record.add(
+        WRENCH,
+        *(replace(w, force=pressed) if on else w for w, on in zip(wrenches, pressing, strict=True)),
+    )
+    poses = [replace(pose(i + 1, touches=False), in_contact=None) for i in range(100)]
+    record.add(POSE, *poses)
+    data = ingest_record(record.write())
+    assert data.contact_location is not None
+    np.testing.assert_array_equal(data.in_contact, pressing)
+    np.testing.assert_array_equal(np.isnan(data.contact_location[:, 0]), ~np.array(pressing))
+    np.testing.assert_array_equal(np.unique(data.group), [0, 1])
+
+
 def test_record_drops_what_cannot_be_used(record: Record) -> None:
     record.add(TARE, tare(1, 2000.0), tare(2, 1990.0))
     record.add(ELECTRODES, frame(6, tare_id=0))  # before any tare
@@ -187,6 +206,19 @@ def test_record_drops_what_cannot_be_used(record: Record) -> None:
     np.testing.assert_array_equal(data.tared_counts[:, 0], [2, 13])
     assert data.contact_location is None
     assert data.in_contact is not None, "without poses, contact is a force above a threshold"
+
+
+def test_no_frame_of_a_biotac_sp_is_left_out_in_silence(record: Record) -> None:
+    sp = replace(
+        frame(2),
+        sensor_type=SensorType.BIOTAC_SP,
+        electrodes=np.full(24, 2000, np.uint16),
+        pac=np.full(27, 2000, np.uint16),
+    )
+    record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, frame(1), sp, frame(3))
+    record.add(WRENCH, wrench(1), wrench(2), wrench(3))
+    with pytest.raises(DatasetError, match="1 of 3 frames of 'finger' are of a BIOTAC_SP with 24"):
+        ingest_record(record.write())
 
 
 def test_record_lacks_something(record: Record, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from palpate.protos.errors import DatasetError, RecordingError
-from palpate.protos.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
+from palpate.protos.messages import ElectrodeFrame, IndenterPoseFrame, SensorType, WrenchFrame
 from palpate.protos.topics import ELECTRODES, POSE, WRENCH
 from palpate.training.testbed.ingest import ingest_experiment
 from palpate.training.testbed.plan import Plan
@@ -69,6 +69,19 @@ def invalidate(streams: Streams) -> None:
     frames[:] = [replace(f, validity=1) for f in frames if isinstance(f, ElectrodeFrame)]
 
 
+def exchange(streams: Streams) -> None:
+    """The last frame is one of a BioTac SP."""
+    frames = streams[ELECTRODES.name]
+    frame = frames[-1]
+    assert isinstance(frame, ElectrodeFrame)
+    frames[-1] = replace(
+        frame,
+        sensor_type=SensorType.BIOTAC_SP,
+        electrodes=np.full(24, 2000, np.uint16),
+        pac=np.full(27, 2000, np.uint16),
+    )
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -76,6 +89,7 @@ def invalidate(streams: Streams) -> None:
         (drop(POSE.name), "no pose stream"),
         (drop(ELECTRODES.name), "no valid BioTac frame"),
         (invalidate, "no valid BioTac frame"),
+        (exchange, "1 of [0-9]+ frames of 'finger' are of a BIOTAC_SP with 24 electrodes"),
         (cut_end_of(ELECTRODES.name, 4), "'s/00/normal': no sample.*increment 4;"),
         (cut_end_of(WRENCH.name, 4), "'s/00/normal': no sample.*increment 4;"),
         (cut_end_of(POSE.name, 1), "'s/00/normal': no sample.*increment 1;"),

@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from palpate.gateway.readings import Reading
-from palpate.protos.config import StrictConfig
+from palpate.protos.config import LinkConfig, StrictConfig
 from palpate.protos.errors import DeviceError
 from palpate.protos.messages import Origin, SensorType
 
@@ -56,15 +56,31 @@ class DeviceIdentity:
     """What is known once a device is open.
 
     Attributes:
-        serial: Serial number of the sensor.
+        serial: Serial number of the sensor; ``Device.open`` keeps the last 64 characters.
         slot_period_s: Time between two slots of a frame [s].
         start_wall_ns: Wall clock at device time zero [ns since the Unix epoch], for recordings that
             know it; None = not known or live.
+        sensor_type: Kind of tactile sensor where only the open device tells: it replaces that of
+            ``DeviceInfo``, and the nominal rate follows; None = as said there.
+        tells_time: Its readings' times are of a clock of its own; False = a live device that tells
+            none, they are the host's monotonic times of arrival.
     """
 
     serial: str
     slot_period_s: float
     start_wall_ns: int | None = None
+    sensor_type: SensorType | None = None
+    tells_time: bool = True
+
+
+SERIAL_MAX = 64
+"""Longest serial number of a frame [characters]."""
+
+
+def _fit_for_wire(name: str) -> str:
+    """What stands for a serial number that is not told may be long, e.g. the path of a line."""
+    printable = "".join(c if c.isascii() and c.isprintable() else "?" for c in name)
+    return printable[-SERIAL_MAX:] or "unknown"
 
 
 class Device(ABC):
@@ -76,13 +92,16 @@ class Device(ABC):
     options_class: ClassVar[type[StrictConfig]]
     """Options of the driver, checked before the device is made."""
 
+    gone_s: ClassVar[float] = 2.0
+    """A live device that has been silent for so long is closed and opened again [s]."""
+
     def __init__(self, info: DeviceInfo) -> None:
         self._info = info
         self._identity: DeviceIdentity | None = None
 
     @property
     def info(self) -> DeviceInfo:
-        """What is known without opening the device."""
+        """What is known without opening the device, and once it has been opened, better."""
         return self._info
 
     @property
@@ -110,7 +129,12 @@ class Device(ABC):
             DeviceError: The device or file cannot be opened or is not what it should be.
         """
         if self._identity is None:
-            self._identity = self._open()
+            identity = self._open()
+            identity = self._identity = replace(identity, serial=_fit_for_wire(identity.serial))
+            kind = identity.sensor_type
+            if kind is not None and kind is not self._info.sensor_type:
+                rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+                self._info = replace(self._info, sensor_type=kind, rate_hz=rate_hz)
 
     def close(self) -> None:
         """Disconnect, or do nothing if not connected; never raises."""
@@ -148,3 +172,17 @@ class Device(ABC):
 
     def __exit__(self, *exc_info: object) -> None:
         self.close()
+
+
+class BusDevice(Device):
+    """A device whose readings come over the bus: somebody else's program is the sensor.
+
+    It may start at any time and shall be heard at once, so opening again, which helps nobody while
+    it does not run, is rare.
+    """
+
+    gone_s = 30.0
+
+    @abstractmethod
+    def join(self, link: LinkConfig, station: str) -> None:
+        """How the gateway has joined the bus; told before the first opening, and only there."""

@@ -5,17 +5,23 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 
+from palpate.gateway.condition.condition import Retare
+from palpate.gateway.condition.stillness import StillLimits
 from palpate.gateway.config import GatewayConfig, SensorConfig
-from palpate.gateway.device import Device
+from palpate.gateway.device import BusDevice, Device
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Pipeline
+from palpate.gateway.timing.discipline import wall_discipline
+from palpate.gateway.timing.wall_clock import WallClock
 from palpate.gateway.worker import SensorWorker
+from palpate.gateway.wrench.device import WrenchDevice
 from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.codec import TARE_REQUEST
+from palpate.protos.codec import TARE_REQUEST, WRENCH_ZERO, WRENCH_ZERO_REQUEST
 from palpate.protos.config import LinkConfig
-from palpate.protos.errors import PalpateError
+from palpate.protos.errors import ConfigError, PalpateError
 from palpate.protos.health import Health, HealthReporter
 from palpate.protos.messages import ServiceState
 from palpate.protos.pauses import avoid_pauses
@@ -55,6 +61,11 @@ def run(
         RecordingError: With ``exit_at_end``, a recording was damaged; all before it was published.
     """
     devices = [_device(sensor) for sensor in config.sensors]
+    for device in devices:
+        if isinstance(device, BusDevice):
+            device.join(link, station)
+    sources: dict[tuple[str, str], str] = {}
+    wall = WallClock()
     health = Health(SERVICE, instance)
     health.set_sensors(tuple(sensor.name for sensor in config.sensors))
     with Session.open(link, station=station) as session:
@@ -65,19 +76,29 @@ def run(
             worker = SensorWorker(
                 sensor.name,
                 device,
-                Pipeline(
-                    device.info,
-                    tare_frames=config.tare_frames,
-                    max_sd_counts=config.tare_max_sd_counts,
-                ),
+                _pipeline(config, device),
                 {
-                    topic.name: session.publisher(topic, sensor=sensor.name, lossless=lossless)
+                    topic.name: session.publisher(topic, sensor=sensor.key_name, lossless=lossless)
                     for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE)
                 },
                 health,
                 pace=config.pace,
                 stop=stop,
+                wall=wall,
+                claim=partial(_claim, sources, sensor),
             )
+            workers.append(worker)
+            if isinstance(device, WrenchDevice):
+                session.queryable(
+                    "zero",
+                    sensor=sensor.name,
+                    request=WRENCH_ZERO_REQUEST,
+                    reply=WRENCH_ZERO,
+                    handler=worker.zero,
+                )
+                continue  # what has no electrodes has no baseline
+            if sensor.of is not None:
+                continue  # its finger answers
             session.queryable(
                 "tare",
                 sensor=sensor.name,
@@ -87,12 +108,11 @@ def run(
                 # Taring takes half a second; looking up a known tare must not wait for it.
                 workers=2,
             )
-            workers.append(worker)
-        refresh = partial(_refresh, health, workers)
+        refresh = partial(_refresh, health, workers, wall)
         presence = session.presence(SERVICE, instance=instance)
         with HealthReporter(session, health, refresh=refresh):
             try:
-                _serve(config, session, workers, health, presence, stop)
+                _serve(config, session, workers, health, presence, stop, refresh)
             finally:
                 if not all(worker.ended.is_set() for worker in workers):
                     health.set_state(ServiceState.STOPPING)
@@ -104,7 +124,38 @@ def run(
 
 
 def _device(sensor: SensorConfig) -> Device:
-    return make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
+    device = make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
+    if sensor.of is not None and device.info.sensor_type is not None:
+        raise ConfigError(
+            f"sensor {sensor.name!r} is of {sensor.of!r}, and a tactile sensor itself",
+            remedy="`of` is for force/torque sensors and poses of the indenter: leave it out",
+        )
+    return device
+
+
+def _pipeline(config: GatewayConfig, device: Device) -> Pipeline:
+    again_s = config.retare_after_s
+    return Pipeline(
+        device.info,
+        tare=config.tare,
+        tare_frames=config.tare_frames,
+        limits=StillLimits(config.tare_max_sd_counts, config.tare_max_pac_sd_counts),
+        retare=None if again_s is None else Retare(again_s, config.retare_drift_counts),
+    )
+
+
+def _claim(sources: dict[tuple[str, str], str], sensor: SensorConfig, stream: str) -> None:
+    """One stream has one source, the finger's own first: two would mix their sequences."""
+    source = sources.get((sensor.key_name, stream))
+    if source == sensor.name:
+        return
+    if source is None or sensor.of is None:
+        sources[sensor.key_name, stream] = sensor.name
+    else:
+        raise ConfigError(
+            f"{source!r} and {sensor.name!r} both publish the {stream} of {sensor.key_name!r}",
+            remedy=f"take one of them out of the profile, or leave out `of` of {sensor.name!r}",
+        )
 
 
 def _serve(
@@ -114,6 +165,7 @@ def _serve(
     health: Health,
     presence: Presence,
     stop: threading.Event,
+    refresh: Callable[[], None],
 ) -> None:
     if config.wait_for and not _wait_for(config.wait_for, session, health, stop):
         return
@@ -128,6 +180,7 @@ def _serve(
         _tell(health, workers, presence)
         if not finished and all(worker.ended.is_set() for worker in workers):
             finished = True
+            refresh()
             _finish(health, workers)
             if config.exit_at_end:
                 stop.wait(config.linger_s)
@@ -144,7 +197,7 @@ def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> No
         return
     if all(worker.serving or worker.ended.is_set() for worker in workers):
         presence.ready()
-        fine = not any(worker.error or worker.silent for worker in workers)
+        fine = all(worker.sound for worker in workers)
         if fine and health.state is not ServiceState.READY:
             health.set_state(ServiceState.READY, "all sensors deliver")
     else:
@@ -153,7 +206,6 @@ def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> No
 
 def _finish(health: Health, workers: list[SensorWorker]) -> None:
     """Every source has ended: account for it in the status."""
-    _refresh(health, workers)
     frames = sum(worker.pipeline.counters["frames_published"] for worker in workers)
     failed = [worker for worker in workers if worker.error is not None]
     if failed:
@@ -165,11 +217,19 @@ def _finish(health: Health, workers: list[SensorWorker]) -> None:
     _log.info("all sources have ended, %d frames published", frames)
 
 
-def _refresh(health: Health, workers: list[SensorWorker]) -> None:
-    """Take over the sensors' counters; several sensors are told apart by a prefix."""
+def _refresh(health: Health, workers: list[SensorWorker], wall: WallClock) -> None:
+    """Take over what sensors count and measure; several are told apart by a prefix."""
     for worker in workers:
         prefix = f"{worker.name}." if len(workers) > 1 else ""
         health.set_counts({prefix + name: value for name, value in worker.counters().items()})
+        for name, measured in worker.gauges().items():
+            health.gauge(prefix + name, measured)
+    wall.look()
+    health.set_counts({"wall_steps": wall.steps})
+    kept = wall_discipline()
+    if kept is not None:
+        health.gauge("wall_synchronised", float(kept.synchronised))
+        health.gauge("wall_error_s", kept.error_s)
 
 
 def _wait_for(

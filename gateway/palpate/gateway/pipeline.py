@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from math import inf
+from typing import Literal
 
+from palpate.gateway.condition.condition import Condition, Retare
+from palpate.gateway.condition.stillness import StillLimits
 from palpate.gateway.device import DeviceIdentity, DeviceInfo
 from palpate.gateway.readings import (
     ElectrodeReading,
@@ -16,12 +19,13 @@ from palpate.gateway.readings import (
     RecordedMessage,
     WrenchReading,
 )
-from palpate.gateway.tare import MAX_SD_COUNTS, TARE_FRAMES, TareCollector, TareLedger
+from palpate.gateway.tare import TARE_FRAMES, TareLedger
+from palpate.gateway.taring import Taring
 from palpate.gateway.timing.clock_map import ClockMap
 from palpate.gateway.timing.stamps import Stamps
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.errors import DeviceError, PalpateError, WireError
+from palpate.protos.errors import DeviceError, WireError
 from palpate.protos.messages import (
     NO_TARE,
     ElectrodeFrame,
@@ -31,6 +35,9 @@ from palpate.protos.messages import (
     WrenchFrame,
 )
 from palpate.protos.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
+
+TareMode = Literal["still", "first", "query"]
+"""When a sensor is tared first: when it is still; when its electrodes do not vary; when asked."""
 
 _HELD_WINDOWS = 10
 """A recording is held back for this many attempts to tare before it goes out untared."""
@@ -59,41 +66,78 @@ class Pipeline:
 
     Args:
         info: The device's facts.
+        tare: When to tare first; a recording is never as ``still`` says, but as ``first``.
         tare_frames: Frames in a tare.
-        max_sd_counts: Largest standard deviation of an untouched electrode [counts].
+        limits: What a sensor that nothing touches does not exceed.
+        retare: When to tare again without being asked; None = never.
     """
 
     def __init__(
         self,
         info: DeviceInfo,
         *,
+        tare: TareMode = "still",
         tare_frames: int = TARE_FRAMES,
-        max_sd_counts: float = MAX_SD_COUNTS,
+        limits: StillLimits | None = None,
+        retare: Retare | None = None,
     ) -> None:
-        self.ledger = TareLedger()
-        self.counters: dict[str, int] = dict.fromkeys(
-            ("frames_published", "missing_frames", "frames_untared", "tares", "tares_refused"), 0
+        self._limits = limits or StillLimits()
+        electrodes_only = replace(self._limits, pac_sd=inf, pdc_sd=inf)
+        if tare == "first":
+            self._limits = electrodes_only
+        # A recording cannot wait for better frames.
+        taring = self._limits if info.live else electrodes_only
+        self._tares_itself = tare != "query"
+        self._taring = Taring(tare_frames, taring, at_start=self._tares_itself)
+        self._retare = retare
+        self.condition: Condition | None = None
+        """How the sensor does; None = it has no electrodes, or was not opened yet."""
+        self._counts = dict.fromkeys(
+            ("frames_published", "missing_frames", "frames_untared", "retares"), 0
         )
-        self.tare_error: DeviceError | None = None
-        """Why the last attempt to tare failed; None after a success."""
         self._info = info
+        self._kind = info.sensor_type
         self.tare_frames = tare_frames
-        self._max_sd_counts = max_sd_counts
         self._serial = ""
         self._slot_period_ns = 0
         self._stamps = Stamps(info.origin)
-        self._first_tare: TareCollector | None = TareCollector(tare_frames, max_sd_counts)
         self._held: list[Outgoing] = []
         self._held_frames = 0
-        self._holding = not info.live
-        self._lock = threading.Lock()
-        self._asked: list[tuple[TareCollector, Future[Tare]]] = []
-        self._over: str = ""
+        # What has no electrodes is never tared: it would be held to its end.
+        self._holding = not info.live and info.sensor_type is not None and self._tares_itself
+
+    @property
+    def ledger(self) -> TareLedger:
+        """Every tare of this run."""
+        return self._taring.ledger
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was published, lost, tared and found wrong."""
+        condition = {} if self.condition is None else self.condition.counters
+        return {**self._counts, **self._taring.counters, **condition}
+
+    @property
+    def tare_error(self) -> DeviceError | None:
+        """Why the last attempt to tare failed; None after a success."""
+        return self._taring.error
 
     def begin(self, identity: DeviceIdentity, clock: ClockMap) -> None:
         """The device was opened, or opened again; sequences and tares go on."""
         self._serial = identity.serial
         self._slot_period_ns = max(1, round(identity.slot_period_s * 1e9))
+        kind = identity.sensor_type or self._info.sensor_type
+        if kind is not self._kind and self.ledger.current_id != NO_TARE:
+            # A finger with other electrodes: the old baseline is not its own.
+            self.ledger.leave()
+            if self._tares_itself:
+                self._taring.attempt()
+        if kind is not None and (self.condition is None or kind is not self._kind):
+            rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+            self.condition = Condition(kind.layout, rate_hz, self._limits, self._retare)
+        elif self.condition is not None:
+            self.condition.begin()
+        self._kind = kind
         self._stamps.begin(clock)
 
     def ask_tare(self, frames: int) -> Future[Tare]:
@@ -102,17 +146,12 @@ class Pipeline:
         Raises:
             DeviceError: No further frames will come to be averaged.
         """
-        future: Future[Tare] = Future()
-        collector = TareCollector(frames or self.tare_frames, self._max_sd_counts)
-        with self._lock:
-            if self._over or self._info.driver == "record":
-                raise DeviceError(
-                    f"{self._serial or 'the sensor'} cannot be tared: "
-                    f"{self._over or 'it is a record, which brings its own tares'}",
-                    remedy="tare a live sensor, or ask for a known tare by its id",
-                )
-            self._asked.append((collector, future))
-        return future
+        is_record = self._info.driver == "record"
+        return self._taring.ask(
+            frames,
+            sensor=self._serial or "the sensor",
+            never="it is a record, which brings its own tares" if is_record else "",
+        )
 
     def push(self, readings: Iterable[Reading], arrival_ns: int) -> list[Outgoing]:
         """Stamp and tare readings.
@@ -139,7 +178,9 @@ class Pipeline:
                 field = FieldFrame(stamp, self._serial, reading.mesh_sha256, reading.displacement)
                 self._pass(Outgoing(FIELD_TRUTH.name, field, due_ns), out)
             elif isinstance(reading, PoseReading):
-                stamp, due_ns = self._stamps.stamp(POSE.name, reading, arrival_ns)
+                stamp, due_ns = self._stamps.stamp(
+                    POSE.name, reading, arrival_ns, reading.missed_before
+                )
                 pose = IndenterPoseFrame(
                     stamp,
                     reading.indenter,
@@ -154,15 +195,9 @@ class Pipeline:
 
     def finish(self, why: str = "the recording has ended") -> list[Outgoing]:
         """The source has ended: what is still held goes out untared."""
-        with self._lock:
-            self._over = why
-            asked, self._asked = self._asked, []
-        for _, future in asked:
-            future.set_exception(
-                DeviceError(f"not tared: {why}", remedy="tare while the sensor delivers")
-            )
+        self._taring.finish(why)
         if self._held_frames and self.tare_error is None:
-            self.tare_error = DeviceError(
+            self._taring.error = DeviceError(
                 f"{self._serial} delivered {self._held_frames} frames, a tare needs "
                 f"{self.tare_frames}",
                 remedy="replay a longer recording, or lower tare_frames",
@@ -173,7 +208,7 @@ class Pipeline:
         stamp, due_ns = self._stamps.stamp(
             ELECTRODES.name, reading, arrival_ns, reading.missed_before
         )
-        kind = self._info.sensor_type
+        kind = self._kind
         if kind is None:
             raise RuntimeError(f"driver {self._info.driver!r} has electrodes and no sensor type")
         frame = ElectrodeFrame(
@@ -189,66 +224,33 @@ class Pipeline:
             self._slot_period_ns,
             self.ledger.current_id,
         )
-        self.counters["missing_frames"] += reading.missed_before
+        self._counts["missing_frames"] += reading.missed_before
         if self._holding:
             self._held.append(Outgoing(ELECTRODES.name, frame, due_ns))
             self._held_frames += 1
         else:
             self._emit(frame, due_ns, out)
-        if self._first_tare is not None or self._asked:
-            self._tare(frame, due_ns, out)
+        self._watch(frame)
+        for tare in self._taring.offer(frame):
+            self._enter(tare, due_ns, out)
+        if self._held_frames >= _HELD_WINDOWS * self.tare_frames:
+            out.extend(self._release(NO_TARE))
 
-    def _tare(self, frame: ElectrodeFrame, due_ns: int, out: list[Outgoing]) -> None:
-        """Offer the frame to the first tare and to those asked for."""
-        if self._first_tare is not None:
-            try:
-                tare = self._first_tare.add(frame)
-            except DeviceError as error:
-                self._refused(error)
-                tare = None
-            if tare is not None:
-                self._first_tare = None
-                self._enter(tare, self._held[0].due_ns if self._held else due_ns, out)
-                out.extend(self._release(tare.tare_id))
-            elif self._held_frames >= _HELD_WINDOWS * self.tare_frames:
-                out.extend(self._release(NO_TARE))
-        with self._lock:
-            asked = list(self._asked)
-        for collector, future in asked:
-            try:
-                tare = collector.add(frame)
-            except DeviceError as error:
-                self._refused(error)
-                self._answer(collector, future, error)
-                continue
-            if tare is not None:
-                self._first_tare = None
-                self._enter(tare, due_ns, out)
-                if self._holding:
-                    out.extend(self._release(tare.tare_id))
-                self._answer(collector, future, tare)
-
-    def _answer(
-        self, collector: TareCollector, future: Future[Tare], answer: Tare | PalpateError
-    ) -> None:
-        with self._lock:
-            self._asked = [item for item in self._asked if item[0] is not collector]
-        if not future.set_running_or_notify_cancel():
-            return
-        if isinstance(answer, PalpateError):
-            future.set_exception(answer)
-        else:
-            future.set_result(answer)
+    def _watch(self, frame: ElectrodeFrame) -> None:
+        """Let the sensor's condition follow; it may ask for another tare."""
+        condition = self.condition
+        assert condition is not None, "begin() comes before push()"
+        if condition.add(frame) and condition.wants_tare and not self._taring.attempting:
+            self._counts["retares"] += 1
+            self._taring.attempt()
 
     def _enter(self, tare: Tare, due_ns: int, out: list[Outgoing]) -> None:
-        self.ledger.enter(tare)
-        self.tare_error = None
-        self.counters["tares"] += 1
-        out.append(Outgoing(TARE.name, tare, due_ns))
-
-    def _refused(self, error: DeviceError) -> None:
-        self.tare_error = error
-        self.counters["tares_refused"] += 1
+        """Tell of a tare, and let go what was held back for it."""
+        if self.condition is not None:
+            self.condition.tared(tare)
+        out.append(Outgoing(TARE.name, tare, self._held[0].due_ns if self._held else due_ns))
+        if self._holding:
+            out.extend(self._release(tare.tare_id))
 
     def _pass(self, item: Outgoing, out: list[Outgoing]) -> None:
         (self._held if self._holding else out).append(item)
@@ -267,22 +269,21 @@ class Pipeline:
         return out
 
     def _emit(self, frame: ElectrodeFrame, due_ns: int, out: list[Outgoing]) -> None:
-        self.counters["frames_published"] += 1
+        self._counts["frames_published"] += 1
         if frame.tare_id == NO_TARE:
-            self.counters["frames_untared"] += 1
+            self._counts["frames_untared"] += 1
         out.append(Outgoing(ELECTRODES.name, frame, due_ns))
 
     def _recorded(self, reading: RecordedMessage, arrival_ns: int) -> Outgoing:
         """A recorded message goes out as it is; its tare is kept for those who ask."""
         if reading.topic == ELECTRODES.name:
-            self.counters["frames_published"] += 1
+            self._counts["frames_published"] += 1
             self._count_recorded_loss(reading.payload)
         elif reading.topic == TARE.name:
             try:
-                self.ledger.enter(TARE_CODEC.decode(reading.payload))
-                self.counters["tares"] += 1
+                self._taring.recorded(TARE_CODEC.decode(reading.payload))
             except WireError:  # it still goes out as recorded; whoever needs it will reject it
-                self.counters["tares_refused"] += 1
+                self._taring.counters["tares_refused"] += 1
         _, due_ns = self._stamps.times(reading.time_s, arrival_ns)
         return Outgoing(reading.topic, reading.payload, due_ns)
 
@@ -291,5 +292,5 @@ class Pipeline:
             frame = ELECTRODE_FRAME.decode(payload)
         except WireError:  # it still goes out as recorded; whoever needs it will reject it
             return
-        self.counters["missing_frames"] += frame.stamp.missed_before
-        self.counters["frames_untared"] += frame.tare_id == NO_TARE
+        self._counts["missing_frames"] += frame.stamp.missed_before
+        self._counts["frames_untared"] += frame.tare_id == NO_TARE

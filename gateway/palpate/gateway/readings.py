@@ -1,6 +1,7 @@
 """What a device yields: readings in the device's own time, before the gateway adds its facts.
 
 A device knows its tick and its time; sequence numbers, host clocks and tares are the gateway's.
+What a driver knows of when things arrived it tells by ``heard``; see ``timing.clock_map``.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from palpate.gateway.timing.clock_map import Heard
 from palpate.protos.messages import CountArray, FloatArray
 
 
@@ -21,12 +23,14 @@ class ElectrodeReading:
         tick: The device's own unwrapped frame counter.
         time_s: The device's time at the first slot [s], from an origin of its own.
         missed_before: Frames the device is known to have lost directly before this one.
-        electrodes: Raw counts E1..E19, uint16, shape ``(19,)``.
+        electrodes: Raw counts E1..E19, uint16, shape ``(19,)`` (SP: 24).
         pdc: Raw static pressure [counts].
-        pac: Raw dynamic pressure in order of sampling [counts], uint16, shape ``(22,)``.
+        pac: Raw dynamic pressure in order of sampling [counts], uint16, shape ``(22,)`` (SP: 27);
+            a sample that was lost leaves its place, invalid.
         tac: Raw dynamic temperature [counts].
         tdc: Raw static temperature [counts].
         validity: Bit set = channel good; the order is that of ``ElectrodeFrame.validity``.
+        heard: What arrived last of the device; None = this reading.
     """
 
     tick: int
@@ -38,6 +42,7 @@ class ElectrodeReading:
     tac: int
     tdc: int
     validity: int
+    heard: Heard | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,7 @@ class WrenchReading:
         torque: Torque on the BioTac about the sensor frame's origin [N m], shape ``(3,)``.
         serial: Serial number of the force/torque sensor.
         overload: The device says its range is exceeded.
+        heard: What arrived last of the device; None = this reading.
     """
 
     tick: int
@@ -59,6 +65,7 @@ class WrenchReading:
     torque: FloatArray
     serial: str
     overload: bool = False
+    heard: Heard | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +78,9 @@ class PoseReading:
         indenter: Standard name, e.g. ``"sphere_14mm"``.
         position: Tip of the indenter [m], sensor frame, float64, shape ``(3,)``.
         orientation: Unit quaternion w x y z of the indenter in the sensor frame, shape ``(4,)``.
-        in_contact: Whether it touches the skin.
+        in_contact: Whether it touches the skin; None = the source cannot know.
+        missed_before: Poses known to have been lost directly before this one.
+        heard: What arrived last of the device; None = this reading.
     """
 
     tick: int
@@ -79,7 +88,9 @@ class PoseReading:
     indenter: str
     position: npt.NDArray[np.float64]
     orientation: npt.NDArray[np.float64]
-    in_contact: bool
+    in_contact: bool | None
+    missed_before: int = 0
+    heard: Heard | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +103,14 @@ class FieldReading:
         mesh_sha256: Content hash of the mesh, 32 bytes.
         displacement: Nodal displacement from the pressurised state [m], sensor frame, float32,
             shape ``(V, 3)``.
+        heard: What arrived last of the device; None = this reading.
     """
 
     tick: int
     time_s: float
     mesh_sha256: bytes
     displacement: FloatArray
+    heard: Heard | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,31 +8,30 @@ from collections import deque
 
 import numpy as np
 
-from palpate.gateway.protocols.channels import ALL_VALID, bit_name
+from palpate.gateway.condition.stillness import MAX_SD_COUNTS, StillLimits, evidence_of
 from palpate.protos.errors import DeviceError, ErrorCode, RemoteError
 from palpate.protos.messages import NO_TARE, ElectrodeFrame, Tare
+
+__all__ = ["MAX_SD_COUNTS", "TARE_FRAMES", "TareCollector", "TareLedger"]
 
 TARE_FRAMES = 50
 """Frames averaged by default: half a second at 100 Hz."""
 
-MAX_SD_COUNTS = 25.0
-"""An electrode that varies more than this is being touched [counts]. A settled sensor has 0.5; the
-public capture, with its pauses of a quarter second, has up to 13."""
-
 _KEPT = 1024
+_STILL = StillLimits()
 
 
 class TareCollector:
-    """Averages consecutive good frames.
+    """Averages consecutive good frames: those with every channel, and PAC as far as it is sampled.
 
     Args:
         frames: How many.
-        max_sd_counts: Largest standard deviation of an untouched electrode [counts].
+        limits: What a sensor that nothing touches does not exceed.
     """
 
-    def __init__(self, frames: int, max_sd_counts: float = MAX_SD_COUNTS) -> None:
+    def __init__(self, frames: int, limits: StillLimits = _STILL) -> None:
         self._wanted = frames
-        self._max_sd_counts = max_sd_counts
+        self._limits = limits
         self._window: deque[ElectrodeFrame] = deque(maxlen=frames)
         self._refused = 0
 
@@ -40,14 +39,16 @@ class TareCollector:
         """Take one frame; return the tare when there are enough.
 
         Raises:
-            DeviceError: A channel stays invalid, or an electrode varies too much to be untouched;
-                names it. The next frame begins anew.
+            DeviceError: A channel stays invalid, or something moves; names it. The next frame
+                begins anew.
         """
-        if frame.validity != ALL_VALID:
+        if _missing(frame):
             self._refused += 1
             if self._refused >= self._wanted:
                 raise self._invalid(frame)
             return None
+        if self._window and self._window[-1].sensor_type is not frame.sensor_type:
+            self._window.clear()  # the finger was exchanged
         self._window.append(frame)
         if len(self._window) < self._wanted:
             return None
@@ -58,32 +59,31 @@ class TareCollector:
 
     def _average(self, window: list[ElectrodeFrame]) -> Tare:
         electrodes = np.array([frame.electrodes for frame in window], np.float64)
-        deviation = electrodes.std(axis=0)
-        worst = int(np.argmax(deviation))
-        if deviation[worst] > self._max_sd_counts:
+        pdc = np.array([frame.pdc for frame in window], np.float64)
+        pac = np.concatenate([_valid_pac(frame) for frame in window]).astype(np.float64)
+        last = window[-1]
+        motion = evidence_of(electrodes, pac, pdc).motion(self._limits)
+        if motion:
             raise DeviceError(
-                f"cannot tare {window[-1].sensor_serial}: E{worst + 1} varies by "
-                f"{deviation[worst]:.0f} counts (sd) over {len(window)} frames, at most "
-                f"{self._max_sd_counts:g} are allowed",
+                f"cannot tare {last.sensor_serial}: {motion}",
                 remedy="take everything off the finger and tare again",
             )
         baseline = electrodes.mean(axis=0).astype(np.float32)
-        last = window[-1]
         return Tare(
             tare_id=_tare_id(last, baseline.tobytes()),
             stamp=last.stamp,
             sensor_serial=last.sensor_serial,
             electrodes=baseline,
-            electrodes_sd=deviation.astype(np.float32),
-            pdc=float(np.mean([frame.pdc for frame in window])),
-            pac=float(np.mean([frame.pac for frame in window])),
+            electrodes_sd=electrodes.std(axis=0).astype(np.float32),
+            pdc=float(pdc.mean()),
+            pac=float(pac.mean()),
             tac=float(np.mean([frame.tac for frame in window])),
             tdc=float(np.mean([frame.tdc for frame in window])),
             frames_averaged=len(window),
         )
 
     def _invalid(self, frame: ElectrodeFrame) -> DeviceError:
-        bad = [bit_name(b) for b in range(ALL_VALID.bit_length()) if not frame.validity >> b & 1]
+        bad = _missing(frame)
         refused, self._refused = self._refused, 0
         self._window.clear()
         return DeviceError(
@@ -91,6 +91,26 @@ class TareCollector:
             f"({refused} frames refused)",
             remedy="check the cable and connector of this finger; see the parity_errors counters",
         )
+
+
+def _missing(frame: ElectrodeFrame) -> list[str]:
+    """Channels that a tare needs and that this frame does not have."""
+    layout = frame.sensor_type.layout
+    slow = (1 << layout.first_pac_bit) - 1
+    bad = ~frame.validity & slow
+    if not bad:
+        return [] if frame.validity >> layout.first_pac_bit else ["PAC"]
+    return [layout.bit_name(bit) for bit in range(layout.first_pac_bit) if bad >> bit & 1]
+
+
+def _valid_pac(frame: ElectrodeFrame) -> np.ndarray:
+    """Samples of PAC that are good."""
+    layout = frame.sensor_type.layout
+    if frame.validity == layout.all_valid:
+        return frame.pac
+    return frame.pac[
+        [bool(frame.validity >> layout.first_pac_bit + k & 1) for k in range(len(frame.pac))]
+    ]
 
 
 def _tare_id(last: ElectrodeFrame, baseline: bytes) -> int:
@@ -121,6 +141,11 @@ class TareLedger:
             self._current_id = tare.tare_id
             while len(self._tares) > _KEPT:
                 del self._tares[next(iter(self._tares))]
+
+    def leave(self) -> None:
+        """No tare is in force any more; those that were can still be found."""
+        with self._lock:
+            self._current_id = NO_TARE
 
     def find(self, tare_id: int) -> Tare:
         """The tare of this id.

@@ -1,4 +1,8 @@
-"""One sensor's thread: open, read, publish; and when the device is lost, open again."""
+"""One sensor's thread: open, read, publish; and when the device is lost, open again.
+
+Readings that waited, because this process or its host stood still, go out with the times at which
+they were taken: who reads them tells by their stamps that they are old.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,25 @@ import logging
 import threading
 import time
 from collections import Counter
-from typing import Any, Literal
+from collections.abc import Callable
+from concurrent.futures import Future
+from math import inf
+from typing import Any, Literal, TypeVar
 
 from palpate.gateway.device import Device
 from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.timing.clock_map import ClockMap, FileClock, LiveClock, PacedClock
+from palpate.gateway.sensor_report import SensorReport
+from palpate.gateway.timing.clock_map import (
+    ArrivalClock,
+    ClockMap,
+    FileClock,
+    LiveClock,
+    PacedClock,
+)
+from palpate.gateway.timing.listening import Listening
+from palpate.gateway.timing.wall_clock import WallClock
+from palpate.gateway.wrench.device import WrenchDevice
+from palpate.gateway.wrench.zeroing import Zeroing
 from palpate.protos.errors import (
     DeviceError,
     DeviceLost,
@@ -22,20 +40,23 @@ from palpate.protos.errors import (
     WireError,
 )
 from palpate.protos.health import Health
-from palpate.protos.messages import NO_TARE, Tare, TareRequest
+from palpate.protos.messages import NO_TARE, Tare, TareRequest, WrenchZero, WrenchZeroRequest
 from palpate.protos.session import Publisher
+
+A = TypeVar("A")
 
 _log = logging.getLogger(__name__)
 
-BACKOFF_S = (0.2, 1.0)
-"""First and longest wait before a lost device is opened again [s]."""
+BACKOFF_S = (0.2, 0.4)
+"""First and longest wait before a lost device is opened again [s]: once it can be, its frames come
+again within a second, and finding it takes up to half of that."""
 
-LOST_S = 0.05
-"""A live sensor that is silent for longer, and for three of its frames, is said to be lost [s]."""
+LOST_S = 0.04
+"""A live sensor that is silent for longer, and for three of its frames, is said to be lost [s]: so
+that who listens knows within 50 ms."""
 
 _READ_S = 0.5
-_GONE_S = 2.0
-"""A live device that has been silent for so long is closed and opened again."""
+_SILENT_READ_S = 0.025
 
 _ENCODERS_DECIDE = "the frame was not published; this is a defect of the device driver"
 
@@ -51,6 +72,9 @@ class SensorWorker:
         health: Told of errors.
         pace: How a recording is paced.
         stop: Ends the thread.
+        wall: The wall clock of the process; None = one of its own.
+        claim: Called with the name of its stream before each message; raises where another sensor
+            publishes that.
     """
 
     def __init__(
@@ -63,6 +87,8 @@ class SensorWorker:
         *,
         pace: Literal["recorded", "fast"],
         stop: threading.Event,
+        wall: WallClock | None = None,
+        claim: Callable[[str], None] = lambda stream: None,
     ) -> None:
         self.name = name
         self.device = device
@@ -80,10 +106,15 @@ class SensorWorker:
         self._publishers = publishers
         self._health = health
         self._pace = pace
+        self._wall = wall or WallClock()
+        self._clock_map: ClockMap | None = None
         self._stop = stop
+        self._claim = claim
         self._counters: Counter[str] = Counter()
         self._device_counters: Counter[str] = Counter()
-        self._tare_error: DeviceError | None = None
+        self._report = SensorReport(name, health)
+        self._wrench = device if isinstance(device, WrenchDevice) else None
+        self._zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
         self._thread = threading.Thread(target=self._run, name=f"sensor {name}", daemon=True)
 
     def start(self) -> None:
@@ -102,6 +133,17 @@ class SensorWorker:
         zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
         return {**zeros, **device, **self._counters, **self.pipeline.counters}
 
+    def gauges(self) -> dict[str, float]:
+        """What is measured of this sensor at present."""
+        clock = {} if self._clock_map is None else dict(self._clock_map.gauges())
+        condition = self.pipeline.condition
+        return clock if condition is None else {**clock, **condition.gauges()}
+
+    @property
+    def sound(self) -> bool:
+        """Whether it delivers, as far as it should, and nothing that is known to be wrong."""
+        return not (self.error or self.silent or self._report.untrue)
+
     def tare(self, request: TareRequest) -> Tare:
         """Answer a tare request: look one up, or tare with the next frames.
 
@@ -111,14 +153,33 @@ class SensorWorker:
         """
         if request.tare_id != NO_TARE:
             return self.pipeline.ledger.find(request.tare_id)
+        self._check_serving()
+        frames = request.frames or self.pipeline.tare_frames
+        wait_s = 2.0 + 2.0 * frames / self.device.info.rate_hz
+        return self._answer(self.pipeline.ask_tare(request.frames), f"{frames} good frames", wait_s)
+
+    def zero(self, request: WrenchZeroRequest) -> WrenchZero:
+        """Answer a request to take the load of a force/torque sensor as zero.
+
+        Raises:
+            DeviceError: The sensor does not deliver, is moved or overloaded, or refuses.
+            RemoteError: It does not answer in time (DEADLINE_EXCEEDED).
+        """
+        zeroing = self._zeroing
+        assert zeroing is not None, "only a force/torque sensor is asked"
+        self._check_serving()
+        count = zeroing.count(request.readings)
+        wait_s = 10.0 + 4.0 * count / self.device.info.rate_hz
+        return self._answer(zeroing.ask(count), f"{count} readings and took its zero", wait_s)
+
+    def _check_serving(self) -> None:
         if not self.serving:
             raise DeviceError(
                 f"sensor {self.name!r} does not deliver at present",
                 remedy="look at palpate status; tare when it is back",
             )
-        frames = request.frames or self.pipeline.tare_frames
-        wait_s = 2.0 + 2.0 * frames / self.device.info.rate_hz
-        future = self.pipeline.ask_tare(request.frames)
+
+    def _answer(self, future: Future[A], what: str, wait_s: float) -> A:
         try:
             return future.result(timeout=wait_s)
         except TimeoutError as error:
@@ -126,13 +187,14 @@ class SensorWorker:
                 raise
             future.cancel()
             raise RemoteError(
-                f"sensor {self.name!r} did not deliver {frames} good frames within {wait_s:.1f} s",
+                f"sensor {self.name!r} did not deliver {what} within {wait_s:.1f} s",
                 remedy="look at palpate status; tare when it is back",
                 code=ErrorCode.DEADLINE_EXCEEDED,
                 retry_after_s=1.0,
             ) from error
 
     def _run(self) -> None:
+        self._report.starts()
         try:
             self._serve()
         except LinkError as error:
@@ -140,14 +202,16 @@ class SensorWorker:
             if not self._stop.is_set():
                 self.crash = error
         except PalpateError as error:
-            self._fail(error)
+            self.error = error
         except BaseException as error:
             # Carried to the main thread, which ends the process; a thread would die unseen.
             _log.exception("sensor %s: defect", self.name)
             self.crash = error
         finally:
             self.serving = False
+            self._give_up("the sensor has ended")
             self.device.close()
+            self._report.ended(self.error)
             self.ended.set()
 
     def _serve(self) -> None:
@@ -155,7 +219,8 @@ class SensorWorker:
         while not self._stop.is_set():
             try:
                 self.device.open()
-                self.pipeline.begin(self.device.identity, self._clock())
+                self._clock_map = self._clock()
+                self.pipeline.begin(self.device.identity, self._clock_map)
                 if self._pump():
                     return
             except DeviceError as error:
@@ -166,65 +231,61 @@ class SensorWorker:
                     backoff_s = BACKOFF_S[0]
                 self.serving = self.silent = False
                 self._counters["device_lost"] += 1
-                self._health.fail(error)
-                _log.warning(
-                    "sensor %s lost, open again in %.1f s: %s", self.name, backoff_s, error
-                )
+                self._report.is_lost(error, backoff_s)
+                self._give_up(error.problem)
             self._device_counters += Counter(self.device.counters)
             self.device.close()
             self._stop.wait(backoff_s)
             backoff_s = min(2.0 * backoff_s, BACKOFF_S[1])
 
     def _clock(self) -> ClockMap:
+        identity = self.device.identity
         if self.device.info.live:
-            return LiveClock()
+            tells_time = identity.tells_time
+            return LiveClock(self._wall) if tells_time else ArrivalClock(self._wall)
         if self._pace == "recorded":
             return PacedClock()
-        identity = self.device.identity
         return FileClock(identity.serial, identity.start_wall_ns)
 
     def _pump(self) -> bool:
         """Read and publish; True when a finite source has ended or ``stop`` is set."""
         info = self.device.info
-        lost_s = max(LOST_S, 3.0 / info.rate_hz)
-        read_s = lost_s / 2.0 if info.live else _READ_S
-        heard_s = time.monotonic()
+        read_s = _SILENT_READ_S if info.live else _READ_S
+        listening = Listening(max(LOST_S, 3.0 / info.rate_hz) if info.live else inf, read_s)
         while not self._stop.is_set():
             try:
-                readings = self.device.read(read_s)
+                readings = self.device.read(min(listening.begin(), _READ_S))
             except DeviceTimeout as error:
-                silent_s = time.monotonic() - heard_s
-                if info.live and silent_s >= _GONE_S:
+                listening.heard_nothing()
+                if info.live and listening.silent_s >= self.device.gone_s:
                     raise DeviceLost(
-                        f"sensor {self.name!r} has been silent for {silent_s:.1f} s",
+                        f"sensor {self.name!r} has been silent for {listening.silent_s:.1f} s",
                         remedy="check its power and cable; it is opened again by itself",
                     ) from error
-                if info.live and silent_s >= lost_s:
-                    self._note_silence(silent_s)
+                if listening.lost and self.serving and not self.silent:
+                    self.silent = True
+                    self._counters["silences"] += 1
+                    self._report.is_silent(listening.silent_s)
                 continue
-            heard_s = time.monotonic()
             self.silent = False
             if not readings:
                 self._publish(self.pipeline.finish())
-                self._note_tare()
+                self._report.tare_refused(self.pipeline.tare_error)
                 return True
             self._publish(self.pipeline.push(readings, time.monotonic_ns()))
-            self._note_tare()
+            self._report.tare_refused(self.pipeline.tare_error)
             self.serving = True
+            if self._zeroing is not None:
+                self._zeroing.follow(readings)
+            lost = self._wrench is not None and self._wrench.zero_lost
+            self._report.delivers(self.pipeline.condition, zero_lost=lost)
+            listening.heard()
         return True
 
-    def _note_silence(self, silent_s: float) -> None:
-        """Tell once of a silence."""
-        if self.silent or not self.serving:
-            return
-        self.silent = True
-        self._counters["silences"] += 1
-        self._health.fail(
-            DeviceTimeout(
-                f"sensor {self.name!r} is lost: silent for {1e3 * silent_s:.0f} ms",
-                remedy="check its power and cable; it is read on by itself",
-            )
-        )
+    def _give_up(self, why: str) -> None:
+        """Who waits for a zero must not wait for a sensor that is gone."""
+        if self._zeroing is not None:
+            self._zeroing.give_up(why)
 
     def _publish(self, items: list[Outgoing]) -> None:
         for item in items:
@@ -232,6 +293,7 @@ class SensorWorker:
                 wait_s = (item.due_ns - time.monotonic_ns()) * 1e-9
                 if wait_s > 0 and self._stop.wait(wait_s):
                     return
+            self._claim(item.topic)
             publisher = self._publishers[item.topic]
             try:
                 if isinstance(item.message, bytes):
@@ -243,17 +305,3 @@ class SensorWorker:
                 self._health.fail(
                     WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
                 )
-
-    def _note_tare(self) -> None:
-        """Tell once of a refused tare."""
-        error = self.pipeline.tare_error
-        if error is not self._tare_error:
-            self._tare_error = error
-            if error is not None:
-                self._health.fail(error, degraded=False)
-                _log.warning("sensor %s: %s", self.name, error)
-
-    def _fail(self, error: PalpateError) -> None:
-        self.error = error
-        self._health.fail(error)
-        _log.error("sensor %s: %s", self.name, error)

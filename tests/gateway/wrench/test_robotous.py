@@ -202,6 +202,8 @@ def test_faults_are_found_named_and_survived(
 ) -> None:
     if fault not in sensor.faults:
         pytest.skip("this line has no such fault")
+    if fault == "unplug" and isinstance(sensor, RobotousCan):
+        shown = "no sample came for 0.3 s"  # the bus stays; the plug has taken its supply
     follower.more()
     sensor.inject(fault, duration_s)
     names = shown.split()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate.protos.alignment import linear
 from palpate.protos.errors import DatasetError
 from palpate.protos.messages import (
     NO_TARE,
@@ -22,17 +24,15 @@ from palpate.protos.messages import (
     WrenchFrame,
 )
 from palpate.protos.record import read_record
+from palpate.protos.sampling import sample_offsets
 from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH
 from palpate.training.dataset import FeatureDataset, Provenance
 from palpate.training.schema import palpate_version
 
 logger = logging.getLogger(__name__)
 
-TOLERANCE_S = 0.005
-"""Half a frame at 100 Hz: a reading farther away belongs to another frame."""
-
 TOUCH_N = 0.2
-"""Without a pose, a force above this counts as contact [N]; above the noise of a 6-axis sensor."""
+"""Where no pose says so, a force above this is contact [N]; above the noise of a 6-axis sensor."""
 
 Times = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -51,8 +51,10 @@ class Streams:
 def ingest_record(path: Path, *, command: str = "", licence: str = "own record") -> FeatureDataset:
     """Read an MCAP record.
 
-    A row is a valid, tared electrode frame that has a wrench within 5 ms (and a pose, where the
-    record has poses of that sensor). A group is a press: it ends halfway between two contacts.
+    A row is a valid, tared electrode frame in whose middle there is a wrench (and a pose, where the
+    record has poses of that sensor): between two readings that are at most three periods apart. A
+    group is a press: it ends halfway between two contacts.
+    Where the source of the poses cannot know whether it touches, a force above ``TOUCH_N`` says so.
 
     Args:
         path: ``NAME.mcap``.
@@ -61,7 +63,8 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
 
     Raises:
         RecordingError: Not a whole record.
-        DatasetError: The record lacks a stream, or no row could be aligned.
+        DatasetError: The record lacks a stream, no row could be aligned, or a sensor is no BioTac
+            with 19 electrodes.
     """
     sensors = read_streams(path)
     parts: list[dict[str, npt.NDArray[Any]]] = []
@@ -95,7 +98,7 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
             input_sha256=digest,
             licence=licence,
             palpate_version=palpate_version(),
-            notes=f"aligned within {TOLERANCE_S * 1e3:g} ms; group = press",
+            notes="wrench and pose at the middle of each frame; group = press",
         ),
         name=str(path),
     )
@@ -130,15 +133,16 @@ def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any
     if not streams.wrenches:
         raise DatasetError(
             f"{path}: sensor {name!r} has no wrench stream",
-            remedy="record the force/torque sensor under the same sensor name",
+            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
         )
+    refuse_other_types(path, name, streams)
     frames = [
         frame
         for frame in streams.frames
-        if frame.sensor_type is SensorType.BIOTAC
-        and frame.electrodes_valid
+        if frame.electrodes_valid
         and frame.tare_id != NO_TARE
         and frame.tare_id in streams.tares
+        and streams.tares[frame.tare_id].electrodes.shape == frame.electrodes.shape
     ]
     if not frames:
         raise DatasetError(
@@ -148,29 +152,31 @@ def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any
         )
     frames.sort(key=lambda frame: time_of(frame.stamp, streams))
     times = np.array([time_of(frame.stamp, streams) for frame in frames], dtype=np.int64)
+    at = times + middles(frames)
 
-    force, has_force = interpolate(
-        times,
+    force, has_force = linear(
+        at,
         np.array([time_of(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
         np.array([w.force for w in streams.wrenches], dtype=np.float64),
     )
     kept = has_force
-    location = touching = None
+    location = None
+    touching = np.linalg.norm(force, axis=1) > TOUCH_N
     if streams.poses:
         pose_times = np.array([time_of(p.stamp, streams) for p in streams.poses], dtype=np.int64)
         positions = np.array([p.position for p in streams.poses], dtype=np.float64)
+        # NaN = not known, and so is what lies between a known and an unknown one
         contact = np.array([[p.in_contact] for p in streams.poses], dtype=np.float64)
-        both, has_pose = interpolate(times, pose_times, np.hstack([positions, contact]))
-        location, touching = both[:, :3], both[:, 3] >= 0.5
+        both, has_pose = linear(at, pose_times, np.hstack([positions, contact]))
+        location = both[:, :3]
+        touching = np.where(np.isnan(both[:, 3]), touching, both[:, 3] >= 0.5)
         kept = kept & has_pose
     if not kept.any():
         raise DatasetError(
-            f"{path}: no frame of {name!r} has a wrench (and pose) within {TOLERANCE_S} s",
+            f"{path}: no frame of {name!r} has a wrench (and pose) within three periods",
             remedy="check that all streams were stamped by the same clock",
         )
     logger.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
-    if touching is None:
-        touching = np.linalg.norm(force, axis=1) > TOUCH_N
 
     baseline = np.array([streams.tares[frame.tare_id].electrodes for frame in frames])
     columns: dict[str, npt.NDArray[Any]] = {
@@ -187,6 +193,22 @@ def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any
     return columns
 
 
+def refuse_other_types(path: Path, name: str, streams: Streams) -> None:
+    """Refuse frames of a sensor that has other electrodes than a data set.
+
+    Raises:
+        DatasetError: There are such; none is left out in silence.
+    """
+    others = [f.sensor_type for f in streams.frames if f.sensor_type is not SensorType.BIOTAC]
+    if others:
+        raise DatasetError(
+            f"{path}: {len(others)} of {len(streams.frames)} frames of {name!r} are of a "
+            f"{others[0].name} with {others[0].electrode_count} electrodes; a data set has "
+            f"{SensorType.BIOTAC.electrode_count}",
+            remedy="record BioTacs with 19 electrodes alone; models are trained for no other",
+        )
+
+
 def time_of(stamp: Stamp, streams: Streams) -> int:
     """Monotonic time [ns] where the streams' first readings share the clock, else wall time."""
     shared = all(
@@ -197,24 +219,9 @@ def time_of(stamp: Stamp, streams: Streams) -> int:
     return stamp.monotonic_ns if shared else stamp.wall_ns
 
 
-def interpolate(at: Times, times: Times, values: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
-    """Values at other times, linear between neighbours, and where that is allowed.
-
-    Allowed is a time whose nearest reading is within the tolerance. Across a gap of more than
-    twice the tolerance the nearest reading is taken instead of a line through the gap.
-    """
-    order = np.argsort(times, kind="stable")
-    times, values = times[order], values[order]
-    origin = times[0]  # float64 holds ns exactly only for small numbers
-    after = np.clip(np.searchsorted(times, at), 0, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    tolerance = round(TOLERANCE_S * 1e9)
-    nearer = np.where(np.abs(at - times[before]) <= np.abs(times[after] - at), before, after)
-    allowed = np.abs(times[nearer] - at) <= tolerance
-    seconds = (times - origin) * 1e-9
-    line = np.stack([np.interp((at - origin) * 1e-9, seconds, column) for column in values.T], 1)
-    gap = (times[after] - times[before] > 2 * tolerance)[:, None]
-    return np.where(gap, values[nearer], line), allowed
+def middles(frames: Sequence[ElectrodeFrame]) -> Times:
+    """From each frame's stamp to the mean instant of its electrodes [ns]: 4 ms, live."""
+    return np.array([sample_offsets(frame).middle_ns for frame in frames], dtype=np.int64)
 
 
 def number_presses(touching: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate.gateway.protocols.channels import SLOTS_PER_FRAME
 from palpate.gateway.readings import Reading, RecordedMessage
 from palpate.protos.codec import ELECTRODE_FRAME
 from palpate.protos.config import StrictConfig
@@ -68,6 +67,7 @@ class Record(Device):
         self._sensor = options.sensor
         self._items: Iterator[RecordItem] = iter(())
         self._damage: RecordingError | None = None
+        self._slots = 0
         self._counters = {"messages": 0, "samples": 0}
 
     @property
@@ -80,8 +80,13 @@ class Record(Device):
         first = self._first_frame()
         self._items = read_record(self._options.path)
         self._damage = None
+        self._slots = first.sensor_type.layout.slots
         self._counters = dict.fromkeys(self._counters, 0)
-        return DeviceIdentity(serial=first.sensor_serial, slot_period_s=first.slot_period_ns * 1e-9)
+        return DeviceIdentity(
+            serial=first.sensor_serial,
+            slot_period_s=first.slot_period_ns * 1e-9,
+            sensor_type=first.sensor_type,
+        )
 
     def _close(self) -> None:
         self._items = iter(())
@@ -94,7 +99,7 @@ class Record(Device):
                     continue
                 self._counters["messages"] += 1
                 if _is_electrodes(item):
-                    self._counters["samples"] += SLOTS_PER_FRAME
+                    self._counters["samples"] += self._slots
                 batch.append(
                     RecordedMessage(item.address.topic, item.payload, item.log_time_ns * 1e-9)
                 )

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from palpate.gateway.biotac.frames import FrameAssembler
-from palpate.gateway.biotac.slots import SlotBlock
+from palpate.gateway.biotac.slots import UNKNOWN, SlotBlock
 from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.readings import ElectrodeReading, Reading
@@ -49,8 +49,8 @@ class TextLogReader:
         block_bytes: Least size of the blocks it is read in [bytes].
 
     Raises:
-        RecordingError: The file cannot be read, is empty, or is not a log of a 19-electrode BioTac;
-            or the port carries no data.
+        RecordingError: The file cannot be read, is empty, or is not a log of a BioTac with 19
+            electrodes or 24; or the port carries no data.
         ConfigError: Several ports carry data and none was chosen.
     """
 
@@ -85,12 +85,18 @@ class TextLogReader:
             )
         self._rebuild_time = len(self._pending) > 1 and not self._pending[:, 0].any()
         self.port = self._choose_port(port)
-        self._check_layout()
+        self.sensor_type = self._find_type()
+        """Kind of sensor, by the channels that were sampled."""
 
     @property
     def slot_period_s(self) -> float:
         """Time between two slots [s]."""
         return 1.0 / self.header.sample_rate_hz
+
+    @property
+    def timed(self) -> bool:
+        """Whether the log tells times; else they are made by counting slots."""
+        return not self._rebuild_time
 
     def blocks(self) -> Iterator[SlotBlock]:
         """Slots in order; afterwards ``damage`` says whether the log was whole."""
@@ -145,6 +151,7 @@ class TextLogReader:
             time_s=time_s,
             batch=table[:, 1].astype(np.int64),
             frame=frame,
+            position=np.full(len(table), UNKNOWN, np.int64),
         )
 
     def _rebuilt_time(self, frame: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
@@ -152,7 +159,7 @@ class TextLogReader:
         before = frame[0] if self._frame_before is None else self._frame_before
         missing = np.maximum(np.diff(frame, prepend=before) - 1, 0)
         index = self._slots_before + np.arange(len(frame))
-        index = index + ch.SLOTS_PER_FRAME * np.cumsum(missing)
+        index = index + self.sensor_type.layout.slots * np.cumsum(missing)
         self._slots_before = int(index[-1]) + 1
         self._frame_before = int(frame[-1])
         return np.asarray(index * self.slot_period_s, np.float64)
@@ -182,7 +189,7 @@ class TextLogReader:
             )
         return port or good[0]
 
-    def _check_layout(self) -> None:
+    def _find_type(self) -> SensorType:
         """Judge the number of electrodes by the rows: neither header nor serial tells it.
 
         The public capture has a serial that starts with BTSP (24 electrodes) and the 19-electrode
@@ -190,20 +197,22 @@ class TextLogReader:
         """
         counters = self._pending[:, 1:3]
         frames = 1 + int(np.count_nonzero((np.diff(counters, axis=0) != 0).any(axis=1)))
-        if frames == 1 and len(self._pending) < ch.SLOTS_PER_FRAME:
-            return  # cut inside its first frame, which is reported as such
         seen = {int(c) for c in np.unique(self._pending[:, 3]) if c >= ch.FIRST_ELECTRODE}
-        wanted = set(range(ch.FIRST_ELECTRODE, ch.FIRST_ELECTRODE + ch.ELECTRODES))
+        last = max(seen, default=0)
+        kind = SensorType.BIOTAC
+        if last >= ch.FIRST_ELECTRODE + ch.ELECTRODES:
+            kind = SensorType.BIOTAC_SP
+        if frames == 1 and len(self._pending) < kind.layout.slots:
+            return kind  # cut inside its first frame, which is reported as such
+        wanted = {c for c in ch.channels_of(kind.layout) if c >= ch.FIRST_ELECTRODE}
         if seen == wanted:
-            return
+            return kind
         absent = ", ".join(ch.channel_name(c) for c in sorted(wanted - seen))
-        extra = ", ".join(ch.channel_name(c) for c in sorted(seen - wanted))
-        detail = f"{absent} never occur" if absent else f"{extra} occur too"
         raise RecordingError(
-            f"{self.path}: the log has {len(seen)} electrodes, not {ch.ELECTRODES} ({detail} in "
-            f"its first {frames} frames)",
-            remedy="palpate reads logs of BioTacs sampled with all 19 electrodes; record with the "
-            "full 44-slot sequence",
+            f"{self.path}: the log has {len(seen)} electrodes, not {len(wanted)} ({absent} never "
+            f"occur in its first {frames} frames)",
+            remedy="palpate reads logs of BioTacs sampled with all 19 electrodes, and of BioTacs "
+            "SP with all 24; record with the full sequence of 44 or 54 slots",
         )
 
 
@@ -218,7 +227,7 @@ class TextLog(Device):
                 driver="text_log",
                 sensor_type=SensorType.BIOTAC,
                 model=f"vendor text log {options.path.name}",
-                rate_hz=ch.SLOT_RATE_HZ / ch.SLOTS_PER_FRAME,
+                rate_hz=ch.frame_rate_hz(SensorType.BIOTAC.layout),
                 live=False,
                 finite=True,
                 origin=Origin.REPLAYED,
@@ -247,7 +256,9 @@ class TextLog(Device):
     def _open(self) -> DeviceIdentity:
         reader = TextLogReader(self._options.path, port=self._options.port)
         self._reader = reader
-        self._assembler = FrameAssembler(reader.slot_period_s)
+        self._assembler = FrameAssembler(
+            reader.slot_period_s, reader.sensor_type.layout, timed=reader.timed
+        )
         self._blocks = reader.blocks()
         return DeviceIdentity(
             serial=self._options.serial
@@ -255,6 +266,7 @@ class TextLog(Device):
             or f"unknown-port{reader.port}",
             slot_period_s=reader.slot_period_s,
             start_wall_ns=reader.header.started_wall_ns,
+            sensor_type=reader.sensor_type,
         )
 
     def _close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -125,12 +126,15 @@ def _number(name: str, values: dict[str, bytes], key: str, default: float) -> fl
     if not text:
         return default
     try:
-        return float(text)
-    except ValueError as error:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
         raise RecordingError(
-            f"{name}: header key {key!r} is {text.decode('latin-1')!r}, not a number",
+            f"{name}: header key {key!r} is {text[:40].decode('latin-1')!r}, not a number",
             remedy="correct the header or export the log again",
-        ) from error
+        )
+    return number
 
 
 def _by_port(value: bytes) -> tuple[str, ...]:

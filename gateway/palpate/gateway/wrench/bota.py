@@ -95,6 +95,7 @@ class WrenchBota(WrenchDevice):
         super().__init__("wrench_bota", f"Bota on {options.port}", 1.0 / period_s, options)
         self._options = options
         self._period_us = 1e6 * period_s
+        self._baud = options.baud  # 0 while it is not known
         self._port = SerialPort(options.port, options.baud or ask.BAUDS_TO_PROBE[0])
         self._begin()
 
@@ -104,7 +105,6 @@ class WrenchBota(WrenchDevice):
         self._boot = ask.TextWait(ask.BOOT_TEXT)
         self._early = b""
         self._clock = SampleClock(self._period_us, _WRAP_US)
-        self._silent_since: float | None = None
 
     def zero(self) -> None:
         """See ``WrenchDevice``; the stream pauses for it.
@@ -148,15 +148,19 @@ class WrenchBota(WrenchDevice):
     def _find(self) -> int:
         """Open the port at the sensor's baud and bring it into its configuration."""
         bauds = (self._options.baud,) if self._options.baud else ask.BAUDS_TO_PROBE
-        until = time.monotonic() + self._options.boot_s
+        began_s = time.monotonic()
+        until = began_s + self._options.boot_s
         while True:
-            for baud in bauds:
+            # A sensor that comes back is at the speed at which it was; probing others takes time.
+            known = self._baud if time.monotonic() - began_s < self._options.boot_s / 2 else 0
+            for baud in (known,) if known else bauds:
                 self._port.close()
                 self._port = SerialPort(self._options.port, baud)
                 self._port.open()
                 for _ in range(_CALLS):
                     with contextlib.suppress(DeviceTimeout):
                         self._configure(_CALL_S)
+                        self._baud = baud
                         return baud
             if time.monotonic() >= until:
                 raise DeviceTimeout(
@@ -182,25 +186,8 @@ class WrenchBota(WrenchDevice):
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
-        since_s = self._silent_since = self._silent_since or time.monotonic()
-        wait_s = max(since_s + _SILENCE_S - time.monotonic(), 0.0)
-        timeout: DeviceTimeout | None = None
-        frames: list[BotaFrame] = []
-        try:
-            frames = self._frames(min(timeout_s, wait_s))
-        except DeviceTimeout as error:
-            timeout = error
-        if frames:
-            self._silent_since = None
-            return [reading for frame in frames if (reading := self._take(frame)) is not None]
-        if time.monotonic() - since_s >= _SILENCE_S:
-            raise DeviceLost(
-                f"{self.info.model}: no sample came for {_SILENCE_S:g} s",
-                remedy="check its power and cable; it is set up and started again by itself",
-            ) from timeout
-        if timeout is not None:
-            raise timeout
-        return []
+        frames = self._unless_silent(self._frames, timeout_s, _SILENCE_S)
+        return [reading for frame in frames if (reading := self._take(frame)) is not None]
 
     def _frames(self, timeout_s: float) -> list[BotaFrame]:
         data, self._early = self._early, b""
@@ -216,8 +203,9 @@ class WrenchBota(WrenchDevice):
             raise self._restarted("its clock began anew")
         if verdict is not Verdict.NEW:
             return None
-        for name in ask.status_names(frame.status & ~ask.OVERRANGE):
-            self._counts["status_" + name.replace(" ", "_")] += 1
+        if told := frame.status & ~ask.OVERRANGE:
+            for name in ask.status_names(told):
+                self._counts["status_" + name.replace(" ", "_")] += 1
         if frame.status & (ask.INVALID | _RAW):
             self._counts["invalid_samples"] += 1
             return None

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
+from pydantic import Field
 
-from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate.gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
 from palpate.gateway.readings import Reading, WrenchReading
+from palpate.gateway.timing.clock_map import Heard
 from palpate.gateway.wrench.mount import Mount, MountOptions
 from palpate.protos.config import StrictConfig
-from palpate.protos.errors import DeviceTimeout
+from palpate.protos.errors import DeviceLost, DeviceTimeout
 from palpate.protos.messages import Origin
+
+Sample = TypeVar("Sample")
+
+_PROMPT_EACH_S = 0.1
+"""How often a sample is read as it comes, though others wait for one another [s]."""
 
 
 class WrenchOptions(StrictConfig):
@@ -25,11 +34,19 @@ class WrenchOptions(StrictConfig):
         serial: Serial number to publish; empty = the device's own, or its address.
         zero_at_start: Take the load at the first opening as zero; only if nothing touches the
             BioTac then. A sensor that was lost and comes back is not zeroed: it may be pressed.
+        zero_max_sd_n: A force that varies more is not taken as zero on request [N].
+        zero_max_sd_nm: A torque that varies more is not taken as zero on request [N m].
+        gather_s: How long samples may wait for one another [s]: who wakes for each of 1000 a second
+            spends more on waking than on them. 0 = none waits, e.g. where a robot is controlled by
+            them. Their times are as good either way.
     """
 
     mount: MountOptions = MountOptions()
-    serial: str = ""
+    serial: str = Field(default="", max_length=SERIAL_MAX, pattern=r"^[ -~]*$")
     zero_at_start: bool = False
+    zero_max_sd_n: float = Field(default=0.5, gt=0.0)
+    zero_max_sd_nm: float = Field(default=0.02, gt=0.0)
+    gather_s: float = Field(default=8e-3, ge=0.0, le=0.05)
 
 
 class WrenchDevice(Device):
@@ -57,8 +74,18 @@ class WrenchDevice(Device):
         self._mount = Mount(options.mount)
         self._counts: Counter[str] = Counter()
         self._serial = options.serial
+        self.zero_limits = options
+        """What varies more is not taken as zero."""
+        self.zero_lost = False
+        """Whether the zero it had may be gone: it was opened again and does not tell."""
+        self._has_zero = False
         self._zero_at_start = options.zero_at_start
+        self._gather_s = options.gather_s
+        self._prompt_s = 0.0
         self._tick = 0
+        self._silent_since: float | None = None
+        self._tells_time = True
+        """Whether its readings have the device's time; known at the latest when it is connected."""
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -72,6 +99,16 @@ class WrenchDevice(Device):
         Raises:
             DeviceError: The device is not open, refuses, or cannot do it.
         """
+
+    def take_zero(self) -> None:
+        """``zero``, and remember that it has one."""
+        self.zero()
+        self._has_zero, self.zero_lost = True, False
+        self._counts["zeros"] += 1
+
+    def _keeps_zero(self) -> bool:
+        """Whether the device, connected again, says that it still has its zero."""
+        return False
 
     @abstractmethod
     def _connect(self) -> str:
@@ -87,18 +124,33 @@ class WrenchDevice(Device):
     def _open(self) -> DeviceIdentity:
         self._counts.clear()
         self._tick = 0
+        self._silent_since = None
         try:
             told = self._connect()
             if self._zero_at_start:
-                self.zero()
+                self.take_zero()
                 self._zero_at_start = False
+            elif self._has_zero and not self._keeps_zero():
+                # No product at hand stores a zero; who was without power has lost it.
+                self._has_zero, self.zero_lost = False, True
+                self._counts["zero_lost"] += 1
         except BaseException:
             self._close()
             raise
-        return DeviceIdentity(self._serial or told, slot_period_s=1.0 / self.info.rate_hz)
+        return DeviceIdentity(
+            self._serial or told,
+            slot_period_s=1.0 / self.info.rate_hz,
+            tells_time=self._tells_time,
+        )
 
     def _read(self, timeout_s: float) -> list[Reading]:
         until = time.monotonic() + timeout_s
+        if self._gather_s and time.monotonic() >= self._prompt_s:
+            # A sample that never waits tells its clock: what is read at even times would come
+            # late by the same for minutes.
+            self._prompt_s = time.monotonic() + _PROMPT_EACH_S
+        elif self._gather_s:
+            time.sleep(min(self._gather_s, timeout_s))
         while True:
             # Half a frame is not a reading, and [] would mean the end of the source.
             left_s = until - time.monotonic()
@@ -112,11 +164,46 @@ class WrenchDevice(Device):
                     remedy="bytes come, but no frame: check baud, model and wiring",
                 )
 
+    def _unless_silent(
+        self, take: Callable[[float], Sequence[Sample]], timeout_s: float, silence_s: float
+    ) -> Sequence[Sample]:
+        """Samples of a sensor that streams by itself, and says nothing when it restarts.
+
+        Args:
+            take: Takes what comes within a time [s]; may give none, e.g. half a frame.
+            timeout_s: How long to wait [s].
+            silence_s: Silence after which it is taken to have restarted [s].
+
+        Raises:
+            DeviceTimeout: None came yet.
+            DeviceLost: None came for too long. Others on a bus may talk on, so that a timeout of
+                the port alone would not tell.
+        """
+        since_s = self._silent_since = self._silent_since or time.monotonic()
+        left_s = max(since_s + silence_s - time.monotonic(), 0.0)
+        timeout: DeviceTimeout | None = None
+        samples: Sequence[Sample] = ()
+        try:
+            samples = take(min(timeout_s, left_s))
+        except DeviceTimeout as error:
+            timeout = error
+        if samples:
+            self._silent_since = None
+        elif time.monotonic() - since_s >= silence_s:
+            raise DeviceLost(
+                f"{self.info.model}: no sample came for {silence_s:g} s",
+                remedy="check its power and cable; it is set up and started again by itself",
+            ) from timeout
+        elif timeout is not None:
+            raise timeout
+        return samples
+
     def _reading(
         self,
         wrench: Sequence[float],
         *,
         time_s: float | None = None,
+        arrival_ns: int | None = None,
         tick: int | None = None,
         overload: bool = False,
     ) -> WrenchReading | None:
@@ -125,18 +212,20 @@ class WrenchDevice(Device):
         Args:
             wrench: Fx Fy Fz [N] Tx Ty Tz [N m] in the force/torque sensor's frame.
             time_s: The device's time [s]; None = it tells none, the host's time of arrival.
+            arrival_ns: Host monotonic clock when it arrived [ns]; None = now.
             tick: The device's unwrapped counter; None = it has none, ours.
             overload: Its range is exceeded.
         """
-        values = np.asarray(wrench, np.float64)
-        if not np.isfinite(values).all():
+        if not all(map(math.isfinite, wrench)):
             self._counts["not_finite"] += 1
             return None
-        force, torque = self._mount.on_biotac(values)
+        force, torque = self._mount.on_biotac(np.array(wrench, np.float64))
         self._tick = self._tick + 1 if tick is None else tick
         if overload:
             self._counts["overloads"] += 1
-        stamp_s = time.monotonic() if time_s is None else time_s
+        if arrival_ns is None:
+            arrival_ns = time.monotonic_ns()
+        stamp_s = 1e-9 * arrival_ns if time_s is None else time_s
         return WrenchReading(
             tick=self._tick,
             time_s=stamp_s,
@@ -144,4 +233,5 @@ class WrenchDevice(Device):
             torque=torque,
             serial=self.identity.serial if self.is_open else self._serial,
             overload=overload,
+            heard=Heard(stamp_s, arrival_ns),
         )

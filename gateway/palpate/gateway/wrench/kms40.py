@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pydantic import Field, model_validator
 
 from palpate.gateway.ports.port import silent
-from palpate.gateway.ports.sockets import TcpPort
+from palpate.gateway.ports.sockets import Received, TcpPort
 from palpate.gateway.protocols import kms40_requests as ask
 from palpate.gateway.protocols.kms40 import (
     FAULTS,
@@ -28,10 +28,12 @@ from palpate.gateway.protocols.kms40 import (
     parse_flags,
 )
 from palpate.gateway.readings import WrenchReading
+from palpate.gateway.timing.arrivals import Arrivals
 from palpate.gateway.wrench.device import WrenchDevice, WrenchOptions
 from palpate.protos.errors import DeviceError, DeviceTimeout
 
 _ANSWER_S = 2.0
+_GREET_S = 0.25
 _GOODBYE_S = 0.3
 _PATIENCE_S = 0.25
 """Silence after which the stream is started again, unless it is that slow by itself [s]."""
@@ -89,17 +91,22 @@ class WrenchKms40(WrenchDevice):
         model = f"Weiss KMS 40 at {options.host}"
         super().__init__("wrench_kms40", model, rate_hz, options)
         self._filter, self._flags_every_s = options.filter_number, options.flags_every_s
+        self._tells_time = False
         self._port = TcpPort(options.host, options.port)
         self._patience_s = max(_PATIENCE_S, 5.0 / rate_hz)
+        self._arrivals = Arrivals(1.0 / rate_hz)
         self._begin()
 
     def _begin(self) -> None:
         """Forget what an earlier connection told."""
         self._decoder = KmsDecoder()
         self._flags = SystemFlags(0)
+        # What the flags mean for a sample: asked 500 times a second, told once.
+        self._faulty = self._over_range = False
         self._flags_due_s = 0.0
         self._flags_asked = False
         self._heard_s = time.monotonic()
+        self._arrivals.begin()
 
     def zero(self) -> None:
         """See ``WrenchDevice``; the stream pauses for it, and what it held is thrown away."""
@@ -108,12 +115,15 @@ class WrenchKms40(WrenchDevice):
             self._ask(ask.tare_request(), "TARE", "1")
         finally:
             self._ask(ask.start_request(), "L1")
+            self._arrivals.begin()
+
+    def _keeps_zero(self) -> bool:
+        return bool(self._flags & SystemFlags.TARE_ON)
 
     def _connect(self) -> str:
         self._begin()
         self._port.open()
-        # It may stream to whom it streamed before; whatever comes is read away.
-        self._ask(ask.stop_request(), "L0")
+        self._greet()
         self._ask(ask.query_request(ask.Query.IDENTITY), "ID")
         serial = self._ask(ask.query_request(ask.Query.SERIAL_NUMBER), "SN")
         if not serial:
@@ -130,6 +140,18 @@ class WrenchKms40(WrenchDevice):
             self._check_flags()
         self._ask(ask.start_request(), "L1")
         return serial
+
+    def _greet(self) -> None:
+        """Stop what it streams to whom it streamed before; a device that is busy may not hear."""
+        until = time.monotonic() + _ANSWER_S
+        while True:
+            left_s = until - time.monotonic()
+            try:
+                self._ask(ask.stop_request(), "L0", within_s=min(_GREET_S, left_s))
+                return
+            except DeviceTimeout:
+                if left_s <= _GREET_S:
+                    raise
 
     def _check_flags(self) -> None:
         self._ask(ask.query_request(ask.Query.FLAGS), "FLAGS")
@@ -152,29 +174,36 @@ class WrenchKms40(WrenchDevice):
         while True:
             left_s = max(until - time.monotonic(), 0.0)
             try:
-                data = self._port.read(min(left_s, self._patience_s))
+                received = self._port.receive(min(left_s, self._patience_s))
             except DeviceTimeout:
-                data = b""
-            readings = self._readings(data)
+                received = None
+            readings = [] if received is None else self._readings(received)
             self._keep_going()
-            if data:
+            if received is not None:
                 return readings
             if time.monotonic() >= until:
                 raise silent(self.info.model, round(timeout_s, 3))
 
-    def _readings(self, data: bytes) -> list[WrenchReading]:
+    def _readings(self, received: Received) -> list[WrenchReading]:
+        records = self._decoder.feed(received.data)
+        count = sum(isinstance(record, ForceLine) for record in records)
+        times_ns = iter(self._arrivals.times_ns(count, received.arrival_ns) if count else ())
         readings = []
-        for record in self._decoder.feed(data):
+        for record in records:
             if isinstance(record, Reply):
                 self._note(record)
             if not isinstance(record, ForceLine):
                 continue
             self._heard_s = time.monotonic()
-            if self._flags & FAULTS:
+            arrival_ns = next(times_ns)
+            if self._faulty:
                 self._counts["invalid_samples"] += 1
                 continue
-            overload = bool(over_range_axes(self._flags))
-            reading = self._reading((*record.force, *record.torque), overload=overload)
+            reading = self._reading(
+                (*record.force, *record.torque),
+                arrival_ns=arrival_ns,
+                overload=self._over_range,
+            )
             if reading is not None:
                 readings.append(reading)
         return readings
@@ -201,6 +230,7 @@ class WrenchKms40(WrenchDevice):
             self._counts["bad_flags"] += 1
             return
         self._flags = flags
+        self._faulty, self._over_range = bool(flags & FAULTS), bool(over_range_axes(flags))
         for name in flag_names(flags & ~_EXPECTED):
             self._counts["status_" + name.replace(" ", "_")] += 1
         if not flags & SystemFlags.CALIBRATION_VALID:

@@ -64,6 +64,7 @@ class Mount:
         zero = np.zeros((3, 3))
         # One product a sample: some sensors send 7000 of them a second.
         self._matrix = sign * np.block([[rotation, zero], [arm @ rotation, rotation]])
+        self._plain = bool((self._matrix == np.eye(6)).all())
 
     def on_biotac(self, wrench: Floats) -> tuple[FloatArray, FloatArray]:
         """Wrench on the BioTac in the sensor frame.
@@ -75,5 +76,5 @@ class Mount:
         Returns:
             Force [N] and torque about the sensor frame's origin [N m], float32, shape (3,).
         """
-        turned = (self._matrix @ wrench).astype(np.float32)
+        turned = (wrench if self._plain else self._matrix @ wrench).astype(np.float32)
         return turned[:3], turned[3:]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.gateway.ports.port import silent
-from palpate.gateway.ports.sockets import UdpPort
+from palpate.gateway.ports.sockets import Received, UdpPort
 from palpate.gateway.ports.web_page import read_page
 from palpate.gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
 from palpate.gateway.protocols.rdt import RdtDecoder, RdtRecord, RdtScale, RdtSequence
@@ -50,11 +50,12 @@ _SEVERAL_SENSORS = 1 << 3
 
 
 class _Record(NamedTuple):
-    """A new record, its number over all starts, and the device's time [s]."""
+    """A new record, its number over all starts, the device's time [s] and its arrival [ns]."""
 
     raw: RdtRecord
     tick: int
     time_s: float | None
+    arrival_ns: int
 
 
 class WrenchRdt(WrenchDevice):
@@ -159,13 +160,14 @@ class WrenchRdt(WrenchDevice):
             counter_hz = None
         wrong, self._clock = self._clock.wrong, CounterClock(counter_hz, self.info.model)
         self._clock.wrong = wrong
+        self._tells_time = counter_hz is not None
         return serial
 
     def _start(self) -> None:
         for _ in range(_STARTS):
             self._port.write(self._profile.start_request())
             with contextlib.suppress(DeviceTimeout):
-                self._early = self._fresh(self._port.read(self._patience_s))
+                self._early = self._fresh(self._port.receive(self._patience_s))
             if self._early:
                 return
         raise DeviceTimeout(
@@ -187,7 +189,13 @@ class WrenchRdt(WrenchDevice):
                 continue
             wrench = self._scale.wrench(record.raw.counts).tolist()
             readings.append(
-                self._reading(wrench, time_s=record.time_s, tick=record.tick, overload=overload)
+                self._reading(
+                    wrench,
+                    time_s=record.time_s,
+                    arrival_ns=record.arrival_ns,
+                    tick=record.tick,
+                    overload=overload,
+                )
             )
         return [reading for reading in readings if reading is not None]
 
@@ -199,10 +207,10 @@ class WrenchRdt(WrenchDevice):
             heard = False
             left_s = max(until - time.monotonic(), 0.0)
             with contextlib.suppress(DeviceTimeout):
-                records += self._fresh(self._port.read(min(left_s, self._patience_s)))
+                records += self._fresh(self._port.receive(min(left_s, self._patience_s)))
                 heard = True
                 for _ in range(_AT_ONCE - 1):
-                    records += self._fresh(self._port.read(0.0))
+                    records += self._fresh(self._port.receive(0.0))
             self._keep_going()
             if heard:
                 break
@@ -218,17 +226,17 @@ class WrenchRdt(WrenchDevice):
             self._counts["starts_repeated"] += 1
             self._port.write(self._profile.start_request())
 
-    def _fresh(self, datagram: bytes) -> list[_Record]:
+    def _fresh(self, datagram: Received) -> list[_Record]:
         """Records of a datagram that are neither repeated nor late."""
         records = []
-        for raw in self._decoder.feed(datagram):
+        for raw in self._decoder.feed(datagram.data):
             self._heard_s = time.monotonic()
             step = self._sequence.step(raw.rdt_sequence, raw.ft_sequence)
             if step.keep:
                 time_s = self._clock.follow(
-                    raw.ft_sequence, self._heard_s, new_epoch=step.new_epoch
+                    raw.ft_sequence, 1e-9 * datagram.arrival_ns, new_epoch=step.new_epoch
                 )
-                records.append(_Record(raw, step.tick, time_s))
+                records.append(_Record(raw, step.tick, time_s, datagram.arrival_ns))
         return records
 
     def _overload(self, raw: RdtRecord) -> bool | None:

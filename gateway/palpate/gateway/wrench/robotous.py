@@ -22,9 +22,10 @@ from palpate.gateway.protocols.robotous_framing import (
     RobotousCanDecoder,
 )
 from palpate.gateway.readings import WrenchReading
+from palpate.gateway.timing.arrivals import Arrivals
 from palpate.gateway.wrench.device import WrenchDevice, WrenchOptions
 from palpate.gateway.wrench.robotous_line import RobotousCanLine, RobotousLine, RobotousSerialLine
-from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate.protos.errors import DeviceError, DeviceTimeout
 
 _ANSWER_S = 0.3
 _ATTEMPTS = 3
@@ -111,10 +112,10 @@ class WrenchRobotous(WrenchDevice):
         model = f"Robotous RFT on {self._line.name}"
         super().__init__("wrench_robotous", model, float(options.rate_hz), options)
         self._options = options
+        self._tells_time = False
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
         self._scale = ask.RobotousScale(1.0, 1.0)
-        self._heard_s = 0.0
-        self._silent_since: float | None = None
+        self._arrivals = Arrivals(1.0 / options.rate_hz)
 
     def zero(self) -> None:
         """See ``WrenchDevice``; what comes meanwhile is thrown away.
@@ -148,7 +149,7 @@ class WrenchRobotous(WrenchDevice):
         self._set(ask.filter_request(cutoff_hz, order=self._options.filter_order))
         self._set(ask.rate_request(self._options.rate_hz))
         self._answer(ask.start_request(), Command.START)
-        self._heard_s, self._silent_since = time.monotonic(), None
+        self._arrivals.begin()
         return serial or self._line.name
 
     def _scale_of(self, told: str) -> ask.RobotousScale:
@@ -173,38 +174,17 @@ class WrenchRobotous(WrenchDevice):
         self._line.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
-        since_s = self._silent_since = self._silent_since or time.monotonic()
-        wait_s = max(since_s + self._silence_s - time.monotonic(), 0.0)
-        timeout: DeviceTimeout | None = None
-        try:
-            samples = self._samples(min(timeout_s, wait_s))
-        except DeviceTimeout as error:
-            samples, timeout = [], error
-        if samples:
-            return self._readings(samples)
-        # Others on the bus may talk on, so that a timeout alone would not tell.
-        if time.monotonic() - since_s >= self._silence_s:
-            raise DeviceLost(
-                f"{self.info.model}: no sample came for {self._silence_s:g} s",
-                remedy="check its power and cable; it is set up and started again by itself",
-            ) from timeout
-        if timeout is not None:
-            raise timeout
-        return []
+        samples = self._unless_silent(self._samples, timeout_s, self._silence_s)
+        return self._readings(samples) if samples else []
 
     def _readings(self, samples: Sequence[RobotousData]) -> list[WrenchReading]:
-        self._silent_since = None
-        # What came together was taken at the sensor's rate, or faster if less time has passed.
-        now_s = time.monotonic()
-        step_s = min(1.0 / self.info.rate_hz, (now_s - self._heard_s) / len(samples))
-        self._heard_s = now_s
+        times_ns = self._arrivals.times_ns(len(samples), time.monotonic_ns())
         readings = []
-        for at, sample in enumerate(samples, start=1 - len(samples)):
+        for arrival_ns, sample in zip(times_ns, samples, strict=True):
             for axis in ask.overloaded_axes(sample.overload):
                 self._counts[f"status_overload_{axis.lower()}"] += 1
             wrench = self._scale.wrench(sample.counts)
-            time_s = now_s + at * step_s
-            reading = self._reading(wrench, time_s=time_s, overload=sample.overload != 0)
+            reading = self._reading(wrench, arrival_ns=arrival_ns, overload=sample.overload != 0)
             if reading is not None:
                 readings.append(reading)
         return readings
@@ -221,7 +201,7 @@ class WrenchRobotous(WrenchDevice):
         until = time.monotonic() + self._silence_s + 2.0 * _ZERO_SAMPLES / self.info.rate_hz
         while len(samples) < _ZERO_SAMPLES:
             samples += self._samples(max(until - time.monotonic(), 0.0))
-        self._heard_s = time.monotonic()
+        self._arrivals.begin()
         if any(sample.overload for sample in samples):
             raise DeviceError(f"{self.info.model}: it is overloaded", remedy="take the load off")
         return [sum(axis) / len(samples) for axis in zip(*(s.counts for s in samples), strict=True)]

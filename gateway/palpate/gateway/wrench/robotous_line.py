@@ -132,11 +132,11 @@ class RobotousCanLine(RobotousLine):
     def read(self, timeout_s: float) -> list[bytes]:
         """See ``RobotousLine``."""
         out = []
-        for message in self._bus.read(timeout_s):
+        for can_id, data, arrival_ns in self._bus.read(timeout_s).messages():
             # Nothing numbers the samples: only their times show that two halves do not belong.
-            if self._decoder.pending and message.arrival_ns - self._first_ns > self._apart_ns:
+            if self._decoder.pending and arrival_ns - self._first_ns > self._apart_ns:
                 self._decoder.reset()
-            if message.can_id == self._ids[0]:
-                self._first_ns = message.arrival_ns
-            out += self._decoder.feed(message.can_id, message.data)
+            if can_id == self._ids[0]:
+                self._first_ns = arrival_ns
+            out += self._decoder.feed(can_id, data)
         return out

@@ -17,9 +17,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from palpate.protos.alignment import linear
 from palpate.protos.errors import ConfigError, DatasetError
-from palpate.protos.messages import SensorType
-from palpate.training.ingest_record import Streams, interpolate, read_streams, time_of
+from palpate.training.ingest_record import (
+    Streams,
+    middles,
+    read_streams,
+    refuse_other_types,
+    time_of,
+)
 from palpate.training.testbed.joint_log import JointLog, read_joint_log
 from palpate.training.testbed.plan import DWELL_S, Motion, commanded_travel
 from palpate.training.testbed.trajectory_file import read_trajectories
@@ -114,13 +120,10 @@ def _samples(record: Path, sensor: str, streams: Streams) -> _Stream:
     if not streams.wrenches:
         raise DatasetError(
             f"{record}: sensor {sensor!r} has no wrench stream",
-            remedy="record the force/torque sensor under the same sensor name",
+            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
         )
-    frames = [
-        frame
-        for frame in streams.frames
-        if frame.sensor_type is SensorType.BIOTAC and frame.electrodes_valid
-    ]
+    refuse_other_types(record, sensor, streams)
+    frames = [frame for frame in streams.frames if frame.electrodes_valid]
     if not frames:
         raise DatasetError(
             f"{record}: sensor {sensor!r} has no valid BioTac frame",
@@ -131,14 +134,16 @@ def _samples(record: Path, sensor: str, streams: Streams) -> _Stream:
         return_index=True,
     )
     frames = [frames[i] for i in first]
-    force, known = interpolate(
-        times,
+    at = times + middles(frames)
+    force, known = linear(
+        at,
         np.array([time_of(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
         np.array([w.force for w in streams.wrenches], dtype=np.float64),
     )
+    walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
     return _Stream(
-        times[known],
-        np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)[known],
+        at[known],
+        (walls + at - times)[known],
         np.array([frame.electrodes for frame in frames], dtype=np.uint16)[known],
         force[known],
     )
@@ -152,7 +157,7 @@ def _tip_of_poses(
             f"{record}: sensor {sensor!r} has no pose stream",
             remedy="record the indenter's pose, or pass the joint log of each arm",
         )
-    return interpolate(
+    return linear(
         samples.time_ns,
         np.array([time_of(p.stamp, streams) for p in streams.poses], dtype=np.int64),
         np.array([p.position for p in streams.poses], dtype=np.float64),
@@ -168,7 +173,7 @@ def _tip_of_joints(
     except ConfigError as error:
         raise ConfigError(f"{log.path}: {error.problem}", remedy=error.remedy) from error
     sensor_robot = registered if log.sensor_robot is None else log.sensor_robot
-    return interpolate(samples.wall_ns, times, sensor_robot.apply(positions))
+    return linear(samples.wall_ns, times, sensor_robot.apply(positions))
 
 
 def _starts(

@@ -1,0 +1,123 @@
+"""Write docs/results/faults.md: every fault of every emulated device, through worker and pipeline.
+
+``python -m docs.make_faults`` takes about ten minutes, in which the machine should be quiet. A
+trial in which this process stood still is repeated: it would time the machine, not the gateway.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+
+from tests.gateway.device_cases import CASES, Case
+from tests.gateway.fault_bench import FaultBench, Outcome
+from tests.gateway.fault_names import LASTING, SLOW_S, told_by, why_untold
+
+PAGE = Path(__file__).parent / "results" / "faults.md"
+
+LASTS_S = 0.5
+LONG_S = (3.3, 4.1)
+"""Lengths of an outage; two, because attempts to open again come at intervals."""
+
+OUTAGES = ("unplug", "restart", "silence", "busoff", "absent")
+"""Faults that can last."""
+
+STOOD_STILL_S = 0.2
+_TRIES = 20
+
+HEAD = """# Faults: how they show, and how soon they are over
+
+Made by `python -m docs.make_faults`: the gateway's own worker and pipeline read each device in
+software, which has each of its faults for {lasts} s, and outages for {long} s too. Every message is
+compared with what the device measured at that time.
+
+*Shows as*: counters and errors that tell of it (those named in `tests/gateway/fault_names.py`).
+*Wrong*: messages that said what was not measured, or went back in time, of all that were published
+from its beginning until all was well. *Over after*: from the end of the fault to the first of the
+good messages that followed one another, after {lasts} s and at worst after an outage. The goal is
+1 s.
+
+"""
+
+
+class _Watch:
+    """Tells how long this process has stood still."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        last_s = time.monotonic()
+        while True:
+            time.sleep(0.02)
+            now_s = time.monotonic()
+            self.longest_s = max(self.longest_s, now_s - last_s)
+            last_s = now_s
+
+
+def _trial(bench: FaultBench, fault: str, lasts_s: float, watch: _Watch) -> Outcome:
+    for _ in range(_TRIES):
+        watch.longest_s = 0.0
+        outcome = bench.trial(fault, lasts_s)
+        if watch.longest_s < STOOD_STILL_S:
+            return outcome
+        _tell(f"repeated: stood still for {watch.longest_s:.1f} s")
+    raise SystemExit(f"this machine is too busy: {fault} was tried {_TRIES} times")
+
+
+def _row(bench: FaultBench, fault: str, watch: _Watch) -> str:
+    name = bench.case.name
+    untold = why_untold(name, fault)
+    outcome = _trial(bench, fault, LASTS_S if untold else SLOW_S.get(fault, LASTS_S), watch)
+    worst = ""
+    if fault in OUTAGES:
+        outages = [_trial(bench, fault, lasts_s, watch) for lasts_s in LONG_S]
+        worst = _milliseconds(max(one.recovery_s for one in outages))
+    told = ", ".join(f"`{one}`" for one in told_by(fault, outcome.counted, outcome.errors))
+    wrong = outcome.wrong + outcome.disordered
+    cells = (fault, untold or told or "**nothing**", f"{wrong} of {outcome.published}",
+             _milliseconds(outcome.recovery_s), worst)  # fmt: skip
+    return f"| {' | '.join(cells)} |"
+
+
+def _tell(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def _milliseconds(time_s: float) -> str:
+    text = f"{1e3 * time_s:.0f} ms"
+    return text if time_s <= 1.0 else f"**{text}**"
+
+
+def _section(case: Case, watch: _Watch) -> str:
+    lines = [f"## {case.name}", "", "| Fault | Shows as | Wrong | Over after | after an outage |"]
+    lines.append("|---|---|---|---|---|")
+    with FaultBench(case) as bench:
+        for fault in sorted(bench.emulator.faults):
+            if (case.name, fault) in LASTING:
+                lines.append(f"| {fault} | {LASTING[case.name, fault]} | | | |")
+                continue
+            lines.append(_row(bench, fault, watch))
+            _tell(f"{case.name} {lines[-1]}")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Try everything and write the page."""
+    watch = _Watch()
+    chosen = [case for case in CASES if case.emulate is not None]
+    if sys.argv[1:]:
+        chosen = [case for case in chosen if case.name in sys.argv[1:]]
+    sections = [_section(case, watch) for case in chosen]
+    if sys.argv[1:]:
+        return  # to look at some of them; the page is of all
+    head = HEAD.format(lasts=LASTS_S, long=" and ".join(map(str, LONG_S)))
+    PAGE.write_text(head + "\n".join(sections), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How a sensor does, told from its frames: whether it is touched, settled, warm and intact."""

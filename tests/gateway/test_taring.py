@@ -1,0 +1,158 @@
+"""When a sensor is tared: at the start, on request, and again by itself."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+from palpate.gateway.condition.condition import Retare
+from palpate.gateway.device import DeviceIdentity, DeviceInfo
+from palpate.gateway.pipeline import Outgoing, Pipeline
+from palpate.gateway.readings import ElectrodeReading
+from palpate.gateway.tare import TareCollector
+from palpate.gateway.timing.clock_map import FileClock, LiveClock
+from palpate.protos.errors import DeviceError
+from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+
+fakes: Any = importlib.import_module("condition_fakes")
+IDENTITY = DeviceIdentity("BT1", 1 / 4400)
+
+
+def pipeline(*, live: bool = True, **options: Any) -> Pipeline:
+    info = DeviceInfo("test", SensorType.BIOTAC, "test", 100.0, live, not live, Origin.LIVE)
+    made = Pipeline(info, **options)
+    made.begin(IDENTITY, LiveClock() if live else FileClock("BT1", None))
+    return made
+
+
+def push(made: Pipeline, frames: Iterable[ElectrodeFrame]) -> list[Outgoing]:
+    """Readings that hold what the frames do."""
+    out: list[Outgoing] = []
+    for frame in frames:
+        reading = ElectrodeReading(
+            tick=frame.stamp.device_tick,
+            time_s=frame.stamp.monotonic_ns * 1e-9,
+            missed_before=0,
+            electrodes=frame.electrodes,
+            pdc=frame.pdc,
+            pac=frame.pac,
+            tac=frame.tac,
+            tdc=frame.tdc,
+            validity=frame.validity,
+        )
+        out += made.push([reading], frame.stamp.monotonic_ns)
+    return out
+
+
+def tares(out: list[Outgoing]) -> list[Tare]:
+    return [item.message for item in out if isinstance(item.message, Tare)]
+
+
+def test_still_waits_for_pac_to_be_quiet() -> None:
+    """A hand that holds the finger: its electrodes are quiet enough, its pulse is not."""
+    made, finger = pipeline(), fakes.Finger()
+    finger.pac_noise = 22.0
+    assert tares(push(made, finger.frames(3.0))) == []
+    assert "cannot tare BT1: PAC varies by 22 counts" in str(made.tare_error)
+    assert made.counters["tares_refused"] == 6
+    finger.pac_noise = 4.0
+    (tare,) = tares(push(made, finger.frames(1.0)))
+    assert tare.pac == pytest.approx(2040.0, abs=0.5)
+    assert made.tare_error is None
+    assert made.condition is not None
+    push(made, finger.frames(1.0))
+    assert made.condition.gauges()["tare_drift_counts"] < 5.0
+
+
+def test_first_looks_at_the_electrodes_only() -> None:
+    made, finger = pipeline(tare="first"), fakes.Finger()
+    finger.pac_noise = 22.0
+    assert len(tares(push(made, finger.frames(0.5)))) == 1
+
+
+def test_query_waits_to_be_asked() -> None:
+    made, finger = pipeline(tare="query"), fakes.Finger()
+    out = push(made, finger.frames(2.0))
+    assert tares(out) == []
+    assert len(out) == 200
+    future = made.ask_tare(0)
+    assert tares(push(made, finger.frames(0.5))) == [future.result(timeout=0)]
+
+
+def test_a_recording_that_is_not_to_be_tared_is_not_held_back() -> None:
+    made, finger = pipeline(live=False, tare="query"), fakes.Finger()
+    out = push(made, finger.frames(0.1))
+    assert [item.message.tare_id for item in out] == [NO_TARE] * 10  # type: ignore[union-attr]
+
+
+def test_a_recording_does_not_wait_for_pac() -> None:
+    made, finger = pipeline(live=False), fakes.Finger()
+    finger.pac_noise = 22.0
+    (tare,) = tares(push(made, finger.frames(0.5)))
+    assert made.ledger.current_id == tare.tare_id
+
+
+def test_a_request_is_refused_while_a_hand_holds_it() -> None:
+    made, finger = pipeline(), fakes.Finger()
+    finger.pac_noise = 22.0
+    future = made.ask_tare(0)
+    push(made, finger.frames(0.5))
+    with pytest.raises(DeviceError, match=r"PAC varies by 22 .*take everything off the finger"):
+        future.result(timeout=0)
+
+
+def test_drift_is_tared_away_if_that_is_allowed() -> None:
+    made = pipeline(retare=Retare(after_s=2.0, drift_counts=10.0))
+    finger = fakes.Finger()
+    (first,) = tares(push(made, finger.frames(1.0)))
+    finger.offset[:] = 15.0
+    out = push(made, finger.frames(4.0))
+    (again,) = tares(out)
+    assert made.counters["retares"] == 1
+    assert (again.electrodes - first.electrodes).mean() == pytest.approx(15.0, abs=1.0)
+    ids = [i.message.tare_id for i in out if isinstance(i.message, ElectrodeFrame)]
+    assert ids[0] == first.tare_id
+    assert ids[-1] == again.tare_id
+
+
+def test_drift_is_not_tared_away_unless_that_is_allowed() -> None:
+    made, finger = pipeline(), fakes.Finger()
+    push(made, finger.frames(1.0))
+    finger.offset[:] = 40.0
+    assert tares(push(made, finger.frames(10.0))) == []
+    assert made.counters["retares"] == 0
+
+
+def test_a_press_that_stays_is_never_tared_away() -> None:
+    made, finger = pipeline(retare=Retare(after_s=1.0)), fakes.Finger()
+    push(made, finger.frames(1.0))
+    finger.press(120.0)
+    assert tares(push(made, finger.frames(15.0))) == []
+
+
+def test_a_sensor_with_one_sample_of_pac_a_frame_can_be_tared() -> None:
+    """As one polled by a PIC32 board."""
+    made, finger = pipeline(), fakes.Finger()
+    finger.invalid = fakes.LAYOUT.all_valid >> 23 << 23
+    (tare,) = tares(push(made, finger.frames(0.5)))
+    assert tare.frames_averaged == 50
+    assert tare.pac == pytest.approx(2040.0, abs=2.0)
+
+
+def test_a_sensor_without_pac_cannot() -> None:
+    finger, collector = fakes.Finger(), TareCollector(5)
+    finger.invalid = fakes.LAYOUT.all_valid >> 22 << 22
+    for _ in range(4):
+        assert collector.add(finger.frame()) is None
+    with pytest.raises(DeviceError, match="cannot tare BT1: PAC invalid"):
+        collector.add(finger.frame())
+
+
+def test_a_biotac_sp_is_tared_by_its_24_electrodes() -> None:
+    collector, finger = TareCollector(5), fakes.Finger(kind=SensorType.BIOTAC_SP)
+    made = [collector.add(finger.frame()) for _ in range(5)]
+    assert made[-1] is not None
+    assert made[-1].electrodes.shape == (24,)
