@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from tests.fuzz.streams import parts
 
 from palpate.gateway.protocols.can_slots import (
@@ -10,6 +11,7 @@ from palpate.gateway.protocols.can_slots import (
     CanSlotDecoder,
     SlotDecoder,
     learn_order,
+    payload_rows,
 )
 from palpate.gateway.protocols.channels import CHANNEL_NAMES
 from palpate.gateway.protocols.spi import channel_of_command, decode_word
@@ -21,15 +23,17 @@ def check(data: bytes) -> None:
     _check_words(parts(data[1:]), fingers)
     _check_order(data[1:])
     bus = CanSlotDecoder(fingers=1, can_id=data[0] if data else None)
-    ours = sum(bus.is_ours(byte) for byte in data)
-    assert bus.counters["other_ids"] == len(data) - ours
+    ours = bus.ours(np.frombuffer(data, np.uint8).astype(np.int64))
+    told = len(data) if ours is None else int(ours.sum())
+    assert bus.counters["other_ids"] == len(data) - told
+    assert told == data.count(data[:1]) if data else ours is None
 
 
 def _check_words(payloads: list[bytes], fingers: int) -> None:
     many, single = SlotDecoder(fingers=fingers), SlotDecoder(fingers=fingers)
-    words = many.decode(payloads)
+    words = many.decode(*payload_rows(payloads))
     for payload in payloads:
-        single.decode([payload])
+        single.decode(*payload_rows([payload]))
     assert many.counters == single.counters
     assert many.finger_counters == single.finger_counters
     counters = many.counters

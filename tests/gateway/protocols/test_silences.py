@@ -74,6 +74,25 @@ def test_a_stall_of_the_host_is_no_loss(at: int, stall_s: float) -> None:
     assert places[-1].time_s == pytest.approx(slots[-1][1])
 
 
+@pytest.mark.parametrize("at_once", [92, 100, 130])
+def test_a_starved_sender_that_catches_up_slowly_has_lost_nothing(at_once: int) -> None:
+    """It runs 1 ms in 20, and sends a little more each time than was sampled meanwhile."""
+    slots = stream(frames=200)
+    wakes_s = (slots[300][1] + 0.06 + 0.02 * k for k in itertools.count())
+    seen, at = slots[:300], 300
+    while at < len(slots):
+        wake_s = next(wakes_s)
+        due = [slot for slot in slots[at : at + at_once] if slot[1] <= wake_s]
+        seen += [(channel, wake_s + 10e-6 * k) for k, (channel, _) in enumerate(due)]
+        at += len(due)
+        if len(due) < at_once:
+            break
+    seen += slots[at:]
+    clock = SlotClock(sequence=E1_FIRST)
+    place_all(clock, seen)
+    assert counted(clock) == {}
+
+
 def test_a_full_queue_behind_a_stall_is_a_loss() -> None:
     slots = stream(frames=100)
     until_s = slots[300][1] + 0.3

@@ -15,6 +15,9 @@ from palpate.gateway.protocols.places import Floats
 _GAP_S = 5e-3
 """Silence that is worth a thought; stamps of a bus scatter by 1 ms (hardware reference 5.1) [s]."""
 
+_PROGRESS_S = 1.5e-3
+"""Delays that fall by more than stamps scatter show that a stall is being made up for [s]."""
+
 _ENVELOPE_S = 0.1
 """How long the least delay is remembered [s]."""
 
@@ -105,8 +108,9 @@ class Silences:
             self._stall_s = max(self._stall_s, gap.stall_s)
             self._begin(stamp_s, gap.least_s)
             return NO_LOSS
-        if gap.least_s < gap.mark_s - self._worth_s / 2:  # being made up for
-            gap.mark_s = gap.least_s
+        # It is being made up for; or who makes up for it was held up again.
+        if gap.least_s < gap.mark_s - _PROGRESS_S or silence_s >= self._worth_s:
+            gap.mark_s = min(gap.mark_s, gap.least_s)
             gap.until_s = stamp_s + self._settle_s
         at_once = broken and delay_s - usual_s >= max(0.75 * self._worth_s, 2 * self._stall_s)
         if not at_once and (stamp_s < gap.until_s or not edge):

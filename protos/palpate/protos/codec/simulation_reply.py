@@ -87,6 +87,8 @@ def _step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> Simulation
     torque = vector3_from_wire(msg.torque, f"{what}.torque").astype(np.float64)
     if msg.wrench:  # absent before it was in the contract
         wrench = _doubles(msg.wrench, 6, f"{what}.wrench")
+        if np.abs(wrench).max() > np.finfo(np.float32).max:  # what is accepted can be said again
+            reject("non_finite", f"{what}.wrench = {wrench.tolist()} exceeds float32")
         force, torque = wrench[:3], wrench[3:]
     if msg.centre_of_pressure:
         centre = _doubles(msg.centre_of_pressure, 3, f"{what}.centre_of_pressure")
