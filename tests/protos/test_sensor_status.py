@@ -41,7 +41,7 @@ def test_what_a_newer_gateway_knows_is_unknown_not_wrong(examples: dict[str, Any
     message = service_pb2.Status.FromString(STATUS.encode(examples["Status"]))
     one = message.sensor_states.add(name="finger", message="new")
     one.state = 77  # type: ignore[assignment]
-    one.faults.add(kind=88, channels=["E1"])  # type: ignore[arg-type]
+    one.faults.add(kind=88, channels=["E1"])
     (found,) = STATUS.decode(message.SerializeToString()).sensor_states
     assert found == SensorStatus(
         "finger", SensorState.UNKNOWN, 0, (ChannelFault(FaultKind.UNKNOWN, ("E1",)),), "new"

@@ -14,6 +14,7 @@ from palpate.gateway.config import GatewayConfig, SensorConfig
 from palpate.gateway.device import BusDevice, Device
 from palpate.gateway.drivers import make_device
 from palpate.gateway.pipeline import Pipeline
+from palpate.gateway.tare_requests import answer_tare, answer_zero
 from palpate.gateway.timing.discipline import wall_discipline
 from palpate.gateway.timing.wall_clock import WallClock
 from palpate.gateway.worker import SensorWorker
@@ -94,7 +95,7 @@ def run(
                     sensor=sensor.name,
                     request=WRENCH_ZERO_REQUEST,
                     reply=WRENCH_ZERO,
-                    handler=worker.zero,
+                    handler=partial(answer_zero, worker),
                 )
                 continue  # what has no electrodes has no baseline
             if sensor.of is not None:
@@ -104,7 +105,7 @@ def run(
                 sensor=sensor.name,
                 request=TARE_REQUEST,
                 reply=TARE_CODEC,
-                handler=worker.tare,
+                handler=partial(answer_tare, worker),
                 # Taring takes half a second; looking up a known tare must not wait for it.
                 workers=2,
             )

@@ -11,9 +11,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Future
 from math import inf
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from palpate.gateway.device import Device
 from palpate.gateway.pipeline import Outgoing, Pipeline
@@ -33,17 +32,12 @@ from palpate.protos.errors import (
     DeviceError,
     DeviceLost,
     DeviceTimeout,
-    ErrorCode,
     LinkError,
     PalpateError,
-    RemoteError,
     WireError,
 )
 from palpate.protos.health import Health
-from palpate.protos.messages import NO_TARE, Tare, TareRequest, WrenchZero, WrenchZeroRequest
 from palpate.protos.session import Publisher
-
-A = TypeVar("A")
 
 _log = logging.getLogger(__name__)
 
@@ -111,10 +105,12 @@ class SensorWorker:
         self._stop = stop
         self._claim = claim
         self._counters: Counter[str] = Counter()
+        self._rejected: set[str] = set()
         self._device_counters: Counter[str] = Counter()
         self._report = SensorReport(name, health)
         self._wrench = device if isinstance(device, WrenchDevice) else None
-        self._zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
+        self.zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
+        """Takes the zero of a force/torque sensor when asked; None = it is none."""
         self._thread = threading.Thread(target=self._run, name=f"sensor {name}", daemon=True)
 
     def start(self) -> None:
@@ -142,56 +138,7 @@ class SensorWorker:
     @property
     def sound(self) -> bool:
         """Whether it delivers, as far as it should, and nothing that is known to be wrong."""
-        return not (self.error or self.silent or self._report.untrue)
-
-    def tare(self, request: TareRequest) -> Tare:
-        """Answer a tare request: look one up, or tare with the next frames.
-
-        Raises:
-            RemoteError: The id is not known (NOT_FOUND).
-            DeviceError: The sensor does not deliver, is touched, or a channel is invalid.
-        """
-        if request.tare_id != NO_TARE:
-            return self.pipeline.ledger.find(request.tare_id)
-        self._check_serving()
-        frames = request.frames or self.pipeline.tare_frames
-        wait_s = 2.0 + 2.0 * frames / self.device.info.rate_hz
-        return self._answer(self.pipeline.ask_tare(request.frames), f"{frames} good frames", wait_s)
-
-    def zero(self, request: WrenchZeroRequest) -> WrenchZero:
-        """Answer a request to take the load of a force/torque sensor as zero.
-
-        Raises:
-            DeviceError: The sensor does not deliver, is moved or overloaded, or refuses.
-            RemoteError: It does not answer in time (DEADLINE_EXCEEDED).
-        """
-        zeroing = self._zeroing
-        assert zeroing is not None, "only a force/torque sensor is asked"
-        self._check_serving()
-        count = zeroing.count(request.readings)
-        wait_s = 10.0 + 4.0 * count / self.device.info.rate_hz
-        return self._answer(zeroing.ask(count), f"{count} readings and took its zero", wait_s)
-
-    def _check_serving(self) -> None:
-        if not self.serving:
-            raise DeviceError(
-                f"sensor {self.name!r} does not deliver at present",
-                remedy="look at palpate status; tare when it is back",
-            )
-
-    def _answer(self, future: Future[A], what: str, wait_s: float) -> A:
-        try:
-            return future.result(timeout=wait_s)
-        except TimeoutError as error:
-            if isinstance(error, PalpateError):
-                raise
-            future.cancel()
-            raise RemoteError(
-                f"sensor {self.name!r} did not deliver {what} within {wait_s:.1f} s",
-                remedy="look at palpate status; tare when it is back",
-                code=ErrorCode.DEADLINE_EXCEEDED,
-                retry_after_s=1.0,
-            ) from error
+        return not (self.error or self.silent or self._rejected or self._report.untrue)
 
     def _run(self) -> None:
         self._report.starts()
@@ -275,8 +222,8 @@ class SensorWorker:
             self._publish(self.pipeline.push(readings, time.monotonic_ns()))
             self._report.tare_refused(self.pipeline.tare_error)
             self.serving = True
-            if self._zeroing is not None:
-                self._zeroing.follow(readings)
+            if self.zeroing is not None:
+                self.zeroing.follow(readings)
             lost = self._wrench is not None and self._wrench.zero_lost
             self._report.delivers(self.pipeline.condition, zero_lost=lost)
             listening.heard()
@@ -284,8 +231,8 @@ class SensorWorker:
 
     def _give_up(self, why: str) -> None:
         """Who waits for a zero must not wait for a sensor that is gone."""
-        if self._zeroing is not None:
-            self._zeroing.give_up(why)
+        if self.zeroing is not None:
+            self.zeroing.give_up(why)
 
     def _publish(self, items: list[Outgoing]) -> None:
         for item in items:
@@ -302,6 +249,11 @@ class SensorWorker:
                     publisher.put(item.message)
             except WireError as error:
                 self._counters["frames_rejected"] += 1
-                self._health.fail(
-                    WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
-                )
+                self._tell_rejected(error)
+
+    def _tell_rejected(self, error: WireError) -> None:
+        """Tell once of each reason: a defect comes with every frame."""
+        if error.reason not in self._rejected:
+            self._rejected.add(error.reason)
+            told = WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
+            self._health.fail(told)

@@ -40,6 +40,10 @@ def palpate_version() -> str:
         return "unknown"
 
 
+_APART_S = 5e-3
+"""However fast states change, statuses are this far apart [s]: they are work too."""
+
+
 class Health:
     """Counters, gauges and state of one process. Safe to use from several threads.
 
@@ -200,6 +204,7 @@ class HealthReporter(Closing):
             except PalpateError as error:
                 if not self._stop.is_set():
                     _log.warning("status not published: %s", error)
+            self._stop.wait(_APART_S)
             self._health.changed.wait(self._period_s)
 
     def close(self) -> None:

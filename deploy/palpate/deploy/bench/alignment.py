@@ -244,7 +244,7 @@ def _catch(
             stop.set()
             for thread in threads:
                 thread.join()
-        told = [one for one in ask_status(session) if one.service == "gateway"]
+        told = [one for one in ask_status(session, timeout_s=5.0) if one.service == "gateway"]
     missing = [name for name in _WRENCHES if not caught.wrenches.get(name)]
     missing += [] if caught.frames else ["finger"]
     missing += [] if caught.poses else ["pose"]
