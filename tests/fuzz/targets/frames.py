@@ -9,9 +9,10 @@ from palpate.gateway.biotac.frames import FrameAssembler
 from palpate.gateway.biotac.slots import SlotBlock
 from palpate.gateway.protocols import channels as ch
 from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT
+from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
 
 _PERIOD_S = 1.0 / 4400.0
+_SLOTS_MAX = 400
 
 
 def check(data: bytes) -> None:
@@ -33,33 +34,35 @@ def check(data: bytes) -> None:
     assert min(whole.counters.values()) >= 0
     assert whole.counters["frames"] == len(readings)
     assert sum(one.missed_before for one in readings) == whole.counters["missing_frames"]
-    for one in (*readings, *again):
-        _check_reading(one, layout.electrodes, layout.pac_samples, layout.slots)
     for run in (readings, again):
+        learnt = False
+        for one in run:
+            _check_reading(one, layout, pac_is_sure=learnt)
+            learnt |= one.validity == layout.all_valid
         ticks = [one.tick for one in run]
         assert ticks == sorted(set(ticks))
 
 
-def _check_reading(one: ElectrodeReading, electrodes: int, pac: int, bits: int) -> None:
-    assert (len(one.electrodes), len(one.pac)) == (electrodes, pac)
-    assert 0 <= one.validity < 1 << bits
+def _check_reading(one: ElectrodeReading, layout: FrameLayout, *, pac_is_sure: bool) -> None:
+    assert (len(one.electrodes), len(one.pac)) == (layout.electrodes, layout.pac_samples)
+    assert 0 <= one.validity <= layout.all_valid
+    good = [bool(one.validity >> bit & 1) for bit in range(layout.slots)]
     # A value tells its channel, so a wrong place shows; PAC tells its place in the round.
-    for k in range(electrodes):
-        if one.validity >> k & 1:
-            assert one.electrodes[k] == 100 * (ch.FIRST_ELECTRODE + k)
-    for k, (name, value) in enumerate(((ch.PDC, one.pdc), (ch.TAC, one.tac), (ch.TDC, one.tdc))):
-        if one.validity >> electrodes + k & 1:
-            assert value == 100 * name
-    for k in range(pac):
-        if one.validity >> electrodes + 3 + k & 1:
-            assert one.pac[k] == 1 + k
+    for k, value in enumerate(one.electrodes.tolist()):
+        assert not good[k] or value == 100 * (ch.FIRST_ELECTRODE + k)
+    slow = ((layout.pdc_bit, ch.PDC, one.pdc), (layout.tac_bit, ch.TAC, one.tac))
+    for bit, name, value in (*slow, (layout.tdc_bit, ch.TDC, one.tdc)):
+        assert not good[bit] or value == 100 * name
+    # Before the first whole frame it is a guess whether the round begins with PAC.
+    for k, value in enumerate(one.pac.tolist()):
+        assert not (pac_is_sure and good[layout.first_pac_bit + k]) or value == 1 + k
 
 
 def _slots(data: bytes, sequence: tuple[int, ...], *, placed: bool) -> SlotBlock:
     rows: list[tuple[int, int, bool, float, int, int, int]] = []
     index = 0
     for count, fate in zip(data[::2], data[1::2], strict=False):
-        for _ in range(count % 128):
+        for _ in range(min(count, _SLOTS_MAX - len(rows))):
             frame, position = divmod(index, len(sequence))
             channel = sequence[position]
             value = 1 + position // 2 if channel == ch.PAC else 100 * channel

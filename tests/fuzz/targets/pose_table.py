@@ -8,24 +8,26 @@ from pathlib import Path
 import numpy as np
 from tests.fuzz.streams import has_remedy
 
-from palpate.gateway.drivers import make_device
+from palpate.gateway.pose.file import PoseFile, PoseFileOptions
 from palpate.gateway.readings import PoseReading
+from palpate.protos.config import parse_config
 from palpate.protos.errors import RecordingError
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-poses-")
 _PATH = Path(_FOLDER.name, "a.csv")
-_OPTIONS = {
+_BENCH = {
     "path": _PATH,
     "indenter": "sphere_7mm",
     "base_sensor": {"position_m": (0.4, 0.0, 0.1), "orientation_wxyz": (0.0, 1.0, 0.0, 0.0)},
     "flange_indenter": {"position_m": (0.0, 0.0, 0.12), "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)},
 }
+_OPTIONS = parse_config(PoseFileOptions, _BENCH, where="fuzz")
 
 
 def check(data: bytes) -> None:
     """All bytes are the file."""
     _PATH.write_bytes(data)
-    device = make_device("pose_file", _OPTIONS)
+    device = PoseFile(_OPTIONS)
     try:
         device.open()
     except RecordingError as error:

@@ -12,6 +12,7 @@ from palpate.gateway.protocols.slot_clock import SlotClock
 
 RATE_HZ = 4400.0
 _PERIOD_S = 1.0 / RATE_HZ
+_SLOTS_MAX = 600
 _NAMES = tuple(SEQUENCES)
 
 Slots = tuple[list[int], list[float]]
@@ -52,7 +53,7 @@ def _stream(data: bytes, sequence: tuple[int, ...], *, exact: bool) -> Slots:
     stamps: list[float] = []
     index, late_s, begun_s = 0, 0.0, 10.0
     for count, fate in zip(data[::2], data[1::2], strict=False):
-        for _ in range(count):
+        for _ in range(min(count, _SLOTS_MAX - len(channels))):
             channels.append(sequence[index % len(sequence)])
             stamps.append(begun_s + index * _PERIOD_S + late_s)
             index += 1

