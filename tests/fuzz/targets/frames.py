@@ -73,8 +73,6 @@ def _slots(data: bytes, sequence: tuple[int, ...], *, placed: bool) -> SlotBlock
             index += fate
         elif fate < 160 and rows:  # the last is of bad parity
             rows[-1] = (rows[-1][0], 0, False, *rows[-1][3:])
-        elif fate < 192 and not placed:  # a channel that nobody knows
-            rows.append((60, 5, True, index * _PERIOD_S, 0, index // len(sequence), -1))
         elif rows and placed:  # it came twice
             rows.append(rows[-1])
     columns = list(zip(*rows, strict=True)) or [()] * 7

@@ -12,7 +12,7 @@ from palpate.gateway.protocols.slot_clock import SlotClock
 
 RATE_HZ = 4400.0
 _PERIOD_S = 1.0 / RATE_HZ
-_SLOTS_MAX = 600
+_SLOTS_MAX = 350
 _NAMES = tuple(SEQUENCES)
 
 Slots = tuple[list[int], list[float]]
