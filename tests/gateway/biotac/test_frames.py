@@ -67,6 +67,23 @@ def test_whole_frame_is_delivered_at_once() -> None:
     assert assembler.counters["duplicate_slots"] == 3
 
 
+@pytest.mark.parametrize("block", [1, 44, 1000])
+@pytest.mark.parametrize(("start", "twice"), [("e1", 1), ("pac", 2)])
+def test_a_pac_slot_that_came_twice_shifts_no_other(start: str, twice: int, block: int) -> None:
+    placed = [
+        [slot._replace(position=k) for k, slot in enumerate(slots_of(frame, start=start))]
+        for frame in (1, 2, 3)
+    ]
+    doubled = [*placed[1][: twice + 1], *placed[1][twice:]]
+    readings, assembler = assemble([*placed[0], *doubled, *placed[2]], block)
+    assert [one.tick for one in readings] == [1, 2, 3]
+    right = [slot.value for slot in placed[1] if slot.channel == ch.PAC]
+    for k, value in enumerate(readings[1].pac.tolist()):
+        good = readings[1].validity >> ch.FIRST_PAC_BIT + k & 1
+        assert value == (right[k] if good else 0)
+    assert assembler.counters["duplicate_slots"] >= 1
+
+
 def test_missing_slots_are_invalid_not_fatal() -> None:
     slots = [s for s in slots_of(1) if s.channel not in (ch.PDC, 20)][:-2]
     readings, assembler = assemble(slots + slots_of(2))

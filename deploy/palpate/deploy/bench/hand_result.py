@@ -1,0 +1,135 @@
+"""What a hand's run came to: losses, share of a core, latencies; and showing it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+CORE_GOAL = 0.5
+"""Share of a core that the gateway may use."""
+
+_LOSSES = ("lost", "missing", "dropped", "parity", "overflow", "incomplete", "silences", "device_l")
+
+
+@dataclass(frozen=True, slots=True)
+class HandResult:
+    """What became of the hand's frames.
+
+    Attributes:
+        seconds: Length of the measurement [s].
+        core: Share of one core that the gateway used.
+        worst_core: The same in its worst tenth.
+        frames: Electrode and wrench frames in the client.
+        lost: Frames that sequence numbers, the devices' own account or invalid channels miss.
+        counters: The gateway's counters of losses that are not zero.
+        p50_s: Median of: last sample of an electrode frame to the client's hands [s].
+        p99_s: 99th percentile [s].
+        wrench_p99_s: The same of the wrenches [s].
+        floor_core: Share of one core that the bare reader used.
+        floor_p50_s: Median of: kernel's stamp of a slot to the bare reader's hands [s].
+        floor_p99_s: 99th percentile [s].
+    """
+
+    seconds: float
+    core: float
+    worst_core: float
+    frames: int
+    lost: int
+    counters: dict[str, int]
+    p50_s: float
+    p99_s: float
+    wrench_p99_s: float
+    floor_core: float
+    floor_p50_s: float
+    floor_p99_s: float
+
+
+def account(
+    rows_file: Path,
+    floor_file: Path,
+    begin_ns: int,
+    end_ns: int,
+    core: float,
+    worst_core: float,
+    before: dict[str, int],
+    after: dict[str, int],
+) -> HandResult:
+    """Count what arrived between two instants.
+
+    Args:
+        rows_file: What the client wrote.
+        floor_file: What the bare reader wrote.
+        begin_ns: Begin by the monotonic clock [ns].
+        end_ns: End [ns].
+        core: Share of a core that the gateway used.
+        worst_core: The same in its worst tenth.
+        before: The gateway's counters at the begin.
+        after: Those at the end.
+    """
+    with np.load(rows_file, allow_pickle=False) as archive:
+        names, rows, lost = archive["sensors"], archive["rows"], int(archive["dropped"])
+    rows = rows[(rows[:, 4] >= begin_ns) & (rows[:, 4] < end_ns)]
+    of_finger = np.array([str(name).startswith("finger") for name in names])
+    for number in range(len(names)):
+        mine = rows[rows[:, 0] == number]
+        lost += int((np.diff(mine[:, 1]) - 1).sum())
+    lost += int(rows[:, 2].sum()) + int(rows[:, 5].sum())
+    silent = 7 - len(np.unique(rows[:, 0]))
+    late_s = (rows[:, 4] - rows[:, 3]) * 1e-9
+    electrodes = late_s[of_finger[rows[:, 0]]]
+    p50, p99 = np.percentile(electrodes, (50, 99))
+    with np.load(floor_file, allow_pickle=False) as archive:
+        floor_p50, floor_p99 = np.percentile(archive["late_s"], (50, 99))
+        floor_core = float(archive["core"])
+    told = {
+        name: value - before.get(name, 0)
+        for name, value in after.items()
+        if any(word in name for word in _LOSSES) and value > before.get(name, 0)
+    }
+    return HandResult(
+        seconds=(end_ns - begin_ns) * 1e-9,
+        core=core,
+        worst_core=worst_core,
+        frames=len(rows),
+        lost=lost + silent,
+        counters=told,
+        p50_s=float(p50),
+        p99_s=float(p99),
+        wrench_p99_s=float(np.percentile(late_s[~of_finger[rows[:, 0]]], 99)),
+        floor_core=floor_core,
+        floor_p50_s=float(floor_p50),
+        floor_p99_s=float(floor_p99),
+    )
+
+
+def show(result: HandResult) -> None:
+    """Print it for people."""
+    console = Console()
+    table = Table(
+        title=f"five BioTacs on CAN, a KMS 40 and a Bota, {result.seconds:.0f} s",
+        title_justify="left",
+    )
+    for column in ("", "gateway", "bare reader", "ratio"):
+        table.add_column(column, justify="right" if column else "left")
+    pairs = (
+        ("share of a core", result.core, result.floor_core, "{:.1%}"),
+        ("last slot to client, p50", result.p50_s * 1e3, result.floor_p50_s * 1e3, "{:.2f} ms"),
+        ("last slot to client, p99", result.p99_s * 1e3, result.floor_p99_s * 1e3, "{:.2f} ms"),
+    )
+    for name, ours, bare, form in pairs:
+        table.add_row(name, form.format(ours), form.format(bare), f"{ours / bare:.2f}")
+    console.print(table)
+    console.print(
+        f"{result.frames:,} frames in the client, {result.lost} lost; in its worst tenth the "
+        f"gateway used {result.worst_core:.1%} of a core (goal {CORE_GOAL:.0%}); wrenches p99 "
+        f"{result.wrench_p99_s * 1e3:.2f} ms",
+        soft_wrap=True,
+        highlight=False,
+    )
+    if result.counters:
+        told = ", ".join(f"{name} {count}" for name, count in result.counters.items())
+        console.print(f"counted by the gateway: {told}", soft_wrap=True, highlight=False)

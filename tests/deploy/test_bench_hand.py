@@ -1,0 +1,70 @@
+"""The benchmark of a hand: its account on a run whose losses are known, and that it runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.deploy.bench.hand_result import HandResult, account
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+SENSORS = [*(f"finger{k}" for k in range(5)), "kms40", "bota"]
+
+
+def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandResult:
+    client, floor = folder / "client.npz", folder / "floor.npz"
+    np.savez(
+        client,
+        sensors=np.array(SENSORS),
+        rows=np.array(rows, np.int64),
+        dropped=np.int64(dropped),
+    )
+    np.savez(floor, late_s=np.array([1e-4, 2e-4]), core=np.float64(0.4))
+    counters = {"finger0.lost_slots": 3, "finger0.samples": 9}
+    return account(client, floor, 0, 10**9, 0.4, 0.5, {"finger0.lost_slots": 1}, counters)
+
+
+def whole_run() -> list[list[int]]:
+    """Sensor, sequence, missed before, last sample, arrival [ns], invalid; 10 of each sensor."""
+    return [[n, k + 1, 0, 10**6 * k, 10**6 * k + 2_000_000, 0] for k in range(10) for n in range(7)]
+
+
+def test_a_whole_run_has_lost_nothing(tmp_path: Path) -> None:
+    result = accounted(tmp_path, whole_run())
+    assert (result.frames, result.lost) == (70, 0)
+    assert result.p50_s == result.p99_s == pytest.approx(2e-3)
+    assert result.floor_p50_s == pytest.approx(1.5e-4)
+    assert result.counters == {"finger0.lost_slots": 2}
+
+
+@pytest.mark.parametrize(
+    ("change", "lost"),
+    [
+        (lambda rows: [row for row in rows if row[:2] != [2, 5]], 1),  # a hole
+        (lambda rows: [[*r[:2], 4 * (r[:2] == [3, 4]), *r[3:]] for r in rows], 4),  # told as missed
+        (lambda rows: [[*r[:5], int(r[:2] == [0, 9])] for r in rows], 1),  # an invalid channel
+        (lambda rows: [row for row in rows if row[0] != 6], 1),  # a sensor that never came
+    ],
+)
+def test_what_is_lost_is_counted(
+    tmp_path: Path, change: Callable[[list[list[int]]], list[list[int]]], lost: int
+) -> None:
+    assert accounted(tmp_path, change(whole_run())).lost == lost
+    assert accounted(tmp_path, whole_run(), dropped=2).lost == 2
+
+
+def test_it_runs(palpate: Palpate) -> None:
+    words = ("bench", "hand", "--seconds", "2", "--floor-seconds", "2", "--json")
+    done = palpate(*words, timeout=120)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    # How many frames a busy machine loses and how late they are, a test cannot ask.
+    assert told["hand"]["frames"] > 0
+    assert told["hand"]["floor_core"] > 0
+    assert {"hand.core_goal_met", "hand.loss_goal_met", "hand.p99_ratio"} <= told.keys()
