@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.deploy.bench.hand_result import HandResult, account
+from palpate.deploy.bench.hand_result import HandResult, Used, account
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -27,7 +27,7 @@ def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandR
     )
     np.savez(floor, late_s=np.array([1e-4, 2e-4]), core=np.float64(0.4))
     counters = {"finger0.lost_slots": 3, "finger0.samples": 9}
-    return account(client, floor, 0, 10**9, 0.4, 0.5, {"finger0.lost_slots": 1}, counters)
+    return account(client, floor, 0, 10**9, Used(0.4, 0.5, 0), {"finger0.lost_slots": 1}, counters)
 
 
 def whole_run() -> list[list[int]]:

@@ -8,6 +8,7 @@ does nothing with what it reads.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -20,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from palpate.deploy.bench.e2e import wait_ready
-from palpate.deploy.bench.hand_result import CORE_GOAL, HandResult, account, show
+from palpate.deploy.bench.hand_result import CORE_GOAL, HandResult, Used, account, show
 from palpate.deploy.bench.results import append_history, machine
 from palpate.deploy.children import Children
 from palpate.deploy.ports import free_endpoint
@@ -87,6 +88,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
             bar.advance(task)
         end_ns = time.monotonic_ns()
         core = (_cpu_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
+        drops = _kernel_drops(pid)
         after = _counters(profile)
         children.stop_one("client")
         children.stop_one("gateway")
@@ -102,7 +104,15 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
         if children.wait("floor", floor_seconds + 20.0) != 0:
             raise children.ended("floor", -1)
         bar.advance(task)
-        return account(rows_file, floor_file, begin_ns, end_ns, core, max(shares), before, after)
+        return account(
+            rows_file,
+            floor_file,
+            begin_ns,
+            end_ns,
+            Used(core, max(shares), drops),
+            before,
+            after,
+        )
 
 
 def _start_emulators(
@@ -183,6 +193,17 @@ def _cpu_s(pid: int) -> float:
     """User and system time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _kernel_drops(pid: int) -> int:
+    """Datagrams that the kernel threw away because the process did not fetch them in time."""
+    sockets = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            sockets.add(os.readlink(link))
+    lines = Path(f"/proc/{pid}/net/udp").read_text("utf-8").splitlines()[1:]
+    rows = [line.split() for line in lines]
+    return sum(int(row[12]) for row in rows if f"socket:[{row[9]}]" in sockets)
 
 
 def _counters(profile: Profile) -> dict[str, int]:

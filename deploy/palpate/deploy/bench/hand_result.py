@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -15,6 +16,20 @@ CORE_GOAL = 0.5
 _LOSSES = ("lost", "missing", "dropped", "parity", "overflow", "incomplete", "silences", "device_l")
 
 
+class Used(NamedTuple):
+    """What the system says of the gateway's process.
+
+    Attributes:
+        core: Share of one core.
+        worst_core: The same in its worst tenth.
+        kernel_drops: Datagrams that it did not fetch in time.
+    """
+
+    core: float
+    worst_core: float
+    kernel_drops: int
+
+
 @dataclass(frozen=True, slots=True)
 class HandResult:
     """What became of the hand's frames.
@@ -23,6 +38,7 @@ class HandResult:
         seconds: Length of the measurement [s].
         core: Share of one core that the gateway used.
         worst_core: The same in its worst tenth.
+        kernel_drops: Datagrams that the kernel threw away because it was not read in time.
         frames: Electrode and wrench frames in the client.
         lost: Frames that sequence numbers, the devices' own account or invalid channels miss.
         counters: The gateway's counters of losses that are not zero.
@@ -37,6 +53,7 @@ class HandResult:
     seconds: float
     core: float
     worst_core: float
+    kernel_drops: int
     frames: int
     lost: int
     counters: dict[str, int]
@@ -53,8 +70,7 @@ def account(
     floor_file: Path,
     begin_ns: int,
     end_ns: int,
-    core: float,
-    worst_core: float,
+    used: Used,
     before: dict[str, int],
     after: dict[str, int],
 ) -> HandResult:
@@ -65,8 +81,7 @@ def account(
         floor_file: What the bare reader wrote.
         begin_ns: Begin by the monotonic clock [ns].
         end_ns: End [ns].
-        core: Share of a core that the gateway used.
-        worst_core: The same in its worst tenth.
+        used: What the gateway's process used and missed.
         before: The gateway's counters at the begin.
         after: Those at the end.
     """
@@ -92,8 +107,9 @@ def account(
     }
     return HandResult(
         seconds=(end_ns - begin_ns) * 1e-9,
-        core=core,
-        worst_core=worst_core,
+        core=used.core,
+        worst_core=used.worst_core,
+        kernel_drops=used.kernel_drops,
         frames=len(rows),
         lost=lost + silent,
         counters=told,
@@ -124,8 +140,9 @@ def show(result: HandResult) -> None:
         table.add_row(name, form.format(ours), form.format(bare), f"{ours / bare:.2f}")
     console.print(table)
     console.print(
-        f"{result.frames:,} frames in the client, {result.lost} lost; in its worst tenth the "
-        f"gateway used {result.worst_core:.1%} of a core (goal {CORE_GOAL:.0%}); wrenches p99 "
+        f"{result.frames:,} frames in the client, {result.lost} lost, "
+        f"{result.kernel_drops} datagrams dropped by the kernel; in its worst tenth the gateway "
+        f"used {result.worst_core:.1%} of a core (goal {CORE_GOAL:.0%}); wrenches p99 "
         f"{result.wrench_p99_s * 1e3:.2f} ms",
         soft_wrap=True,
         highlight=False,
