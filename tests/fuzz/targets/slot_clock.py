@@ -108,4 +108,8 @@ def seeds() -> list[bytes]:
     return [bytes([7 * which + mode, which, mode]) + stream for which, mode in kinds] + [
         bytes([0, 0, 0]) + bytes([200, 0]) * 4 + bytes([3, 1, 3, 1]),
         bytes([63, 1, 2]) + bytes([200, 0]) * 3 + bytes([40, 200, 4, 97, 255, 0]),
+        # PAC came twice and ran ahead over the edge: slots of a frame that is over do not go back.
+        bytes.fromhex(
+            "00000082820082018207822b822c824082468260826e7e807d76838282a082aa82bf82c082c382d382"
+        ),
     ]

@@ -172,6 +172,8 @@ class PacNumbers:
             return None
         told = bool((frame.position >= 0).all())
         in_order = np.argsort(frame.position, kind="stable") if told else np.arange(len(frame))
+        if told and not np.diff(frame.position[in_order]).all():
+            return None  # one came twice, so another may be missing
         channels = frame.channel[in_order]
         if self.round is None or channels.tobytes() != self.round.channel_bytes:
             if not is_whole(channels.tolist(), self._layout):

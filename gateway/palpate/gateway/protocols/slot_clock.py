@@ -147,6 +147,8 @@ class SlotClock:
         if self._index != self._sure[0] + self._since:  # PAC has run ahead
             return None
         size, number = len(order), len(channels)
+        if (self._index + 1) // size < self._frame:  # and had run ahead over the edge
+            return None
         index = np.arange(self._index + 1, self._index + 1 + number)
         position = index % size
         if not np.array_equal(channels, order.cycle[position]):
