@@ -60,9 +60,12 @@ def test_rejected_frames_are_counted_and_told_once(monkeypatch: pytest.MonkeyPat
     device, sink, health, stop = Babbler(), Sink(), Health("gateway", "test"), threading.Event()
     told: list[PalpateError] = []
     fail = health.fail
-    monkeypatch.setattr(
-        health, "fail", lambda error, **how: (told.append(error), fail(error, **how))
-    )
+
+    def note(error: PalpateError, **how: Any) -> None:
+        told.append(error)
+        fail(error, **how)
+
+    monkeypatch.setattr(health, "fail", note)
     worker = SensorWorker(
         "w",
         device,

@@ -16,6 +16,9 @@ _log = logging.getLogger(__name__)
 _LOOK_S = 0.2
 """The condition is judged anew as often [s]."""
 
+_LOG_AGAIN_S = 60.0
+"""A sensor that stays away is logged again after this time [s]: attempts follow closely."""
+
 _FORCES_OFF = "when nothing touches the BioTac, take its zero again: palpate tare {name}"
 
 
@@ -34,6 +37,7 @@ class SensorReport:
         self._told_faults: frozenset[tuple[FaultKind, str]] = frozenset()
         self._zero_lost = False
         self._refused = False
+        self._lost_by, self._log_again_s = "", 0.0
         self.untrue = False
         """Whether it delivers what is not so: dead or stuck channels, forces without their zero."""
 
@@ -48,6 +52,7 @@ class SensorReport:
         if not back and now_s - self._looked_s < _LOOK_S:
             return
         self._looked_s = now_s
+        self._lost_by = ""
         faults = () if condition is None else condition.faults
         message = "" if condition is None else condition.message
         self.untrue = zero_lost or (condition is not None and condition.untrue)
@@ -75,7 +80,10 @@ class SensorReport:
         """It is gone, or cannot be opened."""
         self._tell(SensorState.LOST, message=error.problem)
         self._health.fail(error)
-        _log.warning("sensor %s lost, open again in %.1f s: %s", self._name, backoff_s, error)
+        now_s = time.monotonic()
+        if error.problem != self._lost_by or now_s >= self._log_again_s:
+            self._lost_by, self._log_again_s = error.problem, now_s + _LOG_AGAIN_S
+            _log.warning("sensor %s lost, open again in %.1f s: %s", self._name, backoff_s, error)
 
     def ended(self, error: PalpateError | None) -> None:
         """It will deliver no more."""

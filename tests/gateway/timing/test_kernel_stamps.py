@@ -20,6 +20,13 @@ def test_a_stamp_tells_when_it_was_received() -> None:
     assert kernel.refused == 0
 
 
+def test_none_came_later_than_what_came_after_it() -> None:
+    ms = S // 1000
+    told = np.array([-1, -2 * ms, -40 * ms, 5 * S, -30 * ms, -20 * ms, 5 * S], np.int64)
+    got = stamps().monotonic_of_all(WALL_NS + told, NOW_NS)
+    assert ((got - NOW_NS) // ms).tolist() == [-40, -40, -40, -30, -30, -20, 0]
+
+
 def test_one_of_the_past_or_the_future_is_of_another_clock() -> None:
     kernel = stamps()
     kernel.monotonic_of_ns(WALL_NS, NOW_NS)

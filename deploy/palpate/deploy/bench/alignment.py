@@ -14,7 +14,7 @@ import threading
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -24,6 +24,7 @@ from rich.table import Table
 from palpate.deploy.bench.alignment_account import Spread, apart, stamp_errors
 from palpate.deploy.bench.alignment_page import page_of
 from palpate.deploy.bench.e2e import wait_ready
+from palpate.deploy.bench.lateness import OnTime
 from palpate.deploy.bench.results import append_history, machine
 from palpate.deploy.children import Children
 from palpate.deploy.ports import free_endpoint
@@ -42,7 +43,6 @@ CHANNEL = "239.74.163.7"
 _WRENCHES = ("kms40", "rdt", "bota")
 _DEVICES = ("finger", *_WRENCHES)
 _READY_S = 30.0
-_SLEEP_S = 5e-3
 _IDENTITY = {"position_m": (0.0, 0.0, 0.0), "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
 
 
@@ -52,20 +52,17 @@ class AlignmentResult:
 
     Attributes:
         seconds: Length of the measurement [s].
+        kept: Share of it that counts: when the host left the emulators in time (``lateness``).
         stamps: By stream, stamp less truth.
         apart: By stream, how far it is from the electrodes once aligned by stamps.
         gauges: What the gateway told of the clocks.
-        pauses_s: How late a thread that sleeps 5 ms was, 99 % and worst [s]: what the host added.
-        missed: Frames that the gateway took for lost. The emulator loses none: on a host that
-            starves it, slots that come late look like that, and stamps are of no use.
     """
 
     seconds: float
+    kept: float
     stamps: dict[str, Spread]
     apart: dict[str, Spread]
     gauges: dict[str, float]
-    pauses_s: tuple[float, float]
-    missed: int
 
 
 @dataclass(slots=True)
@@ -84,29 +81,6 @@ class _Caught:
             self.wrenches.setdefault(sensor, []).append(message)
         elif isinstance(message, IndenterPoseFrame):
             self.poses.append(message)
-
-
-class _Watch:
-    """A thread that sleeps, and sees how late it wakes: what the host does to every process."""
-
-    def __init__(self) -> None:
-        self.late_s = [0.0]
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            began_s = time.monotonic()
-            time.sleep(_SLEEP_S)
-            self.late_s.append(time.monotonic() - began_s - _SLEEP_S)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self._stop.set()
-        self._thread.join()
 
 
 def run_alignment(
@@ -135,13 +109,7 @@ def run_alignment(
         _print(result)
     if page is not None:
         text = page_of(
-            result.seconds,
-            result.stamps,
-            result.apart,
-            result.gauges,
-            result.pauses_s,
-            result.missed,
-            machine(),
+            result.seconds, result.kept, result.stamps, result.apart, result.gauges, machine()
         )
         page.write_text(text, encoding="utf-8")
     if save:
@@ -155,7 +123,7 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
         ProcessEnded: A process of the benchmark ended early.
         LinkError: They did not find one another in time, or a stream did not come.
     """
-    with Children("bench-alignment") as children, _Watch() as watch:
+    with Children("bench-alignment") as children:
         sensors = _start_devices(children)
         endpoint = free_endpoint()
         profile = changed(
@@ -167,7 +135,8 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
         )
         children.start_profile(profile)
         part = [sys.executable, "-m", "palpate.deploy.bench.alignment_parts"]
-        children.start("robot", [*part, "robot", endpoint, profile.station])
+        robot = [*part, "robot", endpoint, profile.station, _late_file(children, "robot")]
+        children.start("robot", robot)
         children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
         wait_ready(profile, {"gateway"})
         task = bar.add_task("clocks settle", total=1)
@@ -175,14 +144,23 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
         bar.advance(task)
         names = [*_DEVICES, "robot", "gateway"]
         caught, gauges = _catch(profile, seconds, children, names, bar)
+        for name in ("robot", *_DEVICES):
+            children.stop_one(name)
+        late = [Path(_late_file(children, name)) for name in ("robot", *_DEVICES)]
+    on_time = OnTime.of(late)
+    begin_s, end_s = (1e-9 * caught.frames[at].stamp.monotonic_ns for at in (0, -1))
+    streams = caught.frames, caught.wrenches, caught.poses
     return AlignmentResult(
         seconds,
-        stamp_errors(caught.frames, caught.wrenches, caught.poses),
-        apart(caught.frames, caught.wrenches, caught.poses),
+        float(on_time(np.linspace(begin_s, end_s, 10_000)).mean()),
+        stamp_errors(*streams, on_time),
+        apart(*streams, on_time),
         {name: value for name, value in sorted(gauges.items()) if "clock" in name},
-        (float(np.percentile(watch.late_s, 99)), max(watch.late_s)),
-        sum(frame.stamp.missed_before for frame in caught.frames),
     )
+
+
+def _late_file(children: Children, name: str) -> str:
+    return str(children.folder / f"late-{name}.npy")
 
 
 def _start_devices(children: Children) -> list[dict[str, Any]]:
@@ -197,7 +175,7 @@ def _start_devices(children: Children) -> list[dict[str, Any]]:
     }
     part = [sys.executable, "-m", "palpate.deploy.bench.alignment_parts"]
     for name, words in told.items():
-        children.start(name, [*part, name, *words])
+        children.start(name, [*part, name, *words, _late_file(children, name)])
     bus = {"interface": "udp_multicast", "channel": CHANNEL, "bus_options": {"port": can}}
     rdt = {"product": "ati_net_ft", "host": "127.0.0.1", "port": udp, "http_port": web}
     pose = {"robot": "arm", "rate_hz": 250.0, "indenter": "sphere_7mm"}
@@ -269,17 +247,8 @@ def _print(result: AlignmentResult) -> None:
             numbers = (one.median_s, one.p95_s, one.p99_s, one.max_s)
             table.add_row(name, f"{one.count:,}", *(f"{1e3 * value:.3f} ms" for value in numbers))
         console.print(table)
-    if result.missed:
-        console.print(
-            f"the gateway took {result.missed} frames of the finger for lost, but none was: this "
-            "host is too busy to emulate it; measure again when it is quiet",
-            highlight=False,
-            soft_wrap=True,
-        )
-    usual, worst = result.pauses_s
     console.print(
-        f"meanwhile a sleep of 5 ms was late by {1e3 * usual:.1f} ms at 99 %, "
-        f"{1e3 * worst:.1f} ms at worst",
+        f"{result.kept:.0%} of {result.seconds:g} s count: else this host starved the emulators",
         highlight=False,
         soft_wrap=True,
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from palpate.deploy.bench.lateness import OnTime
 from palpate.deploy.bench.ramp import time_of
 from palpate.protos.alignment import Clock, electrode_instants, linear, times_of
 from palpate.protos.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
@@ -54,10 +55,10 @@ def spread(errors_s: Floats) -> Spread:
     return Spread(len(kept), float(np.median(kept)), float(p95), float(p99), float(sizes.max()))
 
 
-def _off(share: Floats, stamp_ns: npt.NDArray[np.int64]) -> Floats:
-    """Stamp less the time at which the value was there [s]."""
+def _off(share: Floats, stamp_ns: npt.NDArray[np.int64], counts: OnTime) -> Floats:
+    """Stamp less the time at which the value was there [s]; NaN at times that do not count."""
     stamp_s = _seconds(stamp_ns)
-    return np.asarray(stamp_s - time_of(share, stamp_s))
+    return np.where(counts(stamp_s), stamp_s - time_of(share, stamp_s), np.nan)
 
 
 def _seconds(time_ns: npt.NDArray[np.int64]) -> Floats:
@@ -83,7 +84,10 @@ def _travels(frames: Sequence[IndenterPoseFrame]) -> Floats:
 
 
 def stamp_errors(
-    frames: Sequence[ElectrodeFrame], wrenches: Wrenches, poses: Sequence[IndenterPoseFrame]
+    frames: Sequence[ElectrodeFrame],
+    wrenches: Wrenches,
+    poses: Sequence[IndenterPoseFrame],
+    counts: OnTime,
 ) -> dict[str, Spread]:
     """How far each stream's stamps are from when their values were there."""
     at_ns = electrode_instants(frames, Clock.MONOTONIC)
@@ -92,19 +96,24 @@ def stamp_errors(
     pac_ns = stamps_ns[:, None] + np.array([sample_offsets(frame).pac for frame in frames])
     pac = _shares(frames, pac=True)
     errors = {
-        "electrodes": _off(shares, at_ns),
-        "PAC": _off(pac, pac_ns),
-        "electrodes, all at the stamp": _off(shares, at_ns) - _seconds(at_ns - stamps_ns[:, None]),
+        "electrodes": _off(shares, at_ns, counts),
+        "PAC": _off(pac, pac_ns, counts),
+        "electrodes, all at the stamp": _off(shares, at_ns, counts)
+        - _seconds(at_ns - stamps_ns[:, None]),
     }
     for name, stream in wrenches.items():
         share = (_forces(stream)[:, 0] - LOW_N) / SPAN_N
-        errors[name] = _off(share, times_of(stream, Clock.MONOTONIC))
-    errors["pose"] = _off(_travels(poses)[:, 0] / SPAN_M, times_of(poses, Clock.MONOTONIC))
+        errors[name] = _off(share, times_of(stream, Clock.MONOTONIC), counts)
+    shares = _travels(poses)[:, 0] / SPAN_M
+    errors["pose"] = _off(shares, times_of(poses, Clock.MONOTONIC), counts)
     return {name: spread(found) for name, found in errors.items()}
 
 
 def apart(
-    frames: Sequence[ElectrodeFrame], wrenches: Wrenches, poses: Sequence[IndenterPoseFrame]
+    frames: Sequence[ElectrodeFrame],
+    wrenches: Wrenches,
+    poses: Sequence[IndenterPoseFrame],
+    counts: OnTime,
 ) -> dict[str, Spread]:
     """How far apart in time electrodes and other streams are that were aligned by their stamps.
 
@@ -114,7 +123,7 @@ def apart(
     at_ns = electrode_instants(frames, Clock.MONOTONIC)
     about_s = _seconds(at_ns)
     shares = _shares(frames, pac=False)
-    electrodes_s = time_of(shares, about_s)
+    electrodes_s = np.where(counts(about_s), time_of(shares, about_s), np.nan)
     out = {}
     for name, stream in wrenches.items():
         force, _ = linear(at_ns, times_of(stream, Clock.MONOTONIC), _forces(stream))

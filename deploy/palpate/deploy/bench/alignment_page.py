@@ -19,9 +19,8 @@ sends (filters, conversion, adapters) comes on top, and is the same for every re
 ([time.md](../time.md#what-no-stamp-can-know)). The clocks of finger, RDT and Bota run 200 ppm fast,
 the robot's is another than the host's and 40 ppm fast.
 
-The host is shared: meanwhile a thread that sleeps 5 ms was late by {usual:.1f} ms at 99 % and
-by {worst:.1f} ms at worst. Frames of the finger that the gateway took for lost: {missed}; none was,
-but a starved emulator looks like that, and its stamps are of no use.
+The host is shared, and puts emulators aside as it never does with sensors: what they sent more
+than 5 ms late, and what lies around it, is left out. {kept:.0%} of the time counts.
 
 ## Stamps
 
@@ -49,11 +48,10 @@ time what the two show was there. The goal is 1 ms.
 
 def page_of(
     seconds: float,
+    kept: float,
     stamps: dict[str, Spread],
     apart: dict[str, Spread],
     gauges: dict[str, float],
-    pauses_s: tuple[float, float],
-    missed: int,
     machine: dict[str, Any],
 ) -> str:
     """The page as Markdown."""
@@ -61,13 +59,11 @@ def page_of(
     told += [f"| `{name}` | {value:.6g} |" for name, value in gauges.items()]
     return _HEAD.format(
         seconds=seconds,
+        kept=kept,
         machine=f"{machine['cpus']} CPUs ({machine['cpu']}), load {machine['load_1min']}",
         stamps=_table(stamps),
         apart=_table(apart),
         gauges="\n".join(told),
-        usual=1e3 * pauses_s[0],
-        worst=1e3 * pauses_s[1],
-        missed=missed,
     )
 
 

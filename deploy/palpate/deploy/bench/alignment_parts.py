@@ -1,9 +1,9 @@
 """The devices of ``palpate bench alignment``: emulators that all feel one signal, and a robot.
 
-``python -m palpate.deploy.bench.alignment_parts finger CHANNEL PORT`` is a BioTac on CAN, ``kms40
-PORT``, ``rdt PORT HTTP_PORT`` and ``bota LINK`` are force/torque sensors, ``robot ENDPOINT
-STATION`` tells poses. Every device whose clock can drift has one that does, by 200 ppm; the robot's
-is another than the host's altogether.
+``python -m palpate.deploy.bench.alignment_parts finger CHANNEL PORT LATE`` is a BioTac on CAN,
+``kms40 PORT LATE``, ``rdt PORT HTTP_PORT LATE`` and ``bota LINK LATE`` are force/torque sensors,
+``robot ENDPOINT STATION LATE`` tells poses; ``LATE`` is a file for ``lateness``. Every device whose
+clock can drift has one that does, by 200 ppm; the robot's is another than the host's altogether.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from palpate.deploy.bench.alignment_account import (
     SPAN_N,
 )
 from palpate.deploy.bench.harness import stop_on_sigterm
+from palpate.deploy.bench.lateness import Lateness
 from palpate.deploy.bench.ramp import share_at
 from palpate.gateway.emulators.biotac_can import BiotacCanEmulator
 from palpate.gateway.emulators.biotac_slots import Counts, CountTrack, Indices, Times
@@ -32,6 +34,8 @@ from palpate.gateway.emulators.kms40 import Kms40Emulator
 from palpate.gateway.emulators.rdt import RdtEmulator
 
 ROBOT_HZ = 250.0
+_SLOT_RATE_HZ = 4400.0
+_FAST = 200e-6
 _ROBOT_FAST = 40e-6
 _ROBOT_ORIGIN_S = 1e6
 _FOR_EVER_S = 1e6
@@ -48,21 +52,44 @@ class RampCounts(CountTrack):
 class RampForce(HostTimed):
     """The force along z shows it."""
 
+    def __init__(self, lateness: Lateness) -> None:
+        self._lateness = lateness
+
     def __call__(self, t: float) -> Sequence[float]:
         """The wrench at a time of the emulator's own [s]."""
+        self._lateness.note(t + self.lead_s)
         share = float(share_at(np.array(t + self.lead_s)))
         return (0.0, 0.0, LOW_N + SPAN_N * share, 0.0, 0.0, 0.0)
 
 
+class RampFinger(BiotacCanEmulator):
+    """A finger that notes when it was late."""
+
+    def __init__(self, channel: str, port: int, lateness: Lateness) -> None:
+        super().__init__(
+            "udp_multicast",
+            channel,
+            fingers=1,
+            counts=RampCounts(),
+            slot_rate_hz=_SLOT_RATE_HZ * (1.0 + _FAST),
+            options={"port": port},
+        )
+        self._lateness = lateness
+
+    def _send(self, data: bytes) -> None:
+        self._lateness.note(self._block_s + self._at * self._step_s)
+        super()._send(data)
+
+
 def serve(emulator: Emulator, stop: threading.Event) -> None:
     """Emulate until told to stop."""
-    if "clock_drift" in emulator.faults:
+    if not isinstance(emulator, RampFinger) and "clock_drift" in emulator.faults:
         emulator.inject("clock_drift", _FOR_EVER_S)
     with emulator:
         stop.wait()
 
 
-def be_robot(endpoint: str, station: str, stop: threading.Event) -> None:
+def be_robot(endpoint: str, station: str, lateness: Lateness, stop: threading.Event) -> None:
     """Tell poses by a clock that is not the host's, at absolute deadlines."""
     from palpate.protos.client import Client
 
@@ -71,35 +98,29 @@ def be_robot(endpoint: str, station: str, stop: threading.Event) -> None:
         due_s = time.monotonic()
         while not stop.is_set():
             due_s += 1.0 / ROBOT_HZ
-            if time.monotonic() - due_s > 0.5:  # this process stood still; a robot would not have
-                due_s = time.monotonic()
             time.sleep(max(due_s - time.monotonic(), 0.0))
             travel_m = SPAN_M * float(share_at(np.array(due_s)))
             own_s = _ROBOT_ORIGIN_S + due_s * (1.0 + _ROBOT_FAST)
             publisher.put((travel_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), round(1e9 * own_s))
+            lateness.note(due_s)
 
 
 def main() -> None:
-    """Be the device that the first argument names."""
-    stop = stop_on_sigterm()
-    kind, *told = sys.argv[1:]
+    """Be the device that the first argument names; the last is where to write when it was late."""
+    stop, lateness = stop_on_sigterm(), Lateness()
+    kind, *told, late_file = sys.argv[1:]
     if kind == "finger":
-        channel, port = told
-        options = {"port": int(port)}
-        serve(
-            BiotacCanEmulator(
-                "udp_multicast", channel, fingers=1, counts=RampCounts(), options=options
-            ),
-            stop,
-        )
+        serve(RampFinger(told[0], int(told[1]), lateness), stop)
     elif kind == "kms40":
-        serve(Kms40Emulator(RampForce(), port=int(told[0])), stop)
+        serve(Kms40Emulator(RampForce(lateness), port=int(told[0])), stop)
     elif kind == "rdt":
-        serve(RdtEmulator("netft", RampForce(), port=int(told[0]), http_port=int(told[1])), stop)
+        source = RampForce(lateness)
+        serve(RdtEmulator("netft", source, port=int(told[0]), http_port=int(told[1])), stop)
     elif kind == "bota":
-        serve(Bota(RampForce(), path=told[0]), stop)
+        serve(Bota(RampForce(lateness), path=told[0]), stop)
     else:
-        be_robot(told[0], told[1], stop)
+        be_robot(told[0], told[1], lateness, stop)
+    lateness.write(Path(late_file))
 
 
 if __name__ == "__main__":

@@ -66,7 +66,11 @@ class KernelStamps:
     def monotonic_of_all(
         self, stamps_ns: npt.NDArray[np.int64], arrival_ns: int
     ) -> npt.NDArray[np.int64]:
-        """As ``monotonic_of_ns``, for the stamps of what was read at once."""
+        """As ``monotonic_of_ns``, for the stamps of what came in this order and was read at once.
+
+        None came later than what came after it: while the kernel's stamping is being switched on,
+        which takes it some milliseconds after a bus is opened, it stamps at reading.
+        """
         if not self._trusted(arrival_ns):
             self.refused += len(stamps_ns)
             return np.full(len(stamps_ns), arrival_ns)
@@ -74,7 +78,8 @@ class KernelStamps:
         waited_ns = arrival_ns - received_ns
         believed = (waited_ns >= -_EARLY_NS) & (waited_ns <= self._oldest_ns(arrival_ns))
         self.refused += int(len(believed) - np.count_nonzero(believed))
-        return np.where(believed, np.minimum(received_ns, arrival_ns), arrival_ns)
+        came_ns = np.where(believed, np.minimum(received_ns, arrival_ns), arrival_ns)
+        return np.minimum.accumulate(came_ns[::-1])[::-1]
 
     def _oldest_ns(self, arrival_ns: int) -> int:
         """How long what is read now may have waited [ns]."""

@@ -1,0 +1,28 @@
+"""What a sensor's thread tells of it."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from palpate.gateway.sensor_report import SensorReport
+from palpate.protos.errors import DeviceLost
+from palpate.protos.health import Health
+
+
+def test_a_sensor_that_stays_away_is_logged_once_for_each_reason(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    report = SensorReport("thumb", Health("gateway", "a"))
+    pulled = DeviceLost("the line is gone", remedy="plug it in")
+    with caplog.at_level(logging.WARNING):
+        for _ in range(20):
+            report.is_lost(pulled, 0.4)
+        assert caplog.text.count("the line is gone -> plug it in") == 1
+        report.is_lost(DeviceLost("nobody answers", remedy="wait"), 0.4)
+        assert caplog.text.count("nobody answers") == 1
+        report.is_lost(pulled, 0.4)
+        report.delivers(None, zero_lost=False)
+        report.is_lost(pulled, 0.4)
+    assert caplog.text.count("the line is gone") == 3
