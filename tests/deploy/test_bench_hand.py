@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.deploy.bench.hand_result import HandResult, Used, account
+from palpate.protos.messages import ServiceState, Status
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -26,8 +27,21 @@ def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandR
         dropped=np.int64(dropped),
     )
     np.savez(floor, late_s=np.array([1e-4, 2e-4]), core=np.float64(0.4))
-    counters = {"finger0.lost_slots": 3, "finger0.samples": 9}
-    return account(client, floor, 0, 10**9, Used(0.4, 0.5, 0), {"finger0.lost_slots": 1}, counters)
+    looks = [
+        Status(
+            "gateway",
+            "a",
+            ServiceState.READY,
+            1,
+            1,
+            1.0,
+            "1",
+            counters={"finger0.lost_slots": count, "finger0.samples": 9},
+            gauges={"finger0.publish_p99_s": 1e-3 * count, "bota.publish_p99_s": 2e-3},
+        )
+        for count in (5, 3)
+    ]
+    return account(client, floor, 0, 10**9, Used(0.4, 0.5, 0), {"finger0.lost_slots": 1}, looks)
 
 
 def whole_run() -> list[list[int]]:
@@ -41,6 +55,7 @@ def test_a_whole_run_has_lost_nothing(tmp_path: Path) -> None:
     assert result.p50_s == result.p99_s == pytest.approx(2e-3)
     assert result.floor_p50_s == pytest.approx(1.5e-4)
     assert result.counters == {"finger0.lost_slots": 2}
+    assert result.publish_p99_s == pytest.approx(5e-3)
 
 
 @pytest.mark.parametrize(
@@ -67,4 +82,5 @@ def test_it_runs(palpate: Palpate) -> None:
     # How many frames a busy machine loses and how late they are, a test cannot ask.
     assert told["hand"]["frames"] > 0
     assert told["hand"]["floor_core"] > 0
+    assert 0 < told["hand"]["publish_p50_s"] <= told["hand"]["publish_p99_s"]
     assert {"hand.core_goal_met", "hand.loss_goal_met", "hand.p99_ratio"} <= told.keys()

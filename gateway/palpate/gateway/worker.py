@@ -15,7 +15,8 @@ from math import inf
 from typing import Any, Literal
 
 from palpate.gateway.device import Device
-from palpate.gateway.pipeline import Outgoing, Pipeline
+from palpate.gateway.outlet import Outlet
+from palpate.gateway.pipeline import Pipeline
 from palpate.gateway.sensor_report import SensorReport
 from palpate.gateway.timing.clock_map import (
     ArrivalClock,
@@ -34,7 +35,6 @@ from palpate.protos.errors import (
     DeviceTimeout,
     LinkError,
     PalpateError,
-    WireError,
 )
 from palpate.protos.health import Health
 from palpate.protos.session import Publisher
@@ -51,8 +51,6 @@ that who listens knows within 50 ms."""
 
 _READ_S = 0.5
 _SILENT_READ_S = 0.025
-
-_ENCODERS_DECIDE = "the frame was not published; this is a defect of the device driver"
 
 
 class SensorWorker:
@@ -97,15 +95,13 @@ class SensorWorker:
         """Whether it has stopped to deliver, for longer than ``LOST_S``."""
         self.ended = threading.Event()
         """Set when the thread has nothing more to do."""
-        self._publishers = publishers
         self._health = health
         self._pace = pace
         self._wall = wall or WallClock()
         self._clock_map: ClockMap | None = None
         self._stop = stop
-        self._claim = claim
+        self._outlet = Outlet(publishers, health, stop=stop, claim=claim)
         self._counters: Counter[str] = Counter()
-        self._rejected: set[str] = set()
         self._device_counters: Counter[str] = Counter()
         self._report = SensorReport(name, health)
         self._wrench = device if isinstance(device, WrenchDevice) else None
@@ -127,18 +123,22 @@ class SensorWorker:
         device.pop("frames", None)  # the pipeline counts what was published
         # The pipeline's word on missing frames covers every device; Counter drops zeros.
         zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
-        return {**zeros, **device, **self._counters, **self.pipeline.counters}
+        own = self._counters + self._outlet.counters
+        return {**zeros, **device, **own, **self.pipeline.counters}
 
     def gauges(self) -> dict[str, float]:
         """What is measured of this sensor at present."""
-        clock = {} if self._clock_map is None else dict(self._clock_map.gauges())
-        condition = self.pipeline.condition
-        return clock if condition is None else {**clock, **condition.gauges()}
+        gauges = self._outlet.gauges()
+        if self._clock_map is not None:
+            gauges.update(self._clock_map.gauges())
+        if self.pipeline.condition is not None:
+            gauges.update(self.pipeline.condition.gauges())
+        return gauges
 
     @property
     def sound(self) -> bool:
         """Whether it delivers, as far as it should, and nothing that is known to be wrong."""
-        return not (self.error or self.silent or self._rejected or self._report.untrue)
+        return not (self.error or self.silent or self._outlet.refuses or self._report.untrue)
 
     def _run(self) -> None:
         self._report.starts()
@@ -172,7 +172,7 @@ class SensorWorker:
                     return
             except DeviceError as error:
                 if not self.device.info.live:
-                    self._publish(self.pipeline.finish())
+                    self._outlet.put(self.pipeline.finish())
                     raise
                 if self.serving:
                     backoff_s = BACKOFF_S[0]
@@ -214,12 +214,13 @@ class SensorWorker:
                     self._counters["silences"] += 1
                     self._report.is_silent(listening.silent_s)
                 continue
+            read_ns = time.monotonic_ns()
             self.silent = False
             if not readings:
-                self._publish(self.pipeline.finish())
+                self._outlet.put(self.pipeline.finish())
                 self._report.tare_refused(self.pipeline.tare_error)
                 return True
-            self._publish(self.pipeline.push(readings, time.monotonic_ns()))
+            self._outlet.put_read(self.pipeline.push(readings, read_ns), read_ns)
             self._report.tare_refused(self.pipeline.tare_error)
             self.serving = True
             if self.zeroing is not None:
@@ -233,27 +234,3 @@ class SensorWorker:
         """Who waits for a zero must not wait for a sensor that is gone."""
         if self.zeroing is not None:
             self.zeroing.give_up(why)
-
-    def _publish(self, items: list[Outgoing]) -> None:
-        for item in items:
-            if item.due_ns:
-                wait_s = (item.due_ns - time.monotonic_ns()) * 1e-9
-                if wait_s > 0 and self._stop.wait(wait_s):
-                    return
-            self._claim(item.topic)
-            publisher = self._publishers[item.topic]
-            try:
-                if isinstance(item.message, bytes):
-                    publisher.put_payload(item.message)
-                else:
-                    publisher.put(item.message)
-            except WireError as error:
-                self._counters["frames_rejected"] += 1
-                self._tell_rejected(error)
-
-    def _tell_rejected(self, error: WireError) -> None:
-        """Tell once of each reason: a defect comes with every frame."""
-        if error.reason not in self._rejected:
-            self._rejected.add(error.reason)
-            told = WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
-            self._health.fail(told)

@@ -93,6 +93,50 @@ def test_a_starved_sender_that_catches_up_slowly_has_lost_nothing(at_once: int) 
     assert counted(clock) == {}
 
 
+def starved(slots: list[Stamped], seed: int) -> list[Stamped]:
+    """From slot 2000 to 6000 its sender gets the processor in turns; at last it makes up."""
+    rng = np.random.default_rng(seed)
+    now_s = slots[2000][1] + 0.03
+    seen = slots[:2000]
+    while len(seen) < 6000:
+        turn_s = float(rng.uniform(3e-3, 9e-3))
+        now_s += turn_s
+        for channel, due_s in slots[len(seen) :][: int(turn_s / PERIOD_S * rng.uniform(0.6, 1.5))]:
+            if due_s < now_s:
+                seen.append((channel, now_s))
+                now_s += 20e-6
+    queue = (now_s + 60e-6 * k for k in itertools.count())
+    return seen + [(channel, max(due_s, next(queue))) for channel, due_s in slots[len(seen) :]]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_starved_sender_that_falls_behind_in_turns_has_lost_nothing(seed: int) -> None:
+    clock = SlotClock(sequence=E1_FIRST)
+    place_all(clock, starved(scattered(stream(frames=300), 3e-4), seed))
+    assert counted(clock) == {}
+
+
+def scattered(slots: list[Stamped], by_s: float) -> list[Stamped]:
+    """Stamps come late by some time, and in order."""
+    late_s = np.random.default_rng(0).exponential(by_s, len(slots))
+    stamps_s = np.maximum.accumulate(np.array([stamp_s for _, stamp_s in slots]) + late_s)
+    return [(channel, stamp_s) for (channel, _), stamp_s in zip(slots, stamps_s, strict=True)]
+
+
+@pytest.mark.parametrize("clump_s", [0.0, 2e-3, 16e-3, 50e-3])
+def test_whole_frames_that_are_gone_are_told_once_what_follows_is_steady(clump_s: float) -> None:
+    slots = scattered(stream(frames=500), 3e-4)
+    if clump_s:
+        slots = [(c, (t // clump_s + 1) * clump_s) for c, t in slots]
+    clock = SlotClock(sequence=E1_FIRST)
+    gone = 12
+    places = place_all(clock, slots[: 44 * 100] + slots[44 * (100 + gone) :])
+    assert counted(clock) == {"lost_frames": gone}
+    told = next(k for k, place in enumerate(places) if place.frame >= 100 + gone)
+    # Clumps longer than a frame look like a host that stalls again and again.
+    assert told / 44 - 100 <= (8 if clump_s < 0.01 else 210)
+
+
 def test_a_full_queue_behind_a_stall_is_a_loss() -> None:
     slots = stream(frames=100)
     until_s = slots[300][1] + 0.3

@@ -31,6 +31,7 @@ from palpate.deploy.run_folder import write_profile
 from palpate.deploy.status import ask_status
 from palpate.protos.config import LinkConfig
 from palpate.protos.errors import LinkError
+from palpate.protos.messages import Status
 from palpate.protos.session import Session
 
 _BUSES = ({"channel": "239.74.163.2", "fingers": 3}, {"channel": "239.74.163.3", "fingers": 2})
@@ -78,18 +79,19 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
         task = bar.add_task("gateway", total=10)
         time.sleep(_SETTLE_S)
         pid = children.pid("gateway")
-        before = _counters(profile)
+        before = _status(profile).counters
         begin_ns, used_s, shares = time.monotonic_ns(), _cpu_s(pid), []
+        looks: list[Status] = []
         for _ in range(10):
             part_s, part_used_s = time.monotonic(), _cpu_s(pid)
             time.sleep(seconds / 10)
             shares.append((_cpu_s(pid) - part_used_s) / (time.monotonic() - part_s))
             children.check(["gateway", "client", *(f"emulator-{n}" for n in range(4))])
+            looks.append(_status(profile))
             bar.advance(task)
         end_ns = time.monotonic_ns()
         core = (_cpu_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
         drops = _kernel_drops(pid)
-        after = _counters(profile)
         children.stop_one("client")
         children.stop_one("gateway")
         task = bar.add_task("floor", total=1)
@@ -111,7 +113,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
             end_ns,
             Used(core, max(shares), drops),
             before,
-            after,
+            looks,
         )
 
 
@@ -206,12 +208,12 @@ def _kernel_drops(pid: int) -> int:
     return sum(int(row[12]) for row in rows if f"socket:[{row[9]}]" in sockets)
 
 
-def _counters(profile: Profile) -> dict[str, int]:
+def _status(profile: Profile) -> Status:
     link = LinkConfig(connect=profile.link.connect, wait_for_router_s=10)
     with Session.open(link, station=profile.station) as session:
         for _ in range(5):
             for status in ask_status(session):
                 if status.service == "gateway":
-                    return dict(status.counters)
+                    return status
             time.sleep(0.5)
     raise LinkError("the gateway does not answer", remedy="see the logs in the run's folder")

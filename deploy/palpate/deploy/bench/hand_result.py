@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+
+from palpate.protos.messages import Status
 
 CORE_GOAL = 0.5
 """Share of a core that the gateway may use."""
@@ -42,6 +45,9 @@ class HandResult:
         frames: Electrode and wrench frames in the client.
         lost: Frames that sequence numbers, the devices' own account or invalid channels miss.
         counters: The gateway's counters of losses that are not zero.
+        publish_p50_s: Median of: reading in the gateway's hands to its message on the bus, of the
+            sensor and at the time where it was longest (a look every tenth of the run) [s].
+        publish_p99_s: 99th percentile, likewise [s].
         p50_s: Median of: last sample of an electrode frame to the client's hands [s].
         p99_s: 99th percentile [s].
         wrench_p99_s: The same of the wrenches [s].
@@ -57,6 +63,8 @@ class HandResult:
     frames: int
     lost: int
     counters: dict[str, int]
+    publish_p50_s: float
+    publish_p99_s: float
     p50_s: float
     p99_s: float
     wrench_p99_s: float
@@ -71,8 +79,8 @@ def account(
     begin_ns: int,
     end_ns: int,
     used: Used,
-    before: dict[str, int],
-    after: dict[str, int],
+    before: Mapping[str, int],
+    looks: Sequence[Status],
 ) -> HandResult:
     """Count what arrived between two instants.
 
@@ -83,7 +91,7 @@ def account(
         end_ns: End [ns].
         used: What the gateway's process used and missed.
         before: The gateway's counters at the begin.
-        after: Those at the end.
+        looks: What it told during the run; the last at the end.
     """
     with np.load(rows_file, allow_pickle=False) as archive:
         names, rows, lost = archive["sensors"], archive["rows"], int(archive["dropped"])
@@ -102,7 +110,7 @@ def account(
         floor_core = float(archive["core"])
     told = {
         name: value - before.get(name, 0)
-        for name, value in after.items()
+        for name, value in looks[-1].counters.items()
         if any(word in name for word in _LOSSES) and value > before.get(name, 0)
     }
     return HandResult(
@@ -113,12 +121,21 @@ def account(
         frames=len(rows),
         lost=lost + silent,
         counters=told,
+        publish_p50_s=_longest(looks, "publish_p50_s"),
+        publish_p99_s=_longest(looks, "publish_p99_s"),
         p50_s=float(p50),
         p99_s=float(p99),
         wrench_p99_s=float(np.percentile(late_s[~of_finger[rows[:, 0]]], 99)),
         floor_core=floor_core,
         floor_p50_s=float(floor_p50),
         floor_p99_s=float(floor_p99),
+    )
+
+
+def _longest(looks: Sequence[Status], gauge: str) -> float:
+    return max(
+        (value for look in looks for name, value in look.gauges.items() if name.endswith(gauge)),
+        default=float("nan"),
     )
 
 
@@ -143,7 +160,8 @@ def show(result: HandResult) -> None:
         f"{result.frames:,} frames in the client, {result.lost} lost, "
         f"{result.kernel_drops} datagrams dropped by the kernel; in its worst tenth the gateway "
         f"used {result.worst_core:.1%} of a core (goal {CORE_GOAL:.0%}); wrenches p99 "
-        f"{result.wrench_p99_s * 1e3:.2f} ms",
+        f"{result.wrench_p99_s * 1e3:.2f} ms; from a reading to its message on the bus p50 "
+        f"{result.publish_p50_s * 1e3:.2f}, p99 {result.publish_p99_s * 1e3:.2f} ms",
         soft_wrap=True,
         highlight=False,
     )

@@ -29,7 +29,7 @@ class SlotClock:
 
     The position follows from the order of the channels; PAC is taken for the next one until a
     channel with one place says better. How many whole frames are gone follows from the stamps, see
-    ``Silences``; where that has to be waited for, the times of two frames are early.
+    ``Silences``; where that has to be waited for, the times of four frames are early.
 
     Slots before the first whole frame, and before the sequence is known, are not placed.
     ``counters["lost_frames"]`` counts whole cycles, ``counters["lost_slots"]`` the slots beside.
