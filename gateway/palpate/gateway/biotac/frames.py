@@ -124,11 +124,17 @@ class FrameAssembler:
     def _count(self, block: SlotBlock) -> None:
         counters = self.counters
         counters["samples"] += len(block)
-        before_s = block.time_s[0] if self._last_time_s is None else self._last_time_s
-        step = np.diff(block.time_s, prepend=before_s)
-        self._last_time_s = float(block.time_s[-1])
-        late = (step > self._slot_period_s + TIME_JUMP_S) | (step < -TIME_JUMP_S)
-        counters["time_jumps"] += int(np.count_nonzero(late))
+        times_s = block.time_s
+        most_s = self._slot_period_s + TIME_JUMP_S
+        if self._last_time_s is not None:
+            first_s = float(times_s[0]) - self._last_time_s
+            counters["time_jumps"] += not -TIME_JUMP_S <= first_s <= most_s
+        self._last_time_s = float(times_s[-1])
+        steps = times_s[1:] - times_s[:-1]
+        # Of most blocks the extremes say all, and this is done for each.
+        if len(steps) and (steps.max() > most_s or steps.min() < -TIME_JUMP_S):
+            jumps = (steps > most_s) | (steps < -TIME_JUMP_S)
+            counters["time_jumps"] += int(np.count_nonzero(jumps))
         good = block.good
         if not good.all():
             bad = block.channel[~good]
@@ -137,8 +143,10 @@ class FrameAssembler:
                 name = ch.channel_name(int(channel))
                 already = self.parity_errors_by_channel.get(name, 0)
                 self.parity_errors_by_channel[name] = already + int(times_bad)
-        ends = good & ((block.value == 0) | (block.value == COUNTS_MAX))
-        counters["saturated_samples"] += int(np.count_nonzero(ends))
+        value = block.value
+        if value.min() == 0 or value.max() >= COUNTS_MAX:
+            ends = good & ((value == 0) | (value == COUNTS_MAX))
+            counters["saturated_samples"] += int(np.count_nonzero(ends))
 
     def _take_usual(self, slots: SlotBlock, readings: list[ElectrodeReading]) -> int:
         """Deliver whole frames at the start, in the order of the last one; return their slots.

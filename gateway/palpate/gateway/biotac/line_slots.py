@@ -14,6 +14,9 @@ from palpate.gateway.protocols.can_slots import SlotWords
 from palpate.gateway.protocols.places import Floats, Ints, Places
 from palpate.gateway.protocols.spi import WordKind
 
+_GOOD = WordKind.GOOD.value
+"""Of an enum costs as much as the comparison."""
+
 
 @dataclass(frozen=True, slots=True)
 class LineSlots:
@@ -108,7 +111,7 @@ class LineSlots:
 
     def of(self, finger: int) -> SlotBlock:
         """One finger's slots, by its index."""
-        good = self.kind[:, finger] == WordKind.GOOD
+        good = self.kind[:, finger] == _GOOD
         return SlotBlock(
             self.channel,
             self.value[:, finger],

@@ -218,7 +218,8 @@ class SlotOrder:
 
     def __init__(self, channels: Sequence[int]) -> None:
         self.channels = tuple(channels)
-        size = len(self.channels)
+        self.size = size = len(self.channels)
+        """Slots of a cycle."""
         self.anchors = {c: p for p, c in enumerate(channels) if self.channels.count(c) == 1}
         """Positions of the channels that tell theirs."""
         if not self.anchors:
@@ -233,16 +234,13 @@ class SlotOrder:
             for p in range(size)
         ]
 
-    def __len__(self) -> int:
-        return len(self.channels)
-
     def steps(self, position: int, channel: int) -> int:
         """Slots from a position forward to the next one of a channel of the sequence."""
         return self._steps[position][channel]
 
     def steps_near(self, position: int, channel: int, expected: float) -> int:
         """Slots forward to that place of a channel of the sequence which is nearest to a number."""
-        least, size = self.steps(position, channel), len(self)
+        least, size = self.steps(position, channel), self.size
         if abs(least - expected) < 1:
             return least
         places = [p for p, one in enumerate(self.channels) if one == channel]

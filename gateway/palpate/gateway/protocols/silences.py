@@ -157,15 +157,20 @@ class Silences:
         Returns:
             False if they must be judged one by one; then none was taken.
         """
-        if self._gap is not None or stamps_s.max() >= self._lows_until_s:
-            return False
-        if stamps_s[0] - self._last_s >= self._worth_s:
+        if self._gap is not None or stamps_s[0] - self._last_s >= self._worth_s:
             return False
         if len(stamps_s) > 1 and (stamps_s[1:] - stamps_s[:-1]).max() >= self._worth_s:
             return False
         self._last_s = float(stamps_s[-1])
-        self._lows[0] = min(self._lows[0], float(delays_s.min()))
-        self._high_s = max(self._high_s, float(delays_s.max()))
+        late = stamps_s >= self._lows_until_s
+        while late.any():
+            first = int(late.argmax())
+            if first:
+                self._note(float(delays_s[:first].min()), float(delays_s[:first].max()))
+            self._turn(float(stamps_s[first]), float(delays_s[first]))
+            stamps_s, delays_s = stamps_s[first:], delays_s[first:]
+            late = stamps_s >= self._lows_until_s
+        self._note(float(delays_s.min()), float(delays_s.max()))
         return True
 
     def _begin(self, stamp_s: float, delay_s: float) -> None:
@@ -176,10 +181,16 @@ class Silences:
 
     def _remember(self, stamp_s: float, delay_s: float) -> None:
         if stamp_s >= self._lows_until_s:
-            self._spreads_s.append(self._high_s - self._lows[0])
-            self._lows = [delay_s, self._lows[0]]
-            self._high_s = delay_s
-            self._lows_until_s = stamp_s + _ENVELOPE_S
+            self._turn(stamp_s, delay_s)
         else:
-            self._lows[0] = min(self._lows[0], delay_s)
-            self._high_s = max(self._high_s, delay_s)
+            self._note(delay_s, delay_s)
+
+    def _note(self, low_s: float, high_s: float) -> None:
+        self._lows[0] = min(self._lows[0], low_s)
+        self._high_s = max(self._high_s, high_s)
+
+    def _turn(self, stamp_s: float, delay_s: float) -> None:
+        self._spreads_s.append(self._high_s - self._lows[0])
+        self._lows = [delay_s, self._lows[0]]
+        self._high_s = delay_s
+        self._lows_until_s = stamp_s + _ENVELOPE_S

@@ -110,7 +110,7 @@ class SlotClock:
         if self._silences is None or self._index < 0:
             self.counters["unplaced"] += 1
             return None
-        frame, position = divmod(self._index, len(order))
+        frame, position = divmod(self._index, order.size)
         if frame < self._frame:  # PAC had run ahead over the edge
             self.counters["late"] += 1
             return None
@@ -146,7 +146,7 @@ class SlotClock:
             return None
         if self._index != self._sure[0] + self._since:  # PAC has run ahead
             return None
-        size, number = len(order), len(channels)
+        size, number = order.size, len(channels)
         if (self._index + 1) // size < self._frame:  # and had run ahead over the edge
             return None
         index = np.arange(self._index + 1, self._index + 1 + number)
@@ -213,9 +213,9 @@ class SlotClock:
             self._seen.clear()
 
     def _begin(self, order: SlotOrder, position: int, stamp_s: float) -> None:
-        frame_s = len(order) * self._period_s
+        frame_s = order.size * self._period_s
         # What is left of the frame that has begun stands before index 0 and is not placed.
-        self._index = position - len(order) if position else 0
+        self._index = position - order.size if position else 0
         self._origin_s = stamp_s - self._index * self._period_s
         self._begun = self._sure = (self._index, stamp_s)
         self._last_s = stamp_s
@@ -230,9 +230,9 @@ class SlotClock:
 
     def _end_run(self) -> None:
         if self._order is not None and self._silences is not None and self._index >= 0:
-            frames = self._index // len(self._order) + 1
+            frames = self._index // self._order.size + 1
             self._base += frames
-            rest = frames * len(self._order) - self._index
+            rest = frames * self._order.size - self._index
             begun_s = self._last_s if self._exact else self._time_s(self._index)
             self._resume_s = begun_s + rest * self._period_s
         self._silences = None
@@ -251,18 +251,18 @@ class SlotClock:
         else:
             self._since += 1
         before, self._index, self._last_s = self._index, target, stamp_s
-        frames, slots = divmod(missing, len(order)) if self._exact else (0, missing)
+        frames, slots = divmod(missing, order.size) if self._exact else (0, missing)
         if not self._exact:
             certain = target == self._sure[0] + self._since
             frames, shift_s = silences.judge(
                 stamp_s,
                 stamp_s - self._time_s(target),
                 broken=slots > 0,
-                edge=certain and target // len(order) > before // len(order),
+                edge=certain and target // order.size > before // order.size,
             )
             self._origin_s += shift_s
-            self._index += frames * len(order)
-            self._sure = (self._sure[0] + frames * len(order), self._sure[1])
+            self._index += frames * order.size
+            self._sure = (self._sure[0] + frames * order.size, self._sure[1])
         self.counters["lost_frames"] += frames
         self.counters["lost_slots"] += slots
         if slots > 0:
@@ -271,7 +271,7 @@ class SlotClock:
 
     def _target(self, order: SlotOrder, channel: int, stamp_s: float) -> int:
         """Index that the slot seems to have."""
-        size = len(order)
+        size = order.size
         anchored = channel in order.anchors
         index, last_s = self._sure if anchored else (self._index, self._last_s)
         if self._exact:
@@ -284,7 +284,7 @@ class SlotClock:
 
     def _is_early(self, order: SlotOrder, silences: Silences, target: int, stamp_s: float) -> bool:
         """Whether a slot comes too early for its place far ahead, so that it is a past one."""
-        if 2 * (target - self._index) <= max(len(order), 2):
+        if 2 * (target - self._index) <= max(order.size, 2):
             return False
-        leeway_s = max(len(order) * self._period_s / 2, _SCATTER_S)
+        leeway_s = max(order.size * self._period_s / 2, _SCATTER_S)
         return stamp_s - self._time_s(target) < silences.usual_s - leeway_s
