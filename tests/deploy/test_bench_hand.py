@@ -41,7 +41,9 @@ def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandR
         )
         for count in (5, 3)
     ]
-    return account(client, floor, 0, 10**9, Used(0.4, 0.5, 0), {"finger0.lost_slots": 1}, looks)
+    return account(
+        client, floor, 0, 10**9, Used(0.4, 0.5, 0, 0.0), {"finger0.lost_slots": 1}, looks
+    )
 
 
 def whole_run() -> list[list[int]]:
@@ -82,5 +84,6 @@ def test_it_runs(palpate: Palpate) -> None:
     # How many frames a busy machine loses and how late they are, a test cannot ask.
     assert told["hand"]["frames"] > 0
     assert told["hand"]["floor_core"] > 0
+    assert 0.0 <= told["hand"]["stolen"] < 1.0
     assert 0 < told["hand"]["publish_p50_s"] <= told["hand"]["publish_p99_s"]
     assert {"hand.core_goal_met", "hand.loss_goal_met", "hand.p99_ratio"} <= told.keys()

@@ -82,6 +82,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
         before = _status(profile).counters
         begin_ns, used_s, shares = time.monotonic_ns(), _cpu_s(pid), []
         looks: list[Status] = []
+        host = _host_ticks()
         for _ in range(10):
             part_s, part_used_s = time.monotonic(), _cpu_s(pid)
             time.sleep(seconds / 10)
@@ -91,6 +92,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
             bar.advance(task)
         end_ns = time.monotonic_ns()
         core = (_cpu_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
+        total, stolen = (now - then for now, then in zip(_host_ticks(), host, strict=True))
         drops = _kernel_drops(pid)
         children.stop_one("client")
         children.stop_one("gateway")
@@ -111,7 +113,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
             floor_file,
             begin_ns,
             end_ns,
-            Used(core, max(shares), drops),
+            Used(core, max(shares), drops, stolen / max(total, 1)),
             before,
             looks,
         )
@@ -195,6 +197,12 @@ def _cpu_s(pid: int) -> float:
     """User and system time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _host_ticks() -> tuple[int, int]:
+    """Of all cores since boot: all ticks, and those that another virtual machine was given."""
+    ticks = [int(word) for word in Path("/proc/stat").read_text("utf-8").split()[1:9]]
+    return sum(ticks), ticks[7]
 
 
 def _kernel_drops(pid: int) -> int:

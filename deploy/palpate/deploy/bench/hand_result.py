@@ -26,11 +26,13 @@ class Used(NamedTuple):
         core: Share of one core.
         worst_core: The same in its worst tenth.
         kernel_drops: Datagrams that it did not fetch in time.
+        stolen: Share of the cores' time that this virtual machine did not get, though it wanted it.
     """
 
     core: float
     worst_core: float
     kernel_drops: int
+    stolen: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,8 @@ class HandResult:
         core: Share of one core that the gateway used.
         worst_core: The same in its worst tenth.
         kernel_drops: Datagrams that the kernel threw away because it was not read in time.
+        stolen: Share of the cores' time that this virtual machine did not get, though it wanted it:
+            everything is then late, and takes longer by the clock of its processes, too.
         frames: Electrode and wrench frames in the client.
         lost: Frames that sequence numbers, the devices' own account or invalid channels miss.
         counters: The gateway's counters of losses that are not zero.
@@ -60,6 +64,7 @@ class HandResult:
     core: float
     worst_core: float
     kernel_drops: int
+    stolen: float
     frames: int
     lost: int
     counters: dict[str, int]
@@ -118,6 +123,7 @@ def account(
         core=used.core,
         worst_core=used.worst_core,
         kernel_drops=used.kernel_drops,
+        stolen=used.stolen,
         frames=len(rows),
         lost=lost + silent,
         counters=told,
@@ -161,7 +167,8 @@ def show(result: HandResult) -> None:
         f"{result.kernel_drops} datagrams dropped by the kernel; in its worst tenth the gateway "
         f"used {result.worst_core:.1%} of a core (goal {CORE_GOAL:.0%}); wrenches p99 "
         f"{result.wrench_p99_s * 1e3:.2f} ms; from a reading to its message on the bus p50 "
-        f"{result.publish_p50_s * 1e3:.2f}, p99 {result.publish_p99_s * 1e3:.2f} ms",
+        f"{result.publish_p50_s * 1e3:.2f}, p99 {result.publish_p99_s * 1e3:.2f} ms; "
+        f"{result.stolen:.1%} of this machine's cores went to others",
         soft_wrap=True,
         highlight=False,
     )
