@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from tests.gateway.device_cases import CASES, Case
+from tests.gateway.reading_devices import open_again
 from tests.gateway.scenes import was_approached, was_felt, was_measured
 
 from palpate.gateway.device import Device
@@ -82,17 +83,6 @@ class Bench:
         while got := device.read(1.0):
             readings += got
         return readings
-
-    def open_again(self, device: Device) -> None:
-        """As the worker does."""
-        device.close()
-        deadline = time.monotonic() + PATIENCE_S
-        while not device.is_open:
-            assert time.monotonic() < deadline
-            try:
-                device.open()
-            except DeviceError:
-                time.sleep(0.05)
 
 
 @pytest.fixture
@@ -295,7 +285,7 @@ class TestDeviceContract:
         with pytest.raises(DeviceError):
             device.open()
         emulator.inject(bench.case.gone, 1e-9)
-        bench.open_again(device)
+        open_again(device)
         assert len(bench.take(device)) >= SOME
 
     @hardware

@@ -14,7 +14,7 @@ import numpy as np
 from palpate.gateway.emulators.emulator import Emulator
 from palpate.gateway.readings import WrenchReading
 from palpate.gateway.wrench.device import WrenchDevice
-from palpate.protos.errors import DeviceError, DeviceTimeout
+from palpate.protos.errors import DeviceTimeout
 
 PATIENCE_S = 20.0
 CONSTANT = (1.5, -0.25, 1.0, 0.02, -0.01, 0.005)
@@ -86,15 +86,3 @@ def wait_for_timeout(device: WrenchDevice) -> str:
 def end(emulator: Emulator, fault: str) -> None:
     """A fault that lasts is over."""
     emulator.inject(fault, 1e-9)
-
-
-def open_again(device: WrenchDevice) -> None:
-    """As the worker does."""
-    device.close()
-    deadline = time.monotonic() + PATIENCE_S
-    while not device.is_open:
-        assert time.monotonic() < deadline
-        try:
-            device.open()
-        except DeviceError:
-            time.sleep(0.05)

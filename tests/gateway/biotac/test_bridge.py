@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.reading_devices import PATIENCE_S, open_again, read_frames
 
 from palpate.gateway.biotac.bridge import BiotacBridge, BridgeOptions
-from palpate.gateway.device import Device
 from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
 from palpate.gateway.emulators.biotac_can import idle_counts
 from palpate.gateway.protocols.channels import ALL_VALID
@@ -19,7 +19,6 @@ from palpate.protos.config import parse_config
 from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 
 pytest.importorskip("serial")
-PATIENCE_S = 20.0
 
 Emulate = Callable[..., BiotacBridgeEmulator]
 Finger = Callable[..., BiotacBridge]
@@ -54,30 +53,6 @@ def finger() -> Iterator[Finger]:
         device.close()
 
 
-def read(device: Device, until: Callable[[list[ElectrodeReading]], Any]) -> list[ElectrodeReading]:
-    """Readings until a condition holds."""
-    got: list[ElectrodeReading] = []
-    deadline = time.monotonic() + PATIENCE_S
-    while not until(got):
-        assert time.monotonic() < deadline, device.counters
-        try:
-            got += device.read(0.5)  # type: ignore[arg-type]
-        except DeviceTimeout:
-            continue
-    return got
-
-
-def open_again(device: Device) -> None:
-    device.close()
-    deadline = time.monotonic() + PATIENCE_S
-    while not device.is_open:
-        assert time.monotonic() < deadline
-        try:
-            device.open()
-        except DeviceError:
-            time.sleep(0.05)
-
-
 def assert_right(readings: list[ElectrodeReading], index: int) -> None:
     """Every valid electrode of every reading is what the finger measured."""
     assert readings
@@ -105,7 +80,7 @@ def test_three_fingers_of_one_line(
         device = finger(emulator.address, port=index + 1)
         device.open()
         assert device.identity.serial == f"BT-EMU-{index + 1}"
-        readings = read(device, lambda got: len(got) > 20)
+        readings = read_frames(device, lambda got: len(got) > 20)
         assert_right(readings, index)
         whole = [one for one in readings if one.validity == ALL_VALID]
         assert len(whole) >= len(readings) - 3
@@ -120,7 +95,7 @@ def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: Finger) -> Non
     device = finger(emulate(slot_rate_hz=2200.0, fingers=1).address)
     device.open()
     assert device.identity.slot_period_s == pytest.approx(1 / 2200)
-    times = np.diff([one.time_s for one in read(device, lambda got: len(got) > 10)])
+    times = np.diff([one.time_s for one in read_frames(device, lambda got: len(got) > 10)])
     assert np.median(times) == pytest.approx(0.02, abs=1e-6)
 
 
@@ -147,12 +122,12 @@ def test_a_fault_is_counted_and_nothing_wrong_comes_out(
     device = finger(emulator.address)
     device.open()
     # A STATUS has come by then: what the bridge counts is told from the first one on.
-    readings = read(device, lambda got: len(got) > 15)
+    readings = read_frames(device, lambda got: len(got) > 15)
     for _ in range(3):
         wanted = device.counters[counter] + 1
         emulator.inject(fault)
-        readings += read(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
-    readings += read(device, lambda got: got and got[-1].validity == ALL_VALID)
+        readings += read_frames(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
+    readings += read_frames(device, lambda got: got and got[-1].validity == ALL_VALID)
     if fault != "saturated":
         assert_right(readings, 0)
 
@@ -162,7 +137,7 @@ def test_stuck_fingers_come_out_stuck(emulate: Emulate, finger: Finger) -> None:
     device = finger(emulator.address)
     device.open()
     emulator.inject("stuck", 30.0)
-    read(device, lambda got: got and len(set(got[-1].pac)) == 1)
+    read_frames(device, lambda got: got and len(set(got[-1].pac)) == 1)
 
 
 def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: Finger) -> None:
@@ -170,7 +145,7 @@ def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: Finger
     emulator.inject("clock_drift", 30.0)
     device = finger(emulator.address)
     device.open()
-    readings = read(device, lambda got: len(got) > 60)
+    readings = read_frames(device, lambda got: len(got) > 60)
     assert_right(readings, 0)
     assert device.counters["lost_slots"] == device.counters["restarts"] == 0
 
@@ -179,7 +154,7 @@ def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Fi
     emulator = emulate()
     device = finger(emulator.address)
     device.open()
-    read(device, lambda got: len(got) > 5)
+    read_frames(device, lambda got: len(got) > 5)
     emulator.inject("silence", 0.6)
     silent = False
     deadline = time.monotonic() + PATIENCE_S
@@ -189,9 +164,9 @@ def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Fi
             device.read(0.2)
         except DeviceTimeout:
             silent = True
-    readings = read(device, lambda got: sum(one.missed_before for one in got) > 0)
+    readings = read_frames(device, lambda got: sum(one.missed_before for one in got) > 0)
     assert 45 <= sum(one.missed_before for one in readings) <= 80
-    assert_right(read(device, lambda got: len(got) > 5), 0)
+    assert_right(read_frames(device, lambda got: len(got) > 5), 0)
 
 
 @pytest.mark.parametrize(("fault", "message"), [("restart", "restarted"), ("unplug", "is gone")])
@@ -201,12 +176,12 @@ def test_a_bridge_that_begins_anew_is_lost_and_found(
     emulator = emulate()
     device = finger(emulator.address)
     device.open()
-    read(device, lambda got: len(got) > 5)
+    read_frames(device, lambda got: len(got) > 5)
     emulator.inject(fault, 0.0 if fault == "restart" else 0.5)
     with pytest.raises(DeviceLost, match=message):
-        read(device, lambda _: False)
+        read_frames(device, lambda _: False)
     open_again(device)
-    assert_right(read(device, lambda got: len(got) > 5), 0)
+    assert_right(read_frames(device, lambda got: len(got) > 5), 0)
 
 
 def test_an_empty_port_is_no_sensor(emulate: Emulate, finger: Finger) -> None:
@@ -218,7 +193,7 @@ def test_an_empty_port_is_no_sensor(emulate: Emulate, finger: Finger) -> None:
         finger(emulator.address, port=3).open()
     there = finger(emulator.address, port=1)
     there.open()
-    assert_right(read(there, lambda got: len(got) > 5), 0)
+    assert_right(read_frames(there, lambda got: len(got) > 5), 0)
 
 
 def test_the_source_must_be_the_one_that_was_named(emulate: Emulate, finger: Finger) -> None:
@@ -227,7 +202,7 @@ def test_the_source_must_be_the_one_that_was_named(emulate: Emulate, finger: Fin
         finger(emulator.address, source=8).open()
     device = finger(emulator.address, source=9)
     device.open()
-    assert_right(read(device, lambda got: len(got) > 3), 0)
+    assert_right(read_frames(device, lambda got: len(got) > 3), 0)
 
 
 def test_the_wrong_speed_is_told(emulate: Emulate, finger: Finger) -> None:
@@ -241,7 +216,7 @@ def test_without_hello_the_line_names_the_finger(emulate: Emulate, finger: Finge
     device = finger(emulator.address, hello_s=0.0)
     device.open()
     assert device.identity.serial.endswith("port1")
-    assert_right(read(device, lambda got: len(got) > 3), 0)
+    assert_right(read_frames(device, lambda got: len(got) > 3), 0)
 
 
 def test_each_port_once(emulate: Emulate, finger: Finger) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.reading_devices import PATIENCE_S, read_frames
 
 from palpate.gateway.device import Device
 from palpate.gateway.drivers import make_device
@@ -17,7 +18,6 @@ from palpate.gateway.readings import ElectrodeReading
 from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 
 pytest.importorskip("can")
-PATIENCE_S = 20.0
 
 Emulate = Callable[..., BiotacCanEmulator]
 
@@ -51,19 +51,6 @@ def finger(request: pytest.FixtureRequest) -> Iterator[Callable[..., Device]]:
         device.close()
 
 
-def read(device: Device, until: Callable[[list[ElectrodeReading]], Any]) -> list[ElectrodeReading]:
-    """Readings until a condition holds."""
-    got: list[ElectrodeReading] = []
-    deadline = time.monotonic() + PATIENCE_S
-    while not until(got):
-        assert time.monotonic() < deadline, device.counters
-        try:
-            got += device.read(0.5)  # type: ignore[arg-type]
-        except DeviceTimeout:
-            continue
-    return got
-
-
 def of_finger(index: int) -> np.ndarray:
     return np.array(idle_counts(0.0, index)[:19])
 
@@ -81,7 +68,7 @@ def test_three_fingers_of_one_bus(emulate: Emulate, finger: Any, pac_first: bool
     devices = [finger(port=port) for port in (1, 2, 3)]
     for index, device in enumerate(devices):
         device.open()
-        readings = read(device, lambda got: len(got) > 20)
+        readings = read_frames(device, lambda got: len(got) > 20)
         whole = [one for one in readings if one.validity == ALL_VALID]
         assert len(whole) >= len(readings) - 2
         assert_right(readings, index)
@@ -102,7 +89,7 @@ def test_an_empty_port_is_no_sensor_and_a_pulled_one_is_lost(emulate: Emulate, f
         finger(fingers=2, port=2).open()
     there = finger(fingers=2, port=1)
     there.open()
-    assert_right(read(there, lambda got: len(got) > 5), 0)
+    assert_right(read_frames(there, lambda got: len(got) > 5), 0)
     back = finger(fingers=2, port=2)
     deadline = time.monotonic() + PATIENCE_S
     while not back.is_open:
@@ -113,8 +100,8 @@ def test_an_empty_port_is_no_sensor_and_a_pulled_one_is_lost(emulate: Emulate, f
             time.sleep(0.1)
     emulator.inject("absent", 1.0)
     with pytest.raises(DeviceLost, match="no finger answers"):
-        read(back, lambda _: False)
-    assert_right(read(there, lambda got: len(got) > 5), 0)
+        read_frames(back, lambda _: False)
+    assert_right(read_frames(there, lambda got: len(got) > 5), 0)
 
 
 @pytest.mark.parametrize(
@@ -132,13 +119,13 @@ def test_a_fault_is_counted_and_nothing_wrong_comes_out(
 ) -> None:
     emulator, device = emulate(), finger()
     device.open()
-    readings = read(device, lambda got: len(got) > 5)
+    readings = read_frames(device, lambda got: len(got) > 5)
     before = device.counters[counter]
     for times in (1, 2, 3):
         emulator.inject(fault)
         wanted = before + times
-        readings += read(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
-    readings += read(device, lambda got: got and got[-1].validity == ALL_VALID)
+        readings += read_frames(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
+    readings += read_frames(device, lambda got: got and got[-1].validity == ALL_VALID)
     assert device.counters[counter] >= before + 3
     assert_right(readings, 0)
 
@@ -146,7 +133,7 @@ def test_a_fault_is_counted_and_nothing_wrong_comes_out(
 def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Any) -> None:
     emulator, device = emulate(), finger()
     device.open()
-    read(device, lambda got: len(got) > 20)
+    read_frames(device, lambda got: len(got) > 20)
     emulator.inject("silence", 0.8)
     silent = False
     deadline = time.monotonic() + PATIENCE_S
@@ -156,11 +143,11 @@ def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: An
             device.read(0.2)
         except DeviceTimeout:
             silent = True
-    readings = read(device, lambda got: sum(one.missed_before for one in got) > 0)
+    readings = read_frames(device, lambda got: sum(one.missed_before for one in got) > 0)
     assert_right(readings, 0)
     missed = sum(one.missed_before for one in readings)
     assert 60 <= missed <= 90
-    assert_right(read(device, lambda got: len(got) > 10), 0)
+    assert_right(read_frames(device, lambda got: len(got) > 10), 0)
 
 
 def test_nobody_on_the_bus_is_told(finger: Any) -> None:
@@ -184,6 +171,6 @@ def test_opens_again_after_closing(emulate: Emulate, finger: Any) -> None:
     device = finger()
     for _ in range(2):
         device.open()
-        assert_right(read(device, lambda got: len(got) > 3), 0)
+        assert_right(read_frames(device, lambda got: len(got) > 3), 0)
         device.close()
         device.close()

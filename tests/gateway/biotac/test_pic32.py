@@ -2,57 +2,25 @@
 
 from __future__ import annotations
 
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.reading_devices import Follower
 
 from palpate.gateway.biotac.pic32 import VALIDITY, BiotacPic32, Pic32Options
 from palpate.gateway.emulators.biotac_can import idle_counts
 from palpate.gateway.emulators.biotac_pic32 import BiotacPic32Emulator
 from palpate.gateway.readings import ElectrodeReading
 from palpate.protos.config import parse_config
-from palpate.protos.errors import DeviceError, DeviceTimeout
+from palpate.protos.errors import DeviceError
 
 pytest.importorskip("serial")
-PATIENCE_S = 20.0
 
 
-class Follower:
-    """Reads a device as the gateway's worker does: when it is lost, it is opened again."""
-
-    def __init__(self, device: BiotacPic32) -> None:
-        self.device = device
-        self.readings: list[ElectrodeReading] = []
-        self.errors: list[DeviceError] = []
-        self._counts: Counter[str] = Counter()
-
-    def until(self, true: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not true():
-            assert time.monotonic() < deadline, (self.errors, self.counts())
-            try:
-                self.device.open()
-                self.readings += self.device.read(0.1)  # type: ignore[arg-type]
-            except DeviceTimeout:
-                pass
-            except DeviceError as error:
-                self.errors.append(error)
-                self._counts += Counter(self.device.counters)
-                self.device.close()
-                time.sleep(0.02)
-
-    def more(self, count: int = 10) -> list[ElectrodeReading]:
-        """The next readings."""
-        had = len(self.readings)
-        self.until(lambda: len(self.readings) >= had + count)
-        return self.readings[had:]
-
-    def counts(self) -> Counter[str]:
-        return self._counts + Counter(self.device.counters)
+class Board(Follower[ElectrodeReading]):
+    """What the board's finger measured is known."""
 
     def assert_right(self) -> None:
         """Every reading is what the finger measured."""
@@ -78,13 +46,13 @@ def make(board: BiotacPic32Emulator, **options: Any) -> BiotacPic32:
 
 
 @pytest.fixture
-def follower(board: BiotacPic32Emulator) -> Iterator[Follower]:
+def follower(board: BiotacPic32Emulator) -> Iterator[Board]:
     device = make(board)
-    yield Follower(device)
+    yield Board(device, ElectrodeReading)
     device.close()
 
 
-def test_one_frame_each_tick(follower: Follower) -> None:
+def test_one_frame_each_tick(follower: Board) -> None:
     readings = follower.more(150)
     follower.assert_right()
     assert not follower.errors
@@ -98,7 +66,7 @@ def test_one_frame_each_tick(follower: Follower) -> None:
 
 def test_the_older_firmware() -> None:
     with BiotacPic32Emulator(electrodes_first=True) as board:
-        follower = Follower(make(board, layout="electrodes_first", serial="BT-7"))
+        follower = Board(make(board, layout="electrodes_first", serial="BT-7"), ElectrodeReading)
         follower.more()
         follower.assert_right()
         assert follower.device.identity.serial == "BT-7"
@@ -118,7 +86,7 @@ def test_the_older_firmware() -> None:
     ],
 )
 def test_a_fault_is_counted_and_nothing_wrong_comes_out(
-    board: BiotacPic32Emulator, follower: Follower, fault: str, counter: str
+    board: BiotacPic32Emulator, follower: Board, fault: str, counter: str
 ) -> None:
     follower.more()
     for _ in range(3):
@@ -131,7 +99,7 @@ def test_a_fault_is_counted_and_nothing_wrong_comes_out(
 
 @pytest.mark.parametrize("fault", ["restart", "unplug", "silence"])
 def test_a_board_that_is_gone_is_found_again(
-    board: BiotacPic32Emulator, follower: Follower, fault: str
+    board: BiotacPic32Emulator, follower: Board, fault: str
 ) -> None:
     follower.more()
     board.inject(fault, 0.0 if fault == "restart" else 0.8)
@@ -141,7 +109,7 @@ def test_a_board_that_is_gone_is_found_again(
 
 
 def test_saturated_stuck_and_drifting_come_out_as_they_are(
-    board: BiotacPic32Emulator, follower: Follower
+    board: BiotacPic32Emulator, follower: Board
 ) -> None:
     follower.more()
     board.inject("clock_drift", 1.0)
@@ -154,10 +122,10 @@ def test_saturated_stuck_and_drifting_come_out_as_they_are(
 
 
 def test_a_stream_that_runs_already_is_stopped_first(board: BiotacPic32Emulator) -> None:
-    first = Follower(make(board))
-    first.more()
-    first.device._port.close()  # as a process that is killed
-    second = Follower(make(board))
+    killed = make(board)
+    Board(killed, ElectrodeReading).more()
+    killed._port.close()  # as of a process that is killed
+    second = Board(make(board), ElectrodeReading)
     second.more()
     second.assert_right()
     assert not second.errors
@@ -172,7 +140,7 @@ def test_nobody_there_and_the_wrong_speed_are_told(board: BiotacPic32Emulator) -
 
 
 def test_a_finger_that_was_pulled_is_told_and_not_delivered_as_zeros(
-    board: BiotacPic32Emulator, follower: Follower
+    board: BiotacPic32Emulator, follower: Board
 ) -> None:
     follower.more()
     board.inject("absent", 60.0)
@@ -185,7 +153,7 @@ def test_a_finger_that_was_pulled_is_told_and_not_delivered_as_zeros(
 
 
 def test_saturated_channels_are_counted_and_delivered(
-    board: BiotacPic32Emulator, follower: Follower
+    board: BiotacPic32Emulator, follower: Board
 ) -> None:
     follower.more()
     board.inject("saturated", 60.0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from tests.gateway.reading_devices import PATIENCE_S, Follower
 
 from palpate.gateway.emulators.bota import Bota
 from palpate.gateway.emulators.serial_line import SerialLine
@@ -19,7 +19,6 @@ from palpate.protos.errors import ConfigError, DeviceError, DeviceTimeout
 
 pytest.importorskip("serial")
 
-PATIENCE_S = 20.0
 SHARES = (1.0, -2.0, 3.0, 0.1, -0.05, 0.02)
 LOAD = (10.0, -5.0, 20.0, 0.1, -0.05, 0.025)
 
@@ -33,42 +32,6 @@ def is_of_sweep(reading: WrenchReading) -> bool:
     told = [*reading.force, *reading.torque]
     near = [abs(value - share * told[0]) < 1e-5 for value, share in zip(told, SHARES, strict=True)]
     return all(near) and 0.99 < told[0] < 10.2
-
-
-class Follower:
-    """Reads a device as the gateway's worker does: when it is lost, it is opened again."""
-
-    def __init__(self, device: WrenchBota) -> None:
-        self.device = device
-        self.readings: list[WrenchReading] = []
-        self.errors: list[DeviceError] = []
-        self._counts: Counter[str] = Counter()
-
-    def until(self, true: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not true():
-            assert time.monotonic() < deadline, (self.errors, self.counts())
-            try:
-                self.device.open()
-                for reading in self.device.read(0.05):
-                    assert isinstance(reading, WrenchReading)
-                    self.readings.append(reading)
-            except DeviceTimeout:
-                pass
-            except DeviceError as error:
-                self.errors.append(error)
-                self._counts += Counter(self.device.counters)
-                self.device.close()
-                time.sleep(0.02)
-
-    def more(self, count: int = 20) -> list[WrenchReading]:
-        """The next readings."""
-        had = len(self.readings)
-        self.until(lambda: len(self.readings) >= had + count)
-        return self.readings[had:]
-
-    def counts(self) -> Counter[str]:
-        return self._counts + Counter(self.device.counters)
 
 
 def make(sensor: Bota, **options: Any) -> WrenchBota:
@@ -91,9 +54,9 @@ def booted(sensor: Bota) -> None:
 
 
 @pytest.fixture
-def follower(sensor: Bota) -> Iterator[Follower]:
+def follower(sensor: Bota) -> Iterator[Follower[WrenchReading]]:
     with make(sensor, rate_hz=800) as device:
-        yield Follower(device)
+        yield Follower(device, WrenchReading)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +67,7 @@ def test_it_sets_up_the_sensor_and_reads_it(sensor: Bota, rate_hz: int, sinc: in
         assert device.info.rate_hz == pytest.approx(rate_hz, rel=0.005)
         assert (sensor.settings.sinc, sensor.settings.compensated) == (sinc, True)
         assert device.identity.serial == sensor.address
-        readings = Follower(device).more(30)
+        readings = Follower(device, WrenchReading).more(30)
     assert all(map(is_of_sweep, readings))
     for before, after in itertools.pairwise(readings):
         steps = after.tick - before.tick
@@ -120,7 +83,7 @@ def test_values_are_those_of_the_sensor_on_the_mount() -> None:
     with Bota(lambda _: LOAD) as sensor:
         booted(sensor)
         with make(sensor, mount=mount, serial="ours") as device:
-            reading = Follower(device).more(1)[0]
+            reading = Follower(device, WrenchReading).more(1)[0]
     fx, fy, fz, tx, ty, tz = LOAD
     # A quarter turn about z, and the reaction's sign; then the lever of 20 mm.
     force = (fy, -fx, -fz)
@@ -133,7 +96,7 @@ def test_values_are_those_of_the_sensor_on_the_mount() -> None:
 def test_each_value_has_the_time_that_the_sensor_gave_it(sensor: Bota) -> None:
     # The emulator's clock begins with the source's.
     with make(sensor) as device:
-        readings = Follower(device).more(100)
+        readings = Follower(device, WrenchReading).more(100)
     for reading in readings:
         # 1 us of rounding, and float32.
         assert reading.force[0] == pytest.approx(sweep(reading.time_s)[0], abs=1e-4)
@@ -144,7 +107,7 @@ def test_the_speed_is_found_or_given(baud: int, given: int) -> None:
     with Bota(sweep, baud=baud) as sensor:
         booted(sensor)
         with make(sensor, baud=given, rate_hz=200) as device:
-            assert all(map(is_of_sweep, Follower(device).more()))
+            assert all(map(is_of_sweep, Follower(device, WrenchReading).more()))
             assert sensor.settings.baud == baud
 
 
@@ -154,7 +117,7 @@ def test_a_sensor_that_is_booting_is_waited_for(runs_after_boot: bool) -> None:
         Bota(sweep, boot_s=0.4, runs_after_boot=runs_after_boot) as sensor,
         make(sensor, baud=460800) as device,
     ):
-        assert all(map(is_of_sweep, Follower(device).more()))
+        assert all(map(is_of_sweep, Follower(device, WrenchReading).more()))
 
 
 def test_zero_is_taken_in_the_sensor() -> None:
@@ -162,7 +125,7 @@ def test_zero_is_taken_in_the_sensor() -> None:
     with Bota(lambda _: LOAD) as sensor:
         booted(sensor)
         with make(sensor) as device:
-            follower = Follower(device)
+            follower = Follower(device, WrenchReading)
             follower.more()
             before = follower.readings[-1]
             device.zero()
@@ -175,7 +138,7 @@ def test_zero_is_taken_in_the_sensor() -> None:
             device.zero()
             assert sensor.settings.offsets == pytest.approx([-value for value in LOAD], abs=1e-3)
         with make(sensor, zero_at_start=True) as device:
-            assert abs(Follower(device).more(1)[0].force[2]) < 1e-3
+            assert abs(Follower(device, WrenchReading).more(1)[0].force[2]) < 1e-3
 
 
 def test_offsets_that_work_otherwise_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,7 +151,7 @@ def test_offsets_that_work_otherwise_are_found(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(sensor, "_take", turned)
         with pytest.raises(DeviceError, match="after taking zero it still tells"):
             device.zero()
-        assert Follower(device).more(1)[0].force == pytest.approx(LOAD[:3])
+        assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(LOAD[:3])
 
 
 FAULTS = [
@@ -212,7 +175,7 @@ FAULTS = [
 
 @pytest.mark.parametrize(("fault", "duration_s", "shown"), FAULTS)
 def test_faults_are_found_named_and_survived(
-    sensor: Bota, follower: Follower, fault: str, duration_s: float, shown: str
+    sensor: Bota, follower: Follower[WrenchReading], fault: str, duration_s: float, shown: str
 ) -> None:
     follower.more()
     sensor.inject(fault, duration_s)
@@ -229,7 +192,7 @@ def test_faults_are_found_named_and_survived(
     assert sensor.settings.sinc == 64
 
 
-def test_a_clock_that_drifts_loses_nothing(sensor: Bota, follower: Follower) -> None:
+def test_a_clock_that_drifts_loses_nothing(sensor: Bota, follower: Follower[WrenchReading]) -> None:
     sensor.inject("clock_drift", 60.0)
     follower.more(200)
     if not follower.errors:
@@ -243,7 +206,7 @@ def test_the_clock_may_wrap() -> None:
         booted(sensor)
         sensor._clock_us = 2.0**32 - 100_000.0
         with make(sensor) as device:
-            follower = Follower(device)
+            follower = Follower(device, WrenchReading)
             start = follower.more(1)[0].time_s
             follower.until(lambda: follower.readings[-1].time_s > 2.0**32 * 1e-6 + 0.1)
     assert start < 2.0**32 * 1e-6
@@ -252,7 +215,7 @@ def test_the_clock_may_wrap() -> None:
 
 
 def test_a_clock_that_begins_anew_without_a_word_is_a_restart(
-    sensor: Bota, follower: Follower
+    sensor: Bota, follower: Follower[WrenchReading]
 ) -> None:
     follower.more()
     sensor._clock_us = 10_000.0

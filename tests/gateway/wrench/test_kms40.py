@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.reading_devices import open_again
 
 from palpate.gateway.emulators.kms40 import Kms40Emulator
 from palpate.gateway.wrench.kms40 import Kms40Options, WrenchKms40
@@ -170,7 +171,7 @@ def test_a_lost_connection_is_found_and_opened_again(emulator: Kms40Emulator, fa
         with pytest.raises(DeviceLost, match="is gone"):
             fakes.read_until(device, lambda _: False)
         fakes.end(emulator, fault)
-        fakes.open_again(device)
+        open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
         assert emulator.divider == 2
 

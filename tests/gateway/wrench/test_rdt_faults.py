@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.reading_devices import open_again
 
 from palpate.gateway.emulators.emulator import Wrench
 from palpate.gateway.emulators.rdt import RdtEmulator
@@ -85,7 +86,7 @@ def test_a_restart_is_found_and_opened_again() -> None:
         emulator.inject("restart")
         with pytest.raises(DeviceLost, match=r"it was restarted -> .* its zero is gone"):
             fakes.read_until(device, lambda _: False)
-        fakes.open_again(device)
+        open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
         assert emulator.rate_hz == 200.0
 
@@ -97,7 +98,7 @@ def test_unplugged_it_is_found_and_opened_again() -> None:
         with pytest.raises(DeviceLost, match="is gone"):
             fakes.read_until(device, lambda _: False)
         fakes.end(emulator, "unplug")
-        fakes.open_again(device)
+        open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
 
 
@@ -182,7 +183,7 @@ def test_with_a_wrong_rate_it_is_opened_with_the_hosts_clock(
     ):
         with pytest.raises(DeviceLost, match="not 7000 Hz"):
             fakes.read_until(device, lambda _: False)
-        fakes.open_again(device)
+        open_again(device)
         readings = fakes.read_until(device, lambda readings: len(readings) >= 50)
         assert device.counters["counter_rate_wrong"] == 1
         assert abs(readings[-1].time_s - time.monotonic()) < fakes.PATIENCE_S

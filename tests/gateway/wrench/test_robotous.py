@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import pytest
+from tests.gateway.reading_devices import PATIENCE_S, Follower
 
 from palpate.gateway.emulators.robotous import Robotous, RobotousCan, RobotousSerial
 from palpate.gateway.emulators.serial_line import SerialLine
@@ -20,7 +20,6 @@ from palpate.protos.errors import ConfigError, DeviceError, DeviceTimeout
 pytest.importorskip("serial")
 can = pytest.importorskip("can")
 
-PATIENCE_S = 20.0
 SHARES = (1.0, -2.0, 3.0, 0.1, -0.05, 0.02)
 FORCE_STEP, TORQUE_STEP = 1.0 / 50.0, 1.0 / 2000.0
 LOAD = (10.0, -5.0, 20.0, 0.1, -0.05, 0.025)
@@ -41,42 +40,6 @@ def is_of_sweep(reading: WrenchReading) -> bool:
         for value, share, step in zip(told, SHARES, steps, strict=True)
     ]
     return all(near) and 0.98 < ramp < 10.2
-
-
-class Follower:
-    """Reads a device as the gateway's worker does: when it is lost, it is opened again."""
-
-    def __init__(self, device: WrenchRobotous) -> None:
-        self.device = device
-        self.readings: list[WrenchReading] = []
-        self.errors: list[DeviceError] = []
-        self._counts: Counter[str] = Counter()
-
-    def until(self, true: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not true():
-            assert time.monotonic() < deadline, (self.errors, self.counts())
-            try:
-                self.device.open()
-                for reading in self.device.read(0.05):
-                    assert isinstance(reading, WrenchReading)
-                    self.readings.append(reading)
-            except DeviceTimeout:
-                pass
-            except DeviceError as error:
-                self.errors.append(error)
-                self._counts += Counter(self.device.counters)
-                self.device.close()
-                time.sleep(0.02)
-
-    def more(self, count: int = 20) -> list[WrenchReading]:
-        """The next readings."""
-        had = len(self.readings)
-        self.until(lambda: len(self.readings) >= had + count)
-        return self.readings[had:]
-
-    def counts(self) -> Counter[str]:
-        return self._counts + Counter(self.device.counters)
 
 
 def passed(moment_s: float) -> bool:
@@ -106,9 +69,9 @@ def line_of(sensor: Robotous) -> dict[str, Any]:
 
 
 @pytest.fixture
-def follower(sensor: Robotous) -> Iterator[Follower]:
+def follower(sensor: Robotous) -> Iterator[Follower[WrenchReading]]:
     with make(line_of(sensor) | {"rate_hz": 500}) as device:
-        yield Follower(device)
+        yield Follower(device, WrenchReading)
 
 
 def test_it_sets_up_the_sensor_and_reads_it(sensor: Robotous) -> None:
@@ -116,7 +79,7 @@ def test_it_sets_up_the_sensor_and_reads_it(sensor: Robotous) -> None:
     with make(options) as device:
         assert (device.identity.serial, device.info.rate_hz) == ("RFT-1", 1000.0)
         assert (sensor.rate_hz, sensor.filter_code, sensor.running) == (1000.0, (1, 5), True)
-        readings = Follower(device).more(300)
+        readings = Follower(device, WrenchReading).more(300)
         assert device.counters["samples"] >= 300
     assert all(map(is_of_sweep, readings))
     assert not any(reading.overload for reading in readings)
@@ -138,7 +101,7 @@ def test_values_follow_model_and_mount(model: str, divisor: float) -> None:
     }
     with RobotousSerial(lambda _: LOAD, model=model) as sensor:
         with make({"port": sensor.address, "mount": mount, "serial": "ours"}) as device:
-            reading = Follower(device).more(1)[0]
+            reading = Follower(device, WrenchReading).more(1)[0]
     fx, fy, fz, tx, ty, tz = LOAD
     # A quarter turn about z, and the reaction's sign; then the lever of 20 mm.
     force = (fy, -fx, -fz)
@@ -151,21 +114,21 @@ def test_values_follow_model_and_mount(model: str, divisor: float) -> None:
 def test_a_torque_divisor_outdoes_the_model() -> None:
     with RobotousSerial(lambda _: LOAD) as sensor:
         with make({"port": sensor.address, "torque_divisor": 1000.0}) as device:
-            reading = Follower(device).more(1)[0]
+            reading = Follower(device, WrenchReading).more(1)[0]
     assert reading.torque == pytest.approx([2.0 * value for value in LOAD[3:]], abs=1e-6)
 
 
 def test_an_old_stream_is_stopped_first(sensor: Robotous) -> None:
     sensor.running = True
     with make(line_of(sensor) | {"rate_hz": 500}) as device:
-        assert all(map(is_of_sweep, Follower(device).more(50)))
+        assert all(map(is_of_sweep, Follower(device, WrenchReading).more(50)))
         assert sensor.rate_hz == 500.0
 
 
 def test_zero_is_taken_in_the_sensor(sensor: Robotous) -> None:
     sensor._source = lambda _: LOAD
     with make(line_of(sensor) | {"zero_at_start": True}) as device:
-        follower = Follower(device)
+        follower = Follower(device, WrenchReading)
         assert all(not reading.force.any() for reading in follower.more(10))
         sensor._source = lambda _: (11.0, *LOAD[1:])
         follower.until(lambda: follower.readings[-1].force[0] == pytest.approx(1.0))
@@ -198,7 +161,7 @@ FAULTS = [
 
 @pytest.mark.parametrize(("fault", "duration_s", "shown"), FAULTS)
 def test_faults_are_found_named_and_survived(
-    sensor: Robotous, follower: Follower, fault: str, duration_s: float, shown: str
+    sensor: Robotous, follower: Follower[WrenchReading], fault: str, duration_s: float, shown: str
 ) -> None:
     if fault not in sensor.faults:
         pytest.skip("this line has no such fault")
@@ -223,7 +186,7 @@ def test_faults_are_found_named_and_survived(
 
 def test_a_restart_is_followed_by_the_same_settings(sensor: Robotous) -> None:
     with make(line_of(sensor) | {"rate_hz": 500, "cutoff_hz": 50}) as device:
-        follower = Follower(device)
+        follower = Follower(device, WrenchReading)
         follower.more()
         sensor.inject("restart")
         follower.until(lambda: follower.errors)
@@ -233,7 +196,7 @@ def test_a_restart_is_followed_by_the_same_settings(sensor: Robotous) -> None:
 
 @pytest.mark.parametrize("sensor", ["can"], indirect=True)
 def test_bus_off_is_found_and_survived(
-    sensor: Robotous, follower: Follower, monkeypatch: pytest.MonkeyPatch
+    sensor: Robotous, follower: Follower[WrenchReading], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     follower.more()
     assert isinstance(sensor, RobotousCan)
@@ -247,7 +210,9 @@ def test_bus_off_is_found_and_survived(
 
 
 @pytest.mark.parametrize("sensor", ["can"], indirect=True)
-def test_halves_far_apart_are_not_joined(sensor: Robotous, follower: Follower) -> None:
+def test_halves_far_apart_are_not_joined(
+    sensor: Robotous, follower: Follower[WrenchReading]
+) -> None:
     with can.Bus(interface="virtual", channel=sensor.address.partition(":")[2]) as bus:
         follower.more()
         sensor.running = False
@@ -268,7 +233,7 @@ def test_others_on_the_bus_do_not_hide_silence(request: pytest.FixtureRequest) -
         can.Bus(interface="virtual", channel=channel) as bus,
         make({"interface": "virtual", "channel": channel}) as device,
     ):
-        follower = Follower(device)
+        follower = Follower(device, WrenchReading)
         follower.more()
         other = can.Message(arbitration_id=0x300, data=bytes(8), is_extended_id=False)
         noise = bus.send_periodic(other, 0.005)
@@ -303,7 +268,7 @@ def test_an_unknown_model_needs_a_divisor(serial_line: bool) -> None:
         with pytest.raises(DeviceError, match=r"'RFT99-XX' is not in .*-> set model or torque_div"):
             make({"port": sensor.address}).open()
         with make({"port": sensor.address, "model": "RFT44-SB01"}) as device:
-            assert Follower(device).more(1)[0].torque[0] == pytest.approx(0.1)
+            assert Follower(device, WrenchReading).more(1)[0].torque[0] == pytest.approx(0.1)
 
 
 def test_a_model_that_is_another_one_is_refused() -> None:
