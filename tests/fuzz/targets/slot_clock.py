@@ -62,8 +62,8 @@ def _stream(data: bytes, sequence: tuple[int, ...], *, exact: bool) -> Slots:
             index += fate
         elif fate < 96:  # frames are lost
             index += (fate - 63) * len(sequence)
-        elif fate < 128 and not exact:  # the host stands still, and makes up for it
-            late_s += (fate - 95) * 1e-3
+        elif fate < 128:  # the host stands still, and makes up for it
+            late_s += 0.0 if exact else (fate - 95) * 1e-3
         elif fate < 160 and channels:  # slots come twice
             channels += channels[-(fate - 127) :]
             stamps += [stamps[-1]] * (len(channels) - len(stamps))

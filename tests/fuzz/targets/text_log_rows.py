@@ -77,5 +77,13 @@ def seeds() -> list[bytes]:
     lines = [b"0 0 1 17 5000 0", b"0 0 1 99 5 0", b"nan 0 1 17 5 0", b"0 0 1 17 5", b"x", b"",
              b"-0 0 1e3 17 5 0", b"0  0 1 17 5 1 ", b"0 0 -1 17 5 0", b"0 0 1 17 5 2",
              b"1-2 0 1 0 0 0", b"0 0 1_0 17 5 0", b"0 .5 1 17 5. 0"]  # fmt: skip
+    made_up = b"0.0 0 1 17 5 0\n0.1 0 1 0 5 0\r1\n 0 1 18 5 0\n"
     lies = header.replace(b"4400", b"nan"), header.replace(b": 7", b": inf")
-    return [header + rows, rows, plain, *(plain + line + b"\n" + plain for line in lines), *lies]
+    return [
+        header + rows,
+        rows,
+        plain,
+        *(plain + line + b"\n" + plain for line in lines),
+        *lies,
+        made_up,
+    ]
