@@ -105,6 +105,11 @@ def seeds() -> list[bytes]:
     return [bytes([7 * which + mode, which, mode]) + stream for which, mode in kinds] + [
         bytes([0, 0, 0]) + bytes([200, 0]) * 4 + bytes([3, 1, 3, 1]),
         bytes([63, 1, 2]) + bytes([200, 0]) * 3 + bytes([40, 200, 4, 97, 255, 0]),
+        # Another sequence is learnt while PAC has run ahead over the edge of a frame.
+        bytes.fromhex(
+            "0017ffffffff2b985b989898989882e89898989198989898985b9898989898989882820004000000"
+            "823798983798989891989898989898989898989898989898826040ab"
+        ),
         # Another sequence is learnt, and none of it comes.
         bytes.fromhex(
             "9e9e9e9e9e9e9e9e9e9e9e9e9e9e829e9e9e9e9e9e9e9e9e9e1f04827f828082a082aa82bf8282ff"

@@ -230,7 +230,8 @@ class SlotClock:
 
     def _end_run(self) -> None:
         if self._order is not None and self._silences is not None and self._index >= 0:
-            frames = self._index // self._order.size + 1
+            # PAC may have run ahead over the edge, and what came then is placed.
+            frames = max(self._index // self._order.size, self._frame) + 1
             self._base += frames
             rest = frames * self._order.size - self._index
             begun_s = self._last_s if self._exact else self._time_s(self._index)
