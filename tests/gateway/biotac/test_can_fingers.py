@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from tests.gateway.reading_devices import PATIENCE_S, read_frames
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
 from palpate.gateway.emulators.biotac_can import BiotacCanEmulator, idle_counts
 from palpate.gateway.protocols.channels import ALL_VALID
 from palpate.gateway.readings import ElectrodeReading
@@ -20,35 +18,6 @@ from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTi
 pytest.importorskip("can")
 
 Emulate = Callable[..., BiotacCanEmulator]
-
-
-@pytest.fixture
-def emulate(request: pytest.FixtureRequest) -> Iterator[Emulate]:
-    running: list[BiotacCanEmulator] = []
-
-    def start(**options: Any) -> BiotacCanEmulator:
-        emulator = BiotacCanEmulator("virtual", request.node.name, **options)
-        emulator.start()
-        running.append(emulator)
-        return emulator
-
-    yield start
-    for emulator in running:
-        emulator.stop()
-
-
-@pytest.fixture
-def finger(request: pytest.FixtureRequest) -> Iterator[Callable[..., Device]]:
-    made: list[Device] = []
-
-    def make(**options: Any) -> Device:
-        given = {"interface": "virtual", "channel": request.node.name, **options}
-        made.append(make_device("biotac_can", given))
-        return made[-1]
-
-    yield make
-    for device in made:
-        device.close()
 
 
 def of_finger(index: int) -> np.ndarray:

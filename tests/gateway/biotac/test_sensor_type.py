@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.reading_devices import read_frames
 
 from palpate.gateway.biotac.sensor_type import LEARNT_FROM, agreed_type, answering_type
 from palpate.gateway.biotac.slots import Slot, SlotBlock, slot_block
 from palpate.gateway.device import Device
 from palpate.gateway.drivers import make_device
-from palpate.gateway.emulators.biotac_can import BiotacCanEmulator
 from palpate.gateway.protocols import channels as ch
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.errors import ConfigError, DeviceError, DeviceTimeout
+from palpate.protos.errors import ConfigError, DeviceError
 from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout, SensorType
-
-PATIENCE_S = 20.0
 
 
 def slots_of(layout: FrameLayout, *, deaf: bool = False) -> SlotBlock:
@@ -55,47 +51,6 @@ def test_a_pic32_board_polls_no_sp() -> None:
         make_device("biotac_pic32", {"port": "/dev/ttyUSB7", "sensor_type": "biotac_sp"})
 
 
-@pytest.fixture
-def emulate(request: pytest.FixtureRequest) -> Iterator[Callable[..., BiotacCanEmulator]]:
-    pytest.importorskip("can")
-    running: list[BiotacCanEmulator] = []
-
-    def start(**options: Any) -> BiotacCanEmulator:
-        running.append(BiotacCanEmulator("virtual", request.node.name, **options))
-        running[-1].start()
-        return running[-1]
-
-    yield start
-    for emulator in running:
-        emulator.stop()
-
-
-@pytest.fixture
-def finger(request: pytest.FixtureRequest) -> Iterator[Callable[..., Device]]:
-    made: list[Device] = []
-
-    def make(**options: Any) -> Device:
-        given = {"interface": "virtual", "channel": request.node.name, **options}
-        made.append(make_device("biotac_can", given))
-        return made[-1]
-
-    yield make
-    for device in made:
-        device.close()
-
-
-def readings(device: Device, count: int) -> list[ElectrodeReading]:
-    got: list[Any] = []
-    deadline = time.monotonic() + PATIENCE_S
-    while len(got) < count:
-        assert time.monotonic() < deadline, device.counters
-        try:
-            got += device.read(0.5)
-        except DeviceTimeout:
-            continue
-    return got
-
-
 @pytest.mark.parametrize("pac_first", [False, True])
 def test_an_sp_on_can(emulate: Any, finger: Callable[..., Device], pac_first: bool) -> None:
     emulate(electrodes=24, pac_first=pac_first)
@@ -105,7 +60,11 @@ def test_an_sp_on_can(emulate: Any, finger: Callable[..., Device], pac_first: bo
         device.open()
         assert device.identity.sensor_type is device.info.sensor_type is SensorType.BIOTAC_SP
         assert device.info.rate_hz == pytest.approx(4400 / 54)
-        whole = [one for one in readings(device, 5) if one.validity == layout.all_valid]
+        whole = [
+            one
+            for one in read_frames(device, lambda got: len(got) >= 5)
+            if one.validity == layout.all_valid
+        ]
         assert whole
         for one in whole:
             assert (one.electrodes.shape, one.pac.shape) == ((24,), (27,))

@@ -26,10 +26,10 @@ from palpate.deploy.bench.alignment_page import page_of
 from palpate.deploy.bench.e2e import wait_ready
 from palpate.deploy.bench.lateness import OnTime
 from palpate.deploy.bench.results import append_history, machine
+from palpate.deploy.bench.station import free_port, gateway_station
 from palpate.deploy.children import Children
-from palpate.deploy.ports import free_endpoint
 from palpate.deploy.processes import command_line
-from palpate.deploy.profile import Profile, changed, load_profile
+from palpate.deploy.profile import Profile
 from palpate.deploy.run_folder import write_profile
 from palpate.deploy.status import ask_status
 from palpate.protos.config import LinkConfig
@@ -125,14 +125,8 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
     """
     with Children("bench-alignment") as children:
         sensors = _start_devices(children)
-        endpoint = free_endpoint()
-        profile = changed(
-            load_profile("bench").model_copy(update={"processes": ("router",)}),
-            router={"listen": (endpoint,)},
-            link={"connect": (endpoint,)},
-            gateway={"sensors": sensors},
-            log={"level": "warning"},
-        )
+        profile = gateway_station(sensors)
+        endpoint = profile.link.connect[0]
         children.start_profile(profile)
         part = [sys.executable, "-m", "palpate.deploy.bench.alignment_parts"]
         robot = [*part, "robot", endpoint, profile.station, _late_file(children, "robot")]
@@ -165,7 +159,7 @@ def _late_file(children: Children, name: str) -> str:
 
 def _start_devices(children: Children) -> list[dict[str, Any]]:
     """Start the emulators; the gateway's sensors."""
-    can, tcp, udp, web = (int(free_endpoint().rpartition(":")[2]) for _ in range(4))
+    can, tcp, udp, web = (free_port() for _ in range(4))
     line = children.folder / "bota"
     told = {
         "finger": [CHANNEL, str(can)],

@@ -23,10 +23,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from palpate.deploy.bench.e2e import wait_ready
 from palpate.deploy.bench.hand_result import CORE_GOAL, HandResult, Used, account, show
 from palpate.deploy.bench.results import append_history, machine
+from palpate.deploy.bench.station import free_port, gateway_station
 from palpate.deploy.children import Children
-from palpate.deploy.ports import free_endpoint
 from palpate.deploy.processes import command_line
-from palpate.deploy.profile import Profile, changed, load_profile
+from palpate.deploy.profile import Profile
 from palpate.deploy.run_folder import write_profile
 from palpate.deploy.status import ask_status
 from palpate.protos.config import LinkConfig
@@ -126,12 +126,12 @@ def _start_emulators(
     emulate = [sys.executable, "-m", "palpate.deploy", "emulate"]
     buses: list[dict[str, Any]] = []
     for number, bus in enumerate(_BUSES):
-        port = _free_port()
+        port = free_port()
         words = ["--channel", str(bus["channel"]), "--bus", f"port={port}"]
         words += ["--fingers", str(bus["fingers"]), "--seed", str(10 * number)]
         children.start(f"emulator-{number}", [*emulate, "biotac-can", *words])
         buses.append({"interface": "udp_multicast", "channel": bus["channel"], "port": port})
-    tcp, line = _free_port(), children.folder / "bota"
+    tcp, line = free_port(), children.folder / "bota"
     children.start("emulator-2", [*emulate, "kms40", "--port", str(tcp)])
     children.start("emulator-3", [*emulate, "bota", "--link", str(line), "--baud", "460800"])
     deadline = time.monotonic() + 30.0
@@ -172,14 +172,8 @@ def _start_gateway(
         {"name": name, "driver": f"wrench_{name}", "options": options}
         for name, options in wrenches.items()
     ]
-    endpoint = free_endpoint()
-    profile = changed(
-        load_profile("bench").model_copy(update={"processes": ("router",)}),
-        router={"listen": (endpoint,)},
-        link={"connect": (endpoint,)},
-        gateway={"sensors": sensors},
-        log={"level": "warning"},
-    )
+    profile = gateway_station(sensors)
+    endpoint = profile.link.connect[0]
     children.start_profile(profile)
     part = [sys.executable, "-m", "palpate.deploy.bench.hand_parts"]
     children.start("client", [*part, "client", endpoint, profile.station, str(rows_file)])
@@ -187,10 +181,6 @@ def _start_gateway(
     children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
     wait_ready(profile, {"gateway"})
     return profile
-
-
-def _free_port() -> int:
-    return int(free_endpoint().rpartition(":")[2])
 
 
 def _cpu_s(pid: int) -> float:

@@ -121,12 +121,12 @@ class Silences:
         silence_s = stamp_s - self._last_s
         self._last_s = stamp_s
         usual_s = self.usual_s
+        if self._gap is None and silence_s < self._worth_s:
+            self._remember(stamp_s, delay_s)
+            return NO_LOSS
         spread_s = min(self._spreads_s, default=0.0)
         settle_s = self._settle_s + _LONGER * spread_s
         if self._gap is None:
-            if silence_s < self._worth_s:
-                self._remember(stamp_s, delay_s)
-                return NO_LOSS
             until_s, give_up_s = stamp_s + settle_s, stamp_s + _PATIENCE_S
             self._gap = _Gap(until_s, delay_s - usual_s, delay_s, delay_s, give_up_s)
         gap = self._gap
