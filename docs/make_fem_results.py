@@ -41,7 +41,7 @@ def table(headings: list[str], rows: list[list[str]]) -> str:
 
 def sum_up(path: Path) -> None:
     """A store's trajectories in a line each."""
-    from palpate.fem.store.read import SimulationStore
+    from palpate_fem.store.read import SimulationStore
 
     store, rows = SimulationStore.open(path), []
     for name in store.ids():

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from palpate.fem.mesh.geometry import Geometry
-from palpate.fem.mesh.parametric import biotac
+from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.parametric import biotac
 
 PICTURE = Path(__file__).resolve().parent / "pictures" / "fingertip-mesh.png"
 # Title, direction to the viewer, axes to the right and up, sign of the axis to the right.

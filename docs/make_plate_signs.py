@@ -13,22 +13,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.deploy.generate.spec import ExperimentSpec
-from palpate.fem.indenter.pose import rotation_matrix
-from palpate.fem.indenter.shape import Indenter, Kind, Primitive
-from palpate.fem.mechanics.solver import Fingertip, Settings
-from palpate.fem.mesh.parametric import biotac
-from palpate.fem.population.answers import Population
-from palpate.fem.population.member import read_population
-from palpate.fem.service.biotac import BiotacTip
-from palpate.gateway.biotac.conversions import BIOTAC
-from palpate.training.twin_figures.plate import (
+from palpate_deploy.generate.spec import ExperimentSpec
+from palpate_fem.indenter.pose import rotation_matrix
+from palpate_fem.indenter.shape import Indenter, Kind, Primitive
+from palpate_fem.mechanics.solver import Fingertip, Settings
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.population.answers import Population
+from palpate_fem.population.member import read_population
+from palpate_fem.service.biotac import BiotacTip
+from palpate_gateway.biotac.conversions import BIOTAC
+from palpate_training.twin_figures.plate import (
     TOUCHED_COUNTS,
     VENTRAL_COS,
     plate_response,
     read_plate_logs,
 )
-from palpate.training.twin_figures.signs import agreement, signs
+from palpate_training.twin_figures.signs import agreement, signs
 
 Floats = NDArray[np.float64]
 

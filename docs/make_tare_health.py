@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.gateway.condition.condition import Condition
-from palpate.gateway.condition.stillness import StillLimits, evidence_of
-from palpate.gateway.condition.untouched import is_drift
-from palpate.gateway.condition.warm_up import WarmUp
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.tare import TARE_FRAMES, TareCollector
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.protos.errors import DeviceError
-from palpate.protos.messages import ElectrodeFrame, Origin, SensorType, Stamp
+from palpate.errors import DeviceError
+from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp
+from palpate_gateway.condition.condition import Condition
+from palpate_gateway.condition.stillness import StillLimits, evidence_of
+from palpate_gateway.condition.untouched import is_drift
+from palpate_gateway.condition.warm_up import WarmUp
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.tare import TARE_FRAMES, TareCollector
+from palpate_gateway.timing.clock_map import FileClock
 
 Floats = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from palpate.protos.config import LinkConfig
-from palpate.protos.session import run_router
+from palpate.bus import run_router
+from palpate.config import LinkConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -15,8 +15,8 @@ import math
 import sys
 import time
 
-from palpate.protos.client import Client
-from palpate.protos.errors import PalpateError
+from palpate.client import Client
+from palpate.errors import PalpateError
 
 PERIOD_S = 0.004
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 import sys
 import uuid
 
-from palpate.protos.client import Client
-from palpate.protos.errors import PalpateError
-from palpate.protos.messages import SimulationRequest, SimulationStep
-from palpate.protos.simulations import straight_path
+from palpate.client import Client
+from palpate.client.simulations import straight_path
+from palpate.errors import PalpateError
+from palpate.messages import SimulationRequest, SimulationStep
 
 
 def show(number: int, step: SimulationStep) -> None:

@@ -11,15 +11,15 @@ from typer.testing import CliRunner
 
 pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
-from palpate.deploy import cli_files
-from palpate.deploy.options import PalpateGroup
-from palpate.fem.store import hdf5 as store_hdf5
-from palpate.fem.store.export import export
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.services import simulation_view_file
-from palpate.services.simulation_view_file import Simulations
+from palpate_deploy import cli_files
+from palpate_deploy.options import PalpateGroup
+from palpate_fem.store import hdf5 as store_hdf5
+from palpate_fem.store.export import export
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
+from palpate_services import simulation_view_file
+from palpate_services.simulation_view_file import Simulations
 
 NAMES = ["sphere_medium/00/angled", "sphere_medium/00/normal"]
 

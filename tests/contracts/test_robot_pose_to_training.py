@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway import node
-from palpate.gateway.config import GatewayConfig
-from palpate.gateway.drivers import DRIVERS
-from palpate.gateway.pose.placement import Placement, PlacementOptions
-from palpate.gateway.readings import PoseReading, Reading
-from palpate.gateway.virtual.finger import Virtual
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig, parse_config
-from palpate.protos.messages import Pose
-from palpate.protos.record import read_record
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import WRENCH
-from palpate.services import recorder
-from palpate.services.config import RecorderConfig
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import WRENCH
+from palpate.client import Client
+from palpate.config import LinkConfig, parse_config
+from palpate.files.record import read_record
+from palpate.messages import Pose
+from palpate_gateway import node
+from palpate_gateway.config import GatewayConfig
+from palpate_gateway.drivers import DRIVERS
+from palpate_gateway.pose.placement import Placement, PlacementOptions
+from palpate_gateway.readings import PoseReading, Reading
+from palpate_gateway.virtual.finger import Virtual
+from palpate_services import recorder
+from palpate_services.config import RecorderConfig
 
 PATIENCE_S = 20.0
 PERIOD_S = 0.004
@@ -109,7 +109,7 @@ def until(true: Callable[[], bool]) -> None:
 def test_a_robots_pose_is_the_contact_location_of_a_dataset(
     link: LinkConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ingest = pytest.importorskip("palpate.training.ingest_record")
+    ingest = pytest.importorskip("palpate_training.ingest_record")
     module: Any = types.ModuleType("driver_without_pose")
     module.WithoutPose = WithoutPose
     monkeypatch.setitem(sys.modules, "driver_without_pose", module)
@@ -145,9 +145,9 @@ def test_a_robots_pose_is_the_contact_location_of_a_dataset(
 
 def test_a_registration_of_the_testbed_gives_base_sensor(tmp_path: Path) -> None:
     """As docs/devices/robot-pose.md says: the pose that is written there, turned round."""
-    registrations = pytest.importorskip("palpate.training.testbed.registration_file")
-    testbed = pytest.importorskip("palpate.training.testbed.registration")
-    transforms = pytest.importorskip("palpate.training.testbed.transform")
+    registrations = pytest.importorskip("palpate_training.testbed.registration_file")
+    testbed = pytest.importorskip("palpate_training.testbed.registration")
+    transforms = pytest.importorskip("palpate_training.testbed.transform")
     turn = np.array([0.1, 0.9, -0.2, 0.3])
     truth = transforms.Transform.from_pose([0.41, -0.2, 0.13, *(turn / np.linalg.norm(turn))])
     places = [(0.0, 0.0, -0.05), (0.04, 0.0, -0.05), (0.0, 0.05, -0.05), (0.03, 0.06, -0.05)]

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.deploy.virtual_record import write_virtual_record
-from palpate.protos.bundle import read_bundle
-from palpate.protos.codec import ELECTRODE_FRAME, FEATURE_ESTIMATE, TARE, WRENCH_FRAME
-from palpate.protos.errors import BundleError
-from palpate.protos.messages import ElectrodeFrame, FeatureEstimate, Tare
-from palpate.protos.record import read_record
-from palpate.services.estimator import estimate
-from palpate.services.repository import resolve
-from palpate.services.runtime import load
+from palpate.codec import ELECTRODE_FRAME, FEATURE_ESTIMATE, TARE, WRENCH_FRAME
+from palpate.errors import BundleError
+from palpate.files.bundle import read_bundle
+from palpate.files.record import read_record
+from palpate.messages import ElectrodeFrame, FeatureEstimate, Tare
+from palpate_deploy.virtual_record import write_virtual_record
+from palpate_services.estimator import estimate
+from palpate_services.repository import resolve
+from palpate_services.runtime import load
 
 
 def _frames(record: Path) -> tuple[list[ElectrodeFrame], dict[int, Tare], list[float]]:
@@ -37,10 +37,10 @@ def _frames(record: Path) -> tuple[list[ElectrodeFrame], dict[int, Tare], list[f
 @pytest.mark.slow
 def test_a_bundle_that_training_writes_is_served(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from palpate.training.ingest_record import ingest_record
-    from palpate.training.schema import write_dataset
-    from palpate.training.train import TrainConfig
-    from palpate.training.train_features import train_features
+    from palpate_training.ingest_record import ingest_record
+    from palpate_training.schema import write_dataset
+    from palpate_training.train import TrainConfig
+    from palpate_training.train_features import train_features
 
     record = tmp_path / "virtual.mcap"
     write_virtual_record(record, frames=6000, seed=3)

@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Pipeline
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.protos.bundle import read_bundle
-from palpate.protos.codec import FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
-from palpate.protos.messages import (
+from palpate.codec import FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
+from palpate.files.bundle import read_bundle
+from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     FieldEstimate,
@@ -22,9 +19,12 @@ from palpate.protos.messages import (
     Tare,
     WrenchFrame,
 )
-from palpate.services.estimator import estimate, estimate_field, synthesise
-from palpate.services.repository import resolve
-from palpate.services.runtime import Runtime, load
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Pipeline
+from palpate_gateway.timing.clock_map import FileClock
+from palpate_services.estimator import estimate, estimate_field, synthesise
+from palpate_services.repository import resolve
+from palpate_services.runtime import Runtime, load
 
 
 def shipped(task: str) -> Runtime:
@@ -101,11 +101,11 @@ def test_the_shipped_sample_trains_a_field_that_services_serve(
     played: list[object], tmp_path: Path
 ) -> None:
     pytest.importorskip("torch")
-    from palpate.training.fields.bundles import field_bundle
-    from palpate.training.fields.fit import FitConfig
-    from palpate.training.twin.hdf5 import read_mixed
+    from palpate_training.fields.bundles import field_bundle
+    from palpate_training.fields.fit import FitConfig
+    from palpate_training.twin.hdf5 import read_mixed
 
-    path = Path(str(resources.files("palpate.training").joinpath("samples/twin.h5")))
+    path = Path(str(resources.files("palpate_training").joinpath("samples/twin.h5")))
     assert path.stat().st_size < 1.5e6
     sample = read_mixed(path)
     assert set(sample.experiment.unit_names) == {"biotac-1", "biotac-2", "biotac-3"}

@@ -8,14 +8,14 @@ import numpy as np
 from tests.crosscheck.contact import Grading, SphereOnBlock, half_block
 from tests.crosscheck.problem import Bools, Floats, Ints, Problem, Solution
 
-from palpate.fem.indenter.shape import Indenter, Kind, Primitive
-from palpate.fem.mechanics.balance import Balance
-from palpate.fem.mechanics.laws import ContactSettings, Press
-from palpate.fem.mechanics.newton import Newton, NewtonSettings
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.sparse.factor import Factor, make_factor
+from palpate_fem.indenter.shape import Indenter, Kind, Primitive
+from palpate_fem.mechanics.balance import Balance
+from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics.newton import Newton, NewtonSettings
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.sparse.factor import Factor, make_factor
 
 UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)  # half a turn about x: the indenter's body points to +z
 NO_FACES = np.zeros((0, 3), np.int32)

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from palpate.deploy.ports import free_endpoint
-from palpate.deploy.virtual_record import write_virtual_record
-from palpate.protos.config import LinkConfig
-from palpate.services.repository import available
+from palpate.config import LinkConfig
+from palpate_deploy.ports import free_endpoint
+from palpate_deploy.virtual_record import write_virtual_record
+from palpate_services.repository import available
 
 ROOT = Path(__file__).resolve().parents[2]
 BUNDLE = "features-virtual"
@@ -46,7 +46,7 @@ def palpate() -> Palpate:
 
     def run(*arguments: str | Path, timeout: float = 60) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-m", "palpate.deploy", *map(str, arguments)],
+            [sys.executable, "-m", "palpate_deploy", *map(str, arguments)],
             capture_output=True,
             text=True,
             timeout=timeout,
@@ -81,7 +81,7 @@ def station(tmp_path: Path) -> tuple[Path, LinkConfig]:
 def up(station: tuple[Path, LinkConfig], bundle: str) -> Iterator[subprocess.Popen[bytes]]:
     """``palpate up`` with that profile; stopped, or if need be killed, afterwards."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "palpate.deploy", "up", "--profile", str(station[0])],
+        [sys.executable, "-m", "palpate_deploy", "up", "--profile", str(station[0])],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

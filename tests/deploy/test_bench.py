@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.deploy.bench.harness import Gate, bench_counts, read_rows, write_rows
-from palpate.deploy.bench.results import append_history, latency, rounds
-from palpate.protos.errors import ConfigError
-from palpate.protos.messages import COUNTS_MAX
+from palpate.errors import ConfigError
+from palpate.messages import COUNTS_MAX
+from palpate_deploy.bench.harness import Gate, bench_counts, read_rows, write_rows
+from palpate_deploy.bench.results import append_history, latency, rounds
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.deploy.bench.alignment_account import (
+from palpate.messages import (
+    BIOTAC_LAYOUT,
+    ElectrodeFrame,
+    IndenterPoseFrame,
+    Origin,
+    SensorType,
+    Stamp,
+    WrenchFrame,
+)
+from palpate.sampling import slots_of
+from palpate_deploy.bench.alignment_account import (
     LOW_COUNTS,
     LOW_N,
     SPAN_COUNTS,
@@ -22,19 +32,9 @@ from palpate.deploy.bench.alignment_account import (
     spread,
     stamp_errors,
 )
-from palpate.deploy.bench.alignment_page import page_of
-from palpate.deploy.bench.lateness import LATE_S, Lateness, OnTime
-from palpate.deploy.bench.ramp import MARGIN_S, RAMP_S, share_at, time_of
-from palpate.protos.messages import (
-    BIOTAC_LAYOUT,
-    ElectrodeFrame,
-    IndenterPoseFrame,
-    Origin,
-    SensorType,
-    Stamp,
-    WrenchFrame,
-)
-from palpate.protos.sampling import slots_of
+from palpate_deploy.bench.alignment_page import page_of
+from palpate_deploy.bench.lateness import LATE_S, Lateness, OnTime
+from palpate_deploy.bench.ramp import MARGIN_S, RAMP_S, share_at, time_of
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.deploy.bench.hand_result import HandResult, Used, account
-from palpate.protos.messages import ServiceState, Status
+from palpate.messages import ServiceState, Status
+from palpate_deploy.bench.hand_result import HandResult, Used, account
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -17,12 +17,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from palpate.deploy import doctor, training
-from palpate.deploy.cli import app
-from palpate.deploy.failure import exit_code
-from palpate.deploy.ports import check_free, free_endpoint
-from palpate.fem.cli.group import EXTRA_MODULES
-from palpate.protos.errors import (
+from palpate.errors import (
     BundleError,
     ConfigError,
     DeviceLost,
@@ -31,6 +26,11 @@ from palpate.protos.errors import (
     PalpateError,
     RecordingError,
 )
+from palpate_deploy import doctor, training
+from palpate_deploy.cli import app
+from palpate_deploy.failure import exit_code
+from palpate_deploy.ports import check_free, free_endpoint
+from palpate_fem.cli.group import EXTRA_MODULES
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -70,7 +70,7 @@ def test_help_has_a_runnable_example(path: tuple[str, ...]) -> None:
 def test_help_imports_nothing_heavy() -> None:
     heavy = ("numpy", "zenoh", "pydantic", "onnxruntime", "rerun", "torch", "matplotlib", "mcap")
     program = (
-        "import sys; from palpate.deploy.cli import app\n"
+        "import sys; from palpate_deploy.cli import app\n"
         "from typer.testing import CliRunner\n"
         "assert CliRunner().invoke(app, ['--help']).exit_code == 0\n"
         f"print([name for name in {heavy!r} if name in sys.modules])"
@@ -149,7 +149,7 @@ def test_no_router() -> None:
     )
     running = [
         subprocess.Popen(
-            [sys.executable, "-m", "palpate.deploy", *command, "--connect", endpoint],
+            [sys.executable, "-m", "palpate_deploy", *command, "--connect", endpoint],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -236,7 +236,7 @@ def test_json_logs(tmp_path: Path) -> None:
         f'[router]\nlisten = ["{endpoint}"]\n[log]\nformat = "json"\n', encoding="utf-8"
     )
     process = subprocess.Popen(
-        [sys.executable, "-m", "palpate.deploy", "run", "router", "--profile", str(path)],
+        [sys.executable, "-m", "palpate_deploy", "run", "router", "--profile", str(path)],
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.deploy.clock_text import clock_lines, duration_words, wall_words
-from palpate.gateway.timing.clock_map import ClockQuality
-from palpate.gateway.timing.discipline import Discipline
-from palpate.protos.messages import ServiceState, Status
+from palpate.messages import ServiceState, Status
+from palpate_deploy.clock_text import clock_lines, duration_words, wall_words
+from palpate_gateway.timing.clock_map import ClockQuality
+from palpate_gateway.timing.discipline import Discipline
 
 
 def status(gauges: dict[str, float], counters: dict[str, int] | None = None) -> Status:

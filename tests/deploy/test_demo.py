@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.protos.record import summarise
+from palpate.files.record import summarise
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

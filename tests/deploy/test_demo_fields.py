@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.deploy.demo_fields import FieldComparison, FieldStreams
-from palpate.protos.errors import LinkError, StreamTimeout
-from palpate.protos.messages import Origin, Stamp
+from palpate.errors import LinkError, StreamTimeout
+from palpate.messages import Origin, Stamp
+from palpate_deploy.demo_fields import FieldComparison, FieldStreams
 
 MS = 1_000_000
 

@@ -14,21 +14,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.deploy.cli import app
-from palpate.fem.store.content import StoredFingertip
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.sample import sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.training.dataset import Provenance
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.perform import perform
-from palpate.training.testbed.plan import Motion, Plan, Station, Trajectory, make_plan
-from palpate.training.testbed.trajectory_file import write_trajectories
-from palpate.training.twin.content import ExperimentDataset
-from palpate.training.twin.hdf5 import read_experiment, read_mixed
-from palpate.training.twin.processing import process
-from palpate.training.twin.raw_file import read_trials, write_trials
-from palpate.training.twin.trials import RawTrial, TrialHeader, TrialRows
+from palpate_deploy.cli import app
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.sample import sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
+from palpate_training.dataset import Provenance
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.perform import perform
+from palpate_training.testbed.plan import Motion, Plan, Station, Trajectory, make_plan
+from palpate_training.testbed.trajectory_file import write_trajectories
+from palpate_training.twin.content import ExperimentDataset
+from palpate_training.twin.hdf5 import read_experiment, read_mixed
+from palpate_training.twin.processing import process
+from palpate_training.twin.raw_file import read_trials, write_trials
+from palpate_training.twin.trials import RawTrial, TrialHeader, TrialRows
 
 sys.path.append(str(Path(__file__).parents[1] / "training"))
 fakes: Any = importlib.import_module("testbed_fakes")

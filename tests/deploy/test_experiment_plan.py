@@ -12,19 +12,19 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from palpate.deploy.cli import app
-from palpate.fem.indenter.approach import first_contact
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.service.start import skin_of
-from palpate.fem.store.content import StoredFingertip
-from palpate.fem.store.sample import sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.fem.trajectory import Campaign
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.plan import APPROACH_M
-from palpate.training.testbed.registration import Registration
-from palpate.training.testbed.registration_file import write_registrations
-from palpate.training.testbed.trajectory_file import read_trajectories
+from palpate_deploy.cli import app
+from palpate_fem.indenter.approach import first_contact
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.service.start import skin_of
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.sample import sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
+from palpate_fem.trajectory import Campaign
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.plan import APPROACH_M
+from palpate_training.testbed.registration import Registration
+from palpate_training.testbed.registration_file import write_registrations
+from palpate_training.testbed.trajectory_file import read_trajectories
 
 
 def run(*words: object) -> Result:

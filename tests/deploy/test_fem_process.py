@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from palpate.deploy.processes import START_ORDER, service_named
-from palpate.deploy.profile import load_profile, profile_names
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError
+from palpate.client import Client
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError
+from palpate_deploy.processes import START_ORDER, service_named
+from palpate_deploy.profile import load_profile, profile_names
 
 FAKES = Path(__file__).resolve().parents[1] / "fem"
 PATIENCE_S = 20.0
@@ -45,7 +45,7 @@ def test_it_runs_and_ends(link: LinkConfig, tmp_path: Path) -> None:
         encoding="utf-8",
     )
     process = subprocess.Popen(
-        [sys.executable, "-m", "palpate.deploy", "run", "fem", "--profile", str(path)],
+        [sys.executable, "-m", "palpate_deploy", "run", "fem", "--profile", str(path)],
         env={**os.environ, "PYTHONPATH": str(FAKES)},
         stderr=subprocess.PIPE,
         text=True,

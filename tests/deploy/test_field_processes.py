@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from palpate.deploy.doctor import run_doctor
-from palpate.deploy.processes import START_ORDER, service_named
-from palpate.deploy.profile import SERVICES, load_profile
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError
+from palpate.client import Client
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError
+from palpate_deploy.doctor import run_doctor
+from palpate_deploy.processes import START_ORDER, service_named
+from palpate_deploy.profile import SERVICES, load_profile
 
 PATIENCE_S = 20.0
 
@@ -81,7 +81,7 @@ def test_doctor_tries_each_bundle_that_is_served(
 @pytest.mark.parametrize("service", ["field", "synthesis"])
 def test_it_runs_and_ends(service: str, profile: Path, link: LinkConfig) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "palpate.deploy", "run", service, "--profile", str(profile)],
+        [sys.executable, "-m", "palpate_deploy", "run", service, "--profile", str(profile)],
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from palpate.deploy.virtual_record import write_virtual_record
-from palpate.protos.record import read_record
+from palpate.files.record import read_record
+from palpate_deploy.virtual_record import write_virtual_record
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.deploy.generate.mechanics import STORE
-from palpate.deploy.generate.pipeline import EXPERIMENT, MIXED, Generated, generate
-from palpate.deploy.generate.sample import make_sample
-from palpate.deploy.generate.spec import FILE, ExperimentSpec, provenance_sha256
-from palpate.deploy.generate.spread import Processes, Ray, WorkerLostError
-from palpate.deploy.generate.trials import FOLDER
-from palpate.fem.electrodes.unit import UnitParameters
-from palpate.fem.population.member import PAPER, Member
-from palpate.fem.store.read import SimulationStore
-from palpate.protos.errors import ConfigError, DatasetError, LinkError
-from palpate.protos.tape import read_tape
-from palpate.training.twin.hdf5 import read_experiment, read_mixed
+from palpate.errors import ConfigError, DatasetError, LinkError
+from palpate.files.tape import read_tape
+from palpate_deploy.generate.mechanics import STORE
+from palpate_deploy.generate.pipeline import EXPERIMENT, MIXED, Generated, generate
+from palpate_deploy.generate.sample import make_sample
+from palpate_deploy.generate.spec import FILE, ExperimentSpec, provenance_sha256
+from palpate_deploy.generate.spread import Processes, Ray, WorkerLostError
+from palpate_deploy.generate.trials import FOLDER
+from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.population.member import PAPER, Member
+from palpate_fem.store.read import SimulationStore
+from palpate_training.twin.hdf5 import read_experiment, read_mixed
 
 SPEC = ExperimentSpec(
     points=1, angled=1, edge_m=1.2e-3, overtravel_m=0.2e-3, indenters=("sphere_medium",)
@@ -166,7 +166,7 @@ def test_processes_answer_every_task_and_hand_errors_on() -> None:
 
 KILLED = """
 import os, signal, time
-from palpate.deploy.generate.spread import Processes
+from palpate_deploy.generate.spread import Processes
 
 if __name__ == "__main__":
     pool = Processes(1)

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from palpate.deploy.profile import (
+from palpate.errors import ConfigError
+from palpate_deploy.profile import (
     changed,
     load_profile,
     parse_profile,
     plain_values,
     profile_names,
 )
-from palpate.deploy.toml_text import toml_text
-from palpate.protos.errors import ConfigError
+from palpate_deploy.toml_text import toml_text
 
 
 def _write(folder: Path, text: str) -> Path:

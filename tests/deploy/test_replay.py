@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.record import read_record
-from palpate.protos.topics import FEATURES
+from palpate.bus.topics import FEATURES
+from palpate.files.record import read_record
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from palpate.deploy.processes import command_line
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import StreamTimeout
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, FEATURES, STATUS
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
+from palpate.client import Client
+from palpate.config import LinkConfig
+from palpate.errors import StreamTimeout
+from palpate_deploy.processes import command_line
 
 _log = logging.getLogger(__name__)
 

@@ -17,18 +17,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.mechanics.solver import Fingertip, Settings
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.core import Core, DistanceGrid
-from palpate.fem.mesh.geometry import Geometry
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.service import node
-from palpate.fem.service.config import FemConfig
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig, parse_config
-from palpate.protos.errors import PalpateError
-from palpate.protos.session import run_router
+from palpate.bus import run_router
+from palpate.client import Client
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import PalpateError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.solver import Fingertip, Settings
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.core import Core, DistanceGrid
+from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.service import node
+from palpate_fem.service.config import FemConfig
 
 FOLDER = str(Path(__file__).parent)
 sys.path.append(FOLDER)  # tests import the fakes by name, as worker processes do

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.result import Convergence, Floats, Outcome, Step, Trajectory
-from palpate.fem.service.fingertips import OnFraction
-from palpate.fem.store.content import StoredFingertip
-from palpate.fem.store.sample import sample_fingertip
-from palpate.protos.errors import SimulationError
+from palpate.errors import SimulationError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.result import Convergence, Floats, Outcome, Step, Trajectory
+from palpate_fem.service.fingertips import OnFraction
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.sample import sample_fingertip
 
 if TYPE_CHECKING:
-    from palpate.protos.messages import SimulationRequest
+    from palpate.messages import SimulationRequest
 
 QUICK, SLOW, STUBBORN, DIES, SEGFAULTS, DIVERGES, REFUSES, DEFECTIVE, PINCHES, NAN = (
     round(0.01 * k, 2) for k in range(10, 20)
@@ -206,8 +206,8 @@ def make(
 
 def request(name: str, kind: float = QUICK, *, steps: int = 5, **more: Any) -> SimulationRequest:
     """A straight press whose run behaves as ``kind`` says."""
-    from palpate.protos.messages import SimulationParameters, SimulationRequest
-    from palpate.protos.simulations import straight_path  # which would load Zenoh in workers
+    from palpate.client.simulations import straight_path  # which would load Zenoh in workers
+    from palpate.messages import SimulationParameters, SimulationRequest
 
     path = straight_path((0.0, 0.0, -0.009), (0.0, 0.0, -0.005), steps)
     parameters = SimulationParameters(friction_coefficient=kind)

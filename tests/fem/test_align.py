@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.fem.calibration.align import (
+from palpate_fem.calibration.align import (
     INCREMENTS,
     Curve,
     Floats,
@@ -17,7 +17,7 @@ from palpate.fem.calibration.align import (
     curve,
     from_contact,
 )
-from palpate.fem.calibration.cost import Weights, axis_rms_n, cost, peak_n, relative_rms, rms_n
+from palpate_fem.calibration.cost import Weights, axis_rms_n, cost, peak_n, relative_rms, rms_n
 
 EXACT = 1e-12
 """Piecewise linear curves are interpolated exactly, up to rounding."""

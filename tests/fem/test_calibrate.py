@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem.calibration.align import Floats
-from palpate.fem.calibration.calibrate import calibrate
-from palpate.fem.calibration.measured import Indentation
-from palpate.fem.calibration.recover import Planned, recover
-from palpate.fem.calibration.result import Evaluation, read_parameters, write_calibration
-from palpate.fem.calibration.runs import Simulated
-from palpate.fem.calibration.settings import (
+from palpate.errors import ConfigError, DatasetError, SimulationError
+from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.calibrate import calibrate
+from palpate_fem.calibration.measured import Indentation
+from palpate_fem.calibration.recover import Planned, recover
+from palpate_fem.calibration.result import Evaluation, read_parameters, write_calibration
+from palpate_fem.calibration.runs import Simulated
+from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
     PAPER_BOUNDS,
@@ -25,11 +26,10 @@ from palpate.fem.calibration.settings import (
     VOLUME,
     CalibrationSettings,
 )
-from palpate.fem.config import FingertipParameters
-from palpate.fem.mechanics.path import path_lengths
-from palpate.fem.plot.validation import plot_calibration
-from palpate.fem.result import Outcome
-from palpate.protos.errors import ConfigError, DatasetError, SimulationError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.plot.validation import plot_calibration
+from palpate_fem.result import Outcome
 
 RADII_M = {"sphere_small": 1.75e-3, "sphere_medium": 3.5e-3, "sphere_large": 7e-3}
 

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.fem.calibration.align import Floats
-from palpate.fem.calibration.measured import Indentation
-from palpate.fem.calibration.runs import Runs, Simulated
-from palpate.fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
-from palpate.fem.config import FingertipParameters
-from palpate.fem.mechanics.path import path_lengths
-from palpate.fem.result import Outcome, Trajectory
-from palpate.protos.errors import ConfigError, SimulationError
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.measured import Indentation
+from palpate_fem.calibration.runs import Runs, Simulated
+from palpate_fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.result import Outcome, Trajectory
 
 TRUTH = FingertipParameters()
 

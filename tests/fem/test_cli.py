@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.fem.calibration.measured import SIMULATED, Indentation, write_indentations
-from palpate.fem.calibration.result import read_parameters
-from palpate.fem.cli import model as cli_model
-from palpate.fem.cli.app import fem_app
-from palpate.fem.config import FingertipParameters
-from palpate.fem.indenter.outline import outline_of
-from palpate.fem.indenter.path import write_path
-from palpate.fem.store.read import SimulationStore
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError, LinkError, MissingExtraError, PalpateError
-from palpate.protos.messages import SimulationOutcome, SimulationParameters, SimulationRequest
-from palpate.protos.simulations import straight_path
+from palpate.client import Client
+from palpate.client.simulations import straight_path
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, LinkError, MissingExtraError, PalpateError
+from palpate.messages import SimulationOutcome, SimulationParameters, SimulationRequest
+from palpate_fem.calibration.measured import SIMULATED, Indentation, write_indentations
+from palpate_fem.calibration.result import read_parameters
+from palpate_fem.cli import model as cli_model
+from palpate_fem.cli.app import fem_app
+from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.outline import outline_of
+from palpate_fem.indenter.path import write_path
+from palpate_fem.store.read import SimulationStore
 
 fakes: Any = importlib.import_module("fem_fakes")
 
@@ -62,7 +62,7 @@ def test_the_picture_of_a_press_shows_its_indenter(
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(
-        "palpate.fem.plot.step.plot_step", lambda *_, indenter: drawn.append(indenter)
+        "palpate_fem.plot.step.plot_step", lambda *_, indenter: drawn.append(indenter)
     )
     fem("run", "--indenter", "cube_14mm", "--steps", 3, "--png", tmp_path / "press.png")
     (outline,) = drawn
@@ -191,19 +191,19 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
 
 
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "palpate.fem.cli.run", None)
-    monkeypatch.setattr("palpate.fem.cli.group.EXTRA_MODULES", ("palpate",))
+    monkeypatch.setitem(sys.modules, "palpate_fem.cli.run", None)
+    monkeypatch.setattr("palpate_fem.cli.group.EXTRA_MODULES", ("palpate",))
     with pytest.raises(MissingExtraError, match=r'pip install "palpate\[fem\]"'):
         fem("run")
 
 
 PROGRAM = """
 import sys
-from palpate.fem.cli import model as cli_model
+from palpate_fem.cli import model as cli_model
 cli_model.DEFAULT_FACTORY = "fem_fakes:round_finger"
-from palpate.fem.calibration.result import read_parameters
-from palpate.fem.cli.app import fem_app
-from palpate.fem.config import FingertipParameters
+from palpate_fem.calibration.result import read_parameters
+from palpate_fem.cli.app import fem_app
+from palpate_fem.config import FingertipParameters
 fem_app({words!r})
 """
 
@@ -279,6 +279,6 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
 
 
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate.fem.cli.serve._ROUTER_WAIT_S", 0.2)
+    monkeypatch.setattr("palpate_fem.cli.serve._ROUTER_WAIT_S", 0.2)
     with pytest.raises(LinkError, match="no router"):
         fem("serve", "--connect", f"tcp/127.0.0.1:{free_port}")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.fem.cli.app import fem_app
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.protos.errors import ConfigError, DatasetError
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.cli.app import fem_app
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
 
 NAMES = ["cube/00/normal", "sphere_medium/00/normal"]
 

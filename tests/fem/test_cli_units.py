@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from palpate.fem.cli.app import fem_app
-from palpate.fem.population.member import PAPER
-from palpate.protos.errors import ConfigError, DatasetError
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.cli.app import fem_app
+from palpate_fem.population.member import PAPER
 
 
 def test_show_names_each_unit_with_what_it_was_fitted_to() -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.fem.cli.app import fem_app
-from palpate.fem.verify import PUBLIC_SKIN
-from palpate.fem.verify.check import Absent, Case, Check, Measured
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_fem.cli.app import fem_app
+from palpate_fem.verify import PUBLIC_SKIN
+from palpate_fem.verify.check import Absent, Case, Check, Measured
 
 
 def _absent() -> Measured:
@@ -40,7 +40,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path | None]:
             on_check(check, done, len(checks))
         return checks
 
-    monkeypatch.setattr("palpate.fem.verify.run", run)
+    monkeypatch.setattr("palpate_fem.verify.run", run)
     monkeypatch.setenv("COLUMNS", "200")
     return folders
 

@@ -11,16 +11,16 @@ import pytest
 import warp as wp
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.indenter.distance import distance
-from palpate.fem.mechanics.contact import Contact, ContactLaw, contact, return_map
-from palpate.fem.mechanics.element import elements
-from palpate.fem.mechanics.laws import ContactSettings, Press
-from palpate.fem.mechanics.material import NeoHooke
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.surface import Surface
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.core import Core
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.indenter.distance import distance
+from palpate_fem.mechanics.contact import Contact, ContactLaw, contact, return_map
+from palpate_fem.mechanics.element import elements
+from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics.material import NeoHooke
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.surface import Surface
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.core import Core
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.mechanics.creep import LEAST, MOST, START, Creep
-from palpate.fem.mechanics.indentation import Indentation
-from palpate.fem.mechanics.laws import ContactSettings, Press
-from palpate.fem.mechanics.newton import Newton, NewtonSettings
-from palpate.fem.mechanics.solver import Fingertip
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.result import Outcome
-from palpate.fem.sparse.factor import make_factor
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.creep import LEAST, MOST, START, Creep
+from palpate_fem.mechanics.indentation import Indentation
+from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics.newton import Newton, NewtonSettings
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.result import Outcome
+from palpate_fem.sparse.factor import make_factor
 
 Floats = NDArray[np.float64]
 Mesh = Callable[..., SolidMesh]

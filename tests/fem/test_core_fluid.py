@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.mechanics.fluid import cavity
-from palpate.fem.mechanics.laws import ContactSettings
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.solid import SolidMesh
+from palpate_fem.mechanics.fluid import cavity
+from palpate_fem.mechanics.laws import ContactSettings
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.mechanics.contact import ContactLaw, friction_law, normal_law, return_map
+from palpate_fem.mechanics.contact import ContactLaw, friction_law, normal_law, return_map
 
 Floats = NDArray[np.float64]
 

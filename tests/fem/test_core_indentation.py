@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.mechanics.indentation import Indentation
-from palpate.fem.mechanics.newton import Newton, NewtonSettings
-from palpate.fem.mechanics.solver import Fingertip, Settings
-from palpate.fem.mechanics.state import State
-from palpate.fem.result import Outcome, Step, Trajectory
-from palpate.protos.errors import SimulationError
+from palpate.errors import SimulationError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.indentation import Indentation
+from palpate_fem.mechanics.newton import Newton, NewtonSettings
+from palpate_fem.mechanics.solver import Fingertip, Settings
+from palpate_fem.mechanics.state import State
+from palpate_fem.result import Outcome, Step, Trajectory
 
 Floats = NDArray[np.float64]
 Fill = Callable[..., Fingertip]

@@ -10,12 +10,12 @@ import pytest
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from palpate.fem.mechanics.laws import ContactSettings
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.sparse.factor import Factor, Multifrontal, make_factor
-from palpate.protos.errors import ConfigError, SimulationError
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.mechanics.laws import ContactSettings
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.sparse.factor import Factor, Multifrontal, make_factor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

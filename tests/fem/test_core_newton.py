@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.mechanics.element import elements
-from palpate.fem.mechanics.fluid import cavity
-from palpate.fem.mechanics.laws import ContactSettings, Press
-from palpate.fem.mechanics.material import NeoHooke
-from palpate.fem.mechanics.newton import Newton, NewtonSettings
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.sparse.factor import make_factor
-from palpate.protos.errors import SimulationError
+from palpate.errors import SimulationError
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.element import elements
+from palpate_fem.mechanics.fluid import cavity
+from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics.material import NeoHooke
+from palpate_fem.mechanics.newton import Newton, NewtonSettings
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.sparse.factor import make_factor
 
 Floats = NDArray[np.float64]
 Mesh = Callable[..., SolidMesh]

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.pose import rotation_matrix
-from palpate.fem.mechanics.path import interpolate_pose, path_lengths
+from palpate_fem.indenter.pose import rotation_matrix
+from palpate_fem.mechanics.path import interpolate_pose, path_lengths
 
 Floats = NDArray[np.float64]
 

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.mechanics.element import elements
-from palpate.fem.mechanics.laws import ContactSettings
-from palpate.fem.mechanics.material import NeoHooke
-from palpate.fem.mechanics.pattern import Pattern, make_pattern
-from palpate.fem.mechanics.state import State
-from palpate.fem.mechanics.system import System
-from palpate.fem.mesh.solid import SolidMesh
+from palpate_fem.mechanics.element import elements
+from palpate_fem.mechanics.laws import ContactSettings
+from palpate_fem.mechanics.material import NeoHooke
+from palpate_fem.mechanics.pattern import Pattern, make_pattern
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.system import System
+from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.indenter.distance import signed_distance
-from palpate.fem.mechanics.element import Elements, elements
-from palpate.fem.mechanics.fluid import cavity
-from palpate.fem.mechanics.indentation import Indentation
-from palpate.fem.mechanics.material import NeoHooke
-from palpate.fem.mechanics.newton import NewtonSettings
-from palpate.fem.mechanics.outputs import VOIGT
-from palpate.fem.mechanics.solver import Fingertip, Settings
-from palpate.fem.mesh.core import Core
-from palpate.fem.mesh.geometry import Geometry
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.result import Outcome, Step, Trajectory
-from palpate.protos.errors import SimulationError
+from palpate.errors import SimulationError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.mechanics.element import Elements, elements
+from palpate_fem.mechanics.fluid import cavity
+from palpate_fem.mechanics.indentation import Indentation
+from palpate_fem.mechanics.material import NeoHooke
+from palpate_fem.mechanics.newton import NewtonSettings
+from palpate_fem.mechanics.outputs import VOIGT
+from palpate_fem.mechanics.solver import Fingertip, Settings
+from palpate_fem.mesh.core import Core
+from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.result import Outcome, Step, Trajectory
 
 Floats = NDArray[np.float64]
 Fill = Callable[..., Fingertip]

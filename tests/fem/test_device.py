@@ -7,7 +7,7 @@ import sys
 
 FIRST_ARRAY = """
 import numpy as np
-from palpate.fem.device import scalars
+from palpate_fem.device import scalars
 assert scalars(np.arange(3.0)).numpy().sum() == 3.0
 """
 

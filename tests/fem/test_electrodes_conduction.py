@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import Delaunay
 
-from palpate.fem.electrodes.access import access_length
-from palpate.fem.electrodes.conduction import FilmConduction
-from palpate.fem.electrodes.film import FilmMesh
-from palpate.fem.electrodes.table import DISC_DIAMETER_M
-from palpate.protos.errors import SimulationError
+from palpate.errors import SimulationError
+from palpate_fem.electrodes.access import access_length
+from palpate_fem.electrodes.conduction import FilmConduction
+from palpate_fem.electrodes.film import FilmMesh
+from palpate_fem.electrodes.table import DISC_DIAMETER_M
 
 Floats = NDArray[np.float64]
 

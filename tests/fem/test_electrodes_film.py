@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.electrodes.film import FilmMesh, film_mesh
-from palpate.fem.electrodes.gap import GapFinder
-from palpate.fem.electrodes.residual import CLAMP_X_M, fit_of, thickness
-from palpate.fem.electrodes.table import DISC_TERMINAL, TERMINALS
-from palpate.fem.electrodes.unit import UnitParameters
-from palpate.fem.mesh.core import Core
-from palpate.fem.mesh.geometry import Geometry
-from palpate.fem.mesh.parametric import biotac
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.mesh.surface import node_areas, open_edges
-from palpate.protos.errors import ConfigError, SimulationError
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.electrodes.film import FilmMesh, film_mesh
+from palpate_fem.electrodes.gap import GapFinder
+from palpate_fem.electrodes.residual import CLAMP_X_M, fit_of, thickness
+from palpate_fem.electrodes.table import DISC_TERMINAL, TERMINALS
+from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.mesh.core import Core
+from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.mesh.surface import node_areas, open_edges
 
 Floats = NDArray[np.float64]
 Shell = Callable[..., SolidMesh]

@@ -13,16 +13,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from palpate.fem.electrodes.circuit import FULL_SCALE
-from palpate.fem.electrodes.gap import Gap
-from palpate.fem.electrodes.sensor import Electrodes, Response
-from palpate.fem.electrodes.table import SENSING
-from palpate.fem.electrodes.unit import UnitParameters
-from palpate.fem.mesh.nvlabs import read_nvlabs
-from palpate.fem.mesh.parametric import biotac
-from palpate.fem.mesh.surface import node_areas
-from palpate.fem.result import Step
-from palpate.protos.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
+from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
+from palpate_fem.electrodes.circuit import FULL_SCALE
+from palpate_fem.electrodes.gap import Gap
+from palpate_fem.electrodes.sensor import Electrodes, Response
+from palpate_fem.electrodes.table import SENSING
+from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.mesh.nvlabs import read_nvlabs
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.mesh.surface import node_areas
+from palpate_fem.result import Step
 
 Floats = NDArray[np.float64]
 

@@ -12,15 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.electrodes import channels
-from palpate.fem.electrodes.circuit import (
+from palpate.errors import ConfigError
+from palpate_fem.electrodes import channels
+from palpate_fem.electrodes.circuit import (
     convert,
     counts_slope,
     ideal_counts,
     impedance_of,
     log_response,
 )
-from palpate.fem.electrodes.signals import (
+from palpate_fem.electrodes.signals import (
     ElectrodeSignals,
     core_temperature_c,
     log_sigma,
@@ -28,8 +29,7 @@ from palpate.fem.electrodes.signals import (
     slot_offsets_s,
     spatial_modes,
 )
-from palpate.fem.electrodes.unit import LIMITS, UnitParameters
-from palpate.protos.errors import ConfigError
+from palpate_fem.electrodes.unit import LIMITS, UnitParameters
 
 Floats = NDArray[np.float64]
 UNIT = UnitParameters()

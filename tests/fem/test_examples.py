@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.client import Client
+from palpate.client import Client
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def test_a_press_is_shown_step_by_step(
     example: str, service: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ours = functools.partial(Client, service.link.connect[0])  # not a station's usual port
-    monkeypatch.setattr("palpate.protos.client.Client", ours)
+    monkeypatch.setattr("palpate.client.Client", ours)
     runpy.run_path(example, run_name="__main__")
     *steps, last = capsys.readouterr().out.splitlines()
     assert [int(line.split()[0]) for line in steps] == list(range(20))
@@ -33,6 +33,6 @@ def test_without_a_station_it_says_what_to_do(
     example: str, free_port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nowhere = functools.partial(Client, f"tcp/127.0.0.1:{free_port}", timeout_s=0.2)
-    monkeypatch.setattr("palpate.protos.client.Client", nowhere)
+    monkeypatch.setattr("palpate.client.Client", nowhere)
     with pytest.raises(SystemExit, match="palpate up"):
         runpy.run_path(example, run_name="__main__")

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.approach import Surface, check_clear, first_contact
-from palpate.fem.indenter.catalogue import indenter_names, make_indenter
-from palpate.fem.indenter.distance import signed_distance
-from palpate.fem.indenter.pose import facing, rotation_matrix, to_indenter, unit
-from palpate.protos.errors import ConfigError, SimulationError
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.indenter.approach import Surface, check_clear, first_contact
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.pose import facing, rotation_matrix, to_indenter, unit
 
 Floats = NDArray[np.float64]
 Direction = tuple[float, float, float]

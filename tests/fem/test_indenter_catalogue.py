@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.catalogue import ALIASES, BASE_M, indenter_names, make_indenter
-from palpate.fem.indenter.distance import signed_distance
-from palpate.fem.indenter.shape import Kind
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_fem.indenter.catalogue import ALIASES, BASE_M, indenter_names, make_indenter
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.shape import Kind
 
 Floats = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.device import DEVICE, mat33s, scalars, vec3s
-from palpate.fem.indenter.catalogue import indenter_names, make_indenter
-from palpate.fem.indenter.distance import distance, signed_distance, top
-from palpate.fem.indenter.kernels import distances
-from palpate.fem.indenter.pose import rotation_matrix, to_indenter
-from palpate.fem.indenter.shape import Indenter, Kind, Primitive
+from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.distance import distance, signed_distance, top
+from palpate_fem.indenter.kernels import distances
+from palpate_fem.indenter.pose import rotation_matrix, to_indenter
+from palpate_fem.indenter.shape import Indenter, Kind, Primitive
 
 Floats = NDArray[np.float64]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
-from palpate.fem.indenter.distance import signed_distance
-from palpate.fem.indenter.outline import SPACING_M, Floats, Ints, outline_of
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.outline import SPACING_M, Floats, Ints, outline_of
 
 ROUNDING_M = 1e-12
 FACETS = 0.03

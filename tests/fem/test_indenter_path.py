@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.fem.indenter.path import check_path, read_path, write_path
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_fem.indenter.path import check_path, read_path, write_path
 
 HEADER = "x_m,y_m,z_m,qw,qx,qy,qz"
 GOOD = [[0.0, 0.0, -0.0085, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -0.008, 1.0, 0.0, 0.0, 0.0]]

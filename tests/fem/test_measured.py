@@ -11,14 +11,14 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.fem.calibration.measured import (
+from palpate.errors import DatasetError
+from palpate_fem.calibration.measured import (
     MEASURED,
     SIMULATED,
     Indentation,
     read_indentations,
     write_indentations,
 )
-from palpate.protos.errors import DatasetError
 
 NAME = "sphere_medium/03/normal/biotac1"
 

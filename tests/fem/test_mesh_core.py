@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.mesh.core import DistanceGrid, volume_inside
-from palpate.fem.mesh.distance import box_around, grid_points, signed_distance, tabulate
-from palpate.fem.mesh.field import cast, nearest, plane, rounded, softplus
+from palpate_fem.mesh.core import DistanceGrid, volume_inside
+from palpate_fem.mesh.distance import box_around, grid_points, signed_distance, tabulate
+from palpate_fem.mesh.field import cast, nearest, plane, rounded, softplus
 
 Floats = NDArray[np.float64]
 

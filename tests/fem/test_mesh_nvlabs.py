@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from palpate.fem.mesh.distance import signed_distance
-from palpate.fem.mesh.geometry import Geometry
-from palpate.fem.mesh.nvlabs import PARTS, SKIN, read_nvlabs, to_sensor_frame
-from palpate.fem.mesh.parametric import biotac
-from palpate.fem.mesh.quality import scaled_jacobians, solid_volume
-from palpate.fem.mesh.surface import components, enclosed_volume, node_areas, node_normals
-from palpate.fem.mesh.tetfile import boundary, read_obj, read_tet
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_fem.mesh.distance import signed_distance
+from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.nvlabs import PARTS, SKIN, read_nvlabs, to_sensor_frame
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.mesh.quality import scaled_jacobians, solid_volume
+from palpate_fem.mesh.surface import components, enclosed_volume, node_areas, node_normals
+from palpate_fem.mesh.tetfile import boundary, read_obj, read_tet
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.mesh.check import check_mesh
-from palpate.fem.mesh.geometry import Geometry
-from palpate.fem.mesh.parametric import NAIL_X_M, NAIL_Y_M, biotac
-from palpate.fem.mesh.quality import scaled_jacobians, solid_volume
-from palpate.fem.mesh.shape import CavityShape, CoreShape
-from palpate.fem.mesh.surface import enclosed_volume, face_vectors, node_normals
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_fem.mesh.check import check_mesh
+from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.parametric import NAIL_X_M, NAIL_Y_M, biotac
+from palpate_fem.mesh.quality import scaled_jacobians, solid_volume
+from palpate_fem.mesh.shape import CavityShape, CoreShape
+from palpate_fem.mesh.surface import enclosed_volume, face_vectors, node_normals
 
 Floats = NDArray[np.float64]
 
@@ -144,7 +144,7 @@ def test_thickness_moves_nodes_along_straight_lines_and_changes_nothing_else() -
 
 
 def test_equal_builds_have_equal_hashes() -> None:
-    from palpate.fem.mesh import parametric
+    from palpate_fem.mesh import parametric
 
     first = biotac(edge_m=1e-3).mesh.sha256
     parametric._surface.cache_clear()

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.fem.mesh.check import check_mesh
-from palpate.fem.mesh.extrude import extrude
-from palpate.fem.mesh.quality import scaled_jacobians, solid_volume
-from palpate.fem.mesh.solid import SolidMesh
-from palpate.fem.mesh.surface import (
+from palpate.errors import SimulationError
+from palpate_fem.mesh.check import check_mesh
+from palpate_fem.mesh.extrude import extrude
+from palpate_fem.mesh.quality import scaled_jacobians, solid_volume
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.mesh.surface import (
     components,
     enclosed_volume,
     face_vectors,
@@ -22,8 +23,7 @@ from palpate.fem.mesh.surface import (
     node_normals,
     open_edges,
 )
-from palpate.fem.mesh.topology import bag
-from palpate.protos.errors import SimulationError
+from palpate_fem.mesh.topology import bag
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

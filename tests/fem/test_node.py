@@ -13,26 +13,26 @@ import numpy as np
 import pytest
 import zenoh
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.service import node
-from palpate.fem.service.config import FemConfig
-from palpate.fem.service.reply import as_reply
-from palpate.fem.service.request import path_of
-from palpate.protos.client import Client
-from palpate.protos.codec import ERROR, SIMULATION_REQUEST
-from palpate.protos.config import LinkConfig, parse_config
-from palpate.protos.errors import ConfigError, ErrorCode, RemoteError
-from palpate.protos.messages import (
+from palpate.bus import MAX_REPLY_BYTES, Delivery
+from palpate.bus.topics import ENCODING_PREFIX, SIMULATION_PROGRESS, sensor_key
+from palpate.client import Client
+from palpate.client.simulations import straight_path
+from palpate.codec import ERROR, SIMULATION_REQUEST
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import ConfigError, ErrorCode, RemoteError
+from palpate.messages import (
     SimulationOutcome,
     SimulationParameters,
     SimulationPhase,
     SimulationProgress,
     SimulationReply,
 )
-from palpate.protos.session import MAX_REPLY_BYTES, Delivery
-from palpate.protos.simulations import straight_path
-from palpate.protos.topics import ENCODING_PREFIX, SIMULATION_PROGRESS, sensor_key
 from palpate.v1 import simulation_pb2
+from palpate_fem.config import FingertipParameters
+from palpate_fem.service import node
+from palpate_fem.service.config import FemConfig
+from palpate_fem.service.reply import as_reply
+from palpate_fem.service.request import path_of
 
 fakes: Any = importlib.import_module("fem_fakes")
 

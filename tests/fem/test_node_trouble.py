@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.errors import ErrorCode, PalpateError, RemoteError
-from palpate.protos.messages import (
+from palpate.errors import ErrorCode, PalpateError, RemoteError
+from palpate.messages import (
     ServiceState,
     SimulationOutcome,
     SimulationParameters,
@@ -76,7 +76,7 @@ def test_a_killed_worker_is_replaced(service: Any) -> None:
     assert first.wait(PATIENCE_S)
     for path in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
         for pid in map(int, path.read_text().split()):
-            if b"palpate.fem.service.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            if b"palpate_fem.service.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
                 os.kill(pid, signal.SIGKILL)
     thread.join(PATIENCE_S)
     assert out[0].code is ErrorCode.INTERNAL

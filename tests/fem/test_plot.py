@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem.plot.curves import travel_m
-from palpate.fem.plot.section import cut_sides, cut_solid, cut_surface, outline
-from palpate.fem.plot.step import plot_curves, plot_overview, plot_step, von_mises
-from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.store.content import StoredFingertip, TrajectorySummary
-from palpate.fem.store.files import StoreDiskError
-from palpate.fem.store.sample import (
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.plot.curves import travel_m
+from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
+from palpate_fem.plot.step import plot_curves, plot_overview, plot_step, von_mises
+from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.store.content import StoredFingertip, TrajectorySummary
+from palpate_fem.store.files import StoreDiskError
+from palpate_fem.store.sample import (
     INNER_M,
     OUTER_M,
     indenter_outline,
@@ -23,7 +24,6 @@ from palpate.fem.store.sample import (
     sample_trajectory,
     sphere_outline,
 )
-from palpate.protos.errors import ConfigError, DatasetError
 
 FACETS = 0.03
 """A ball of 24 facets around has 1.1 % less section than a round one, off its centre up to 3 %."""

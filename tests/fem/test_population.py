@@ -13,24 +13,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.electrodes.gap import Gap
-from palpate.fem.electrodes.sensor import Electrodes
-from palpate.fem.electrodes.unit import UnitParameters
-from palpate.fem.mesh.parametric import biotac
-from palpate.fem.population.answers import Extremes
-from palpate.fem.population.fit import fit_unit
-from palpate.fem.population.fitting import OVERTRAVELS_M, Deep, overtravel_for
-from palpate.fem.population.member import (
+from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.electrodes.gap import Gap
+from palpate_fem.electrodes.sensor import Electrodes
+from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.population.answers import Extremes
+from palpate_fem.population.fit import fit_unit
+from palpate_fem.population.fitting import OVERTRAVELS_M, Deep, overtravel_for
+from palpate_fem.population.member import (
     PAPER,
     Member,
     Wanted,
     read_population,
     write_population,
 )
-from palpate.fem.population.mount import clear_steps
-from palpate.fem.result import Step, Trajectory
-from palpate.protos.anatomy import ELECTRODE_POSITIONS
-from palpate.protos.errors import ConfigError, DatasetError
+from palpate_fem.population.mount import clear_steps
+from palpate_fem.result import Step, Trajectory
 
 Floats = NDArray[np.float64]
 

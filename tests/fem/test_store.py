@@ -14,15 +14,15 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.store.content import StoredFingertip
-from palpate.fem.store.export import export
-from palpate.fem.store.files import StoreMismatchError, StoreTakenError
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.protos.errors import ConfigError, DatasetError
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.export import export
+from palpate_fem.store.files import StoreMismatchError, StoreTakenError
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
 
 ID = "sphere_medium/03/normal"
 FLOAT32 = 6e-8
@@ -218,9 +218,9 @@ def test_export_onto_a_full_disk(path: Path) -> None:
     program = """
 import resource, signal, sys
 from pathlib import Path
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.export import export
-from palpate.fem.store.files import StoreDiskError
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.export import export
+from palpate_fem.store.files import StoreDiskError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
 try:

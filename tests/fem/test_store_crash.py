@@ -11,20 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from palpate.fem.result import Trajectory
-from palpate.fem.store.content import StoredFingertip
-from palpate.fem.store.files import StoreDiskError, StoreTakenError
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.sample import sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
+from palpate_fem.result import Trajectory
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.files import StoreDiskError, StoreTakenError
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.sample import sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
 
 PRELUDE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
-from palpate.fem.store.read import FINGERTIP, SimulationStore
-from palpate.fem.store.files import StoreTakenError, StoreDiskError
-from palpate.fem.store.sample import sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
+from palpate_fem.store.read import FINGERTIP, SimulationStore
+from palpate_fem.store.files import StoreTakenError, StoreDiskError
+from palpate_fem.store.sample import sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
 path = Path(sys.argv[1])
 tip = sample_fingertip(divisions=4)
 press = sample_trajectory(tip, steps=5)

@@ -11,13 +11,13 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.fem.result import Trajectory
-from palpate.fem.store.content import StoredFingertip
-from palpate.fem.store.files import StoreDiskError
-from palpate.fem.store.read import FINGERTIP, SimulationStore
-from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.protos.errors import ConfigError, DatasetError
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.result import Trajectory
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.files import StoreDiskError
+from palpate_fem.store.read import FINGERTIP, SimulationStore
+from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
 
 ID = "sphere_medium/03/normal"
 

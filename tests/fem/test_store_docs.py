@@ -8,9 +8,9 @@ from pathlib import Path
 import h5py
 import pytest
 
-from palpate.fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate.fem.store.trajectory import CONVERGENCE
-from palpate.fem.store.writer import StoreWriter
+from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate_fem.store.trajectory import CONVERGENCE
+from palpate_fem.store.writer import StoreWriter
 
 
 @pytest.fixture(scope="module")

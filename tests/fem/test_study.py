@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem import study
-from palpate.fem.plot.study import plot_study
-from palpate.fem.result import Outcome
+from palpate_fem import study
+from palpate_fem.plot.study import plot_study
+from palpate_fem.result import Outcome
 
 
 def test_a_linear_field_is_carried_over() -> None:

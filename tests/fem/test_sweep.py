@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.fem.config import FingertipParameters
-from palpate.fem.indenter.catalogue import make_indenter
-from palpate.fem.indenter.distance import signed_distance
-from palpate.fem.result import Outcome, Trajectory
-from palpate.fem.service.batch import Batch, BatchReport, Press
-from palpate.fem.service.jobs import Setup
-from palpate.fem.service.sweep import sweep_into_store
-from palpate.fem.store.read import SimulationStore
-from palpate.protos.errors import DatasetError, RemoteError
+from palpate.errors import DatasetError, RemoteError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.service.batch import Batch, BatchReport, Press
+from palpate_fem.service.jobs import Setup
+from palpate_fem.service.sweep import sweep_into_store
+from palpate_fem.store.read import SimulationStore
 
 fakes: Any = importlib.import_module("fem_fakes")
 

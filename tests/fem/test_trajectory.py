@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fem.indenter.approach import Surface, check_clear
-from palpate.fem.indenter.catalogue import indenter_names, make_indenter
-from palpate.fem.indenter.path import check_path
-from palpate.fem.indenter.pose import rotation_matrix
-from palpate.fem.trajectory import (
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.indenter.approach import Surface, check_clear
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.path import check_path
+from palpate_fem.indenter.pose import rotation_matrix
+from palpate_fem.trajectory import (
     ANGLE_RAD,
     CLEARANCE_M,
     Campaign,
@@ -24,7 +25,6 @@ from palpate.fem.trajectory import (
     press_path,
     sample_targets,
 )
-from palpate.protos.errors import ConfigError, SimulationError
 
 Floats = NDArray[np.float64]
 

@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fem.calibration.align import Floats
-from palpate.fem.calibration.measured import SIMULATED, Indentation, write_indentations
-from palpate.fem.calibration.runs import Simulated, simulate_all
-from palpate.fem.config import FingertipParameters
-from palpate.fem.mechanics.path import path_lengths
-from palpate.fem.plot.validation import examples, plot_examples, plot_indenters
-from palpate.fem.result import Outcome
-from palpate.fem.store.export import export
-from palpate.fem.store.read import SimulationStore
-from palpate.fem.store.sample import sample_fingertip, sample_trajectory
-from palpate.fem.store.writer import StoreWriter
-from palpate.fem.validation.report import (
+from palpate.errors import DatasetError
+from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.measured import SIMULATED, Indentation, write_indentations
+from palpate_fem.calibration.runs import Simulated, simulate_all
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
+from palpate_fem.result import Outcome
+from palpate_fem.store.export import export
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.sample import sample_fingertip, sample_trajectory
+from palpate_fem.store.writer import StoreWriter
+from palpate_fem.validation.report import (
     INDENTER_HEADINGS,
     TRAJECTORY_HEADINGS,
     indenter_rows,
@@ -29,9 +30,8 @@ from palpate.fem.validation.report import (
     trajectory_rows,
     write_report,
 )
-from palpate.fem.validation.simulated import measured_from, simulated_from
-from palpate.fem.validation.validate import Validation, validate
-from palpate.protos.errors import DatasetError
+from palpate_fem.validation.simulated import measured_from, simulated_from
+from palpate_fem.validation.validate import Validation, validate
 
 TOUCH_M = 1e-3
 STIFFNESS = np.array([200.0, 0.0, 1000.0])

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from palpate.fem import verify
-from palpate.fem.mechanics.system import System
-from palpate.fem.verify import closed_forms
-from palpate.fem.verify.check import Absent, Case, Check, Measured
-from palpate.protos.errors import SimulationError
+from palpate.errors import SimulationError
+from palpate_fem import verify
+from palpate_fem.mechanics.system import System
+from palpate_fem.verify import closed_forms
+from palpate_fem.verify.check import Absent, Case, Check, Measured
 
 
 def _quick() -> list[Any]:
@@ -80,7 +80,7 @@ def test_a_compressible_skin_is_found_out(monkeypatch: pytest.MonkeyPatch) -> No
     def soft(*args: Any, bulk_ratio: float, **more: Any) -> Any:
         return System(*args, bulk_ratio=20.0, **more)
 
-    monkeypatch.setattr("palpate.fem.verify.body.System", soft)
+    monkeypatch.setattr("palpate_fem.verify.body.System", soft)
     (check,) = verify.run(only="equibiaxial")
     assert not check.passed
     assert check.value == pytest.approx(check.reference, rel=0.2)

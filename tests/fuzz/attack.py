@@ -11,9 +11,9 @@ from typing import Any
 
 from tests.fuzz.corpus import TARGETS, load_target
 
-from palpate.protos.extras import require
+from palpate.extras import require
 
-_WATCHED = ("palpate.gateway", "palpate.protos.record", "mcap")
+_WATCHED = ("palpate_gateway", "palpate.files.record", "mcap")
 """Packages whose branches count as coverage."""
 
 

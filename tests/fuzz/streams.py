@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from palpate.protos.errors import PalpateError
+from palpate.errors import PalpateError
 
 Bytes = Callable[[bytes], bytes]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from palpate.protos.messages import ElectrodeFrame, Origin, SensorType, Stamp, Tare
+from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp, Tare
 
 RATE_HZ = 100.0
 LAYOUT = SensorType.BIOTAC.layout

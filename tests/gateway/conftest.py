@@ -16,19 +16,19 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway import node
-from palpate.gateway.config import GatewayConfig
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Pipeline
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.protos.codec import SERVICE_REQUEST, STATUS, TARE, TARE_REQUEST
-from palpate.protos.config import LinkConfig, parse_config
-from palpate.protos.errors import PalpateError
-from palpate.protos.messages import ServiceRequest, ServiceState, Status, Tare, TareRequest
-from palpate.protos.record import RecordWriter
-from palpate.protos.session import Delivery, Session, Tap, run_router
-from palpate.protos.tape import write_tape
-from palpate.protos.topics import TOPICS, sensor_key
+from palpate.bus import Delivery, Session, Tap, run_router
+from palpate.bus.topics import TOPICS, sensor_key
+from palpate.codec import SERVICE_REQUEST, STATUS, TARE, TARE_REQUEST
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import PalpateError
+from palpate.files.record import RecordWriter
+from palpate.files.tape import write_tape
+from palpate.messages import ServiceRequest, ServiceState, Status, Tare, TareRequest
+from palpate_gateway import node
+from palpate_gateway.config import GatewayConfig
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Pipeline
+from palpate_gateway.timing.clock_map import FileClock
 
 sys.path.append(str(Path(__file__).parent))  # tests import the fakes by name
 

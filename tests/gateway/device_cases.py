@@ -15,9 +15,9 @@ from typing import Any
 
 from tests.gateway.scenes import COARSE, FINE, ramp
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.emulators.emulator import Emulator
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.emulators.emulator import Emulator
 
 Options = dict[str, Any]
 
@@ -70,7 +70,7 @@ class Case:
 
 def _class(path: str) -> Any:
     module, _, name = path.partition(":")
-    return getattr(importlib.import_module(f"palpate.gateway.emulators.{module}"), name)
+    return getattr(importlib.import_module(f"palpate_gateway.emulators.{module}"), name)
 
 
 def _at(emulator: Any) -> Options:

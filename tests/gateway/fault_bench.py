@@ -18,11 +18,11 @@ from typing import Any, Self, cast
 from tests.gateway.device_cases import Case
 from tests.gateway.scenes import was_approached, was_felt, was_measured
 
-from palpate.gateway.pipeline import Pipeline
-from palpate.gateway.worker import SensorWorker
-from palpate.protos.errors import PalpateError
-from palpate.protos.health import Health
-from palpate.protos.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
+from palpate.errors import PalpateError
+from palpate.health import Health
+from palpate.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
+from palpate_gateway.pipeline import Pipeline
+from palpate_gateway.worker import SensorWorker
 
 PATIENCE_S = 90.0
 SOUND = 15

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from fnmatch import fnmatch
 
-from palpate.protos.errors import PalpateError
+from palpate.errors import PalpateError
 
 _SILENCE = ("silences", "DeviceLost")
 _GONE = ("DeviceLost", "silences", "lost_frames")

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import strategies as st
 
-from palpate.gateway.device import Device
-from palpate.gateway.pose.rigid import compose, inverse, normalised
-from palpate.gateway.readings import PoseReading, Reading
-from palpate.protos.errors import DeviceTimeout, RecordingError
-from palpate.protos.messages import Pose, RobotPoseFrame
+from palpate.errors import DeviceTimeout, RecordingError
+from palpate.messages import Pose, RobotPoseFrame
+from palpate_gateway.device import Device
+from palpate_gateway.pose.rigid import compose, inverse, normalised
+from palpate_gateway.readings import PoseReading, Reading
 
 PATIENCE_S = 20.0
 NEAR = 1e-12  # a metre in float64, a few products deep

@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from palpate.gateway.device import Device
-from palpate.gateway.readings import ElectrodeReading, WrenchReading
-from palpate.protos.errors import DeviceError, DeviceTimeout
+from palpate.errors import DeviceError, DeviceTimeout
+from palpate_gateway.device import Device
+from palpate_gateway.readings import ElectrodeReading, WrenchReading
 
 PATIENCE_S = 20.0
 """A test that waits longer has failed [s]."""

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from palpate.gateway.emulators.emulator import Wrench
-from palpate.protos.messages import COUNTS_MAX
+from palpate.messages import COUNTS_MAX
+from palpate_gateway.emulators.emulator import Wrench
 
 SHARES = (1.0, -2.0, 3.0, 0.1, -0.05, 0.02)
 

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.gateway.config import GatewayConfig
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError
+from palpate.config import parse_config
+from palpate.errors import ConfigError
+from palpate_gateway.config import GatewayConfig
 
 
 def test_defaults_are_one_virtual_finger() -> None:

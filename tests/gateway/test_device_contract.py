@@ -15,18 +15,18 @@ from tests.gateway.device_cases import CASES, Case
 from tests.gateway.reading_devices import open_again
 from tests.gateway.scenes import was_approached, was_felt, was_measured
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import DRIVERS, make_device
-from palpate.gateway.emulators.emulator import Emulator
-from palpate.gateway.readings import (
+from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.messages import Origin, SensorType
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import DRIVERS, make_device
+from palpate_gateway.emulators.emulator import Emulator
+from palpate_gateway.readings import (
     ElectrodeReading,
     PoseReading,
     Reading,
     RecordedMessage,
     WrenchReading,
 )
-from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
-from palpate.protos.messages import Origin, SensorType
 
 PATIENCE_S = 20.0
 SOME = 12

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from palpate.gateway.cli.probe import device_of
-from palpate.gateway.config import GatewayConfig
-from palpate.gateway.drivers import make_device
-from palpate.protos.config import parse_config
+from palpate.config import parse_config
+from palpate_gateway.cli.probe import device_of
+from palpate_gateway.config import GatewayConfig
+from palpate_gateway.drivers import make_device
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs" / "devices").glob("*.md"))

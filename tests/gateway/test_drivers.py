@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway import drivers
-from palpate.gateway.virtual.finger import Virtual
-from palpate.protos.errors import ConfigError, MissingExtraError
+from palpate.errors import ConfigError, MissingExtraError
+from palpate_gateway import drivers
+from palpate_gateway.virtual.finger import Virtual
 
 
 def test_built_in_drivers() -> None:
@@ -37,7 +37,7 @@ def test_unknown_option_names_the_nearest() -> None:
 
 
 def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("mine", "palpate.gateway.virtual.finger:Virtual", drivers.ENTRY_POINTS)
+    point = EntryPoint("mine", "palpate_gateway.virtual.finger:Virtual", drivers.ENTRY_POINTS)
 
     def fake(**query: Any) -> EntryPoints:
         return EntryPoints([point]).select(**query)
@@ -50,9 +50,9 @@ def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("target", "error", "message"),
     [
-        ("palpate.gateway.nothing:X", ConfigError, "module 'palpate.gateway.nothing'"),
-        ("palpate.gateway.virtual.finger:Nothing", ConfigError, "no device class"),
-        ("palpate.gateway.virtual.finger:math", ConfigError, "no device class"),
+        ("palpate_gateway.nothing:X", ConfigError, "module 'palpate_gateway.nothing'"),
+        ("palpate_gateway.virtual.finger:Nothing", ConfigError, "no device class"),
+        ("palpate_gateway.virtual.finger:math", ConfigError, "no device class"),
     ],
 )
 def test_broken_table_entry(
@@ -77,8 +77,8 @@ def test_table_is_lazy() -> None:
     import subprocess
 
     code = (
-        "import sys, palpate.gateway.drivers; "
-        "print('palpate.gateway.virtual.finger' in sys.modules)"
+        "import sys, palpate_gateway.drivers; "
+        "print('palpate_gateway.virtual.finger' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

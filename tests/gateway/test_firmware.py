@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
-from palpate.gateway.protocols.can_slots import SEQUENCES
-from palpate.gateway.protocols.spi import channel_of_command, encode_word
+from palpate_gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
+from palpate_gateway.protocols.can_slots import SEQUENCES
+from palpate_gateway.protocols.spi import channel_of_command, encode_word
 
 FIRMWARE = Path(__file__).parents[2] / "deploy" / "firmware" / "bridge"
 

@@ -16,15 +16,15 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator
-from palpate.gateway.emulators.emulator import HostTimed
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.emulators.robotous import RobotousSerial
-from palpate.protos import clock
-from palpate.protos.errors import StaleError
-from palpate.protos.messages import ElectrodeFrame, WrenchFrame
-from palpate.protos.session import Delivery, Received
-from palpate.protos.topics import ELECTRODES, WRENCH
+from palpate import clock
+from palpate.bus import Delivery, Received
+from palpate.bus.topics import ELECTRODES, WRENCH
+from palpate.errors import StaleError
+from palpate.messages import ElectrodeFrame, WrenchFrame
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
+from palpate_gateway.emulators.emulator import HostTimed
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.robotous import RobotousSerial
 
 PATIENCE_S = 20.0
 STOPPED_S = 1.5
@@ -37,9 +37,9 @@ that takes the time of reading for that of the sample would be wrong by up to ``
 
 GATEWAY = """
 import json, signal, sys, threading
-from palpate.gateway import node
-from palpate.gateway.config import GatewayConfig
-from palpate.protos.config import LinkConfig, parse_config
+from palpate_gateway import node
+from palpate_gateway.config import GatewayConfig
+from palpate.config import LinkConfig, parse_config
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: stop.set())
 values, connect = json.loads(sys.argv[1]), sys.argv[2]

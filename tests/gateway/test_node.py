@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway import node
-from palpate.gateway.config import GatewayConfig
-from palpate.gateway.drivers import DRIVERS
-from palpate.gateway.readings import Reading
-from palpate.gateway.virtual import finger as virtual
-from palpate.protos.config import LinkConfig, parse_config
-from palpate.protos.errors import ConfigError, DeviceLost, ErrorCode, LinkError, RemoteError
-from palpate.protos.messages import Origin, ServiceState
-from palpate.protos.session import Delivery
-from palpate.protos.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
+from palpate.bus import Delivery
+from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import ConfigError, DeviceLost, ErrorCode, LinkError, RemoteError
+from palpate.messages import Origin, ServiceState
+from palpate_gateway import node
+from palpate_gateway.config import GatewayConfig
+from palpate_gateway.drivers import DRIVERS
+from palpate_gateway.readings import Reading
+from palpate_gateway.virtual import finger as virtual
 
 PATIENCE_S = 10.0
 

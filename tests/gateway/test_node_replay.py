@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.codec import TARE
-from palpate.protos.errors import RecordingError, RemoteError
-from palpate.protos.messages import ElectrodeFrame, Origin, ServiceState
-from palpate.protos.record import read_record
+from palpate.codec import TARE
+from palpate.errors import RecordingError, RemoteError
+from palpate.files.record import read_record
+from palpate.messages import ElectrodeFrame, Origin, ServiceState
 
 PATIENCE_S = 10.0
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.one_core import stay_on_one_core
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_gateway.one_core import stay_on_one_core
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux")
 
 _IN_ANOTHER_PROCESS = """
 import os, threading
-from palpate.gateway.one_core import stay_on_one_core
+from palpate_gateway.one_core import stay_on_one_core
 early, seen = threading.Event(), {}
 def look(name):
     early.wait()

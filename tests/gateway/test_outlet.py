@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.outlet import Outlet
-from palpate.gateway.pipeline import Outgoing
-from palpate.protos.health import Health
+from palpate.health import Health
+from palpate_gateway.outlet import Outlet
+from palpate_gateway.pipeline import Outgoing
 
 
 class Slow:

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.device import DeviceIdentity, DeviceInfo
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.readings import ElectrodeReading, FieldReading, Reading, RecordedMessage
-from palpate.gateway.timing.clock_map import FileClock, LiveClock, PacedClock
-from palpate.protos.codec import ELECTRODE_FRAME
-from palpate.protos.errors import DeviceError
-from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
-from palpate.protos.topics import TOPICS
+from palpate.bus.topics import TOPICS
+from palpate.codec import ELECTRODE_FRAME
+from palpate.errors import DeviceError
+from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate_gateway.device import DeviceIdentity, DeviceInfo
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.readings import ElectrodeReading, FieldReading, Reading, RecordedMessage
+from palpate_gateway.timing.clock_map import FileClock, LiveClock, PacedClock
 
 IDENTITY = DeviceIdentity("BT1", 1 / 4400)
 

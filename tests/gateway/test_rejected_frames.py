@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate.gateway.pipeline import Pipeline
-from palpate.gateway.readings import Reading, WrenchReading
-from palpate.gateway.worker import SensorWorker
-from palpate.protos.config import StrictConfig
-from palpate.protos.errors import PalpateError
-from palpate.protos.health import Health
-from palpate.protos.messages import Origin, ServiceState
-from palpate.protos.topics import WRENCH
+from palpate.bus.topics import WRENCH
+from palpate.config import StrictConfig
+from palpate.errors import PalpateError
+from palpate.health import Health
+from palpate.messages import Origin, ServiceState
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.pipeline import Pipeline
+from palpate_gateway.readings import Reading, WrenchReading
+from palpate_gateway.worker import SensorWorker
 
 
 class Babbler(Device):

@@ -6,9 +6,9 @@ import logging
 
 import pytest
 
-from palpate.gateway.sensor_report import SensorReport
-from palpate.protos.errors import DeviceLost
-from palpate.protos.health import Health
+from palpate.errors import DeviceLost
+from palpate.health import Health
+from palpate_gateway.sensor_report import SensorReport
 
 
 def test_a_sensor_that_stays_away_is_logged_once_for_each_reason(

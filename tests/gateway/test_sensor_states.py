@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from palpate.deploy.status import show_status
-from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator
-from palpate.protos.errors import StreamTimeout
-from palpate.protos.health import Health, HealthReporter
-from palpate.protos.messages import (
+from palpate.bus import Delivery
+from palpate.bus.topics import STATUS
+from palpate.errors import StreamTimeout
+from palpate.health import Health, HealthReporter
+from palpate.messages import (
     ChannelFault,
     FaultKind,
     SensorState,
@@ -21,8 +21,8 @@ from palpate.protos.messages import (
     ServiceState,
     Status,
 )
-from palpate.protos.session import Delivery
-from palpate.protos.topics import STATUS
+from palpate_deploy.status import show_status
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
 
 PAC, PDC = 22, 19
 

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from palpate.gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.readings import ElectrodeReading, Reading
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.protos.codec import ELECTRODE_FRAME, TARE
-from palpate.protos.config import StrictConfig
-from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate.codec import ELECTRODE_FRAME, TARE
+from palpate.config import StrictConfig
+from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.readings import ElectrodeReading, Reading
+from palpate_gateway.timing.clock_map import FileClock
 
 FRAMES = 30
 INFO = DeviceInfo("test", SensorType.BIOTAC, "test", 100.0, True, False, Origin.LIVE)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.gateway.protocols.channels import ALL_VALID, TDC_BIT
-from palpate.gateway.tare import TareCollector, TareLedger
-from palpate.protos.errors import DeviceError, ErrorCode, RemoteError
-from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Stamp, Tare
+from palpate.errors import DeviceError, ErrorCode, RemoteError
+from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Stamp, Tare
+from palpate_gateway.protocols.channels import ALL_VALID, TDC_BIT
+from palpate_gateway.tare import TareCollector, TareLedger
 
 
 def frame(sequence: int, offset: int = 0, validity: int = ALL_VALID) -> ElectrodeFrame:

@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.condition.condition import Retare
-from palpate.gateway.device import DeviceIdentity, DeviceInfo
-from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.readings import ElectrodeReading
-from palpate.gateway.tare import TareCollector
-from palpate.gateway.timing.clock_map import FileClock, LiveClock
-from palpate.protos.errors import DeviceError
-from palpate.protos.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate.errors import DeviceError
+from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate_gateway.condition.condition import Retare
+from palpate_gateway.device import DeviceIdentity, DeviceInfo
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.readings import ElectrodeReading
+from palpate_gateway.tare import TareCollector
+from palpate_gateway.timing.clock_map import FileClock, LiveClock
 
 fakes: Any = importlib.import_module("condition_fakes")
 IDENTITY = DeviceIdentity("BT1", 1 / 4400)

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from palpate.gateway.emulators.emulator import Emulator
-from palpate.gateway.readings import WrenchReading
-from palpate.gateway.wrench.device import WrenchDevice
-from palpate.protos.errors import DeviceTimeout
+from palpate.errors import DeviceTimeout
+from palpate_gateway.emulators.emulator import Emulator
+from palpate_gateway.readings import WrenchReading
+from palpate_gateway.wrench.device import WrenchDevice
 
 PATIENCE_S = 20.0
 CONSTANT = (1.5, -0.25, 1.0, 0.02, -0.01, 0.005)

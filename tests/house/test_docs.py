@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos import errors
+from palpate import errors
 
 ROOT = Path(__file__).resolve().parents[2]
 MIRROR = [10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18]
@@ -85,10 +85,10 @@ def test_makefile_describes_every_target() -> None:
 @pytest.fixture(scope="module")
 def command() -> Any:
     """The tree of `palpate` commands."""
-    if importlib.util.find_spec("palpate.deploy.cli") is None:
-        pytest.skip("palpate.deploy.cli does not exist")
+    if importlib.util.find_spec("palpate_deploy.cli") is None:
+        pytest.skip("palpate_deploy.cli does not exist")
     typer = importlib.import_module("typer")
-    cli = importlib.import_module("palpate.deploy.cli")
+    cli = importlib.import_module("palpate_deploy.cli")
     return typer.main.get_command(cli.app)
 
 

@@ -15,22 +15,24 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("protos", "gateway", "fem", "training", "services", "deploy")
+PACKAGES = {room: "palpate" if room == "protos" else f"palpate_{room}" for room in ROOMS}
+ROOM_OF = {package: room for room, package in PACKAGES.items()}
 LINTER: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
     "tool"
 ]["importlinter"]
 
 # Packages with one home.  import-linter can forbid a package to a room but cannot say "only here".
 # What the bare floor of the benchmark uses, because it must not use palpate's own code.
-FLOOR = "deploy/palpate/deploy/bench/floor.py"
+FLOOR = "deploy/palpate_deploy/bench/floor.py"
 
 HOMES = {
-    "zenoh": ("protos/palpate/protos/session/", FLOOR),
+    "zenoh": ("protos/palpate/bus/", FLOOR),
     # The bare reader of the benchmark must not use palpate's own ports.
-    "serial": ("gateway/", "deploy/palpate/deploy/bench/hand_parts.py"),
-    "can": ("gateway/", "deploy/palpate/deploy/bench/hand_parts.py"),
+    "serial": ("gateway/", "deploy/palpate_deploy/bench/hand_parts.py"),
+    "can": ("gateway/", "deploy/palpate_deploy/bench/hand_parts.py"),
     "torch": ("training/",),
     "warp": ("fem/",),
-    "onnxruntime": ("services/", "training/palpate/training/export.py", FLOOR),
+    "onnxruntime": ("services/", "training/palpate_training/export.py", FLOOR),
     "rerun": ("services/",),
     "google": ("protos/",),
     "palpate.v1": ("protos/", FLOOR),
@@ -38,21 +40,20 @@ HOMES = {
 
 # file to plant in, line to plant, a word of the contract that must catch it
 PLANTS = [
-    ("services/palpate/services/planted.py", "import palpate.gateway", "Rooms share only protos"),
-    ("protos/palpate/protos/planted.py", "import palpate.training", "Rooms share only protos"),
-    ("gateway/palpate/gateway/planted.py", "import palpate.deploy", "Rooms share only protos"),
-    ("fem/palpate/extra/__init__.py", "", "Rooms share only protos"),
+    ("services/palpate_services/planted.py", "import palpate_gateway", "Rooms share only palpate"),
+    ("protos/palpate/planted.py", "import palpate_training", "Rooms share only palpate"),
+    ("gateway/palpate_gateway/planted.py", "import palpate_deploy", "Rooms share only palpate"),
     (
-        "gateway/palpate/gateway/planted.py",
+        "gateway/palpate_gateway/planted.py",
         "from palpate.v1 import frames_pb2",
         "generated wire classes",
     ),
-    ("gateway/palpate/gateway/planted.py", "import zenoh", "protos.session speaks Zenoh"),
-    ("protos/palpate/protos/codec/planted.py", "import zenoh", "Messages are plain data"),
-    ("services/palpate/services/planted.py", "import serial", "Ports stay in the gateway"),
-    ("services/palpate/services/planted.py", "import torch", "Torch stays in training"),
-    ("services/palpate/services/planted.py", "import warp", "Warp stays in fem"),
-    ("fem/palpate/fem/indenter/planted.py", "import palpate.fem.store", "only point down"),
+    ("gateway/palpate_gateway/planted.py", "import zenoh", "palpate.bus speaks Zenoh"),
+    ("protos/palpate/codec/planted.py", "import zenoh", "Messages are plain data"),
+    ("services/palpate_services/planted.py", "import serial", "Ports stay in the gateway"),
+    ("services/palpate_services/planted.py", "import torch", "Torch stays in training"),
+    ("services/palpate_services/planted.py", "import warp", "Warp stays in fem"),
+    ("fem/palpate_fem/indenter/planted.py", "import palpate_fem.store", "only point down"),
 ]
 
 
@@ -90,8 +91,8 @@ def _write(path: Path, text: str = "") -> None:
 @pytest.fixture
 def stub_house(tmp_path: Path) -> Path:
     """Our rooms as empty modules, with every module that a contract names, under our settings."""
-    for room in ROOMS:
-        _write(tmp_path / room / "palpate" / room / "__init__.py")
+    for room, package in PACKAGES.items():
+        _write(tmp_path / room / package / "__init__.py")
     _write(tmp_path / "protos/palpate/v1/frames_pb2.py")
     _write(tmp_path / "protos/palpate/v1/__init__.py")
     for contract in LINTER["contracts"]:
@@ -104,8 +105,8 @@ def stub_house(tmp_path: Path) -> Path:
         named = (*contract.get("source_modules", ()), *contract.get("forbidden_modules", ()))
         for name in (*layered, *named):
             parts = name.split(".")
-            if parts[0] == "palpate" and len(parts) > 2:
-                _write(tmp_path.joinpath(parts[1], *parts, "__init__.py"))
+            if parts[0] in ROOM_OF and len(parts) > 1:
+                _write(tmp_path.joinpath(ROOM_OF[parts[0]], *parts, "__init__.py"))
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     _write(tmp_path / "pyproject.toml", text[text.index("[tool.importlinter]") :])
     return tmp_path

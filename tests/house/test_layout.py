@@ -1,6 +1,6 @@
-"""The folders are laid out so that `palpate` is one name and nothing else leaks.
+"""Each room holds one plain package, and nothing else that can be imported.
 
-Why each rule exists: docs/adr/0001-import-names.md.
+Why: docs/adr/0018-a-package-for-each-room.md.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("protos", "gateway", "fem", "training", "services", "deploy")
-PARTS = {room: {room} for room in ROOMS} | {"protos": {"protos", "v1"}}
+PACKAGES = {room: "palpate" if room == "protos" else f"palpate_{room}" for room in ROOMS}
 
 # Top-level import names of what we depend on.  A module of ours with such a name, run by its path,
 # would shadow the package.
@@ -27,41 +27,27 @@ def _visible(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_namespace_has_no_init(room: str) -> None:
-    """A stray ``palpate/__init__.py`` would hide every other room in an editable install."""
-    assert not (ROOT / room / "palpate" / "__init__.py").exists()
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_source_root_holds_nothing_importable_beside_the_namespace(room: str) -> None:
-    """A room is on ``sys.path``: a module or package beside ``palpate/`` would be a top-level one.
-
-    ``deploy`` may also hold folders of data (profiles, units), as long as they hold no Python.
-    """
+def test_room_holds_one_package_and_no_other_python(room: str) -> None:
+    """A room is on ``sys.path``: anything importable beside its package would be a second name."""
     leaks = []
     for entry in _visible(ROOT / room):
-        if entry.name == "palpate":
+        if entry.name == PACKAGES[room]:
             continue
         if entry.is_dir():
+            # deploy also holds folders of data: systemd units, udev rules, firmware in C
             if room != "deploy" or any(entry.rglob("*.py")) or entry.name in DEPENDENCIES:
                 leaks.append(entry.name)
         elif entry.suffix in {".py", ".pyi", ".so", ".pth"}:
             leaks.append(entry.name)
-    assert not leaks, f"{room}/ may hold palpate/ and documents only; move {leaks}"
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_namespace_holds_only_its_own_room(room: str) -> None:
-    parts = {entry.name for entry in _visible(ROOT / room / "palpate")}
-    assert parts == PARTS[room]
+    assert not leaks, f"{room}/ may hold {PACKAGES[room]}/ and documents only; move {leaks}"
 
 
 @pytest.mark.parametrize("room", ROOMS)
 def test_room_says_what_it_is(room: str) -> None:
     readme = ROOT / room / "README.md"
-    assert readme.is_file(), f"{room}/README.md: what the room is for, a line per file"
+    assert readme.is_file(), f"{room}/README.md: what the room is for and where to start reading"
     assert readme.read_text(encoding="utf-8").startswith("# ")
-    package = ROOT / room / "palpate" / room
+    package = ROOT / room / PACKAGES[room]
     assert (package / "py.typed").is_file(), f"{package.relative_to(ROOT)}/py.typed is missing"
     assert '"""' in (package / "__init__.py").read_text(encoding="utf-8")
 
@@ -71,7 +57,7 @@ def test_every_package_has_an_init() -> None:
     missing = {
         path.parent.relative_to(ROOT).as_posix()
         for room in ROOMS
-        for path in (ROOT / room / "palpate" / room).rglob("*.py")
+        for path in (ROOT / room).rglob("*.py")
         if not (path.parent / "__init__.py").is_file()
     }
     assert not missing
@@ -81,7 +67,7 @@ def test_no_module_is_named_like_a_dependency() -> None:
     shadows = [
         path.relative_to(ROOT).as_posix()
         for room in ROOMS
-        for path in (ROOT / room / "palpate").rglob("*.py")
+        for path in (ROOT / room).rglob("*.py")
         if path.stem in DEPENDENCIES
         or (path.name == "__init__.py" and path.parent.name in DEPENDENCIES)
     ]

@@ -11,8 +11,8 @@ import pytest
 
 HEAVY = ("torch", "onnxruntime", "onnx", "rerun", "matplotlib", "h5py", "scipy", "warp", "pyarrow")
 LIST_PROTOS = (
-    "import pkgutil, importlib, palpate.protos as protos\n"
-    "for module in pkgutil.walk_packages(protos.__path__, 'palpate.protos.'):\n"
+    "import pkgutil, importlib, palpate as protos\n"
+    "for module in pkgutil.walk_packages(protos.__path__, 'palpate.'):\n"
     "    importlib.import_module(module.name)"
 )
 
@@ -38,11 +38,11 @@ def test_protos_load_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     ("module", "may_load"),
     [
-        ("palpate.protos.client", ()),
-        ("palpate.deploy.cli", ()),
-        ("palpate.gateway.node", ()),
-        ("palpate.services.features", ("onnxruntime",)),
-        ("palpate.services.recorder", ("rerun", "pyarrow")),
+        ("palpate.client", ()),
+        ("palpate_deploy.cli", ()),
+        ("palpate_gateway.node", ()),
+        ("palpate_services.features", ("onnxruntime",)),
+        ("palpate_services.recorder", ("rerun", "pyarrow")),
     ],
 )
 def test_module_loads_only_what_it_needs(module: str, may_load: tuple[str, ...]) -> None:

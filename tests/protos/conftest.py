@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos import clock
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ErrorCode
-from palpate.protos.messages import (
+from palpate import clock
+from palpate.bus import Session
+from palpate.config import LinkConfig
+from palpate.errors import ErrorCode
+from palpate.messages import (
     ElectrodeFrame,
     ErrorReply,
     FeatureEstimate,
@@ -48,7 +49,6 @@ from palpate.protos.messages import (
     WrenchZero,
     WrenchZeroRequest,
 )
-from palpate.protos.session import Session
 
 
 def _floats(*values: float) -> Any:

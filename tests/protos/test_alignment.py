@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.protos.alignment import (
+from palpate.alignment import (
     Clock,
     common_clock,
     electrode_instants,
@@ -17,8 +17,8 @@ from palpate.protos.alignment import (
     slerp,
     times_of,
 )
-from palpate.protos.errors import DatasetError
-from palpate.protos.messages import ElectrodeFrame, Origin, SensorType, Stamp, WrenchFrame
+from palpate.errors import DatasetError
+from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp, WrenchFrame
 
 MS = 1_000_000
 SLOT_NS = 227_273

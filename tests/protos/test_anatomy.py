@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.protos.anatomy import (
+from palpate.anatomy import (
     ELECTRODE_MIRROR,
     ELECTRODE_NORMALS,
     ELECTRODE_POSITIONS,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from google.protobuf import json_format
 
-from palpate.protos.codec import ELECTRODE_FRAME, SYNTHESIS_ESTIMATE, TARE, Codec
-from palpate.protos.errors import WireError
-from palpate.protos.messages import (
+from palpate.codec import ELECTRODE_FRAME, SYNTHESIS_ESTIMATE, TARE, Codec
+from palpate.errors import WireError
+from palpate.messages import (
     BIOTAC_LAYOUT,
     BIOTAC_SP_LAYOUT,
     ElectrodeFrame,

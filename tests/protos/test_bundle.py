@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos.bundle import TASKS, Manifest, read_bundle, write_bundle
-from palpate.protos.errors import BundleError
+from palpate.errors import BundleError
+from palpate.files.bundle import TASKS, Manifest, read_bundle, write_bundle
 
 
 @pytest.fixture

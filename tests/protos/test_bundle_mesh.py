@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.protos.bundle import Manifest, read_bundle, read_mesh, write_bundle
-from palpate.protos.errors import BundleError
-from palpate.protos.field_mesh import FieldMesh, mesh_from_bytes, mesh_to_bytes
-from palpate.protos.messages import TensorInfo
-from palpate.protos.tasks import TASKS, check_tensors, tensors_of
+from palpate.errors import BundleError
+from palpate.files.bundle import Manifest, read_bundle, read_mesh, write_bundle
+from palpate.files.field_mesh import FieldMesh, mesh_from_bytes, mesh_to_bytes
+from palpate.files.tasks import TASKS, check_tensors, tensors_of
+from palpate.messages import TensorInfo
 
 NODES = 5
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from palpate.protos.codec import (
+from palpate.codec import (
     CODECS,
     ELECTRODE_FRAME,
     FEATURE_ESTIMATE,
@@ -22,8 +22,8 @@ from palpate.protos.codec import (
     FIELD_REQUEST,
     Codec,
 )
-from palpate.protos.errors import PalpateError, WireError
-from palpate.protos.messages import ElectrodeFrame, FieldFrame, Origin, Stamp
+from palpate.errors import PalpateError, WireError
+from palpate.messages import ElectrodeFrame, FieldFrame, Origin, Stamp
 from palpate.v1 import common_pb2, frames_pb2, service_pb2
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "v1"

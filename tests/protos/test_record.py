@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.codec import ELECTRODE_FRAME, WRENCH_FRAME
-from palpate.protos.errors import RecordingError, WireError
-from palpate.protos.record import (
+from palpate.bus.topics import sensor_key
+from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
+from palpate.errors import RecordingError, WireError
+from palpate.files.record import (
     RecordWriter,
     check_readable,
     descriptor_set,
@@ -23,7 +24,6 @@ from palpate.protos.record import (
     recover,
     summarise,
 )
-from palpate.protos.topics import sensor_key
 
 KEY = sensor_key("lab", "finger", "electrodes")
 
@@ -184,7 +184,7 @@ def test_a_full_disk_is_named(tmp_path: Path, payload: bytes) -> None:
 _CHILD = """
 import sys, time
 from pathlib import Path
-from palpate.protos.record import RecordWriter
+from palpate.files.record import RecordWriter
 writer = RecordWriter(Path(sys.argv[1]))
 payload = sys.stdin.buffer.read()
 i = 0

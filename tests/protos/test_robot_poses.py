@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.client import Client
-from palpate.protos.codec import INDENTER_POSE_FRAME, ROBOT_POSE_FRAME
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError, LinkError, WireError
-from palpate.protos.messages import Pose, RobotPoseFrame
-from palpate.protos.robot_poses import RobotPosePublisher
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ROBOT_POSE
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ROBOT_POSE
+from palpate.client import Client
+from palpate.client.robot_poses import RobotPosePublisher
+from palpate.codec import INDENTER_POSE_FRAME, ROBOT_POSE_FRAME
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, LinkError, WireError
+from palpate.messages import Pose, RobotPoseFrame
 from palpate.v1 import frames_pb2, robot_pb2
 
 PATIENCE_S = 20.0

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.protos.messages import ElectrodeFrame, Origin, SensorType, Stamp
-from palpate.protos.sampling import is_polled, sample_offsets, sample_times, slots_of
+from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp
+from palpate.sampling import is_polled, sample_offsets, sample_times, slots_of
 
 SLOT_NS = 227_273
 START_NS = 5_000_000_000

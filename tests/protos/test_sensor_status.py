@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.codec import STATUS, WRENCH_ZERO
-from palpate.protos.errors import WireError
-from palpate.protos.health import Health
-from palpate.protos.messages import ChannelFault, FaultKind, SensorState, SensorStatus, Status
+from palpate.codec import STATUS, WRENCH_ZERO
+from palpate.errors import WireError
+from palpate.health import Health
+from palpate.messages import ChannelFault, FaultKind, SensorState, SensorStatus, Status
 from palpate.v1 import service_pb2
 
 STATES = (

@@ -11,10 +11,13 @@ from typing import Any
 import pytest
 import zenoh
 
-from palpate.protos.client import Client
-from palpate.protos.codec import TARE, TARE_REQUEST
-from palpate.protos.config import LinkConfig, parse_config
-from palpate.protos.errors import (
+from palpate.bus import Delivery, Session, run_router
+from palpate.bus.tares import TareBook
+from palpate.bus.topics import FEATURES, STATUS, sensor_key
+from palpate.client import Client
+from palpate.codec import TARE, TARE_REQUEST
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import (
     ConfigError,
     DeviceError,
     ErrorCode,
@@ -23,17 +26,14 @@ from palpate.protos.errors import (
     StaleError,
     StreamTimeout,
 )
-from palpate.protos.health import Health, HealthReporter
-from palpate.protos.messages import (
+from palpate.health import Health, HealthReporter
+from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     ServiceState,
     Tare,
     TareRequest,
 )
-from palpate.protos.session import Delivery, Session, run_router
-from palpate.protos.tares import TareBook
-from palpate.protos.topics import FEATURES, STATUS, sensor_key
 
 FrameOf = Callable[..., ElectrodeFrame]
 WaitUntil = Callable[..., None]

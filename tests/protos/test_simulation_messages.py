@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.client import Client
-from palpate.protos.codec import SIMULATION_REPLY, SIMULATION_REQUEST
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ErrorCode, LinkError, RemoteError, SimulationError, WireError
-from palpate.protos.messages import (
+from palpate.bus import MAX_REPLY_BYTES, Answer, Session
+from palpate.bus.topics import asking_key
+from palpate.client import Client
+from palpate.client.simulations import join, straight_path
+from palpate.codec import SIMULATION_REPLY, SIMULATION_REQUEST
+from palpate.config import LinkConfig
+from palpate.errors import ErrorCode, LinkError, RemoteError, SimulationError, WireError
+from palpate.messages import (
     Pose,
     SimulationOutcome,
     SimulationProgress,
@@ -23,9 +26,6 @@ from palpate.protos.messages import (
     SimulationRequest,
     SimulationStep,
 )
-from palpate.protos.session import MAX_REPLY_BYTES, Answer, Session
-from palpate.protos.simulations import join, straight_path
-from palpate.protos.topics import asking_key
 from palpate.v1 import simulation_pb2
 
 MESH = bytes(range(32))

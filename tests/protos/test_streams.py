@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import zenoh
 
-from palpate.protos.codec import ELECTRODE_FRAME
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import (
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, TARE, sensor_key
+from palpate.codec import ELECTRODE_FRAME
+from palpate.config import LinkConfig
+from palpate.errors import (
     StaleError,
     StreamTimeout,
 )
-from palpate.protos.messages import (
+from palpate.messages import (
     ElectrodeFrame,
     Origin,
 )
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, TARE, sensor_key
 
 FrameOf = Callable[..., ElectrodeFrame]
 WaitUntil = Callable[..., None]

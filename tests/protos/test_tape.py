@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.protos.tape import Tape, build_tape, check_tape, read_tape, tape_unit, write_tape
+from palpate.errors import ConfigError, DatasetError
+from palpate.files.tape import Tape, build_tape, check_tape, read_tape, tape_unit, write_tape
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("tape_arrays")

@@ -16,9 +16,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from palpate.protos.errors import DatasetError
-from palpate.protos.tape import build_tape, read_tape, write_tape
-from palpate.protos.tape import file as tape_file
+from palpate.errors import DatasetError
+from palpate.files.tape import build_tape, read_tape, write_tape
+from palpate.files.tape import file as tape_file
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("tape_arrays")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.protos.whole import written_whole
+from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
 
 
 def test_a_file_appears_when_the_block_ends(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos import clock
-from palpate.protos.bundle import TASKS, Bundle, Manifest, read_bundle, write_bundle
-from palpate.protos.config import LinkConfig
-from palpate.protos.messages import (
+from palpate import clock
+from palpate.bus import run_router
+from palpate.config import LinkConfig
+from palpate.files.bundle import TASKS, Bundle, Manifest, read_bundle, write_bundle
+from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,
     Origin,
@@ -27,7 +28,6 @@ from palpate.protos.messages import (
     Tare,
     WrenchFrame,
 )
-from palpate.protos.session import run_router
 
 sys.path.append(str(Path(__file__).parent))  # tests import field_bundles by name
 

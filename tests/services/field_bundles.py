@@ -11,10 +11,10 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from palpate.protos.bundle import Manifest, write_bundle
-from palpate.protos.field_mesh import FieldMesh
-from palpate.protos.messages import FieldEstimate, FieldFrame, FloatArray, Stamp
-from palpate.protos.tasks import tensors_of
+from palpate.files.bundle import Manifest, write_bundle
+from palpate.files.field_mesh import FieldMesh
+from palpate.files.tasks import tensors_of
+from palpate.messages import FieldEstimate, FieldFrame, FloatArray, Stamp
 
 RINGS, AROUND = 5, 6
 NODES = 2 * RINGS * AROUND

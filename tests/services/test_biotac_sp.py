@@ -13,22 +13,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.bundle import read_bundle
-from palpate.protos.client import Client
-from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.codec import TARE_REQUEST
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import BundleError, ErrorCode, RemoteError
-from palpate.protos.health import Health
-from palpate.protos.messages import ElectrodeFrame, SensorType, ServiceState, Tare
-from palpate.protos.record import read_record
-from palpate.protos.session import Delivery, Sample, Session
-from palpate.protos.topics import ELECTRODES, FEATURES, TARE, TOPICS, sensor_key
-from palpate.services import features, field
-from palpate.services.config import FeaturesConfig, FieldConfig, RecorderConfig
-from palpate.services.estimator import Refusal, estimate, estimate_field
-from palpate.services.keeper import RecordKeeper
-from palpate.services.runtime import load
+from palpate.bus import Delivery, Sample, Session
+from palpate.bus.topics import ELECTRODES, FEATURES, TARE, TOPICS, sensor_key
+from palpate.client import Client
+from palpate.codec import TARE as TARE_CODEC
+from palpate.codec import TARE_REQUEST
+from palpate.config import LinkConfig
+from palpate.errors import BundleError, ErrorCode, RemoteError
+from palpate.files.bundle import read_bundle
+from palpate.files.record import read_record
+from palpate.health import Health
+from palpate.messages import ElectrodeFrame, SensorType, ServiceState, Tare
+from palpate_services import features, field
+from palpate_services.config import FeaturesConfig, FieldConfig, RecorderConfig
+from palpate_services.estimator import Refusal, estimate, estimate_field
+from palpate_services.keeper import RecordKeeper
+from palpate_services.runtime import load
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -145,7 +145,7 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
-    from palpate.services.view import review
+    from palpate_services.view import review
 
     def frames(kind: SensorType, first: int) -> list[Any]:
         sequences = range(first, first + 40)
@@ -178,7 +178,7 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
 
 
 def test_a_lost_pac_sample_is_a_gap_in_the_picture(make_frame: Frames) -> None:
-    from palpate.services.scene import SensorScene
+    from palpate_services.scene import SensorScene
 
     layout = SP.layout
     frame = make_frame(sensor_type=SP)

@@ -12,18 +12,18 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.bundle import read_bundle
-from palpate.protos.codec import MODEL_METADATA, SERVICE_REQUEST, STATUS, TARE_REQUEST
-from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import StreamTimeout
-from palpate.protos.messages import ElectrodeFrame, Origin, ServiceRequest, Status, Tare
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, FEATURES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE, Topic
-from palpate.services import features, field, synthesis
-from palpate.services.config import FeaturesConfig, FieldConfig, SynthesisConfig
-from palpate.services.estimator import estimate, estimate_field, synthesise
-from palpate.services.runtime import Runtime, load
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE, Topic
+from palpate.codec import MODEL_METADATA, SERVICE_REQUEST, STATUS, TARE_REQUEST
+from palpate.codec import TARE as TARE_CODEC
+from palpate.config import LinkConfig
+from palpate.errors import StreamTimeout
+from palpate.files.bundle import read_bundle
+from palpate.messages import ElectrodeFrame, Origin, ServiceRequest, Status, Tare
+from palpate_services import features, field, synthesis
+from palpate_services.config import FeaturesConfig, FieldConfig, SynthesisConfig
+from palpate_services.estimator import estimate, estimate_field, synthesise
+from palpate_services.runtime import Runtime, load
 
 bundles: Any = importlib.import_module("field_bundles")
 

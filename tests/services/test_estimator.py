@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.protos.bundle import Bundle, read_bundle
-from palpate.protos.codec import FEATURE_ESTIMATE
-from palpate.protos.messages import ElectrodeFrame, FeatureEstimate, SensorType, Tare
-from palpate.services.estimator import Refusal, estimate, tared_counts
-from palpate.services.runtime import Runtime, load
+from palpate.codec import FEATURE_ESTIMATE
+from palpate.files.bundle import Bundle, read_bundle
+from palpate.messages import ElectrodeFrame, FeatureEstimate, SensorType, Tare
+from palpate_services.estimator import Refusal, estimate, tared_counts
+from palpate_services.runtime import Runtime, load
 
 Frames = Callable[..., ElectrodeFrame]
 

@@ -12,17 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.codec import (
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, FEATURES, TARE
+from palpate.codec import (
     ELECTRODE_FRAME,
     MODEL_METADATA,
     SERVICE_REQUEST,
     STATUS,
     TARE_REQUEST,
 )
-from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError, StreamTimeout
-from palpate.protos.messages import (
+from palpate.codec import TARE as TARE_CODEC
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, StreamTimeout
+from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     Origin,
@@ -32,12 +34,10 @@ from palpate.protos.messages import (
     Tare,
     TareRequest,
 )
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, FEATURES, TARE
-from palpate.services import features
-from palpate.services.config import FeaturesConfig
-from palpate.services.estimator import estimate
-from palpate.services.runtime import Runtime
+from palpate_services import features
+from palpate_services.config import FeaturesConfig
+from palpate_services.estimator import estimate
+from palpate_services.runtime import Runtime
 
 Frames = Callable[..., ElectrodeFrame]
 Tares = Callable[..., Tare]
@@ -237,8 +237,8 @@ def test_lost_tare_of_one_sensor_does_not_hold_up_another(
 def test_lossless_replay_answers_every_frame_with_the_bytes_of_the_estimator(
     serve: Serve, bundle: Any, make_frame: Frames, make_tare: Tares
 ) -> None:
-    from palpate.protos.codec import FEATURE_ESTIMATE
-    from palpate.services.runtime import load
+    from palpate.codec import FEATURE_ESTIMATE
+    from palpate_services.runtime import load
 
     replayed = [make_frame(n, origin=Origin.REPLAYED, monotonic_ns=n) for n in range(1, 501)]
     with serve(delivery="every", accept_replayed=True) as session:

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.bundle import read_bundle
-from palpate.protos.codec import FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
-from palpate.protos.errors import BundleError
-from palpate.protos.messages import (
+from palpate.codec import FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
+from palpate.errors import BundleError
+from palpate.files.bundle import read_bundle
+from palpate.messages import (
     ElectrodeFrame,
     FieldEstimate,
     SensorType,
     SynthesisEstimate,
     Tare,
 )
-from palpate.services.estimator import Refusal, estimate_field, synthesise, tared_counts
-from palpate.services.runtime import Runtime, load
+from palpate_services.estimator import Refusal, estimate_field, synthesise, tared_counts
+from palpate_services.runtime import Runtime, load
 
 bundles: Any = importlib.import_module("field_bundles")
 

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.bundle import read_bundle
-from palpate.protos.client import Client
-from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.codec import TARE_REQUEST
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ErrorCode, LinkError, RemoteError
-from palpate.protos.messages import ElectrodeFrame, Origin, Tare
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE
-from palpate.services import field, synthesis
-from palpate.services.answering import Pace
-from palpate.services.config import FieldConfig, SynthesisConfig
-from palpate.services.estimator import estimate_field
-from palpate.services.runtime import load
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE
+from palpate.client import Client
+from palpate.codec import TARE as TARE_CODEC
+from palpate.codec import TARE_REQUEST
+from palpate.config import LinkConfig
+from palpate.errors import ErrorCode, LinkError, RemoteError
+from palpate.files.bundle import read_bundle
+from palpate.messages import ElectrodeFrame, Origin, Tare
+from palpate_services import field, synthesis
+from palpate_services.answering import Pace
+from palpate_services.config import FieldConfig, SynthesisConfig
+from palpate_services.estimator import estimate_field
+from palpate_services.runtime import load
 
 bundles: Any = importlib.import_module("field_bundles")
 

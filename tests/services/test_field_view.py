@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError
-from palpate.protos.messages import ElectrodeFrame, Stamp, SynthesisEstimate, Tare
-from palpate.protos.record import read_record
-from palpate.protos.session import Session
-from palpate.protos.topics import FIELD, FIELD_TRUTH, SYNTHESIS
-from palpate.services import recorder
-from palpate.services.config import RecorderConfig
-from palpate.services.field_scene import FieldThinner
-from palpate.services.meshes import MeshLibrary
-from palpate.services.scene import SensorScene
+from palpate.bus import Session
+from palpate.bus.topics import FIELD, FIELD_TRUTH, SYNTHESIS
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError
+from palpate.files.record import read_record
+from palpate.messages import ElectrodeFrame, Stamp, SynthesisEstimate, Tare
+from palpate_services import recorder
+from palpate_services.config import RecorderConfig
+from palpate_services.field_scene import FieldThinner
+from palpate_services.meshes import MeshLibrary
+from palpate_services.scene import SensorScene
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -129,7 +129,7 @@ def test_recorded_and_drawn(
     until: Until,
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate.services.view import review
+    from palpate_services.view import review
 
     mine = str(bundles.write(tmp_path / "mine", "field"))
     stop = threading.Event()
@@ -153,7 +153,7 @@ def test_recorded_and_drawn(
             found: dict[str, int] = {}
 
             def came() -> bool:
-                from palpate.protos.client import Client
+                from palpate.client import Client
 
                 with Client(link.connect[0]) as robot:
                     for status in robot.status():
@@ -194,7 +194,7 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
     make_frame: Frames, tmp_path: Path
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate.services.view import View
+    from palpate_services.view import View
 
     meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
     field = bundles.truth(stamp_at(make_frame().stamp, 0.0))

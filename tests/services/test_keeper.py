@@ -12,17 +12,17 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.codec import ELECTRODE_FRAME
-from palpate.protos.errors import ErrorCode
-from palpate.protos.health import Health
-from palpate.protos.messages import ElectrodeFrame, ServiceState
-from palpate.protos.record import RecordWriter, check_readable, read_record
-from palpate.protos.session import Sample
-from palpate.protos.topics import ELECTRODES, sensor_key
-from palpate.services import keeper as keeper_module
-from palpate.services.config import RecorderConfig
-from palpate.services.keeper import RecordKeeper
-from palpate.services.recovery import leftovers, recover_all
+from palpate.bus import Sample
+from palpate.bus.topics import ELECTRODES, sensor_key
+from palpate.codec import ELECTRODE_FRAME
+from palpate.errors import ErrorCode
+from palpate.files.record import RecordWriter, check_readable, read_record
+from palpate.health import Health
+from palpate.messages import ElectrodeFrame, ServiceState
+from palpate_services import keeper as keeper_module
+from palpate_services.config import RecorderConfig
+from palpate_services.keeper import RecordKeeper
+from palpate_services.recovery import leftovers, recover_all
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -214,7 +214,7 @@ def test_view_that_fails_leaves_the_record_alone(
 
 def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    from palpate.services.view import View
+    from palpate_services.view import View
 
     path = tmp_path / "view.rrd"
     with View(path, title="view", max_bytes=1) as view:

@@ -16,11 +16,14 @@ from typing import Any
 
 import pytest
 
-from palpate.protos.codec import SERVICE_REQUEST, STATUS, TARE_REQUEST
-from palpate.protos.codec import TARE as TARE_CODEC
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError, ErrorCode
-from palpate.protos.messages import (
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, FEATURES, POSE, TARE, WRENCH, sensor_key
+from palpate.codec import SERVICE_REQUEST, STATUS, TARE_REQUEST
+from palpate.codec import TARE as TARE_CODEC
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, ErrorCode
+from palpate.files.record import RecordWriter, read_record
+from palpate.messages import (
     ElectrodeFrame,
     Origin,
     ServiceRequest,
@@ -28,12 +31,9 @@ from palpate.protos.messages import (
     Status,
     Tare,
 )
-from palpate.protos.record import RecordWriter, read_record
-from palpate.protos.session import Delivery, Session
-from palpate.protos.topics import ELECTRODES, FEATURES, POSE, TARE, WRENCH, sensor_key
-from palpate.services import features, recorder
-from palpate.services.config import FeaturesConfig, RecorderConfig
-from palpate.services.recovery import leftovers, recover_all
+from palpate_services import features, recorder
+from palpate_services.config import FeaturesConfig, RecorderConfig
+from palpate_services.recovery import leftovers, recover_all
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -140,8 +140,8 @@ def test_record_view_and_picture_of_a_session(
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
-    from palpate.services.plot import plot_record
-    from palpate.services.view import review
+    from palpate_services.plot import plot_record
+    from palpate_services.view import review
 
     with station(lossless=True, out=tmp_path) as session:
         answers = session.subscriber(FEATURES, delivery=Delivery.EVERY)
@@ -259,9 +259,9 @@ def test_unknown_topic_is_named() -> None:
 KILLED = """
 import sys, threading
 from pathlib import Path
-from palpate.protos.config import LinkConfig
-from palpate.services import recorder
-from palpate.services.config import RecorderConfig
+from palpate.config import LinkConfig
+from palpate_services import recorder
+from palpate_services.config import RecorderConfig
 
 config = RecorderConfig(out=Path(sys.argv[1]), rrd=False, min_free_bytes=0)
 recorder.run(config, LinkConfig(connect=(sys.argv[2],)), "lab", threading.Event())

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from palpate.protos.errors import ConfigError
-from palpate.services.repository import available, resolve
+from palpate.errors import ConfigError
+from palpate_services.repository import available, resolve
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.bundle import Bundle, read_bundle
-from palpate.protos.errors import BundleError, MissingExtraError
-from palpate.services.external_data import has_external_data
-from palpate.services.runtime import load
+from palpate.errors import BundleError, MissingExtraError
+from palpate.files.bundle import Bundle, read_bundle
+from palpate_services.external_data import has_external_data
+from palpate_services.runtime import load
 
 onnx = pytest.importorskip("onnx")
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.services.simulation_view import LONGEST_ARROW_M, review_simulations
-from palpate.services.simulation_view_file import Simulations, choose, is_simulations
-from palpate.services.simulation_view_surface import border_of, normals_of, shades
+from palpate.errors import DatasetError
+from palpate_services.simulation_view import LONGEST_ARROW_M, review_simulations
+from palpate_services.simulation_view_file import Simulations, choose, is_simulations
+from palpate_services.simulation_view_surface import border_of, normals_of, shades
 
 h5py = pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 

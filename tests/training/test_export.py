@@ -11,15 +11,15 @@ import onnxruntime
 import pytest
 import torch
 
-from palpate.protos.bundle import read_bundle
-from palpate.protos.errors import BundleError, DatasetError
-from palpate.training import export
-from palpate.training.dataset import FeatureDataset
-from palpate.training.export import FeaturesGraph, check_parity, export_features, to_onnx
-from palpate.training.models import Mlp
-from palpate.training.schema import write_dataset
-from palpate.training.train import TrainConfig
-from palpate.training.train_features import train_features
+from palpate.errors import BundleError, DatasetError
+from palpate.files.bundle import read_bundle
+from palpate_training import export
+from palpate_training.dataset import FeatureDataset
+from palpate_training.export import FeaturesGraph, check_parity, export_features, to_onnx
+from palpate_training.models import Mlp
+from palpate_training.schema import write_dataset
+from palpate_training.train import TrainConfig
+from palpate_training.train_features import train_features
 
 MakeData = Callable[..., FeatureDataset]
 QUICK = TrainConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)

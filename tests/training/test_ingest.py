@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError, RecordingError
-from palpate.protos.messages import (
+from palpate.bus.topics import ELECTRODES, POSE, TARE, WRENCH, Topic, sensor_key
+from palpate.errors import DatasetError, RecordingError
+from palpate.files.record import RecordWriter
+from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,
     Origin,
@@ -18,10 +20,8 @@ from palpate.protos.messages import (
     Tare,
     WrenchFrame,
 )
-from palpate.protos.record import RecordWriter
-from palpate.protos.topics import ELECTRODES, POSE, TARE, WRENCH, Topic, sensor_key
-from palpate.training.ingest_lasa import ingest_lasa
-from palpate.training.ingest_record import ingest_record, number_presses
+from palpate_training.ingest_lasa import ingest_lasa
+from palpate_training.ingest_record import ingest_record, number_presses
 
 PERIOD_NS = 10_000_000
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from palpate.training import baselines
-from palpate.training.metrics import (
+from palpate_training import baselines
+from palpate_training.metrics import (
     cluster_bootstrap,
     force_errors,
     force_metrics,

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.dataset import FeatureDataset
-from palpate.training.schema import open_dataset, write_dataset
+from palpate.errors import DatasetError
+from palpate_training.dataset import FeatureDataset
+from palpate_training.schema import open_dataset, write_dataset
 
 MakeData = Callable[..., FeatureDataset]
 

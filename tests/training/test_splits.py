@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.protos.errors import DatasetError
-from palpate.training import splits
-from palpate.training.splits import (
+from palpate.errors import DatasetError
+from palpate_training import splits
+from palpate_training.splits import (
     Split,
     by_group,
     contiguous_folds,

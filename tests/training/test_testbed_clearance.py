@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos.errors import ConfigError
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.clearance import (
+from palpate.errors import ConfigError
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.clearance import (
     ErrorModel,
     RegistrationErrors,
     link_sensitivity,
@@ -19,8 +19,8 @@ from palpate.training.testbed.clearance import (
     plate_holes,
     simulate_registrations,
 )
-from palpate.training.testbed.kinematics import Arm
-from palpate.training.testbed.registration import register
+from palpate_training.testbed.kinematics import Arm
+from palpate_training.testbed.registration import register
 
 Floats = npt.NDArray[np.float64]
 NONE = ErrorModel(0.0, 0.0, 0.0, 0.0, 0.0)

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.training.cli import data_app
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.clearance import plate_holes
-from palpate.training.testbed.kinematics import Arm
-from palpate.training.testbed.plan import Plan, commanded_travel
-from palpate.training.testbed.registration_file import COLUMNS, read_registrations
-from palpate.training.twin.raw_file import read_contents, read_trials
-from palpate.training.twin.trials import RawTrial
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli import data_app
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.clearance import plate_holes
+from palpate_training.testbed.kinematics import Arm
+from palpate_training.testbed.plan import Plan, commanded_travel
+from palpate_training.testbed.registration_file import COLUMNS, read_registrations
+from palpate_training.twin.raw_file import read_contents, read_trials
+from palpate_training.twin.trials import RawTrial
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

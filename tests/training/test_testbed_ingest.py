@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.protos.topics import POSE
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.ingest import ingest_experiment
-from palpate.training.testbed.joint_log import JointLog, read_joint_log
-from palpate.training.testbed.kinematics import Arm
-from palpate.training.testbed.plan import Plan, commanded_travel
-from palpate.training.testbed.transform import Transform
-from palpate.training.twin.trials import RawTrial
+from palpate.bus.topics import POSE
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.ingest import ingest_experiment
+from palpate_training.testbed.joint_log import JointLog, read_joint_log
+from palpate_training.testbed.kinematics import Arm
+from palpate_training.testbed.plan import Plan, commanded_travel
+from palpate_training.testbed.transform import Transform
+from palpate_training.twin.trials import RawTrial
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError, RecordingError
-from palpate.protos.messages import ElectrodeFrame, IndenterPoseFrame, SensorType, WrenchFrame
-from palpate.protos.topics import ELECTRODES, POSE, WRENCH
-from palpate.training.testbed.ingest import ingest_experiment
-from palpate.training.testbed.plan import Plan
-from palpate.training.twin.trials import RawTrial
+from palpate.bus.topics import ELECTRODES, POSE, WRENCH
+from palpate.errors import DatasetError, RecordingError
+from palpate.messages import ElectrodeFrame, IndenterPoseFrame, SensorType, WrenchFrame
+from palpate_training.testbed.ingest import ingest_experiment
+from palpate_training.testbed.plan import Plan
+from palpate_training.twin.trials import RawTrial
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

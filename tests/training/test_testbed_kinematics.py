@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.protos.errors import ConfigError, MissingExtraError
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.kinematics import ACCURACY_M, Arm
-from palpate.training.testbed.transform import Transform, facing, rotation_matrices
+from palpate.errors import ConfigError, MissingExtraError
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.kinematics import ACCURACY_M, Arm
+from palpate_training.testbed.transform import Transform, facing, rotation_matrices
 
 PLANAR = """<robot name="planar">
 <link name="base"/><link name="upper"/><link name="fore"/><link name="hand"/>

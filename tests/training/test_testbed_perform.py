@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos.errors import ConfigError
-from palpate.training.testbed.perform import contact_travel, perform
-from palpate.training.testbed.wrench_sensor import WrenchSensor
-from palpate.training.twin.trials import RawTrial, TrialHeader
+from palpate.errors import ConfigError
+from palpate_training.testbed.perform import contact_travel, perform
+from palpate_training.testbed.wrench_sensor import WrenchSensor
+from palpate_training.twin.trials import RawTrial, TrialHeader
 
 Floats = npt.NDArray[np.float64]
 HEADER = TrialHeader("biotac-1", "sphere_3-5mm/00/normal", "sphere_3-5mm", "left")

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.protos.errors import ConfigError
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.kinematics import ACCURACY_M
-from palpate.training.testbed.plan import (
+from palpate.errors import ConfigError
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.kinematics import ACCURACY_M
+from palpate_training.testbed.plan import (
     Plan,
     Station,
     Trajectory,
@@ -24,7 +24,7 @@ from palpate.training.testbed.plan import (
     increments_of,
     make_plan,
 )
-from palpate.training.testbed.transform import rotation_matrices
+from palpate_training.testbed.transform import rotation_matrices
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.protos.errors import ConfigError
-from palpate.training.testbed.clearance import plate_holes
-from palpate.training.testbed.registration import average, frame_of, register
-from palpate.training.testbed.transform import (
+from palpate.errors import ConfigError
+from palpate_training.testbed.clearance import plate_holes
+from palpate_training.testbed.registration import average, frame_of, register
+from palpate_training.testbed.transform import (
     Transform,
     facing,
     quaternions,

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.plan import Plan
-from palpate.training.testbed.trajectory_file import read_trajectories, write_trajectories
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.plan import Plan
+from palpate_training.testbed.trajectory_file import read_trajectories, write_trajectories
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from palpate.training.dataset import FeatureDataset
-from palpate.training.models import Mlp, predict
-from palpate.training.splits import by_group
-from palpate.training.train import TrainConfig, drift, train
+from palpate_training.dataset import FeatureDataset
+from palpate_training.models import Mlp, predict
+from palpate_training.splits import by_group
+from palpate_training.train import TrainConfig, drift, train
 
 MakeData = Callable[..., FeatureDataset]
 QUICK = TrainConfig(widths=(32, 32), epochs=30, batch_rows=64)

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.training.cli import data_app, train_app
-from palpate.training.dataset import FeatureDataset
-from palpate.training.force_real import (
+from palpate_training.cli import data_app, train_app
+from palpate_training.dataset import FeatureDataset
+from palpate_training.force_real import (
     experiment_count,
     run_force_real,
     write_report,
 )
-from palpate.training.ingest_lasa import ingest_lasa
-from palpate.training.schema import write_dataset
-from palpate.training.splits import cut_into_blocks
-from palpate.training.train import TrainConfig
+from palpate_training.ingest_lasa import ingest_lasa
+from palpate_training.schema import write_dataset
+from palpate_training.splits import cut_into_blocks
+from palpate_training.train import TrainConfig
 
 MakeData = Callable[..., FeatureDataset]
 MAGNITUDE, ANGLE = "force_magnitude_median_n", "force_angle_median_rad"

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.dataset import Provenance
-from palpate.training.twin.assemble import assemble_experiment, assemble_mixed
-from palpate.training.twin.content import ExperimentDataset, MixedDataset
-from palpate.training.twin.features import features
-from palpate.training.twin.hdf5 import content_sha256
-from palpate.training.twin.subset import subset
-from palpate.training.twin.trials import MixedRows, TrialRows
+from palpate.errors import DatasetError
+from palpate_training.dataset import Provenance
+from palpate_training.twin.assemble import assemble_experiment, assemble_mixed
+from palpate_training.twin.content import ExperimentDataset, MixedDataset
+from palpate_training.twin.features import features
+from palpate_training.twin.hdf5 import content_sha256
+from palpate_training.twin.subset import subset
+from palpate_training.twin.trials import MixedRows, TrialRows
 
 MakeRows = Callable[..., TrialRows]
 

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.twin.basis import Blocks, encode, fit_basis, loss
-from palpate.training.twin.content import FloatArray
+from palpate.errors import DatasetError
+from palpate_training.twin.basis import Blocks, encode, fit_basis, loss
+from palpate_training.twin.content import FloatArray
 
 NODES = 30
 

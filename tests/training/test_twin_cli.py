@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.training.cli import data_app
-from palpate.training.dataset import FeatureDataset
-from palpate.training.schema import open_dataset, write_dataset
-from palpate.training.twin.content import ExperimentDataset, MixedDataset
-from palpate.training.twin.export import export_published
-from palpate.training.twin.hdf5 import content_sha256, write_experiment, write_mixed
-from palpate.training.twin.published import read_published
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli import data_app
+from palpate_training.dataset import FeatureDataset
+from palpate_training.schema import open_dataset, write_dataset
+from palpate_training.twin.content import ExperimentDataset, MixedDataset
+from palpate_training.twin.export import export_published
+from palpate_training.twin.hdf5 import content_sha256, write_experiment, write_mixed
+from palpate_training.twin.published import read_published
 
 
 def _run(*words: object) -> Result:

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.twin.content import EXPERIMENT_ARRAYS, ExperimentDataset, MixedDataset
-from palpate.training.twin.hdf5 import (
+from palpate.errors import DatasetError
+from palpate_training.twin.content import EXPERIMENT_ARRAYS, ExperimentDataset, MixedDataset
+from palpate_training.twin.hdf5 import (
     MIXED_COLUMNS,
     content_sha256,
     read_experiment,

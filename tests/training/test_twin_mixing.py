@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.twin.mixing import common_trajectories, interpolate, mix
-from palpate.training.twin.trials import SimulatedTrial, TrialHeader, TrialRows
+from palpate.errors import DatasetError
+from palpate_training.twin.mixing import common_trajectories, interpolate, mix
+from palpate_training.twin.trials import SimulatedTrial, TrialHeader, TrialRows
 
 HEADER = TrialHeader("biotac-1", "sphere/03/normal", "sphere", "left")
 

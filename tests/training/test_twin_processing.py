@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.protos.errors import DatasetError
-from palpate.training.twin.processing import (
+from palpate.errors import DatasetError
+from palpate_training.twin.processing import (
     above_threshold,
     filter_force,
     from_half_newton,
@@ -20,8 +20,8 @@ from palpate.training.twin.processing import (
     process_all,
     tare,
 )
-from palpate.training.twin.threshold import Floats, crossing, from_threshold, onset
-from palpate.training.twin.trials import RawTrial, TrialHeader, TrialRows
+from palpate_training.twin.threshold import Floats, crossing, from_threshold, onset
+from palpate_training.twin.trials import RawTrial, TrialHeader, TrialRows
 
 HEADER = TrialHeader("biotac-1", "sphere/03/normal", "sphere", "left")
 DWELL = 50

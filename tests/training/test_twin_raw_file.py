@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.dataset import Provenance
-from palpate.training.twin.processing import process
-from palpate.training.twin.raw_file import COLUMNS, read_contents, read_trials, write_trials
-from palpate.training.twin.trials import RawTrial, TrialHeader
+from palpate.errors import DatasetError
+from palpate_training.dataset import Provenance
+from palpate_training.twin.processing import process
+from palpate_training.twin.raw_file import COLUMNS, read_contents, read_trials, write_trials
+from palpate_training.twin.trials import RawTrial, TrialHeader
 
 RATE_HZ = 20
 SAMPLES = 20

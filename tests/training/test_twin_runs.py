@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.twin.runs import Floats, Run, Texts, find_runs, name_trajectories
+from palpate.errors import DatasetError
+from palpate_training.twin.runs import Floats, Run, Texts, find_runs, name_trajectories
 
 
 def _rows(force: list[float], z_mm: list[float], kinds: str) -> list[tuple[int, int]]:

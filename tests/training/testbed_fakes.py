@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos.messages import (
+from palpate.bus.topics import ELECTRODES, POSE, WRENCH, sensor_key
+from palpate.files.record import RecordWriter
+from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,
     Origin,
@@ -17,14 +19,12 @@ from palpate.protos.messages import (
     Stamp,
     WrenchFrame,
 )
-from palpate.protos.record import RecordWriter
-from palpate.protos.topics import ELECTRODES, POSE, WRENCH, sensor_key
-from palpate.training.testbed import arm as stand_in
-from palpate.training.testbed.kinematics import Arm
-from palpate.training.testbed.perform import perform
-from palpate.training.testbed.plan import Plan, Station, Trajectory, assign_arm, make_plan
-from palpate.training.testbed.trajectory_file import write_trajectories
-from palpate.training.twin.trials import RawTrial, TrialHeader
+from palpate_training.testbed import arm as stand_in
+from palpate_training.testbed.kinematics import Arm
+from palpate_training.testbed.perform import perform
+from palpate_training.testbed.plan import Plan, Station, Trajectory, assign_arm, make_plan
+from palpate_training.testbed.trajectory_file import write_trajectories
+from palpate_training.twin.trials import RawTrial, TrialHeader
 
 START_NS = 1_700_000_000_000_000_000
 BOOT_NS = START_NS - 7_000_000_000_000  # monotonic clock = wall clock minus this

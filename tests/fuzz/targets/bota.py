@@ -7,14 +7,14 @@ import struct
 
 from tests.fuzz.streams import all_counted, pieces, plain_search, same_in_pieces, sealed
 
-from palpate.gateway.protocols.bota import (
+from palpate_gateway.protocols.bota import (
     FRAME_BYTES,
     BotaDecoder,
     TextWait,
     find_ack,
     status_names,
 )
-from palpate.gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.checksums import crc16_x25
 
 _GOOD = bytes.fromhex(
     "AA 0000 0000803F 00000040 00004040 CDCCCC3D CDCC4C3E 9A99993E 40E20100 0000CC41 7235"

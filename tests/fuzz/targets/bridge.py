@@ -7,7 +7,7 @@ from collections import defaultdict
 
 from tests.fuzz.streams import all_counted, same_in_pieces, sealed
 
-from palpate.gateway.protocols.bridge import (
+from palpate_gateway.protocols.bridge import (
     SLOTS_MAX,
     Body,
     BridgeDecoder,
@@ -20,8 +20,8 @@ from palpate.gateway.protocols.bridge import (
     decode_body,
     encode,
 )
-from palpate.gateway.protocols.checksums import crc16_x25
-from palpate.gateway.protocols.cobs import PacketSplitter, decode, encode_packet
+from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.cobs import PacketSplitter, decode, encode_packet
 
 _LONGEST = 12 + 2 + SLOTS_MAX * 11
 _HELLO = Hello(4400, 44, (Finger("BT1", "0602"),))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tests.fuzz.streams import parts
 
-from palpate.gateway.protocols.can_slots import (
+from palpate_gateway.protocols.can_slots import (
     FINGERS_MAX,
     SEQUENCES,
     CanSlotDecoder,
@@ -13,8 +13,8 @@ from palpate.gateway.protocols.can_slots import (
     learn_order,
     payload_rows,
 )
-from palpate.gateway.protocols.channels import CHANNEL_NAMES
-from palpate.gateway.protocols.spi import channel_of_command, decode_word
+from palpate_gateway.protocols.channels import CHANNEL_NAMES
+from palpate_gateway.protocols.spi import channel_of_command, decode_word
 
 
 def check(data: bytes) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from tests.fuzz.streams import pieces
 
-from palpate.gateway.biotac.frames import FrameAssembler
-from palpate.gateway.biotac.slots import SlotBlock
-from palpate.gateway.protocols import channels as ch
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.biotac.slots import SlotBlock
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading
 
 _PERIOD_S = 1.0 / 4400.0
 _SLOTS_MAX = 400

@@ -7,7 +7,7 @@ from typing import cast
 
 from tests.fuzz.streams import all_counted, same_in_pieces
 
-from palpate.gateway.protocols.kms40 import (
+from palpate_gateway.protocols.kms40 import (
     LINE_MAX,
     ForceLine,
     KmsDecoder,

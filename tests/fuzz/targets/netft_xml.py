@@ -6,8 +6,8 @@ import math
 
 from tests.fuzz.streams import has_remedy
 
-from palpate.gateway.protocols.netft_xml import parse_netft_xml
-from palpate.protos.errors import DeviceError
+from palpate.errors import DeviceError
+from palpate_gateway.protocols.netft_xml import parse_netft_xml
 
 
 def check(data: bytes) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from tests.fuzz.streams import all_counted, plain_search, same_in_pieces, sealed
 
-from palpate.gateway.protocols.checksums import sum16
-from palpate.gateway.protocols.optoforce import (
+from palpate_gateway.protocols.checksums import sum16
+from palpate_gateway.protocols.optoforce import (
     OptoForceData,
     OptoForceDecoder,
     OptoForceReply,

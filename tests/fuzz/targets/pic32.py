@@ -6,7 +6,8 @@ import struct
 
 from tests.fuzz.streams import all_counted, same_in_pieces
 
-from palpate.gateway.protocols.pic32 import (
+from palpate.messages import COUNTS_MAX
+from palpate_gateway.protocols.pic32 import (
     LARGEST_LOAD_G,
     RECORD_BYTES,
     SAMPLE_BYTES,
@@ -16,7 +17,6 @@ from palpate.gateway.protocols.pic32 import (
     decode_load,
     decode_sample,
 )
-from palpate.protos.messages import COUNTS_MAX
 
 _RECORD = struct.Struct("<I23Hii")
 

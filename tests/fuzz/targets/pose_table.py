@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from tests.fuzz.streams import has_remedy
 
-from palpate.gateway.pose.file import PoseFile, PoseFileOptions
-from palpate.gateway.readings import PoseReading
-from palpate.protos.config import parse_config
-from palpate.protos.errors import RecordingError
+from palpate.config import parse_config
+from palpate.errors import RecordingError
+from palpate_gateway.pose.file import PoseFile, PoseFileOptions
+from palpate_gateway.readings import PoseReading
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-poses-")
 _PATH = Path(_FOLDER.name, "a.csv")

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 from tests.fuzz.streams import parts
 
-from palpate.gateway.protocols.rdt import (
+from palpate_gateway.protocols.rdt import (
     BELIEVABLE_LOSS,
     RECORD_BYTES,
     U32,
@@ -17,7 +17,7 @@ from palpate.gateway.protocols.rdt import (
     RdtSequence,
     unwrap,
 )
-from palpate.gateway.protocols.rdt_profiles import PROFILES, hex_sensor_number
+from palpate_gateway.protocols.rdt_profiles import PROFILES, hex_sensor_number
 
 _RECORD = struct.Struct(">3I6i")
 _SCALE = RdtScale(1e6, 1e6)

@@ -9,15 +9,15 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 from tests.fuzz.streams import has_remedy
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Pipeline
-from palpate.gateway.readings import RecordedMessage
-from palpate.gateway.recordings.record import Record, RecordOptions
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.protos.codec import ELECTRODE_FRAME
-from palpate.protos.errors import ConfigError, RecordingError
-from palpate.protos.record import descriptor_set, summarise
-from palpate.protos.topics import TOPICS, sensor_key
+from palpate.bus.topics import TOPICS, sensor_key
+from palpate.codec import ELECTRODE_FRAME
+from palpate.errors import ConfigError, RecordingError
+from palpate.files.record import descriptor_set, summarise
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Pipeline
+from palpate_gateway.readings import RecordedMessage
+from palpate_gateway.recordings.record import Record, RecordOptions
+from palpate_gateway.timing.clock_map import FileClock
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-record-")
 _PATH = Path(_FOLDER.name, "a.mcap")

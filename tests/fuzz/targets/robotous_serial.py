@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.fuzz.streams import all_counted, plain_search, same_in_pieces, sealed
 
-from palpate.gateway.protocols.robotous import (
+from palpate_gateway.protocols.robotous import (
     REPLY_BYTES,
     REQUEST_BYTES,
     RobotousData,
@@ -15,7 +15,7 @@ from palpate.gateway.protocols.robotous import (
     decode,
     overloaded_axes,
 )
-from palpate.gateway.protocols.robotous_framing import RobotousSerialDecoder, serial_frame
+from palpate_gateway.protocols.robotous_framing import RobotousSerialDecoder, serial_frame
 
 
 def _is_good(frame: bytes) -> bool:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from tests.fuzz.streams import pieces
 
-from palpate.gateway.protocols.can_slots import SEQUENCES
-from palpate.gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.protocols.can_slots import SEQUENCES
+from palpate_gateway.protocols.slot_clock import SlotClock
 
 RATE_HZ = 4400.0
 _PERIOD_S = 1.0 / RATE_HZ

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.gateway.protocols.spi import (
+from palpate.messages import COUNTS_MAX
+from palpate_gateway.protocols.spi import (
     CHANNEL_MAX,
     ERROR_WORDS,
     WordKind,
@@ -15,7 +16,6 @@ from palpate.gateway.protocols.spi import (
     encode_word,
     printable_prefix,
 )
-from palpate.protos.messages import COUNTS_MAX
 
 
 def check(data: bytes) -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 from tests.fuzz.streams import has_remedy
 from tests.fuzz.targets import text_log_rows
 
-from palpate.gateway.protocols.channels import FIRST_ELECTRODE, SLOTS_PER_FRAME
-from palpate.gateway.readings import ElectrodeReading
-from palpate.gateway.recordings.text_log import TextLog, TextLogOptions
-from palpate.protos.errors import ConfigError, RecordingError
-from palpate.protos.messages import COUNTS_MAX
+from palpate.errors import ConfigError, RecordingError
+from palpate.messages import COUNTS_MAX
+from palpate_gateway.protocols.channels import FIRST_ELECTRODE, SLOTS_PER_FRAME
+from palpate_gateway.readings import ElectrodeReading
+from palpate_gateway.recordings.text_log import TextLog, TextLogOptions
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-text-log-")
 _PATH = Path(_FOLDER.name, "a.log")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from tests.fuzz.streams import has_remedy
 
-from palpate.gateway.protocols.channels import CHANNEL_NAMES
-from palpate.gateway.recordings.text_log_header import split_header
-from palpate.gateway.recordings.text_log_rows import Rows, count_columns, parse_rows
-from palpate.protos.errors import RecordingError
-from palpate.protos.messages import COUNTS_MAX
+from palpate.errors import RecordingError
+from palpate.messages import COUNTS_MAX
+from palpate_gateway.protocols.channels import CHANNEL_NAMES
+from palpate_gateway.recordings.text_log_header import split_header
+from palpate_gateway.recordings.text_log_rows import Rows, count_columns, parse_rows
 
 NAME = "a.log"
 

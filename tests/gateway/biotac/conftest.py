@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.emulators.biotac_can import BiotacCanEmulator
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from tests.gateway.reading_devices import PATIENCE_S, open_again, read_frames
 
-from palpate.gateway.biotac.bridge import BiotacBridge, BridgeOptions
-from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
-from palpate.gateway.emulators.biotac_can import idle_counts
-from palpate.gateway.protocols.channels import ALL_VALID
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.config import parse_config
+from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.biotac.bridge import BiotacBridge, BridgeOptions
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
+from palpate_gateway.emulators.biotac_can import idle_counts
+from palpate_gateway.protocols.channels import ALL_VALID
+from palpate_gateway.readings import ElectrodeReading
 
 pytest.importorskip("serial")
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from tests.gateway.reading_devices import PATIENCE_S, read_frames
 
-from palpate.gateway.emulators.biotac_can import BiotacCanEmulator, idle_counts
-from palpate.gateway.protocols.channels import ALL_VALID
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.emulators.biotac_can import BiotacCanEmulator, idle_counts
+from palpate_gateway.protocols.channels import ALL_VALID
+from palpate_gateway.readings import ElectrodeReading
 
 pytest.importorskip("can")
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.gateway.biotac import conversions as conv
+from palpate_gateway.biotac import conversions as conv
 
 # Hardware reference 1.9: counts and degrees Celsius.
 CHECKED_C = {1000: 29.8, 1500: 40.3, 2000: 48.6, 2500: 55.6, 3100: 63.0}

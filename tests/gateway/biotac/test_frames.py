@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.biotac.frames import FrameAssembler
-from palpate.gateway.biotac.slots import Slot, slot_block
-from palpate.gateway.protocols import channels as ch
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.messages import BIOTAC_LAYOUT
+from palpate.messages import BIOTAC_LAYOUT
+from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.biotac.slots import Slot, slot_block
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading
 
 PERIOD_S = 1 / 4400
 

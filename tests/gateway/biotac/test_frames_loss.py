@@ -9,11 +9,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.biotac.frames import FrameAssembler
-from palpate.gateway.biotac.slots import UNKNOWN, Slot, SlotBlock, slot_block
-from palpate.gateway.protocols import channels as ch
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.biotac.slots import UNKNOWN, Slot, SlotBlock, slot_block
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading
 
 PERIOD_S = 1 / 4400
 LAYOUTS = [BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT]

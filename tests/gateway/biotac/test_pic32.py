@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from tests.gateway.reading_devices import Follower
 
-from palpate.gateway.biotac.pic32 import VALIDITY, BiotacPic32, Pic32Options
-from palpate.gateway.emulators.biotac_can import idle_counts
-from palpate.gateway.emulators.biotac_pic32 import BiotacPic32Emulator
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.config import parse_config
-from palpate.protos.errors import DeviceError
+from palpate.config import parse_config
+from palpate.errors import DeviceError
+from palpate_gateway.biotac.pic32 import VALIDITY, BiotacPic32, Pic32Options
+from palpate_gateway.emulators.biotac_can import idle_counts
+from palpate_gateway.emulators.biotac_pic32 import BiotacPic32Emulator
+from palpate_gateway.readings import ElectrodeReading
 
 pytest.importorskip("serial")
 

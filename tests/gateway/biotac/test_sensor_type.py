@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from tests.gateway.reading_devices import read_frames
 
-from palpate.gateway.biotac.sensor_type import LEARNT_FROM, agreed_type, answering_type
-from palpate.gateway.biotac.slots import Slot, SlotBlock, slot_block
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.protocols import channels as ch
-from palpate.protos.errors import ConfigError, DeviceError
-from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout, SensorType
+from palpate.errors import ConfigError, DeviceError
+from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout, SensorType
+from palpate_gateway.biotac.sensor_type import LEARNT_FROM, agreed_type, answering_type
+from palpate_gateway.biotac.slots import Slot, SlotBlock, slot_block
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.protocols import channels as ch
 
 
 def slots_of(layout: FrameLayout, *, deaf: bool = False) -> SlotBlock:

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.gateway.biotac.can_fingers import CanOptions, CanSource
-from palpate.gateway.biotac.frames import FrameAssembler
-from palpate.gateway.emulators.biotac_slots import SlotBlocks, idle_counts, round_of
-from palpate.gateway.ports.can_bus import CanBatch
-from palpate.gateway.timing.clock_map import LiveClock
-from palpate.protos.errors import DeviceTimeout
-from palpate.protos.messages import BIOTAC_LAYOUT
+from palpate.errors import DeviceTimeout
+from palpate.messages import BIOTAC_LAYOUT
+from palpate_gateway.biotac.can_fingers import CanOptions, CanSource
+from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.emulators.biotac_slots import SlotBlocks, idle_counts, round_of
+from palpate_gateway.ports.can_bus import CanBatch
+from palpate_gateway.timing.clock_map import LiveClock
 
 SLOT_S = 1.0 / 4400.0
 START_S = 100.0

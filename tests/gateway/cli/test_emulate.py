@@ -20,15 +20,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.deploy.cli import app
-from palpate.gateway.config import GatewayConfig
-from palpate.gateway.drivers import make_device
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.emulators.twin import loop_options, make_loop
-from palpate.protos.config import parse_config
+from palpate.config import parse_config
+from palpate_deploy.cli import app
+from palpate_gateway.config import GatewayConfig
+from palpate_gateway.drivers import make_device
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.twin import loop_options, make_loop
 
 PATIENCE_S = 60.0
-PALPATE = [sys.executable, "-m", "palpate.deploy"]
+PALPATE = [sys.executable, "-m", "palpate_deploy"]
 
 Emulate = Callable[..., "Program"]
 

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from palpate.deploy.cli import app
-from palpate.gateway.cli import inventory
-from palpate.gateway.drivers import driver_names
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.protos.errors import MissingExtraError
+from palpate.errors import MissingExtraError
+from palpate_deploy.cli import app
+from palpate_gateway.cli import inventory
+from palpate_gateway.drivers import driver_names
+from palpate_gateway.emulators.kms40 import Kms40Emulator
 
 PATIENCE_S = 30.0
 
@@ -181,7 +181,7 @@ def test_monitor_draws_a_table(kms40: Kms40Emulator, monkeypatch: pytest.MonkeyP
 
 def test_ctrl_c_ends_the_monitor(kms40: Kms40Emulator) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "palpate.deploy", "gateway", "monitor", *at(kms40), "--json"],
+        [sys.executable, "-m", "palpate_deploy", "gateway", "monitor", *at(kms40), "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

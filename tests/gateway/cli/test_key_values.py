@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.gateway.cli.faults import Fault, parse_faults
-from palpate.gateway.cli.key_values import (
+from palpate.errors import ConfigError
+from palpate_gateway.cli.faults import Fault, parse_faults
+from palpate_gateway.cli.key_values import (
     command_words,
     parse_key_values,
     parse_value,
     sensor_toml,
     text_keys,
 )
-from palpate.gateway.wrench.kms40 import Kms40Options
-from palpate.protos.errors import ConfigError
+from palpate_gateway.wrench.kms40 import Kms40Options
 
 plain = st.text(st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"]), max_size=20)
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.gateway.cli.reading_text import text_of, values_of
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate_gateway.cli.reading_text import text_of, values_of
+from palpate_gateway.readings import ElectrodeReading
 
 
 def reading(layout: FrameLayout, *, lost: tuple[int, ...] = ()) -> ElectrodeReading:

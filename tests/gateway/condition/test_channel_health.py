@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.condition.blocks import Blocks
-from palpate.gateway.condition.channel_health import REMEDIES, ChannelHealth, describe
-from palpate.protos.messages import FaultKind
+from palpate.messages import FaultKind
+from palpate_gateway.condition.blocks import Blocks
+from palpate_gateway.condition.channel_health import REMEDIES, ChannelHealth, describe
 
 fakes: Any = importlib.import_module("condition_fakes")
 LAYOUT = fakes.LAYOUT

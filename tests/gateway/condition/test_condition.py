@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.condition.condition import Condition, Retare
-from palpate.gateway.condition.stillness import StillLimits
-from palpate.gateway.condition.untouched import Touch
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.tare import TareCollector
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.protos.errors import DeviceError
-from palpate.protos.messages import ElectrodeFrame, FaultKind
+from palpate.errors import DeviceError
+from palpate.messages import ElectrodeFrame, FaultKind
+from palpate_gateway.condition.condition import Condition, Retare
+from palpate_gateway.condition.stillness import StillLimits
+from palpate_gateway.condition.untouched import Touch
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.tare import TareCollector
+from palpate_gateway.timing.clock_map import FileClock
 
 fakes: Any = importlib.import_module("condition_fakes")
 

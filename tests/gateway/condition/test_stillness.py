@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.condition.blocks import Block, Blocks
-from palpate.gateway.condition.stillness import (
+from palpate.messages import ElectrodeFrame, SensorType
+from palpate_gateway.condition.blocks import Block, Blocks
+from palpate_gateway.condition.stillness import (
     StillLimits,
     evidence_of,
     evidence_of_blocks,
 )
-from palpate.protos.messages import ElectrodeFrame, SensorType
 
 fakes: Any = importlib.import_module("condition_fakes")
 ALL = np.ones(19, np.bool_)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.gateway.condition.untouched import Touch, UntouchedLevel, is_drift
+from palpate_gateway.condition.untouched import Touch, UntouchedLevel, is_drift
 
 fakes: Any = importlib.import_module("condition_fakes")
 ALL = np.ones(19, np.bool_)

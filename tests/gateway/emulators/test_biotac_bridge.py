@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
-from palpate.gateway.emulators.biotac_slots import idle_counts, word
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
+from palpate_gateway.emulators.biotac_slots import idle_counts, word
 
 serial = pytest.importorskip("serial")
 wires: Any = importlib.import_module("bridge_wire")

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.emulators.biotac_pic32 import BiotacPic32Emulator
+from palpate_gateway.emulators.biotac_pic32 import BiotacPic32Emulator
 
 serial = pytest.importorskip("serial")
 

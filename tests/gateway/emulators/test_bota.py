@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.emulators.bota import SINCS, Bota, crc16_x25
+from palpate_gateway.emulators.bota import SINCS, Bota, crc16_x25
 
 serial = pytest.importorskip("serial")
 

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import pytest
 
-from palpate.gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.kms40 import Kms40Emulator
 
 WRENCH = (1.5, -0.25, 1.0, 0.02, -0.01, 0.005)
 LINE = b"F={1.5000,-0.2500,1.0000,0.0200,-0.0100,0.0050}"

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.emulators.rdt import LATCHED, RdtEmulator, record
+from palpate_gateway.emulators.rdt import LATCHED, RdtEmulator, record
 
 START = bytes.fromhex("1234000200000000")
 BIAS = bytes.fromhex("1234004200000000")

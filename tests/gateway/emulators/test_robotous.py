@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from palpate.gateway.emulators.robotous import RobotousCan, RobotousSerial
+from palpate_gateway.emulators.robotous import RobotousCan, RobotousSerial
 
 serial = pytest.importorskip("serial")
 can = pytest.importorskip("can")

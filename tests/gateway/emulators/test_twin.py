@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.emulators.biotac_slots import CHANNELS, SlotBlocks, idle_counts, round_of
-from palpate.gateway.emulators.twin import (
+from palpate.errors import ConfigError
+from palpate_gateway.drivers import make_device
+from palpate_gateway.emulators.biotac_slots import CHANNELS, SlotBlocks, idle_counts, round_of
+from palpate_gateway.emulators.twin import (
     RATE_HZ,
     Loop,
     TwinCounts,
@@ -21,8 +22,7 @@ from palpate.gateway.emulators.twin import (
     loop_options,
     make_loop,
 )
-from palpate.gateway.readings import ElectrodeReading, WrenchReading
-from palpate.protos.errors import ConfigError
+from palpate_gateway.readings import ElectrodeReading, WrenchReading
 
 PAC = CHANNELS - 1
 
@@ -105,7 +105,7 @@ def test_another_process_plays_the_same_scene(loop: Loop) -> None:
     walls = [time.time() + 0.37 * k for k in range(60)]
     program = (
         "import json, sys, time\n"
-        "from palpate.gateway.emulators.twin import TwinWrench, loop_options, make_loop\n"
+        "from palpate_gateway.emulators.twin import TwinWrench, loop_options, make_loop\n"
         "felt = TwinWrench(make_loop(loop_options(1, seed=3)))\n"
         "ahead_s = time.time() - time.monotonic()\n"
         "print(json.dumps([felt(wall - ahead_s) for wall in json.loads(sys.argv[1])]))\n"

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from palpate.gateway.emulators.bota import Bota, crc16_x25
-from palpate.gateway.emulators.emulator import Emulator, HostTimed, no_load, slow_press
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.emulators.rdt import RdtEmulator
-from palpate.gateway.emulators.robotous import RobotousCan, RobotousSerial
+from palpate_gateway.emulators.bota import Bota, crc16_x25
+from palpate_gateway.emulators.emulator import Emulator, HostTimed, no_load, slow_press
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.rdt import RdtEmulator
+from palpate_gateway.emulators.robotous import RobotousCan, RobotousSerial
 
 serial = pytest.importorskip("serial")
 can = pytest.importorskip("can")

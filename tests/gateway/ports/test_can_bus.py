@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from palpate.gateway.ports.can_bus import CanBus
-from palpate.gateway.ports.can_frames import BUS_OFF
-from palpate.gateway.ports.datagrams import BATCH
-from palpate.protos.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.ports.can_bus import CanBus
+from palpate_gateway.ports.can_frames import BUS_OFF
+from palpate_gateway.ports.datagrams import BATCH
 
 can = pytest.importorskip("can")
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.gateway.ports.can_frames import (
+from palpate_gateway.ports.can_frames import (
     BUS_OFF,
     NOTHING,
     CanFrame,
@@ -23,7 +23,7 @@ from palpate.gateway.ports.can_frames import (
     MulticastReader,
     from_socketcan,
 )
-from palpate.gateway.ports.datagrams import (
+from palpate_gateway.ports.datagrams import (
     BATCH,
     LARGEST,
     NO_STAMP,

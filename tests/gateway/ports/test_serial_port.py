@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from palpate.gateway.ports.serial_port import SerialPort, settle
-from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.ports.serial_port import SerialPort, settle
 
 pytest.importorskip("serial")
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from palpate.gateway.ports.sockets import TcpPort, UdpPort
-from palpate.protos.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.ports.sockets import TcpPort, UdpPort
 
 
 @pytest.fixture

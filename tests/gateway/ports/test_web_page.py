@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from palpate.gateway.emulators.web_page import WebPage
-from palpate.gateway.ports.web_page import read_page
-from palpate.protos.errors import DeviceError
+from palpate.errors import DeviceError
+from palpate_gateway.emulators.web_page import WebPage
+from palpate_gateway.ports.web_page import read_page
 
 
 @contextmanager

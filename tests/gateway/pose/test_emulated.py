@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.deploy.cli import app
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.emulators.robot import (
+from palpate.errors import DeviceLost, DeviceTimeout
+from palpate.messages import Pose
+from palpate_deploy.cli import app
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.emulators.robot import (
     BASE_SENSOR,
     FLANGE_INDENTER,
     RobotEmulator,
     slow_approach,
 )
-from palpate.gateway.emulators.twin import RATE_HZ, loop_options
-from palpate.gateway.emulators.twin_tip import TipLoop, TwinTip, tip_loop
-from palpate.gateway.readings import PoseReading
-from palpate.protos.errors import DeviceLost, DeviceTimeout
-from palpate.protos.messages import Pose
+from palpate_gateway.emulators.twin import RATE_HZ, loop_options
+from palpate_gateway.emulators.twin_tip import TipLoop, TwinTip, tip_loop
+from palpate_gateway.readings import PoseReading
 
 fakes: Any = importlib.import_module("pose_fakes")
 PATIENCE_S: float = fakes.PATIENCE_S

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.readings import PoseReading, Reading
-from palpate.protos.errors import ConfigError, RecordingError
-from palpate.protos.messages import Origin
+from palpate.errors import ConfigError, RecordingError
+from palpate.messages import Origin
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import PoseReading, Reading
 
 fakes: Any = importlib.import_module("pose_fakes")
 COUNT = 150

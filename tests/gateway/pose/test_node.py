@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway import node
-from palpate.gateway.config import GatewayConfig
-from palpate.protos import clock
-from palpate.protos.client import Client
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError
-from palpate.protos.messages import Origin, ServiceState
-from palpate.protos.robot_poses import RobotPosePublisher
-from palpate.protos.session import Delivery
-from palpate.protos.topics import POSE, ROBOT_POSE, TARE
+from palpate import clock
+from palpate.bus import Delivery
+from palpate.bus.topics import POSE, ROBOT_POSE, TARE
+from palpate.client import Client
+from palpate.client.robot_poses import RobotPosePublisher
+from palpate.config import parse_config
+from palpate.errors import ConfigError
+from palpate.messages import Origin, ServiceState
+from palpate_gateway import node
+from palpate_gateway.config import GatewayConfig
 
 fakes: Any = importlib.import_module("pose_fakes")
 PATIENCE_S: float = fakes.PATIENCE_S

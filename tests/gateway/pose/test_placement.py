@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from palpate.gateway.pose.placement import Placement, PlacementOptions
-from palpate.gateway.pose.rigid import compose, inverse
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError
-from palpate.protos.messages import Pose
+from palpate.config import parse_config
+from palpate.errors import ConfigError
+from palpate.messages import Pose
+from palpate_gateway.pose.placement import Placement, PlacementOptions
+from palpate_gateway.pose.rigid import compose, inverse
 
 fakes: Any = importlib.import_module("pose_fakes")
 matrix, poses, NEAR = fakes.matrix, fakes.poses, fakes.NEAR

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.readings import PoseReading
-from palpate.protos.errors import ConfigError, RecordingError
-from palpate.protos.messages import RobotPoseFrame
-from palpate.protos.record import RecordWriter
-from palpate.protos.topics import ROBOT_POSE, sensor_key
+from palpate.bus.topics import ROBOT_POSE, sensor_key
+from palpate.errors import ConfigError, RecordingError
+from palpate.files.record import RecordWriter
+from palpate.messages import RobotPoseFrame
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import PoseReading
 
 fakes: Any = importlib.import_module("pose_fakes")
 WALL_NS = 1_700_000_000_000_000_000

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from palpate.gateway.pose.rigid import compose, inverse, is_unit
-from palpate.protos.messages import Pose
+from palpate.messages import Pose
+from palpate_gateway.pose.rigid import compose, inverse, is_unit
 
 fakes: Any = importlib.import_module("pose_fakes")
 matrix, poses = fakes.matrix, fakes.poses

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.device import BusDevice
-from palpate.gateway.drivers import make_device
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig
-from palpate.protos.errors import ConfigError, DeviceLost, DeviceTimeout
-from palpate.protos.messages import Origin
-from palpate.protos.session import Publisher, Session
-from palpate.protos.topics import ROBOT_POSE
+from palpate.bus import Publisher, Session
+from palpate.bus.topics import ROBOT_POSE
+from palpate.client import Client
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, DeviceLost, DeviceTimeout
+from palpate.messages import Origin
 from palpate.v1 import robot_pb2
+from palpate_gateway.device import BusDevice
+from palpate_gateway.drivers import make_device
 
 fakes: Any = importlib.import_module("pose_fakes")
 PATIENCE_S: float = fakes.PATIENCE_S

@@ -6,8 +6,8 @@ from itertools import count
 
 import pytest
 
-from palpate.gateway.pose.track import PoseTrack, Verdict
-from palpate.protos.messages import Pose, RobotPoseFrame
+from palpate.messages import Pose, RobotPoseFrame
+from palpate_gateway.pose.track import PoseTrack, Verdict
 
 HERE = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 NEW, DROPPED, RESTARTED = Verdict.NEW, Verdict.DROPPED, Verdict.RESTARTED

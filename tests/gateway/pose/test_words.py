@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.deploy.cli import app
-from palpate.gateway.cli.probe import device_of
-from palpate.gateway.cli.reading_text import text_of, values_of
-from palpate.gateway.readings import PoseReading
-from palpate.protos.client import Client
-from palpate.protos.config import LinkConfig
-from palpate.protos.session import Session
-from palpate.protos.topics import ROBOT_POSE
+from palpate.bus import Session
+from palpate.bus.topics import ROBOT_POSE
+from palpate.client import Client
+from palpate.config import LinkConfig
+from palpate_deploy.cli import app
+from palpate_gateway.cli.probe import device_of
+from palpate_gateway.cli.reading_text import text_of, values_of
+from palpate_gateway.readings import PoseReading
 
 fakes: Any = importlib.import_module("pose_fakes")
 PATIENCE_S: float = fakes.PATIENCE_S
@@ -116,7 +116,7 @@ def test_the_example_tells_poses(
     (command,) = re.findall(r"palpate gateway probe (.*)", text)
     driver, *options = shlex.split(command)
     ours = functools.partial(Client, link.connect[0], timeout_s=PATIENCE_S)
-    monkeypatch.setattr("palpate.protos.client.Client", ours)
+    monkeypatch.setattr("palpate.client.Client", ours)
     monkeypatch.setattr(sys, "argv", [str(example), "1.5"])
     with device_of(driver, [*options, f"connect={link.connect[0]}"]) as device:
         player = threading.Thread(
@@ -139,7 +139,7 @@ def test_the_example_without_a_station_says_what_to_do(
     root: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nowhere = functools.partial(Client, f"tcp/127.0.0.1:{free_port}", timeout_s=0.2)
-    monkeypatch.setattr("palpate.protos.client.Client", nowhere)
+    monkeypatch.setattr("palpate.client.Client", nowhere)
     monkeypatch.setattr(sys, "argv", ["robot_pose.py"])
     with pytest.raises(SystemExit, match="palpate up"):
         runpy.run_path(str(root / "docs" / "examples" / "robot_pose.py"), run_name="__main__")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import bota
-from palpate.gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols import bota
+from palpate_gateway.protocols.checksums import crc16_x25
 
 # The vector of the hardware reference, section 3.6.
 VECTOR = bytes.fromhex(

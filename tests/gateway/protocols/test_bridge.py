@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import spi
-from palpate.gateway.protocols.bridge import (
+from palpate_gateway.protocols import spi
+from palpate_gateway.protocols.bridge import (
     Body,
     BridgeDecoder,
     BridgeRecord,
@@ -21,10 +21,10 @@ from palpate.gateway.protocols.bridge import (
     decode_body,
     encode,
 )
-from palpate.gateway.protocols.can_slots import SEQUENCES, SlotDecoder, payload_rows
-from palpate.gateway.protocols.checksums import crc16_x25
-from palpate.gateway.protocols.cobs import decode, encode_packet
-from palpate.gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.protocols.can_slots import SEQUENCES, SlotDecoder, payload_rows
+from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.cobs import decode, encode_packet
+from palpate_gateway.protocols.slot_clock import SlotClock
 
 HELLO = Hello(4400, 44, (Finger("BT00000000000123", "0205"), Finger("", "")))
 STATUS = Status((1, 2, 3), 4, 5)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.gateway.protocols.bridge import (
+from palpate_gateway.protocols.bridge import (
     Body,
     BridgeDecoder,
     Finger,

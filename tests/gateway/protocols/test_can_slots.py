@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import channels as ch
-from palpate.gateway.protocols import spi
-from palpate.gateway.protocols.can_slots import (
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.protocols import spi
+from palpate_gateway.protocols.can_slots import (
     CanSlotDecoder,
     SlotDecoder,
     learn_order,
     payload_rows,
 )
-from palpate.gateway.protocols.spi import WordKind
+from palpate_gateway.protocols.spi import WordKind
 
 # Vectors of the hardware reference, 2.1.
 PAC_2040 = bytes.fromhex("80 7F C1 7F C1 7F C1")

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols.checksums import crc16_x25, sum8, sum16
-from palpate.gateway.protocols.resync import FrameFinder
+from palpate_gateway.protocols.checksums import crc16_x25, sum8, sum16
+from palpate_gateway.protocols.resync import FrameFinder
 
 
 def bitwise_crc(data: bytes) -> int:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import kms40_requests as ask
-from palpate.gateway.protocols.kms40 import (
+from palpate_gateway.protocols import kms40_requests as ask
+from palpate_gateway.protocols.kms40 import (
     AXES,
     FAULTS,
     LINE_MAX,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
-from palpate.protos.errors import DeviceError
+from palpate.errors import DeviceError
+from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
 
 TAGS = {
     "prodname": "Net F/T",

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import optoforce
-from palpate.gateway.protocols.checksums import sum16
-from palpate.gateway.protocols.optoforce import OptoForceData, OptoForceDecoder, OptoForceReply
+from palpate_gateway.protocols import optoforce
+from palpate_gateway.protocols.checksums import sum16
+from palpate_gateway.protocols.optoforce import OptoForceData, OptoForceDecoder, OptoForceReply
 
 # Every vector of the hardware reference, section 3.4.
 CONFIGURE = bytes.fromhex("AA 00 32 03 0A 04 FF 01 EC")

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.protocols import bota, kms40, kms40_requests, optoforce, pic32, robotous
-from palpate.gateway.protocols.checksums import crc16_x25
-from palpate.gateway.protocols.rdt import RdtDecoder, RdtScale
-from palpate.gateway.protocols.rdt_profiles import HEX, NET_FT, hex_filter_request
-from palpate.gateway.protocols.robotous_framing import RobotousSerialDecoder, serial_frame
-from palpate.gateway.protocols.spi import WordKind, channel_of_command, decode_word
+from palpate_gateway.protocols import bota, kms40, kms40_requests, optoforce, pic32, robotous
+from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.rdt import RdtDecoder, RdtScale
+from palpate_gateway.protocols.rdt_profiles import HEX, NET_FT, hex_filter_request
+from palpate_gateway.protocols.robotous_framing import RobotousSerialDecoder, serial_frame
+from palpate_gateway.protocols.spi import WordKind, channel_of_command, decode_word
 
 SENT: dict[str, tuple[Callable[[], bytes], str]] = {
     "3.1 identity": (

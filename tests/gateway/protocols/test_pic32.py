@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import pic32
-from palpate.gateway.protocols.pic32 import Layout, Pic32Decoder, Pic32Record, Pic32Sample
+from palpate_gateway.protocols import pic32
+from palpate_gateway.protocols.pic32 import Layout, Pic32Decoder, Pic32Record, Pic32Sample
 
 SAMPLE = Pic32Sample(2040, 2650, 2050, 1100, tuple(range(3001, 3020)))
 END = bytes(58)

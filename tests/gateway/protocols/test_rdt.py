@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols.rdt import (
+from palpate_gateway.protocols.rdt import (
     BELIEVABLE_LOSS,
     LATE_WINDOW,
     U32,
@@ -18,7 +18,7 @@ from palpate.gateway.protocols.rdt import (
     encode_request,
     unwrap,
 )
-from palpate.gateway.protocols.rdt_profiles import (
+from palpate_gateway.protocols.rdt_profiles import (
     AXIA,
     HEX,
     NET_FT,

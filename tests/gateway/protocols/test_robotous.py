@@ -6,8 +6,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import robotous as rft
-from palpate.gateway.protocols import robotous_framing as framing
+from palpate_gateway.protocols import robotous as rft
+from palpate_gateway.protocols import robotous_framing as framing
 
 # Every vector of the hardware reference, section 3.5.
 REQUESTS = {

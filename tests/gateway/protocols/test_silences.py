@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.gateway.protocols.can_slots import SEQUENCES
-from palpate.gateway.protocols.places import Place
-from palpate.gateway.protocols.slot_clock import SlotClock
-from palpate.gateway.recordings.text_log import TextLogReader
+from palpate_gateway.protocols.can_slots import SEQUENCES
+from palpate_gateway.protocols.places import Place
+from palpate_gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.recordings.text_log import TextLogReader
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]
 PERIOD_S = 1 / 4400

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.gateway.biotac.frames import FrameAssembler
-from palpate.gateway.biotac.slots import Slot, slot_block
-from palpate.gateway.protocols import channels as ch
-from palpate.gateway.protocols.can_slots import SEQUENCES, SlotOrder
-from palpate.gateway.protocols.places import Place
-from palpate.gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.biotac.slots import Slot, slot_block
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.protocols.can_slots import SEQUENCES, SlotOrder
+from palpate_gateway.protocols.places import Place
+from palpate_gateway.protocols.slot_clock import SlotClock
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]
 PERIOD_S = 1 / 4400

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.gateway.protocols import channels, spi
-from palpate.protos.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate_gateway.protocols import channels, spi
 
 # Every vector of the hardware reference, sections 1.3 and 1.4.
 COMMANDS = {

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.readings import ElectrodeReading
-from palpate.protos.errors import ConfigError
+from palpate.errors import ConfigError
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import ElectrodeReading
 
 FRAMES, PORTS, SLOTS = 300, 3, 44
 CHANNELS = [channel for one in (*range(17, 36), 1, 2, 3) for channel in (one, 0)]
@@ -92,5 +92,5 @@ def test_a_row_that_ends_with_a_space_takes_the_fast_way(
     def slow(*_: object) -> Callable[..., Any]:
         raise AssertionError("line by line")
 
-    monkeypatch.setattr("palpate.gateway.recordings.text_log_rows._parse_slow", slow)
+    monkeypatch.setattr("palpate_gateway.recordings.text_log_rows._parse_slow", slow)
     assert len(replay(path, 2)[0]) == FRAMES

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.readings import RecordedMessage
-from palpate.gateway.recordings.record import recorded_sensors
-from palpate.protos.errors import ConfigError, RecordingError
-from palpate.protos.record import RecordWriter, read_record
-from palpate.protos.topics import FEATURES, sensor_key
+from palpate.bus.topics import FEATURES, sensor_key
+from palpate.errors import ConfigError, RecordingError
+from palpate.files.record import RecordWriter, read_record
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import RecordedMessage
+from palpate_gateway.recordings.record import recorded_sensors
 
 
 def messages(path: Path, sensor: str = "") -> list[RecordedMessage]:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.protocols import channels as ch
-from palpate.gateway.readings import ElectrodeReading
-from palpate.gateway.recordings.text_log import TextLog, TextLogOptions, TextLogReader
-from palpate.protos.errors import ConfigError, PalpateError, RecordingError
-from palpate.protos.messages import SensorType
+from palpate.errors import ConfigError, PalpateError, RecordingError
+from palpate.messages import SensorType
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading
+from palpate_gateway.recordings.text_log import TextLog, TextLogOptions, TextLogReader
 
 
 def replay(

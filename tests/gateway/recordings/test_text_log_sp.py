@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.readings import ElectrodeReading
-from palpate.gateway.recordings.text_log import TextLog, TextLogOptions
-from palpate.protos.messages import SensorType
+from palpate.messages import SensorType
+from palpate_gateway.readings import ElectrodeReading
+from palpate_gateway.recordings.text_log import TextLog, TextLogOptions
 
 
 def replay(path: Path) -> tuple[list[ElectrodeReading], TextLog]:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from palpate.gateway.timing.arrivals import Arrivals
+from palpate_gateway.timing.arrivals import Arrivals
 
 MS = 1_000_000
 

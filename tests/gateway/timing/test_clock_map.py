@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.gateway.timing.clock_map import (
+from palpate import clock
+from palpate_gateway.timing.clock_map import (
     ArrivalClock,
     ClockQuality,
     FileClock,
@@ -15,8 +16,7 @@ from palpate.gateway.timing.clock_map import (
     LiveClock,
     PacedClock,
 )
-from palpate.gateway.timing.wall_clock import LOOK_NS, ClockPair, WallClock
-from palpate.protos import clock
+from palpate_gateway.timing.wall_clock import LOOK_NS, ClockPair, WallClock
 
 MS = 1_000_000
 FRAME_S = 0.01

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.gateway.timing.envelope import WINDOW_S, Envelope, middle_slope
+from palpate_gateway.timing.envelope import WINDOW_S, Envelope, middle_slope
 
 Floats = npt.NDArray[np.float64]
 Delay = Callable[[np.random.Generator, Floats], Floats]

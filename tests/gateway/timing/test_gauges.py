@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.timing.clock_map import ClockQuality
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.timing.clock_map import ClockQuality
 
 
 def test_each_sensors_clock_and_the_wall_clock_are_told(bus: Any) -> None:

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.gateway.timing.kernel_stamps import KernelStamps
-from palpate.gateway.timing.wall_clock import ClockPair, WallClock
+from palpate_gateway.timing.kernel_stamps import KernelStamps
+from palpate_gateway.timing.wall_clock import ClockPair, WallClock
 
 S = 1_000_000_000
 NOW_NS, WALL_NS = 1_000 * S, 1_790_000_000 * S

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.gateway.timing import listening
-from palpate.gateway.timing.listening import Listening
+from palpate_gateway.timing import listening
+from palpate_gateway.timing.listening import Listening
 
 
 class Clock:

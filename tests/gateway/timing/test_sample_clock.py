@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.gateway.timing.sample_clock import SampleClock, Verdict
+from palpate_gateway.timing.sample_clock import SampleClock, Verdict
 
 WRAP_US = 2**32
 

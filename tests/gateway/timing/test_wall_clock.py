@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from palpate.gateway.timing.discipline import Discipline, wall_discipline
-from palpate.gateway.timing.kernel_stamps import OLDEST_NS, KernelStamps
-from palpate.gateway.timing.wall_clock import LOOK_NS, ClockPair, WallClock, read_pair
+from palpate_gateway.timing.discipline import Discipline, wall_discipline
+from palpate_gateway.timing.kernel_stamps import OLDEST_NS, KernelStamps
+from palpate_gateway.timing.wall_clock import LOOK_NS, ClockPair, WallClock, read_pair
 
 EPOCH_NS = 1_700_000_000_000_000_000
 S = 1_000_000_000

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.protocols.channels import ALL_VALID
-from palpate.gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
-from palpate.protos.errors import ConfigError, DeviceLost, DeviceTimeout
+from palpate.errors import ConfigError, DeviceLost, DeviceTimeout
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.protocols.channels import ALL_VALID
+from palpate_gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
 
 fakes: Any = importlib.import_module("tape_fakes")
 

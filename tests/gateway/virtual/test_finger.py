@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.device import Device
-from palpate.gateway.drivers import make_device
-from palpate.gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
-from palpate.gateway.virtual.physics import Unit, contact, electrode_counts, films
-from palpate.gateway.virtual.trajectory import touch
-from palpate.protos.anatomy import ELECTRODE_POSITIONS
+from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate_gateway.device import Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
+from palpate_gateway.virtual.physics import Unit, contact, electrode_counts, films
+from palpate_gateway.virtual.trajectory import touch
 
 
 def collect(**options: Any) -> dict[str, Any]:

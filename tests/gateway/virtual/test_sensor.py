@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.readings import ElectrodeReading, PoseReading, Reading
-from palpate.protos.tape import read_tape
+from palpate.files.tape import read_tape
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import ElectrodeReading, PoseReading, Reading
 
 fakes: Any = importlib.import_module("tape_fakes")
 

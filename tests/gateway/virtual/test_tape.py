@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.drivers import make_device
-from palpate.gateway.pipeline import Outgoing, Pipeline
-from palpate.gateway.readings import (
+from palpate.errors import ConfigError, DatasetError
+from palpate.files.tape import Tape, read_tape
+from palpate.messages import Tare
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.readings import (
     ElectrodeReading,
     FieldReading,
     PoseReading,
     Reading,
     WrenchReading,
 )
-from palpate.gateway.timing.clock_map import FileClock
-from palpate.gateway.virtual import tape as virtual_tape
-from palpate.gateway.virtual.press import between, order, poses
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.protos.messages import Tare
-from palpate.protos.tape import Tape, read_tape
+from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.virtual import tape as virtual_tape
+from palpate_gateway.virtual.press import between, order, poses
 
 fakes: Any = importlib.import_module("tape_fakes")
 

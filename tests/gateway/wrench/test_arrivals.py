@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.emulators.rdt import RdtEmulator
-from palpate.gateway.ports.sockets import Received
-from palpate.gateway.readings import WrenchReading
-from palpate.gateway.wrench.kms40 import Kms40Options, WrenchKms40
-from palpate.gateway.wrench.rdt import WrenchRdt
-from palpate.gateway.wrench.rdt_options import RdtOptions
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.rdt import RdtEmulator
+from palpate_gateway.ports.sockets import Received
+from palpate_gateway.readings import WrenchReading
+from palpate_gateway.wrench.kms40 import Kms40Options, WrenchKms40
+from palpate_gateway.wrench.rdt import WrenchRdt
+from palpate_gateway.wrench.rdt_options import RdtOptions
 
 MS = 1_000_000
 LINE = b"F={1.0,0,0,0,0,0},4\n"

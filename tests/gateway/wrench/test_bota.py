@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from tests.gateway.reading_devices import PATIENCE_S, Follower
 
-from palpate.gateway.emulators.bota import Bota
-from palpate.gateway.emulators.serial_line import SerialLine
-from palpate.gateway.readings import WrenchReading
-from palpate.gateway.wrench.bota import BotaOptions, WrenchBota
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError, DeviceError, DeviceTimeout
+from palpate.config import parse_config
+from palpate.errors import ConfigError, DeviceError, DeviceTimeout
+from palpate_gateway.emulators.bota import Bota
+from palpate_gateway.emulators.serial_line import SerialLine
+from palpate_gateway.readings import WrenchReading
+from palpate_gateway.wrench.bota import BotaOptions, WrenchBota
 
 pytest.importorskip("serial")
 

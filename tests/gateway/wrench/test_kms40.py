@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from tests.gateway.reading_devices import open_again
 
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.wrench.kms40 import Kms40Options, WrenchKms40
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError, DeviceError, DeviceLost
+from palpate.config import parse_config
+from palpate.errors import ConfigError, DeviceError, DeviceLost
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.wrench.kms40 import Kms40Options, WrenchKms40
 
 fakes: Any = importlib.import_module("wrench_fakes")
 

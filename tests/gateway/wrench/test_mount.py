@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.gateway.wrench.mount import Mount, MountOptions
-from palpate.protos.config import parse_config
-from palpate.protos.errors import ConfigError
+from palpate.config import parse_config
+from palpate.errors import ConfigError
+from palpate_gateway.wrench.mount import Mount, MountOptions
 
 FORCE, TORQUE = np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3])
 

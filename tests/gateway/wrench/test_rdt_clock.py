@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.gateway.wrench.rdt_clock import CHECK_S, CounterClock
-from palpate.protos.errors import DeviceLost
+from palpate.errors import DeviceLost
+from palpate_gateway.wrench.rdt_clock import CHECK_S, CounterClock
 
 
 def test_goes_on_over_its_end() -> None:

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.deploy.tare import take_tare
-from palpate.gateway.emulators.bota import Bota
-from palpate.gateway.emulators.kms40 import Kms40Emulator
-from palpate.gateway.emulators.robotous import RobotousSerial
-from palpate.protos.codec import WRENCH_ZERO, WRENCH_ZERO_REQUEST
-from palpate.protos.errors import ErrorCode, LinkError, RemoteError
-from palpate.protos.messages import (
+from palpate.codec import WRENCH_ZERO, WRENCH_ZERO_REQUEST
+from palpate.errors import ErrorCode, LinkError, RemoteError
+from palpate.messages import (
     SensorState,
     SensorStatus,
     ServiceState,
     WrenchZero,
     WrenchZeroRequest,
 )
+from palpate_deploy.tare import take_tare
+from palpate_gateway.emulators.bota import Bota
+from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.robotous import RobotousSerial
 
 fakes: Any = importlib.import_module("wrench_fakes")
 

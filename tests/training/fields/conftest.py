@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos.anatomy import ELECTRODE_POSITIONS
-from palpate.training.dataset import Provenance
-from palpate.training.fields.fit import FitConfig
-from palpate.training.twin.content import (
+from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate_training.dataset import Provenance
+from palpate_training.fields.fit import FitConfig
+from palpate_training.twin.content import (
     ExperimentDataset,
     FieldBasis,
     MixedDataset,

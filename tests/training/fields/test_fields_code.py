@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.fields.code import FieldCode, fit_code
-from palpate.training.fields.fit import synthesis_features
-from palpate.training.fields.sites import CORE_RADIUS_M, RADII_M, SITES, core_normal, pooling
-from palpate.training.fields.split import by_trajectory
-from palpate.training.splits import Split
-from palpate.training.twin.content import MixedDataset
+from palpate.errors import DatasetError
+from palpate_training.fields.code import FieldCode, fit_code
+from palpate_training.fields.fit import synthesis_features
+from palpate_training.fields.sites import CORE_RADIUS_M, RADII_M, SITES, core_normal, pooling
+from palpate_training.fields.split import by_trajectory
+from palpate_training.splits import Split
+from palpate_training.twin.content import MixedDataset
 
 
 @pytest.fixture(scope="module")

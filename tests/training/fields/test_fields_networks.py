@@ -12,12 +12,12 @@ import onnxruntime
 import pytest
 import torch
 
-from palpate.protos.bundle import read_bundle
-from palpate.protos.errors import BundleError, DatasetError
-from palpate.training.export import onnx_bytes
-from palpate.training.fields import export
-from palpate.training.fields.bundles import field_bundle, synthesis_bundle
-from palpate.training.fields.fit import (
+from palpate.errors import BundleError, DatasetError
+from palpate.files.bundle import read_bundle
+from palpate_training.export import onnx_bytes
+from palpate_training.fields import export
+from palpate_training.fields.bundles import field_bundle, synthesis_bundle
+from palpate_training.fields.fit import (
     FieldModel,
     FitConfig,
     fit_field,
@@ -25,9 +25,9 @@ from palpate.training.fields.fit import (
     synthesis_features,
     tared_counts,
 )
-from palpate.training.fields.networks import FieldGraph, SynthesisGraph
-from palpate.training.fields.split import Held, by_trajectory, of_units
-from palpate.training.twin.content import MixedDataset
+from palpate_training.fields.networks import FieldGraph, SynthesisGraph
+from palpate_training.fields.split import Held, by_trajectory, of_units
+from palpate_training.twin.content import MixedDataset
 
 
 @pytest.fixture(scope="module")

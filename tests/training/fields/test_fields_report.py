@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.protos.bundle import read_bundle
-from palpate.training.cli import train_app
-from palpate.training.cli_fields import EPOCHS
-from palpate.training.evaluate import Result
-from palpate.training.fields.evaluate import ALL, MEAN, OWN, RIDGE, ZERO, TaskReport, typical
-from palpate.training.fields.evaluate_field import evaluate_field
-from palpate.training.fields.evaluate_synthesis import evaluate_synthesis
-from palpate.training.fields.features_report import evaluate_features, features_networks
-from palpate.training.fields.fit import FitConfig
-from palpate.training.fields.pictures import by_force, ventral_faces
-from palpate.training.fields.report import headline_table, table, write_report
-from palpate.training.fields.rivals import mean, ridge, zero
-from palpate.training.train import TrainConfig
-from palpate.training.twin.content import MixedDataset
-from palpate.training.twin.hdf5 import write_experiment, write_mixed
+from palpate.files.bundle import read_bundle
+from palpate_training.cli import train_app
+from palpate_training.cli_fields import EPOCHS
+from palpate_training.evaluate import Result
+from palpate_training.fields.evaluate import ALL, MEAN, OWN, RIDGE, ZERO, TaskReport, typical
+from palpate_training.fields.evaluate_field import evaluate_field
+from palpate_training.fields.evaluate_synthesis import evaluate_synthesis
+from palpate_training.fields.features_report import evaluate_features, features_networks
+from palpate_training.fields.fit import FitConfig
+from palpate_training.fields.pictures import by_force, ventral_faces
+from palpate_training.fields.report import headline_table, table, write_report
+from palpate_training.fields.rivals import mean, ridge, zero
+from palpate_training.train import TrainConfig
+from palpate_training.twin.content import MixedDataset
+from palpate_training.twin.hdf5 import write_experiment, write_mixed
 
 SHORT = TrainConfig(widths=(32,), epochs=15, batch_rows=64)
 
@@ -84,7 +84,7 @@ def test_numbers_hang_together(reports: list[TaskReport], mixed: MixedDataset) -
 
 
 def test_zero_is_the_motion_itself(reports: list[TaskReport], mixed: MixedDataset) -> None:
-    from palpate.training.fields.split import by_trajectory, of_units
+    from palpate_training.fields.split import by_trajectory, of_units
 
     rows = of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-2"]).split.test
     truth = np.linalg.norm(mixed.displacement(rows), axis=2)

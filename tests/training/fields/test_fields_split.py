@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.fields.split import by_trajectory, of_units, unit_sets
-from palpate.training.twin.content import MixedDataset
+from palpate.errors import DatasetError
+from palpate_training.fields.split import by_trajectory, of_units, unit_sets
+from palpate_training.twin.content import MixedDataset
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from palpate.training.dataset import Provenance
-from palpate.training.twin.content import ExperimentDataset, FieldBasis, MixedDataset, SkinMesh
+from palpate_training.dataset import Provenance
+from palpate_training.twin.content import ExperimentDataset, FieldBasis, MixedDataset, SkinMesh
 
 
 @pytest.fixture

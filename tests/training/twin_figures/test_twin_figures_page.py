@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.protos.errors import ConfigError, DatasetError
-from palpate.training.cli import data_app
-from palpate.training.twin.content import ExperimentDataset, MixedDataset
-from palpate.training.twin.hdf5 import write_experiment, write_mixed
-from palpate.training.twin_figures.idle import IdleStream
-from palpate.training.twin_figures.page import PAGE, Sources, write_page
-from palpate.training.twin_figures.plate import PlateLog
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli import data_app
+from palpate_training.twin.content import ExperimentDataset, MixedDataset
+from palpate_training.twin.hdf5 import write_experiment, write_mixed
+from palpate_training.twin_figures.idle import IdleStream
+from palpate_training.twin_figures.page import PAGE, Sources, write_page
+from palpate_training.twin_figures.plate import PlateLog
 
 pytest.importorskip("matplotlib", reason="matplotlib not installed (extra training)")
 pytest.importorskip("h5py", reason="h5py not installed (extra training)")

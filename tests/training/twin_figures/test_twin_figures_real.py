@@ -11,21 +11,21 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from palpate.protos.errors import DatasetError
-from palpate.training.twin.content import ExperimentDataset
-from palpate.training.twin_figures.idle import (
+from palpate.errors import DatasetError
+from palpate_training.twin.content import ExperimentDataset
+from palpate_training.twin_figures.idle import (
     FORCE_CALIBRATION,
     read_idle_real,
     read_idle_twin,
 )
-from palpate.training.twin_figures.noise import drift, spectrum
-from palpate.training.twin_figures.plate import (
+from palpate_training.twin_figures.noise import drift, spectrum
+from palpate_training.twin_figures.plate import (
     CONTACT_NORMAL,
     PlateLog,
     plate_response,
     read_plate_logs,
 )
-from palpate.training.twin_figures.signs import agreement, flat_presses, signs
+from palpate_training.twin_figures.signs import agreement, flat_presses, signs
 
 pytest.importorskip("matplotlib", reason="matplotlib not installed (extra training)")
 

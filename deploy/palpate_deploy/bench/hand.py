@@ -1,0 +1,217 @@
+"""``palpate bench hand``: five BioTacs and two force/torque sensors through one gateway.
+
+Emulators play the twin at full rate: three fingers on one CAN bus and two on another (4400 slots a
+second each), a KMS 40 over TCP (500 Hz) and a Bota over a serial line (1000 Hz). Nothing may be
+lost. The floor is a program that reads the same devices with python-can, sockets and pyserial and
+does nothing with what it reads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from palpate.bus import Session
+from palpate.config import LinkConfig
+from palpate.errors import LinkError
+from palpate.messages import Status
+from palpate_deploy.bench.e2e import wait_ready
+from palpate_deploy.bench.hand_result import CORE_GOAL, HandResult, Used, account, show
+from palpate_deploy.bench.results import append_history, machine
+from palpate_deploy.bench.station import free_port, gateway_station
+from palpate_deploy.children import Children
+from palpate_deploy.processes import command_line
+from palpate_deploy.profile import Profile
+from palpate_deploy.run_folder import write_profile
+from palpate_deploy.status import ask_status
+
+_BUSES = ({"channel": "239.74.163.2", "fingers": 3}, {"channel": "239.74.163.3", "fingers": 2})
+_SETTLE_S = 4.0
+
+
+def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool) -> None:
+    """Measure, print, and on request keep.
+
+    Args:
+        seconds: Length of the measurement [s].
+        floor_seconds: Length of the floor's [s].
+        as_json: Print JSON.
+        save: Append to the history.
+    """
+    columns = (TextColumn("{task.description:32}"), BarColumn(), TimeElapsedColumn())
+    quiet = Console(stderr=True)
+    with Progress(*columns, console=quiet, disable=not sys.stderr.isatty()) as bar:
+        result = measure_hand(seconds, floor_seconds, bar)
+    values = {
+        "hand": asdict(result),
+        "hand.core_goal_met": result.core <= CORE_GOAL,
+        "hand.loss_goal_met": result.lost == 0,
+        "hand.p99_ratio": round(result.p99_s / result.floor_p99_s, 2),
+    }
+    if as_json:
+        print(json.dumps({**values, "machine": machine()}, indent=2))
+    else:
+        show(result)
+    if save:
+        append_history("hand", values)
+
+
+def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandResult:
+    """Start everything, measure the gateway, then the floor.
+
+    Raises:
+        ProcessEnded: A process of the benchmark ended early.
+        LinkError: They did not find one another in time.
+    """
+    with Children("bench-hand") as children:
+        buses, wrenches = _start_emulators(children)
+        rows_file, floor_file = children.folder / "client.npz", children.folder / "floor.npz"
+        profile = _start_gateway(children, buses, wrenches, rows_file)
+        task = bar.add_task("gateway", total=10)
+        time.sleep(_SETTLE_S)
+        pid = children.pid("gateway")
+        before = _status(profile).counters
+        begin_ns, used_s, shares = time.monotonic_ns(), _cpu_s(pid), []
+        looks: list[Status] = []
+        host = _host_ticks()
+        for _ in range(10):
+            part_s, part_used_s = time.monotonic(), _cpu_s(pid)
+            time.sleep(seconds / 10)
+            shares.append((_cpu_s(pid) - part_used_s) / (time.monotonic() - part_s))
+            children.check(["gateway", "client", *(f"emulator-{n}" for n in range(4))])
+            looks.append(_status(profile))
+            bar.advance(task)
+        end_ns = time.monotonic_ns()
+        core = (_cpu_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
+        total, stolen = (now - then for now, then in zip(_host_ticks(), host, strict=True))
+        drops = _kernel_drops(pid)
+        children.stop_one("client")
+        children.stop_one("gateway")
+        task = bar.add_task("floor", total=1)
+        plan = {
+            "seconds": floor_seconds,
+            "buses": buses,
+            "sockets": [[wrenches["kms40"]["host"], wrenches["kms40"]["port"]]],
+            "lines": [[wrenches["bota"]["port"], wrenches["bota"]["baud"]]],
+        }
+        part = [sys.executable, "-m", "palpate_deploy.bench.hand_parts"]
+        children.start("floor", [*part, "floor", str(floor_file), json.dumps(plan)])
+        if children.wait("floor", floor_seconds + 20.0) != 0:
+            raise children.ended("floor", -1)
+        bar.advance(task)
+        return account(
+            rows_file,
+            floor_file,
+            begin_ns,
+            end_ns,
+            Used(core, max(shares), drops, stolen / max(total, 1)),
+            before,
+            looks,
+        )
+
+
+def _start_emulators(
+    children: Children,
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Start them; python-can's options of the buses, and the addresses of the wrench sensors."""
+    emulate = [sys.executable, "-m", "palpate_deploy", "emulate"]
+    buses: list[dict[str, Any]] = []
+    for number, bus in enumerate(_BUSES):
+        port = free_port()
+        words = ["--channel", str(bus["channel"]), "--bus", f"port={port}"]
+        words += ["--fingers", str(bus["fingers"]), "--seed", str(10 * number)]
+        children.start(f"emulator-{number}", [*emulate, "biotac-can", *words])
+        buses.append({"interface": "udp_multicast", "channel": bus["channel"], "port": port})
+    tcp, line = free_port(), children.folder / "bota"
+    children.start("emulator-2", [*emulate, "kms40", "--port", str(tcp)])
+    children.start("emulator-3", [*emulate, "bota", "--link", str(line), "--baud", "460800"])
+    deadline = time.monotonic() + 30.0
+    names = [f"emulator-{number}" for number in range(4)]
+    while not all("palpate gateway probe" in children.log(n).read_text("utf-8") for n in names):
+        children.check(names)
+        if time.monotonic() > deadline:
+            raise LinkError("an emulator does not start", remedy=f"see {children.folder / 'logs'}")
+        time.sleep(0.1)
+    return buses, {
+        "kms40": {"host": "127.0.0.1", "port": tcp},
+        "bota": {"port": str(line), "baud": 460800, "rate_hz": 1000.0},
+    }
+
+
+def _start_gateway(
+    children: Children,
+    buses: list[dict[str, Any]],
+    wrenches: dict[str, dict[str, Any]],
+    rows_file: Path,
+) -> Profile:
+    sensors = [
+        {
+            "name": f"finger{number}{port}",
+            "driver": "biotac_can",
+            "options": {
+                "interface": options["interface"],
+                "channel": options["channel"],
+                "bus_options": {"port": options["port"]},
+                "fingers": bus["fingers"],
+                "port": port,
+            },
+        }
+        for number, (bus, options) in enumerate(zip(_BUSES, buses, strict=True))
+        for port in range(1, int(str(bus["fingers"])) + 1)
+    ]
+    sensors += [
+        {"name": name, "driver": f"wrench_{name}", "options": options}
+        for name, options in wrenches.items()
+    ]
+    profile = gateway_station(sensors)
+    endpoint = profile.link.connect[0]
+    children.start_profile(profile)
+    part = [sys.executable, "-m", "palpate_deploy.bench.hand_parts"]
+    children.start("client", [*part, "client", endpoint, profile.station, str(rows_file)])
+    wait_ready(profile, {"client"})
+    children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
+    wait_ready(profile, {"gateway"})
+    return profile
+
+
+def _cpu_s(pid: int) -> float:
+    """User and system time of a process so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _host_ticks() -> tuple[int, int]:
+    """Of all cores since boot: all ticks, and those that another virtual machine was given."""
+    ticks = [int(word) for word in Path("/proc/stat").read_text("utf-8").split()[1:9]]
+    return sum(ticks), ticks[7]
+
+
+def _kernel_drops(pid: int) -> int:
+    """Datagrams that the kernel threw away because the process did not fetch them in time."""
+    sockets = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            sockets.add(os.readlink(link))
+    lines = Path(f"/proc/{pid}/net/udp").read_text("utf-8").splitlines()[1:]
+    rows = [line.split() for line in lines]
+    return sum(int(row[12]) for row in rows if f"socket:[{row[9]}]" in sockets)
+
+
+def _status(profile: Profile) -> Status:
+    link = LinkConfig(connect=profile.link.connect, wait_for_router_s=10)
+    with Session.open(link, station=profile.station) as session:
+        for _ in range(5):
+            for status in ask_status(session):
+                if status.service == "gateway":
+                    return status
+            time.sleep(0.5)
+    raise LinkError("the gateway does not answer", remedy="see the logs in the run's folder")

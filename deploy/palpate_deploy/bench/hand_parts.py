@@ -1,0 +1,144 @@
+"""The two readers of ``palpate bench hand``: a client of the gateway, and the bare floor.
+
+``python -m palpate_deploy.bench.hand_parts client ENDPOINT STATION OUT`` takes every frame of every
+sensor and writes down when. ``... floor OUT JSON`` reads the same devices with nothing but
+python-can, pyserial and sockets, and writes down how late it had what.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import threading
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import StreamTimeout
+from palpate_deploy.bench.harness import stop_on_sigterm
+
+_LAST_SLOT = 0x86
+"""Command byte of TDC, which only one more slot of a round follows."""
+
+
+def client(endpoint: str, station: str, out: Path) -> None:
+    """Take electrode and wrench frames until ``SIGTERM``; then write one row for each.
+
+    Columns: sensor, sequence, frames missed before, time of its last sample and of its arrival by
+    the monotonic clock [ns], whether a channel of it is invalid.
+    """
+    from palpate.bus import Delivery, Session
+    from palpate.bus.topics import ELECTRODES, WRENCH
+    from palpate.config import LinkConfig
+    from palpate.messages import ElectrodeFrame
+
+    stop = stop_on_sigterm()
+    names: dict[str, int] = {}
+    rows = array("q")
+    lock = threading.Lock()
+    link = LinkConfig(connect=(endpoint,), wait_for_router_s=20)
+    with Session.open(link, station=station) as session:
+        streams = [session.subscriber(one, delivery=Delivery.QUEUE) for one in (ELECTRODES, WRENCH)]
+
+        def take(stream: Any) -> None:
+            while not stop.is_set():
+                try:
+                    got = stream.next(timeout_s=0.1)
+                except StreamTimeout:
+                    continue
+                now_ns = time.monotonic_ns()
+                frame, stamp = got.message, got.message.stamp
+                last_ns, bad = stamp.monotonic_ns, 0
+                if isinstance(frame, ElectrodeFrame):
+                    layout = frame.sensor_type.layout
+                    last_ns += (layout.slots - 1) * frame.slot_period_ns
+                    bad = int(frame.validity != (1 << layout.slots) - 1)
+                with lock:
+                    number = names.setdefault(got.sensor, len(names))
+                    rows.extend((number, stamp.sequence, stamp.missed_before, last_ns, now_ns, bad))
+
+        threads = [threading.Thread(target=take, args=(stream,)) for stream in streams]
+        with session.presence("client", instance="client") as presence:
+            for thread in threads:
+                thread.start()
+            presence.ready()
+            stop.wait()
+        for thread in threads:
+            thread.join()
+        dropped = sum(
+            stream.counters.get(key, 0) for stream in streams for key in ("dropped", "overflow")
+        )
+    np.savez(
+        out,
+        sensors=np.array(list(names), dtype=str),
+        rows=np.array(rows, dtype=np.int64).reshape(-1, 6),
+        dropped=np.int64(dropped),
+    )
+
+
+def floor(out: Path, told: str) -> None:
+    """Read what ``told`` names for so many seconds, a thread for each device, and write how."""
+    import can
+    import serial
+
+    stop_on_sigterm()
+    plan = json.loads(told)
+    until_s = time.monotonic() + plan["seconds"]
+    offset_s = time.time() - time.monotonic()
+    lates, counts = [array("d") for _ in plan["buses"]], [0] * 3
+
+    def read_bus(options: dict[str, Any], late: array[float]) -> None:
+        with can.Bus(**options) as bus:
+            while time.monotonic() < until_s:
+                message = bus.recv(0.1)
+                if message is not None:
+                    counts[0] += 1
+                    if message.data[0] == _LAST_SLOT:
+                        late.append(time.monotonic() + offset_s - message.timestamp)
+
+    def read_socket(host: str, port: int) -> None:
+        with socket.create_connection((host, port), timeout=2.0) as link:
+            link.sendall(b"L1()\n")
+            while time.monotonic() < until_s:
+                counts[1] += link.recv(65536).count(b"\n")
+
+    def read_line(line: str, baud: int) -> None:
+        with serial.Serial(line, baud, timeout=0.1) as port:
+            port.write(b"R")
+            while time.monotonic() < until_s:
+                counts[2] += len(port.read(max(1, port.in_waiting)))
+
+    threads = [
+        *(
+            threading.Thread(target=read_bus, args=pair)
+            for pair in zip(plan["buses"], lates, strict=True)
+        ),
+        *(threading.Thread(target=read_socket, args=pair) for pair in plan["sockets"]),
+        *(threading.Thread(target=read_line, args=pair) for pair in plan["lines"]),
+    ]
+    used_s, began_s = time.process_time(), time.monotonic()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    elapsed_s = time.monotonic() - began_s
+    np.savez(
+        out,
+        late_s=np.concatenate([np.array(late) for late in lates]),
+        slots=np.int64(counts[0]),
+        lines=np.int64(counts[1]),
+        serial_bytes=np.int64(counts[2]),
+        core=np.float64((time.process_time() - used_s) / elapsed_s),
+        seconds=np.float64(elapsed_s),
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "client":
+        client(sys.argv[2], sys.argv[3], Path(sys.argv[4]))
+    else:
+        floor(Path(sys.argv[2]), sys.argv[3])

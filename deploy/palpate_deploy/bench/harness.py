@@ -1,0 +1,95 @@
+"""What both sides of the benchmark share and neither is measured for: frames, gate, results."""
+
+from __future__ import annotations
+
+import mmap
+import signal
+import threading
+import time
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate_deploy.parent import end_with_parent
+
+SERIAL = "BENCH-0001"
+REST_COUNTS = 3000
+SLOTS = 44
+KINDS = 256
+"""Different frames, prepared before the first is due."""
+
+_NOISE_COUNTS = 2
+_SEED = 1
+_LOOK_S = 0.02
+
+
+def bench_counts() -> npt.NDArray[np.uint16]:
+    """Raw counts of the prepared frames: E1..E19, PDC, 22 PAC, TAC, TDC; shape ``(KINDS, 44)``."""
+    noise = np.random.default_rng(_SEED).integers(-_NOISE_COUNTS, _NOISE_COUNTS + 1, (KINDS, SLOTS))
+    return (REST_COUNTS + noise).astype(np.uint16)
+
+
+class Gate:
+    """One byte of shared memory for each source: open = send, shut = wait. Free to look at.
+
+    A source that is stopped by a signal instead would lose its links after the lease.
+
+    Args:
+        path: A file of some bytes; made if absent.
+        index: Which byte.
+    """
+
+    SIZE = 16
+
+    def __init__(self, path: Path, index: int) -> None:
+        if not path.exists():
+            path.write_bytes(bytes(self.SIZE))
+        with open(path, "r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), self.SIZE)
+        self._index = index
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a source may send."""
+        return self._memory[self._index] != 0
+
+    def set(self, is_open: bool) -> None:
+        """Open or shut it."""
+        self._memory[self._index] = int(is_open)
+
+    def wait(self) -> None:
+        """Wait until it is open."""
+        while not self.is_open:
+            time.sleep(_LOOK_S)
+
+
+def stop_on_sigterm() -> threading.Event:
+    """An event that ``SIGTERM`` sets; the process also ends with its parent."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGTERM, on_signal)
+    end_with_parent()
+    return stop
+
+
+def write_rows(
+    out: Path, sensors: list[str], rows: list[tuple[int, int, int]], *, dropped: int
+) -> None:
+    """Write what a client saw: sequence, stamp and arrival [ns] of each estimate."""
+    np.savez(
+        out,
+        sensors=np.array(sensors, dtype=str),
+        rows=np.array(rows, dtype=np.int64).reshape(-1, 3),
+        dropped=np.int64(dropped),
+    )
+
+
+def read_rows(path: Path) -> tuple[npt.NDArray[np.str_], npt.NDArray[np.int64], int]:
+    """Sensors, rows and drops as ``write_rows`` wrote them."""
+    with np.load(path, allow_pickle=False) as archive:
+        return archive["sensors"], archive["rows"], int(archive["dropped"])

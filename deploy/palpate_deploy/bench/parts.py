@@ -1,0 +1,68 @@
+"""The two processes of palpate that a benchmark adds to ``palpate run``: gateway and client.
+
+``python -m palpate_deploy.bench.parts gateway PROFILE`` is the gateway as a station runs it, with
+the benchmark's device in its driver table. ``... client ENDPOINT STATION OUT DELIVERY`` is a
+robot: it takes every estimate as it comes and writes down how old it was.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from palpate.errors import StreamTimeout
+from palpate_deploy.bench.harness import stop_on_sigterm, write_rows
+
+DRIVER = "palpate_deploy.bench.device:Bench"
+
+
+def gateway(profile: str) -> None:
+    """Run the gateway with the benchmark's driver."""
+    from palpate_deploy.processes import run_service
+    from palpate_deploy.profile import load_profile
+    from palpate_gateway.drivers import DRIVERS
+
+    DRIVERS["bench"] = DRIVER
+    run_service("gateway", load_profile(profile))
+
+
+def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
+    """Take estimates until ``SIGTERM``; then write sensor, sequence, stamp and arrival of each.
+
+    Args:
+        endpoint: The router.
+        station: Name of the station.
+        out: File to write.
+        delivery: ``newest`` as a robot's controller does, or ``queue`` to count what arrives.
+    """
+    from palpate.bus import Delivery, Session
+    from palpate.bus.topics import FEATURES
+    from palpate.config import LinkConfig
+
+    stop = stop_on_sigterm()
+    sensors: list[str] = []
+    rows: list[tuple[int, int, int]] = []
+    with Session.open(LinkConfig(connect=(endpoint,)), station=station) as session:
+        stream = session.subscriber(FEATURES, delivery=Delivery(delivery))
+        with session.presence("client", instance="client") as presence:
+            presence.ready()
+            while not stop.is_set():
+                try:
+                    got = stream.next(timeout_s=0.1)
+                except StreamTimeout:
+                    continue
+                now_ns = time.monotonic_ns()  # the estimate is in the robot's hands, decoded
+                source = got.message.source
+                rows.append((source.sequence, source.monotonic_ns, now_ns))
+                sensors.append(got.sensor)
+        counters = stream.counters
+    dropped = counters.get("dropped", 0) + counters.get("overflow", 0)
+    write_rows(out, sensors, rows, dropped=dropped)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "gateway":
+        gateway(sys.argv[2])
+    else:
+        client(sys.argv[2], sys.argv[3], Path(sys.argv[4]), sys.argv[5])

@@ -1,0 +1,206 @@
+"""Stage three: the paper's data sets, purely experimental and mixed, of all that was executed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate_deploy.generate.mechanics import OnProgress
+from palpate_deploy.generate.trials import file_of, read_trials
+from palpate_fem.result import Trajectory
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.trajectory import CLEARANCE_M
+from palpate_training.dataset import Provenance
+from palpate_training.twin.assemble import assemble_experiment, assemble_mixed
+from palpate_training.twin.basis import fit_basis
+from palpate_training.twin.content import (
+    ExperimentDataset,
+    MixedDataset,
+    SkinMesh,
+)
+from palpate_training.twin.mixing import mix
+from palpate_training.twin.trials import MixedRows, SimulatedTrial, TrialRows
+
+Floats = npt.NDArray[np.float64]
+
+SUBSET = 128
+"""Nodes of the paper's fields."""
+
+
+@dataclass(frozen=True, slots=True)
+class Assembled:
+    """Both data sets, and what is in neither.
+
+    Attributes:
+        experiment: Purely experimental.
+        mixed: With simulated fields.
+        dropped: Trial and reason of each that was left out of one or both.
+    """
+
+    experiment: ExperimentDataset
+    mixed: MixedDataset
+    dropped: list[tuple[str, str]]
+
+
+def assemble(
+    store: SimulationStore,
+    folder: Path,
+    unit_names: tuple[str, ...],
+    provenance: Provenance,
+    *,
+    on_progress: OnProgress,
+) -> Assembled:
+    """Make both data sets.
+
+    Args:
+        store: Simulated trajectories.
+        folder: Files of their trials.
+        unit_names: Units, in order.
+        provenance: Of both.
+        on_progress: Called after each trajectory that was read.
+
+    Raises:
+        DatasetError: A file is damaged, or nothing was executed.
+    """
+    fingertip = store.fingertip()
+    names = [name for name in store.ids() if file_of(folder, name).exists()]
+    if not names:
+        raise DatasetError(f"{folder} holds no trial", remedy="run the stages before")
+    rows: dict[str, tuple[TrialRows, ...]] = {}
+    simulated: dict[str, SimulatedTrial] = {}
+    dropped: list[tuple[str, str]] = []
+    for k, name in enumerate(names):
+        done = read_trials(folder, name)
+        dropped += [(f"{unit} {name}", why) for unit, why in done.dropped]
+        if done.rows:
+            rows[name] = done.rows
+            simulated[name] = simulated_trial(name, store.trajectory(name), done.believed)
+        on_progress(k + 1, len(names), "read")
+    every = [one for some in rows.values() for one in some]
+    experiment = assemble_experiment(every, provenance, unit_names=unit_names)
+    mixed = join(
+        every,
+        simulated,
+        dropped,
+        fingertip,
+        provenance,
+        unit_names=unit_names,
+        on_progress=on_progress,
+    )
+    return Assembled(experiment, mixed, sorted(dropped))
+
+
+def join(
+    rows: Sequence[TrialRows],
+    simulated: dict[str, SimulatedTrial],
+    dropped: list[tuple[str, str]],
+    fingertip: StoredFingertip,
+    provenance: Provenance,
+    *,
+    unit_names: tuple[str, ...],
+    on_progress: OnProgress,
+) -> MixedDataset:
+    """Make the mixed data set of trials, real ones or the twin's, and their simulations.
+
+    Args:
+        rows: Trials whose trajectories were simulated.
+        simulated: By trajectory.
+        dropped: Gets trial and reason of each that cannot be mixed.
+        fingertip: What was simulated.
+        provenance: Of the data set.
+        unit_names: Units, in order.
+        on_progress: Called before each part of the work.
+
+    Raises:
+        DatasetError: Nothing is left.
+    """
+    mesh = skin_mesh(fingertip)
+    on_progress(0, 1, "basis of the fields")
+    basis = fit_basis(lambda: _blocks(simulated.values()))
+    on_progress(0, 1, "mixed data set")
+    mixed = assemble_mixed(
+        _mixed(rows, simulated, dropped), basis, mesh, provenance, unit_names=unit_names
+    )
+    on_progress(1, 1, "mixed data set")
+    return mixed
+
+
+def simulated_trial(name: str, trajectory: Trajectory, believed: int) -> SimulatedTrial:
+    """A simulated trajectory from first contact on, as it is mixed with trials.
+
+    Args:
+        name: Its id.
+        trajectory: As simulated.
+        believed: How many of its steps to take, one or more.
+    """
+    steps = trajectory.steps[:believed]
+    poses = np.array([step.pose[:3] for step in steps])
+    travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1) - CLEARANCE_M
+    fields = np.array([step.displacement for step in steps], np.float32)
+    return SimulatedTrial(
+        trajectory=name,
+        travel_m=np.concatenate([[0.0], travel]),
+        force=np.concatenate([np.zeros((1, 3)), [step.force for step in steps]]),
+        displacement=np.concatenate([np.zeros_like(fields[:1]), fields]),
+        converged=len(steps) + 1,
+    )
+
+
+def _blocks(simulated: Iterable[SimulatedTrial]) -> Iterator[npt.NDArray[np.float32]]:
+    for trial in simulated:
+        yield trial.displacement
+
+
+def _mixed(
+    rows: Sequence[TrialRows],
+    simulated: dict[str, SimulatedTrial],
+    dropped: list[tuple[str, str]],
+) -> Iterator[MixedRows]:
+    for one in rows:
+        try:
+            yield mix(one, simulated[one.header.trajectory])
+        except DatasetError as error:
+            dropped.append((f"{one.header.unit} {one.header.trajectory}", str(error)))
+
+
+def skin_mesh(fingertip: StoredFingertip) -> SkinMesh:
+    """The pressurised skin with its surfaces in triangles, and the nodes that errors count on."""
+    nodes = fingertip.pressurised_nodes
+    return SkinMesh(
+        nodes=nodes,
+        outer_faces=_triangles(fingertip.mesh.outer_faces),
+        inner_faces=_triangles(fingertip.mesh.inner_faces),
+        subset=ventral_subset(nodes, fingertip.mesh.outer_nodes),
+        sha256=fingertip.mesh.sha256.hex(),
+    )
+
+
+def ventral_subset(nodes: Floats, outer: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """128 nodes of the ventral outer surface, each as far as can be from those before.
+
+    The paper takes 128 nodes of its mesh and does not say which.
+
+    Args:
+        nodes: [m], shape (V, 3).
+        outer: Ids of the nodes of the outer surface.
+    """
+    ventral = outer[nodes[outer, 2] < 0.0]
+    points = nodes[ventral]
+    chosen = [int(points[:, 2].argmin())]
+    away = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(SUBSET, len(points)):
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.sort(ventral[chosen]).astype(np.int32)
+
+
+def _triangles(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    if faces.shape[1] == 3:
+        return faces
+    return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]).astype(np.int32)

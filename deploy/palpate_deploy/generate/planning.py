@@ -1,0 +1,124 @@
+"""The paper's plan for a real robot: the simulated skin says where to press, the arms who can."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from palpate.errors import ConfigError
+from palpate_deploy.generate.mechanics import plans_of
+from palpate_deploy.generate.registration import stand_in_arm
+from palpate_deploy.generate.spec import ExperimentSpec
+from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.trajectory import Indentation
+from palpate_training.testbed.arm import HOME, sensor_robot
+from palpate_training.testbed.kinematics import Arm
+from palpate_training.testbed.plan import (
+    ARMS,
+    Eliminated,
+    Plan,
+    Station,
+    Trajectory,
+    assign_arm,
+    make_plan,
+)
+from palpate_training.testbed.registration import Registration
+
+SAME_PATH = 1e-6
+"""Paths of the same plan agree to this, in metres and in numbers of a quaternion."""
+
+
+def stations_of(
+    arms: Mapping[str, Arm], registrations: Mapping[str, Registration] | None
+) -> dict[str, Station]:
+    """The arms as they stand.
+
+    Args:
+        arms: Kinematics by arm; an arm without gets poses only, whose joints its controller finds.
+        registrations: By arm; None = the stand-in arms, which stand where the twin's do.
+
+    Raises:
+        ConfigError: Kinematics are given for an arm that is not registered.
+    """
+    if registrations is None and not arms:
+        return {side: Station(sensor_robot(side), stand_in_arm(side), HOME) for side in ARMS}
+    for arm in arms:
+        if arm not in (registrations or {}):
+            raise ConfigError(
+                f"the {arm} arm has a URDF and no registration",
+                remedy="measure its holes, palpate data register, and give --registration",
+            )
+    return {
+        arm: Station(found.sensor_robot, arms.get(arm))
+        for arm, found in (registrations or {}).items()
+    }
+
+
+def plan_experiment(
+    spec: ExperimentSpec,
+    fingertip: StoredFingertip,
+    stations: Mapping[str, Station],
+    *,
+    store: SimulationStore | None = None,
+    on_progress: Callable[[int, int, str], None] = lambda *_: None,
+) -> tuple[Plan, list[Eliminated]]:
+    """Plan what the twin presses, to the paper's depths.
+
+    Args:
+        spec: Indenters, points, angles and seed; its overtravel is left out.
+        fingertip: Whose skin is aimed at.
+        stations: By arm; a single one executes everything.
+        store: Simulation that the trials will be mixed with: what it holds must be this plan's.
+        on_progress: Called before each trajectory.
+
+    Returns:
+        The plan, and what no arm can follow.
+
+    Raises:
+        ConfigError: No station, or the store holds a trajectory of the same name that goes
+            elsewhere.
+    """
+    if not stations:
+        raise ConfigError("no arm is registered", remedy="palpate data register")
+    plans = plans_of(replace(spec, overtravel_m=0.0), fingertip)
+    if store is not None:
+        _check_same(plans, store)
+
+    def trajectories() -> Iterator[Trajectory]:
+        for k, plan in enumerate(plans):
+            on_progress(k, len(plans), plan.name)
+            yield _trajectory(plan, stations)
+
+    found = make_plan(trajectories(), stations)
+    on_progress(len(plans), len(plans), "")
+    return found
+
+
+def _trajectory(plan: Indentation, stations: Mapping[str, Station]) -> Trajectory:
+    arm = assign_arm(plan.target) if len(stations) > 1 else next(iter(stations))
+    return Trajectory(
+        trajectory=plan.name,
+        indenter=plan.indenter,
+        arm=arm,
+        target=plan.target,
+        direction=plan.direction,
+        contact_m=plan.contact_m,
+        depth_m=plan.depth_m,
+    )
+
+
+def _check_same(plans: list[Indentation], store: SimulationStore) -> None:
+    """Names alone do not tell: with another seed they are the same, and the points are not."""
+    there = set(store.ids())
+    for plan in plans:
+        if plan.name not in there:
+            continue
+        off = float(np.abs(store.summary(plan.name).path[0] - plan.path[0]).max())
+        if off > SAME_PATH:
+            raise ConfigError(
+                f"{store.path}: {plan.name} starts {off:.3g} m from this plan's",
+                remedy="give the --seed with which the store was made",
+            )

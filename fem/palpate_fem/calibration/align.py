@@ -1,0 +1,264 @@
+"""How two indentations are made comparable: the paper's data processing, as pure functions.
+
+Paper, "Experimental data processing" and "Experimental and simulation data processing": force
+below 0.5 N is noise and is left out; the point of exactly 0.5 N is interpolated and starts the
+curve; both curves end at the smaller final displacement, counted from there; both are
+interpolated at the ends of 20 even increments. The start itself is no sample: there both are 0.5 N
+by construction, so it would only flatter the error.
+
+Aligning at 0.5 N hides by how much one of them touches earlier: ``Aligned.depth_offset_m``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import DatasetError
+from palpate_fem.mechanics.path import path_lengths
+
+Floats = NDArray[np.float64]
+
+THRESHOLD_N = 0.5
+"""Force at which curves begin [N] (paper, "Experimental data processing", step 3)."""
+INCREMENTS = 20
+"""Even displacement increments (paper, "Experimental and simulation data processing", step 5)."""
+_LARGEST_SHIFT_M = 0.3e-3
+"""Bound of a fitted shift [m]: three times what noise of 0.05 N does to the crossing where the
+force rises by 0.5 N/mm."""
+_SHIFT_DONE_M = 1e-8
+_SHIFTS = 12
+_SAME_PLACE_M = 1e-9
+"""Poses closer than this are one place: held, not moved; robots repeat to 2e-5 m."""
+
+
+class Reason(StrEnum):
+    """Why two curves cannot be compared."""
+
+    TOO_SHORT = "fewer than two samples"
+    NEVER_REACHES = "never reaches the threshold force"
+    STARTS_ABOVE = "begins above the threshold force"
+    NOTHING_BEYOND = "ends where it reaches the threshold force"
+
+
+class Unalignable(DatasetError):
+    """Two curves cannot be compared.
+
+    Args:
+        side: ``"simulation"`` or ``"measurement"``: which one is to blame.
+        reason: Why.
+        threshold_n: Force at which curves begin [N].
+    """
+
+    def __init__(self, side: str, reason: Reason, threshold_n: float) -> None:
+        super().__init__(
+            f"the {side} {reason} ({threshold_n:g} N)",
+            remedy="leave this trajectory out, or record it from above the skin and deeper",
+        )
+        self.side = side
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Net force against the way of the indenter.
+
+    Attributes:
+        travel_m: Path length since the first pose [m], increasing, shape (K,).
+        force_n: Net force on the BioTac [N], sensor frame, shape (K, 3).
+    """
+
+    travel_m: Floats
+    force_n: Floats
+
+    def begins_at(self, threshold_n: float) -> bool:
+        """Whether the first sample has this force: such a curve has been cut there."""
+        return bool(abs(np.linalg.norm(self.force_n[0]) - threshold_n) < 1e-9 * threshold_n)
+
+    def scaled(self, factor: float) -> Curve:
+        """The same curve with ``factor`` times the force."""
+        return Curve(self.travel_m, self.force_n * factor)
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """Two curves, sampled alike; N = number of increments.
+
+    Attributes:
+        displacement_m: Since the threshold force, each its own [m], shape (N,).
+        simulated_n: Simulated force [N], shape (N, 3).
+        measured_n: Measured force [N], shape (N, 3).
+        depth_offset_m: Travel at the threshold, simulation minus measurement [m]: positive if the
+            simulation touches later, that is deeper. The comparison of forces does not see it.
+        coverage: Common displacement as a part of the measured one; below 1 the simulation stopped
+            early or touched late.
+    """
+
+    displacement_m: Floats
+    simulated_n: Floats
+    measured_n: Floats
+    depth_offset_m: float
+    coverage: float
+
+
+def curve(path: Floats, force_n: Floats) -> Curve:
+    """Curve of a trajectory, shorter than its path if it stopped early.
+
+    Args:
+        path: Poses of the indenter, shape (K, 7).
+        force_n: Net force at the first of them [N], shape (k, 3) with k <= K.
+    """
+    return along(path_lengths(path)[: len(force_n)], force_n)
+
+
+def along(travel_m: Floats, force_n: Floats) -> Curve:
+    """Curve of samples.
+
+    Of several at one place the last counts, as in the paper ("the final time step of each 0.1 mm
+    displacement increment").
+
+    Args:
+        travel_m: Path length at each sample [m], not decreasing, shape (K,).
+        force_n: Net force there [N], shape (K, 3).
+    """
+    last = np.append(np.diff(travel_m) > _SAME_PLACE_M, True)[: len(travel_m)]
+    return Curve(travel_m[last], np.asarray(force_n, np.float64)[last])
+
+
+def from_contact(whole: Curve, *, side: str, threshold_n: float = THRESHOLD_N) -> Curve:
+    """The part of a curve from exactly the threshold force on.
+
+    Single samples that noise lifts over the threshold before contact do not count as contact: the
+    curve begins at the last crossing before its greatest force. Later samples below the threshold
+    are left out.
+
+    Args:
+        whole: The curve, from before contact.
+        side: Named in the error.
+        threshold_n: Force at which it begins [N].
+
+    Raises:
+        Unalignable: It never reaches the threshold, or begins above it.
+    """
+    magnitude = np.sqrt(np.einsum("ki,ki->k", whole.force_n, whole.force_n))
+    if len(magnitude) < 2:
+        raise Unalignable(side, Reason.TOO_SHORT, threshold_n)
+    peak = int(magnitude.argmax())
+    if magnitude[peak] < threshold_n:
+        raise Unalignable(side, Reason.NEVER_REACHES, threshold_n)
+    below = np.flatnonzero(magnitude[:peak] < threshold_n)
+    if whole.begins_at(threshold_n):
+        return whole
+    if not len(below):
+        raise Unalignable(side, Reason.STARTS_ABOVE, threshold_n)
+    before = int(below[-1])
+    share = _share_to(whole.force_n[before], whole.force_n[before + 1], threshold_n)
+    keep = np.flatnonzero(magnitude[before + 1 :] >= threshold_n) + before + 1
+    start_m = whole.travel_m[before] + share * np.diff(whole.travel_m[before : before + 2])[0]
+    start_n = whole.force_n[before] + share * np.diff(whole.force_n[before : before + 2], axis=0)[0]
+    # the first sample may hold the threshold exactly: then it is the start, not a second one
+    keep = keep[whole.travel_m[keep] > start_m + _SAME_PLACE_M]
+    return Curve(
+        np.concatenate([[start_m], whole.travel_m[keep]]),
+        np.concatenate([start_n[None], whole.force_n[keep]]),
+    )
+
+
+def align(
+    simulated: Curve,
+    measured: Curve,
+    *,
+    threshold_n: float = THRESHOLD_N,
+    increments: int = INCREMENTS,
+    fit_offset: bool = False,
+) -> Aligned:
+    """Bring a simulated and a measured curve of the same path to the same samples.
+
+    Args:
+        simulated: From before contact.
+        measured: From before contact, or from the threshold force on.
+        threshold_n: Force at which both begin [N].
+        increments: Even increments of the common displacement.
+        fit_offset: Shift the simulation from there to where the forces agree best. Noise moves the
+            measured curve's crossing of the threshold, and with it every sample; the shift takes
+            that back. The paper does not do it.
+
+    Raises:
+        Unalignable: One of them never reaches the threshold, begins above it, or ends there.
+    """
+    ours = from_contact(simulated, side="simulation", threshold_n=threshold_n)
+    theirs = from_contact(measured, side="measurement", threshold_n=threshold_n)
+    for side, part in (("simulation", ours), ("measurement", theirs)):
+        if part.travel_m[-1] <= part.travel_m[0]:
+            raise Unalignable(side, Reason.NOTHING_BEYOND, threshold_n)
+    start_m = float(ours.travel_m[0])
+    if fit_offset:
+        start_m += _best_shift(simulated, start_m, theirs, increments)
+    return _resampled(simulated, start_m, theirs, increments)
+
+
+def _resampled(simulated: Curve, start_m: float, measured: Curve, increments: int) -> Aligned:
+    """Sample a whole simulated curve from some travel on, and a measured one from its start."""
+    displacement, coverage = _common(simulated, start_m, measured, increments)
+    return Aligned(
+        displacement,
+        _at(simulated, start_m + displacement)[0],
+        _at(measured, measured.travel_m[0] + displacement)[0],
+        start_m - float(measured.travel_m[0]),
+        coverage,
+    )
+
+
+def _common(
+    simulated: Curve, start_m: float, measured: Curve, increments: int
+) -> tuple[Floats, float]:
+    """Displacements that both have [m], shape (increments,), and their part of the measured one."""
+    length = float(measured.travel_m[-1] - measured.travel_m[0])
+    common = min(float(simulated.travel_m[-1]) - start_m, length)
+    return common * np.arange(1, increments + 1) / increments, common / length
+
+
+def _best_shift(simulated: Curve, start_m: float, measured: Curve, increments: int) -> float:
+    """Shift of the simulation's start with the least squared difference of the forces [m].
+
+    Gauss-Newton in one unknown; the curves are piecewise linear, so it may end up between two
+    pieces, a fraction of a micrometre apart.
+    """
+    shift, most = 0.0, min(_LARGEST_SHIFT_M, 0.5 * float(simulated.travel_m[-1] - start_m))
+    for _ in range(_SHIFTS):
+        displacement, _ = _common(simulated, start_m + shift, measured, increments)
+        force, slope = _at(simulated, start_m + shift + displacement)
+        difference = force - _at(measured, measured.travel_m[0] + displacement)[0]
+        step = -float(np.vdot(difference, slope) / np.vdot(slope, slope))
+        new = min(max(shift + step, -most), most)
+        if abs(new - shift) < _SHIFT_DONE_M:
+            return new
+        shift = new
+    return shift
+
+
+def _at(line: Curve, travel_m: Floats) -> tuple[Floats, Floats]:
+    """Force at some travels, linearly interpolated, and its slope [N/m], shapes (N, 3)."""
+    way, force = line.travel_m, line.force_n
+    before = np.minimum(np.maximum(way.searchsorted(travel_m) - 1, 0), len(way) - 2)
+    start = way[before]
+    length = way[before + 1] - start
+    slope = (force[before + 1] - force[before]) / length[:, None]
+    # the last travel may lie beyond the end by a rounding error
+    return force[before] + np.minimum(travel_m - start, length)[:, None] * slope, slope
+
+
+def _share_to(a: Floats, b: Floats, magnitude: float) -> float:
+    """Share s in (0, 1] where |a + s (b - a)| is ``magnitude``, for |a| < magnitude <= |b|.
+
+    Interpolating the magnitude instead would miss it where the direction turns.
+    """
+    step = b - a
+    square, half, rest = step @ step, a @ step, a @ a - magnitude**2
+    # rest < 0, so this root is the positive one; this form does not cancel for half > 0
+    root = np.sqrt(half * half - square * rest)
+    share = -rest / (half + root) if half > 0 else (root - half) / square
+    return min(float(share), 1.0)

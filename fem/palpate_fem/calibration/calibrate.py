@@ -1,0 +1,301 @@
+"""Calibration: skin thickness, modulus, friction and fluid volume from measured forces.
+
+The paper minimises its cost by SLSQP over four parameters, with a run for every evaluation. Two of
+them need no run: forces scale exactly with the modulus at an unchanged shape, and the fluid's
+volume follows from the total thickness. So a coarse scan in thickness and friction finds a place to
+start. Each step from there runs the simulator once beside the point for each parameter, minimises
+the cost by SLSQP over all parameters, with curves linear in those and exact in the modulus, and is
+taken only if runs at its end confirm it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from palpate.errors import DatasetError, SimulationError
+from palpate_fem.calibration.align import Floats, Unalignable
+from palpate_fem.calibration.errors import estimates
+from palpate_fem.calibration.local import LocalModel
+from palpate_fem.calibration.measured import SIMULATED, Indentation
+from palpate_fem.calibration.model import (
+    Case,
+    Fit,
+    State,
+    compare,
+    failures_at,
+    fit_modulus,
+)
+from palpate_fem.calibration.result import Calibration, Evaluation, axis_rms, trajectory_fits
+from palpate_fem.calibration.runs import Runs, Simulated, Simulator
+from palpate_fem.calibration.settings import (
+    FRICTION,
+    STEPS,
+    THICKNESS,
+    VOLUME,
+    CalibrationSettings,
+)
+from palpate_fem.calibration.slsqp import minimise
+from palpate_fem.result import Outcome
+
+_REACH = {THICKNESS: 0.15, FRICTION: 0.6, VOLUME: 0.15}
+"""First and largest change of a logarithm in one step: about half a cell of the scan."""
+_STILL = {THICKNESS: 1e-3, FRICTION: 5e-3, VOLUME: 1e-3}
+"""Changes of the logarithms below which the search has arrived; a tenth of what is asked for."""
+_ENOUGH = 1e-5
+"""A promised gain below this part of the cost is no reason for another run: moving all parameters
+by one standard deviation changes the cost of N samples by about 1 / 2N of it."""
+
+
+def calibrate(
+    simulator: Simulator,
+    measured: Sequence[Indentation],
+    settings: CalibrationSettings | None = None,
+    *,
+    executor: Executor | None = None,
+    on_evaluation: Callable[[Evaluation], None] | None = None,
+    on_run: Callable[[int, int], None] | None = None,
+) -> Calibration:
+    """Find the parameters that bring simulated forces closest to measured ones.
+
+    Args:
+        simulator: Runs indentations; the sensor is not part of a run.
+        measured: Trajectories, of one or several sensors. Friction shows only where the indenter
+            slips, so angled ones belong to them. Thickness and modulus replace one another until
+            the skin is pinched on the core: one press of the long cylinder with noise of 0.02 N
+            gives the thickness within 2.2 % up to 6 N, and within 0.13 % up to 12 N.
+        settings: Bounds, weights, search; None = the paper's.
+        executor: Runs simulations in parallel, e.g. a process pool; None = one after the other.
+        on_evaluation: Told of every evaluation of the cost that took runs.
+        on_run: Told after each run how many of the present batch are done, and how many it has.
+
+    Returns:
+        The parameters, how sure they are, how well they fit, and all that was left out.
+
+    Raises:
+        DatasetError: No measured trajectory can be compared at all.
+        SimulationError: No simulation can be compared with its measurement.
+    """
+    search = _Search(simulator, measured, settings or CalibrationSettings(), executor, on_run)
+    search.on_evaluation = on_evaluation
+    return search.run()
+
+
+class _Search:
+    """State of one calibration."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        measured: Sequence[Indentation],
+        settings: CalibrationSettings,
+        executor: Executor | None,
+        on_run: Callable[[int, int], None] | None,
+    ) -> None:
+        self.settings = settings
+        self.runs = Runs(simulator, executor, on_run)
+        self.on_evaluation: Callable[[Evaluation], None] | None = None
+        self.history: list[Evaluation] = []
+        self.excluded: dict[str, str] = {}
+        self.notes: list[str] = []
+        self.cases: list[Case] = []
+        for item in measured:
+            try:
+                self.cases.append(Case.of(item, settings))
+            except Unalignable as error:
+                self.excluded[item.name] = error.problem
+        if not self.cases:
+            reasons = "; ".join(f"{name}: {why}" for name, why in self.excluded.items())
+            raise DatasetError(
+                f"no measured trajectory can be compared ({reasons or 'none given'})",
+                remedy=f"record from above the skin to well above {settings.threshold_n:g} N",
+            )
+
+    def run(self) -> Calibration:
+        state, fit = self.scan()
+        if self.settings.volume_is_free:
+            low, high = self.settings.bounds[VOLUME]
+            volume = min(max(state.fluid_volume_m3, low), high)
+            state = self.simulate([np.append(state.point, volume)])[0]
+            fit = self.evaluate(state, "start")
+            if not math.isfinite(fit.cost):
+                raise _hopeless(self.cases, fit)
+        return self.refine(state, fit)
+
+    def simulate(self, points: Sequence[Floats]) -> list[State]:
+        """Run all cases at all points, in one batch."""
+        jobs = [
+            (self.settings.parameters(point), case.item) for point in points for case in self.cases
+        ]
+        results = self.runs.run(jobs)
+        count = len(self.cases)
+        batches = [results[i * count : (i + 1) * count] for i in range(len(points))]
+        for batch in batches:
+            self._note_early_ends(batch)
+        return [State.of(p, batch) for p, batch in zip(points, batches, strict=True)]
+
+    def _note_early_ends(self, batch: Sequence[Simulated]) -> None:
+        for case, result in zip(self.cases, batch, strict=True):
+            if result.outcome is not Outcome.COMPLETE:
+                why = f" ({result.reason})" if result.reason else ""
+                note = f"{case.item.name}: some runs ended early: {result.outcome}{why}"
+                if note not in self.notes:
+                    self.notes.append(note)
+
+    def evaluate(self, state: State, stage: str) -> Fit:
+        """Fit the modulus and report."""
+        fit = fit_modulus(state, self.cases, self.settings)
+        names = [case.item.name for case in self.cases]
+        entry = Evaluation(
+            stage=stage,
+            parameters=self.settings.parameters(
+                state.point, fit.modulus_pa if math.isfinite(fit.cost) else None
+            ),
+            cost=fit.cost,
+            axis_rms_n=axis_rms(fit.pairs),
+            thickness_m=state.thickness_m,
+            fluid_volume_m3=state.fluid_volume_m3,
+            simulations=self.runs.count,
+            failures={names[i]: why for i, why in fit.failures.items()},
+        )
+        self.history.append(entry)
+        if self.on_evaluation is not None:
+            self.on_evaluation(entry)
+        return fit
+
+    def drop(self, which: int, why: str, states: Sequence[State]) -> list[State]:
+        """Leave a case out from now on, in the open."""
+        self.excluded[self.cases[which].item.name] = why
+        kept = [i for i in range(len(self.cases)) if i != which]
+        self.cases = [self.cases[i] for i in kept]
+        return [state.only(kept) for state in states]
+
+    def scan(self) -> tuple[State, Fit]:
+        """Best point of the coarse scan; a case that fails at most points is left out.
+
+        Where most cases fail it is the point's fault, e.g. as paths begin inside a thick skin.
+        """
+        states = self.simulate(self.settings.scan_points())
+        while True:
+            fits = [self.evaluate(state, "scan") for state in states]
+            fair = [fit for fit in fits if len(fit.failures) <= len(self.cases) / 2] or fits
+            failed = [sum(i in fit.failures for fit in fair) for i in range(len(self.cases))]
+            worst = int(np.argmax(failed))
+            none_left = not any(math.isfinite(fit.cost) for fit in fits)
+            if not none_left and failed[worst] <= len(fair) / 2:
+                best = int(np.argmin([fit.cost for fit in fits]))
+                return states[best], fits[best]
+            fit = next(fit for fit in fair if worst in fit.failures)
+            if len(self.cases) == 1:
+                raise _hopeless(self.cases, fit)
+            states = self.drop(worst, f"simulation: {fit.failures[worst]}", states)
+
+    def refine(self, state: State, fit: Fit) -> Calibration:
+        """Step to the optimum, each step confirmed by runs."""
+        names = self.settings.simulated
+        largest = np.array([_REACH[name] for name in names])
+        still = np.array([_STILL[name] for name in names])
+        reach, model, converged = largest.copy(), None, False
+        for _ in range(self.settings.iterations):
+            if model is None:
+                state, fit, model = self.local_model(state, fit)
+            shift, promised = minimise(model, math.log(fit.modulus_pa), reach)
+            gain = fit.cost - promised
+            if (np.abs(shift) <= still).all() or gain <= _ENOUGH * fit.cost:
+                converged = True
+                break
+            trial = self.simulate([state.point * np.exp(shift)])[0]
+            trial_fit = self.evaluate(trial, "step")
+            won = fit.cost - trial_fit.cost
+            if won > 0.1 * gain:
+                state, fit, model = trial, trial_fit, None
+                reach = np.minimum(reach * (1.5 if won > 0.75 * gain else 1.0), largest)
+            else:
+                reach = 0.3 * np.minimum(np.abs(shift), reach)
+                reach = np.maximum(reach, still)
+        else:
+            self.notes.append(f"stopped after {self.settings.iterations} steps, still moving")
+        if model is None:
+            state, fit, model = self.local_model(state, fit)
+        return self._result(model, fit, converged)
+
+    def local_model(self, state: State, fit: Fit) -> tuple[State, Fit, LocalModel]:
+        """Runs beside a point, one parameter moved each; cases that fail both ways are left out."""
+        while True:
+            moved, failures = self._moved(state, fit.modulus_pa)
+            if not failures:
+                return state, fit, LocalModel(state, moved, self.cases, self.settings)
+            which, why = next(iter(failures.items()))
+            if len(self.cases) == 1:
+                raise SimulationError(
+                    f"no simulation beside the optimum can be compared: {why}",
+                    remedy="choose a shallower trajectory, or look into why the solver stops",
+                )
+            (state,) = self.drop(which, f"simulation beside the optimum: {why}", [state])
+            fit = fit_modulus(state, self.cases, self.settings)
+
+    def _moved(self, state: State, modulus_pa: float) -> tuple[list[State], dict[int, str]]:
+        points = []
+        for i, name in enumerate(self.settings.simulated):
+            ahead = state.point.copy()
+            ahead[i] *= 1.0 + STEPS[name]
+            if ahead[i] > self.settings.bounds[name][1]:
+                ahead[i] = state.point[i] / (1.0 + STEPS[name])
+            points.append(ahead)
+        moved = self.simulate(points)
+        for i, beside in enumerate(moved):
+            if not failures_at(beside, self.cases, modulus_pa, self.settings):
+                continue
+            back = state.point.copy()
+            back[i] *= state.point[i] / beside.point[i]
+            moved[i] = self.simulate([back])[0]
+            failures = failures_at(moved[i], self.cases, modulus_pa, self.settings)
+            if failures:
+                return moved, failures
+        return moved, {}
+
+    def _result(self, model: LocalModel, fit: Fit, converged: bool) -> Calibration:
+        state, settings = model.base, self.settings
+        still = np.zeros(len(state.point))
+        paper = replace(settings, fit_offsets=False)
+        factor = fit.modulus_pa / settings.reference_shear_modulus_pa
+        paper_pairs = [
+            compare(line, case, factor, paper)
+            for line, case in zip(state.curves, self.cases, strict=True)
+        ]
+        found = estimates(model, still, math.log(fit.modulus_pa))
+        thickness_sd = next(e.sd for e in found if e.name == THICKNESS) / state.point[0]
+        stiff = replace(settings.parameters(state.point), shear_modulus_pa=fit.modulus_pa)
+        return Calibration(
+            parameters=stiff,
+            estimates=found,
+            fluid_volume_m3=state.fluid_volume_m3,
+            fluid_volume_sd_m3=float(abs(model.volume_slopes[0]) * thickness_sd)
+            if not settings.volume_is_free
+            else next(e.sd for e in found if e.name == VOLUME),
+            thickness_m=state.thickness_m,
+            cost=fit.cost,
+            axis_rms_n=axis_rms(fit.pairs),
+            paper_axis_rms_n=axis_rms(paper_pairs),
+            trajectories=trajectory_fits(
+                [case.item for case in self.cases], fit.pairs, paper_pairs
+            ),
+            history=tuple(self.history),
+            simulations=self.runs.count,
+            converged=converged,
+            excluded=dict(self.excluded),
+            notes=tuple(self.notes),
+            self_test=any(case.item.origin == SIMULATED for case in self.cases),
+        )
+
+
+def _hopeless(cases: Sequence[Case], fit: Fit) -> SimulationError:
+    reasons = "; ".join(f"{cases[i].item.name}: {why}" for i, why in fit.failures.items())
+    return SimulationError(
+        f"no simulation can be compared with its measurement ({reasons})",
+        remedy="check indenter, sensor frame and path, or give other bounds",
+    )

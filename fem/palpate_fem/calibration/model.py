@@ -1,0 +1,199 @@
+"""The cost at a simulated point, with the best modulus: it takes no further run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from palpate_fem.calibration.align import (
+    Aligned,
+    Curve,
+    Floats,
+    Unalignable,
+    align,
+    curve,
+    from_contact,
+)
+from palpate_fem.calibration.cost import axis_rms_n, thickness_error_m
+from palpate_fem.calibration.measured import Indentation
+from palpate_fem.calibration.runs import Simulated
+from palpate_fem.calibration.settings import MODULUS, CalibrationSettings
+
+_GRID = 13
+"""Moduli tried before the search between two of them: steps of 20 % over the paper's bounds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A measured trajectory, its whole curve, and the part from the threshold force on."""
+
+    item: Indentation
+    whole: Curve
+    contact: Curve
+
+    @classmethod
+    def of(cls, item: Indentation, settings: CalibrationSettings) -> Case:
+        """Prepare a trajectory.
+
+        Raises:
+            Unalignable: It does not reach the threshold from below.
+        """
+        return cls.of_curve(item, curve(item.pose, item.force), settings)
+
+    @classmethod
+    def of_curve(cls, item: Indentation, whole: Curve, settings: CalibrationSettings) -> Case:
+        """Prepare a trajectory with another curve than its own."""
+        threshold = settings.threshold_n
+        return cls(item, whole, from_contact(whole, side="measurement", threshold_n=threshold))
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """All runs at one point.
+
+    Attributes:
+        point: Values of the simulated parameters.
+        curves: One for each case, at the modulus of the runs.
+        thickness_m: Total thickness [m].
+        fluid_volume_m3: Fluid [m^3].
+    """
+
+    point: Floats
+    curves: tuple[Curve, ...]
+    thickness_m: float
+    fluid_volume_m3: float
+
+    @classmethod
+    def of(cls, point: Floats, runs: Sequence[Simulated]) -> State:
+        """From the runs of all cases; refused ones know no thickness."""
+        known = [run for run in runs if math.isfinite(run.thickness_m)]
+        first = known[0] if known else runs[0]
+        return cls(
+            point, tuple(run.curve for run in runs), first.thickness_m, first.fluid_volume_m3
+        )
+
+    def only(self, kept: Sequence[int]) -> State:
+        """The same without the cases that are not kept."""
+        curves = tuple(self.curves[i] for i in kept)
+        return State(self.point, curves, self.thickness_m, self.fluid_volume_m3)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The best modulus at one point, and how well it fits.
+
+    Attributes:
+        cost: Total cost [N]; infinite if a case cannot be compared.
+        modulus_pa: Best modulus [Pa].
+        pairs: Aligned curves, one for each case.
+        failures: Index of each case that cannot be compared, and why.
+    """
+
+    cost: float
+    modulus_pa: float
+    pairs: tuple[Aligned, ...]
+    failures: dict[int, str]
+
+
+def compare(simulated: Curve, case: Case, factor: float, settings: CalibrationSettings) -> Aligned:
+    """A simulated curve, scaled by the modulus, against a measured one.
+
+    Raises:
+        Unalignable: It does not reach the threshold.
+    """
+    return align(
+        simulated.scaled(factor),
+        case.contact,
+        threshold_n=settings.threshold_n,
+        increments=settings.increments,
+        fit_offset=settings.fit_offsets,
+    )
+
+
+def fit_modulus(state: State, cases: Sequence[Case], settings: CalibrationSettings) -> Fit:
+    """Find the modulus that fits the runs of one point best; needs no further run."""
+    low, high = settings.log_bounds(MODULUS)
+    grid = np.linspace(low, high, _GRID)
+    costs = np.array([_cost_at(log, state, cases, settings) for log in grid])
+    best = int(costs.argmin())
+    if not math.isfinite(costs[best]):
+        return Fit(math.inf, math.nan, (), _failures(state, cases, settings, grid))
+    if best > 0 and not math.isfinite(costs[best - 1]):
+        # the best would be softer still, but a case that ends early holds it back
+        softer = math.exp(grid[best - 1])
+        return Fit(math.inf, math.nan, (), failures_at(state, cases, softer, settings))
+    bracket = (grid[max(best - 1, 0)], grid[min(best + 1, _GRID - 1)])
+    worst = 10.0 * float(costs[best]) + 1.0  # instead of infinity, which spoils a parabola
+    found = minimize_scalar(
+        lambda log: min(_cost_at(log, state, cases, settings), worst),
+        bounds=bracket,
+        method="bounded",
+        options={"xatol": 1e-4},
+    )
+    log, cost = (found.x, found.fun) if found.fun < costs[best] else (grid[best], costs[best])
+    factor = math.exp(log) / settings.reference_shear_modulus_pa
+    pairs = tuple(
+        compare(line, case, factor, settings)
+        for line, case in zip(state.curves, cases, strict=True)
+    )
+    return Fit(float(cost), math.exp(log), pairs, {})
+
+
+def failures_at(
+    state: State, cases: Sequence[Case], modulus_pa: float, settings: CalibrationSettings
+) -> dict[int, str]:
+    """Index of each case that cannot be compared at this modulus, and why."""
+    failures = {}
+    for i, (line, case) in enumerate(zip(state.curves, cases, strict=True)):
+        try:
+            pair = compare(line, case, modulus_pa / settings.reference_shear_modulus_pa, settings)
+        except Unalignable as error:
+            failures[i] = error.problem
+        else:
+            if pair.coverage < settings.least_coverage:
+                failures[i] = f"covers {pair.coverage:.0%} of the displacement"
+    return failures
+
+
+def _cost_at(
+    log_modulus: float, state: State, cases: Sequence[Case], settings: CalibrationSettings
+) -> float:
+    factor = math.exp(log_modulus) / settings.reference_shear_modulus_pa
+    return force_and_thickness_cost(state.curves, cases, factor, state.thickness_m, settings)
+
+
+def force_and_thickness_cost(
+    curves: Sequence[Curve],
+    cases: Sequence[Case],
+    factor: float,
+    thickness_m: float,
+    settings: CalibrationSettings,
+) -> float:
+    """Cost of scaled curves [N]; infinite if one cannot be compared."""
+    pairs = []
+    for line, case in zip(curves, cases, strict=True):
+        try:
+            pairs.append(compare(line, case, factor, settings))
+        except Unalignable:
+            return math.inf
+        if pairs[-1].coverage < settings.least_coverage:
+            return math.inf
+    error = thickness_error_m(thickness_m, settings.target_thickness_m)
+    weights = settings.weights
+    return weights.force * float(axis_rms_n(pairs).sum()) + weights.thickness * error
+
+
+def _failures(
+    state: State, cases: Sequence[Case], settings: CalibrationSettings, grid: Floats
+) -> dict[int, str]:
+    """Cases that can be compared at no modulus, and why not at the stiffest, which reaches most."""
+    at_each = [failures_at(state, cases, math.exp(log), settings) for log in grid]
+    always = set(at_each[0]).intersection(*at_each)
+    # each may be comparable by itself, but not where the others are
+    return {i: at_each[-1][i] for i in sorted(always)} or dict.fromkeys(
+        range(len(cases)), "no modulus suits it and the others"
+    )

@@ -1,0 +1,182 @@
+"""Does calibration find what was planted? Simulate, add noise, calibrate, compare.
+
+A self-test: the simulator explains its own forces, so it says how far noise, alignment and search
+reach, and nothing about the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from palpate.errors import SimulationError
+from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.calibrate import calibrate
+from palpate_fem.calibration.measured import SIMULATED, Indentation
+from palpate_fem.calibration.result import Calibration, Evaluation
+from palpate_fem.calibration.runs import Runs, Simulated, Simulator
+from palpate_fem.calibration.settings import (
+    FRICTION,
+    MODULUS,
+    THICKNESS,
+    VOLUME,
+    CalibrationSettings,
+)
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.path import path_lengths
+
+TOLERANCES = {THICKNESS: 0.02, MODULUS: 0.02, FRICTION: 0.05, VOLUME: 0.01}
+"""Relative errors that the calibration must stay below."""
+
+
+class Planned(NamedTuple):
+    """A trajectory to simulate: id, indenter, poses (K, 7) that begin above the skin."""
+
+    name: str
+    indenter: str
+    path: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """Planted and found parameters.
+
+    Attributes:
+        truth: Planted values by name, the fluid volume included.
+        found: Calibrated values.
+        sd: Their standard deviations as the calibration states them.
+        calibration: All of it.
+        measured: The noisy trajectories it was made from.
+    """
+
+    truth: dict[str, float]
+    found: dict[str, float]
+    sd: dict[str, float]
+    calibration: Calibration
+    measured: tuple[Indentation, ...]
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Relative errors, signed."""
+        return {name: self.found[name] / value - 1.0 for name, value in self.truth.items()}
+
+    @property
+    def passed(self) -> bool:
+        """Whether every error is within its tolerance."""
+        return all(abs(error) <= TOLERANCES[name] for name, error in self.errors.items())
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Parameter, planted, found, error, stated deviation, tolerance, verdict; for a table."""
+        return [
+            (
+                name,
+                f"{self.truth[name]:.4g}",
+                f"{self.found[name]:.4g}",
+                f"{error:+.2%}",
+                f"{self.sd[name] / self.found[name]:.2%}",
+                f"{TOLERANCES[name]:.0%}",
+                "ok" if abs(error) <= TOLERANCES[name] else "FAILED",
+            )
+            for name, error in self.errors.items()
+        ]
+
+
+def noisy(
+    planned: Planned, run: Simulated, sensor: str, noise_n: float, random: np.random.Generator
+) -> Indentation:
+    """A simulated trajectory as an instrument would record it, up to where it ended.
+
+    Args:
+        planned: What was simulated.
+        run: The result, at the poses of the path.
+        sensor: Name of the pretended sensor.
+        noise_n: Standard deviation of the noise of each axis [N].
+        random: Source of the noise.
+
+    Raises:
+        SimulationError: Fewer than two steps, or steps that are not at the poses of the path.
+    """
+    count = len(run.forces)
+    if count < 2 or not np.allclose(run.travel, path_lengths(planned.path)[:count]):
+        raise SimulationError(
+            f"{planned.name} cannot be simulated: {run.outcome} {run.reason}".strip(),
+            remedy="plan another trajectory",
+        )
+    return Indentation(
+        f"{planned.name}/{sensor}",
+        planned.indenter,
+        sensor,
+        planned.path[:count],
+        run.forces + random.normal(0.0, noise_n, run.forces.shape),
+        SIMULATED,
+        str(run.outcome),
+    )
+
+
+def recover(
+    simulator: Simulator,
+    truth: FingertipParameters,
+    trajectories: Sequence[Planned],
+    noise_n: float,
+    seed: int,
+    *,
+    sensors: int = 1,
+    settings: CalibrationSettings | None = None,
+    executor: Executor | None = None,
+    on_evaluation: Callable[[Evaluation], None] | None = None,
+    on_run: Callable[[int, int], None] | None = None,
+) -> Recovery:
+    """Calibrate on simulated, noisy trajectories of known parameters.
+
+    The calibration gets forces and poses only, and begins with its scan.
+
+    Args:
+        simulator: Runs both.
+        truth: Planted parameters.
+        trajectories: What to simulate; angled ones among them, for friction.
+        noise_n: Standard deviation of the noise of each axis [N].
+        seed: Of the noise.
+        sensors: Records of each trajectory with noise of their own; the paper had three BioTacs.
+        settings: Of the calibration.
+        executor: Where simulations run.
+        on_evaluation: See ``calibrate``.
+        on_run: See ``calibrate``.
+
+    Raises:
+        SimulationError: The planted trajectories cannot be simulated or compared.
+    """
+    random = np.random.default_rng(seed)
+    plans = [Indentation(p.name, p.indenter, "-", p.path, np.zeros((len(p.path), 3)))
+             for p in trajectories]  # fmt: skip
+    runs = Runs(simulator, executor, on_run).run((truth, plan) for plan in plans)
+    measured = tuple(
+        noisy(planned, run, f"virtual{number + 1}", noise_n, random)
+        for planned, run in zip(trajectories, runs, strict=True)
+        for number in range(sensors)
+    )
+    result = calibrate(
+        simulator,
+        measured,
+        settings,
+        executor=executor,
+        on_evaluation=on_evaluation,
+        on_run=on_run,
+    )
+    planted = {
+        THICKNESS: truth.skin_thickness_m,
+        MODULUS: truth.shear_modulus_pa,
+        FRICTION: truth.friction_coefficient,
+        VOLUME: runs[0].fluid_volume_m3,
+    }
+    sd = {estimate.name: estimate.sd for estimate in result.estimates}
+    return Recovery(
+        planted,
+        {name: result.value(name) for name in planted},
+        {VOLUME: result.fluid_volume_sd_m3} | sd,
+        result,
+        measured,
+    )

@@ -1,0 +1,216 @@
+"""What a calibration found, and its file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.calibration.align import Aligned
+from palpate_fem.calibration.cost import axis_rms_n, rms_n
+from palpate_fem.calibration.errors import Estimate
+from palpate_fem.calibration.measured import Indentation
+from palpate_fem.config import FingertipParameters
+
+SCHEMA = "palpate.calibration"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """One evaluation of the cost that took runs.
+
+    Attributes:
+        stage: ``scan``, ``start`` or ``step``.
+        parameters: Where; the modulus is the best one there.
+        cost: Total cost [N]; infinite if a trajectory could not be compared.
+        axis_rms_n: RMS force error of each axis [N].
+        thickness_m: Total thickness [m].
+        fluid_volume_m3: Fluid [m^3].
+        simulations: Runs made until now.
+        failures: Trajectory and reason, of those that could not be compared.
+    """
+
+    stage: str
+    parameters: FingertipParameters
+    cost: float
+    axis_rms_n: tuple[float, ...]
+    thickness_m: float
+    fluid_volume_m3: float
+    simulations: int
+    failures: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryFit:
+    """How one trajectory fits at the optimum; ``pair`` has the curves.
+
+    ``rms_n`` is what was minimised; ``paper_rms_n`` is with the paper's alignment at 0.5 N.
+    """
+
+    name: str
+    indenter: str
+    sensor: str
+    rms_n: float
+    paper_rms_n: float
+    depth_offset_m: float
+    coverage: float
+    pair: Aligned
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Calibrated parameters and what speaks for and against them.
+
+    Attributes:
+        parameters: For the solver; its fluid volume is None unless the volume was free.
+        estimates: Each free parameter with uncertainty, sensitivity and bounds.
+        fluid_volume_m3: Fluid between skin and core [m^3].
+        fluid_volume_sd_m3: One standard deviation [m^3].
+        thickness_m: Total thickness that was reached [m].
+        cost: Total cost [N].
+        axis_rms_n: RMS force error of each axis [N], as minimised.
+        paper_axis_rms_n: The same with the paper's alignment at 0.5 N.
+        trajectories: Each compared trajectory.
+        history: Every evaluation that took runs, in order.
+        simulations: Runs made.
+        converged: Whether the last step was below what matters.
+        excluded: Trajectories that were not compared, with the reason.
+        notes: What else the reader must know, such as runs that ended early.
+        self_test: Whether the "measurements" are simulations themselves.
+    """
+
+    parameters: FingertipParameters
+    estimates: tuple[Estimate, ...]
+    fluid_volume_m3: float
+    fluid_volume_sd_m3: float
+    thickness_m: float
+    cost: float
+    axis_rms_n: tuple[float, ...]
+    paper_axis_rms_n: tuple[float, ...]
+    trajectories: tuple[TrajectoryFit, ...]
+    history: tuple[Evaluation, ...]
+    simulations: int
+    converged: bool
+    excluded: dict[str, str]
+    notes: tuple[str, ...]
+    self_test: bool
+
+    def value(self, name: str) -> float:
+        """Value of a calibrated parameter [SI], the fluid volume included."""
+        if name == "fluid_volume_m3":
+            return self.fluid_volume_m3
+        return float(getattr(self.parameters, name))
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Parameter, value, standard deviation, force per 1 %, bounds, remark; for a table."""
+        rows: list[tuple[str, ...]] = []
+        for item in self.estimates:
+            remark = "at its bound" if item.at_bound else ""
+            if math.isinf(item.sd):
+                remark = "not determined by these trajectories"
+            rows.append(
+                (
+                    item.name,
+                    f"{item.value:.4g}",
+                    f"{item.sd:.2g}",
+                    f"{item.sensitivity_n:.3f} N",
+                    f"{item.lower:g} .. {item.upper:g}",
+                    remark,
+                )
+            )
+        if not any(item.name == "fluid_volume_m3" for item in self.estimates):
+            volume = f"{self.fluid_volume_m3:.4g}"
+            follows = f"follows from {self.parameters.total_thickness_m * 1e3:g} mm thickness"
+            rows.append(
+                ("fluid_volume_m3", volume, f"{self.fluid_volume_sd_m3:.2g}", "", "", follows)
+            )
+        return rows
+
+
+def axis_rms(pairs: Sequence[Aligned]) -> tuple[float, ...]:
+    """RMS force error of each axis [N]; NaN if nothing was compared."""
+    return tuple(axis_rms_n(pairs).tolist()) if pairs else (math.nan,) * 3
+
+
+def trajectory_fits(
+    items: Sequence[Indentation], pairs: Sequence[Aligned], paper_pairs: Sequence[Aligned]
+) -> tuple[TrajectoryFit, ...]:
+    """Pair each compared trajectory with its curves."""
+    return tuple(
+        TrajectoryFit(
+            item.name,
+            item.indenter,
+            item.sensor,
+            rms_n(pair),
+            rms_n(paper_pair),
+            pair.depth_offset_m,
+            pair.coverage,
+            pair,
+        )
+        for item, pair, paper_pair in zip(items, pairs, paper_pairs, strict=True)
+    )
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write JSON without NaN or infinity (null instead); the file appears whole or not at all.
+
+    Raises:
+        DatasetError: The disk refused.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n", "utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise DatasetError(
+            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
+        ) from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def write_calibration(path: Path, result: Calibration) -> None:
+    """Write a calibration as JSON; ``read_parameters`` takes it up again.
+
+    Raises:
+        DatasetError: The disk refused.
+    """
+    write_json(path, {"schema": SCHEMA, "schema_version": SCHEMA_VERSION} | asdict(result))
+
+
+def read_parameters(path: Path) -> FingertipParameters:
+    """Parameters of a calibration file.
+
+    Raises:
+        ConfigError: There is no such file, it is no calibration, or its values are out of range.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        if (content["schema"], content["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
+            raise KeyError("schema")
+        return FingertipParameters(**content["parameters"])
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(
+            f"{path}: no calibration of schema {SCHEMA} {SCHEMA_VERSION} ({error!r})",
+            remedy="make it with `palpate fem calibrate`",
+        ) from error

@@ -1,0 +1,187 @@
+"""Runs of the simulator for comparison with measurements: each once, several at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import CancelledError, Executor, Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.calibration.align import Curve, Floats, along
+from palpate_fem.calibration.measured import Indentation
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.result import Outcome, Trajectory
+
+Key = tuple[object, ...]
+
+_PLACES = 9
+"""Decimals of a path's metres that tell runs apart: a nanometre is far below what a solver sees."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """What a comparison needs of one simulated indentation.
+
+    Attributes:
+        forces: Net force on the BioTac at the first k poses of the path, the untouched first one
+            included [N], sensor frame, shape (k, 3).
+        travel: Path length at each of them [m], shape (k,).
+        thickness_m: Total thickness of the pressurised finger [m].
+        fluid_volume_m3: Fluid between skin and core [m^3].
+        outcome: How it ended.
+        reason: Why it did not complete.
+    """
+
+    forces: Floats
+    travel: Floats
+    thickness_m: float
+    fluid_volume_m3: float
+    outcome: Outcome
+    reason: str = ""
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, *, thickness_m: float, fluid_volume_m3: float) -> Simulated:
+        """From a solver's trajectory, whose steps begin at the second pose, and its finger."""
+        forces = from_rest(trajectory.forces)
+        return cls(
+            forces,
+            path_lengths(trajectory.path)[: len(forces)],
+            thickness_m,
+            fluid_volume_m3,
+            trajectory.outcome,
+            trajectory.reason,
+        )
+
+    @property
+    def curve(self) -> Curve:
+        """Force against travel."""
+        return along(self.travel, self.forces)
+
+
+def from_rest(force_n: Floats) -> Floats:
+    """Forces at a solver's steps, and none before them at the untouched first pose [N]."""
+    return np.concatenate([np.zeros((1, 3)), force_n])
+
+
+class Simulator(Protocol):
+    """Runs one indentation; it must be picklable for a process pool.
+
+    Successive calls of a process mostly share their parameters: an implementation should keep the
+    last pressurised finger. A run that ends early is an answer, not an error.
+    """
+
+    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+        """Indent a finger of these parameters along a path, shape (K, 7)."""
+        ...
+
+
+class Runs:
+    """Memo of runs, filled through an executor.
+
+    Args:
+        simulator: What runs.
+        executor: Where it runs, e.g. a process pool; None = here, one after the other.
+        on_run: Told after each run how many of those now asked for are done, and how many they are.
+
+    Attributes:
+        count: Runs made so far.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        executor: Executor | None = None,
+        on_run: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self._simulator = simulator
+        self._executor = executor
+        self._on_run = on_run
+        self._memo: dict[Key, Simulated] = {}
+        self.count = 0
+
+    def run(self, jobs: Iterable[tuple[FingertipParameters, Indentation]]) -> list[Simulated]:
+        """Results in the order of the jobs; what ran before is not run again.
+
+        A run that the simulator refuses comes back without steps, with the reason.
+
+        Raises:
+            SimulationError: A process of the simulation died.
+        """
+        wanted = [(_key(parameters, item), parameters, item) for parameters, item in jobs]
+        new = {key: (p, item) for key, p, item in wanted if key not in self._memo}
+        for done, (key, result) in enumerate(self._results(new), start=1):
+            self._memo[key] = result
+            self.count += 1
+            if self._on_run is not None:
+                self._on_run(done, len(new))
+        return [self._memo[key] for key, _, _ in wanted]
+
+    def _results(
+        self, new: dict[Key, tuple[FingertipParameters, Indentation]]
+    ) -> Iterable[tuple[Key, Simulated]]:
+        if self._executor is None:
+            for key, (parameters, item) in new.items():
+                yield key, _simulate(self._simulator, parameters, item.indenter, item.pose)
+            return
+        futures: dict[Future[Simulated], Key] = {}
+        try:
+            for key, (parameters, item) in new.items():
+                future = self._executor.submit(
+                    _simulate, self._simulator, parameters, item.indenter, item.pose
+                )
+                futures[future] = key
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except (BrokenProcessPool, CancelledError) as error:
+            raise SimulationError(
+                f"a process of the simulation ended by itself: {error}",
+                remedy="check the memory of the machine, or use fewer processes",
+            ) from error
+        finally:  # after an error or Ctrl-C nobody waits for the rest
+            for future in futures:
+                future.cancel()
+
+
+def _simulate(
+    simulator: Simulator, parameters: FingertipParameters, indenter: str, path: Floats
+) -> Simulated:
+    """One run; a refused one is one trajectory's trouble, not that of all."""
+    try:
+        return simulator.simulate(parameters, indenter, path)
+    except (SimulationError, ConfigError) as error:
+        nothing = np.empty(0)
+        return Simulated(
+            np.empty((0, 3)), nothing, math.nan, math.nan, Outcome.DIVERGED, f"refused: {error}"
+        )
+
+
+def _key(parameters: FingertipParameters, item: Indentation) -> Key:
+    """One key for what gives one answer: the sensor and the measured force do not matter."""
+    path = np.round(item.pose, _PLACES) + 0.0  # -0.0 and 0.0 are one place
+    return (parameters, item.indenter, path.tobytes())
+
+
+def simulate_all(
+    simulator: Simulator,
+    parameters: FingertipParameters,
+    measured: Sequence[Indentation],
+    *,
+    executor: Executor | None = None,
+    on_run: Callable[[int, int], None] | None = None,
+) -> dict[str, Simulated]:
+    """Run every measured trajectory in simulation; sensors that share a path share its run.
+
+    Returns:
+        Simulations by the name of the trajectory.
+
+    Raises:
+        SimulationError: A process of the simulation died.
+    """
+    results = Runs(simulator, executor, on_run).run((parameters, item) for item in measured)
+    return {item.name: result for item, result in zip(measured, results, strict=True)}

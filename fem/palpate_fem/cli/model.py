@@ -1,0 +1,91 @@
+"""Which fingertip a command means: mesh, parameters, and how many workers solve it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from palpate.errors import ConfigError
+from palpate_fem.config import FingertipParameters
+from palpate_fem.service.config import DEFAULT_FACTORY
+from palpate_fem.service.jobs import Setup
+
+PARAMETRIC = "biotac"
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What the options of a command say.
+
+    Attributes:
+        factory: ``module:function`` that makes fingertips.
+        options: Its keyword arguments.
+        parameters: Of the fingertip.
+    """
+
+    factory: str
+    options: Mapping[str, object]
+    parameters: FingertipParameters
+
+    def setup(self, *, keep: int = 1) -> Setup:
+        """For workers."""
+        return Setup(self.factory, self.options, self.parameters, keep)
+
+
+def model_of(
+    *,
+    mesh: str,
+    edge_mm: float | None,
+    layers: int,
+    fit: Path | None = None,
+    skin_thickness_mm: float | None = None,
+    shear_modulus_kpa: float | None = None,
+    friction: float | None = None,
+) -> Model:
+    """Check the options and convert their units.
+
+    Raises:
+        ConfigError: A value is out of range, or a file is not there.
+    """
+    options: dict[str, object] = {"layers": layers}
+    if mesh != PARAMETRIC:
+        if not Path(mesh).is_dir():
+            raise ConfigError(
+                f"--mesh {mesh}: there is no such folder",
+                remedy=f"give the folder that holds meshes/biotac, or {PARAMETRIC!r}",
+            )
+        if edge_mm is not None:
+            raise ConfigError(
+                "--edge-mm is for the parametric mesh", remedy="leave it out, or --mesh biotac"
+            )
+        options["mesh"] = str(Path(mesh).resolve())
+    elif edge_mm is not None:
+        options["edge_m"] = edge_mm * 1e-3
+    base = FingertipParameters()
+    if fit is not None:
+        from palpate_fem.calibration.result import read_parameters
+
+        base = read_parameters(fit)
+    given = {
+        "skin_thickness_m": None if skin_thickness_mm is None else skin_thickness_mm * 1e-3,
+        "shear_modulus_pa": None if shear_modulus_kpa is None else shear_modulus_kpa * 1e3,
+        "friction_coefficient": friction,
+    }
+    wanted = {name: value for name, value in given.items() if value is not None}
+    return Model(DEFAULT_FACTORY, options, replace(base, **wanted))
+
+
+def workers_for(wanted: int, jobs: int | None = None) -> tuple[int, int]:
+    """Workers, and threads for each, on this host.
+
+    Args:
+        wanted: As asked for; 0 = one for each core.
+        jobs: How much there is to do, if that is known.
+    """
+    cores = os.cpu_count() or 1
+    workers = wanted or cores
+    if jobs is not None:
+        workers = max(1, min(workers, jobs))
+    return workers, max(1, cores // workers)

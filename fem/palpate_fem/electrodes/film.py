@@ -1,0 +1,282 @@
+"""The film's mesh: triangles on the core where fluid wets it, with the electrodes' rims in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, cKDTree
+
+from palpate.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
+from palpate.errors import ConfigError
+from palpate_fem.electrodes.table import DISC_DIAMETER_M, DISC_TERMINAL
+from palpate_fem.mesh.core import Core
+from palpate_fem.mesh.surface import face_vectors, open_edges
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+EDGE_M = 0.55e-3
+"""Of the triangles between the discs [m]: 3,000 nodes on the BioTac."""
+
+TOP_Z_M = 1.2e-3  # above, the core turns into the dorsal flat under the nail (mesh.shape: 1.91 mm)
+BACK_X_M = -17.9e-3  # behind, the rounded proximal edge and the clamp (mesh.shape: -18.54 mm)
+RADIUS_M = 5.1e-3  # of the capsule that the points are laid on before they go onto the core
+
+# Rings of nodes about a disc: radius over the disc's, how many, angle of the first in steps. The
+# current leaves at the rim, so rings are dense there; those next to it have its angles, or Delaunay
+# would flip its edges.
+RINGS = (
+    (0.4, 8, 0.0),
+    (0.7, 14, 0.5),
+    (0.88, 24, 0.0),
+    (1.0, 24, 0.0),
+    (1.13, 24, 0.0),
+    (1.35, 20, 0.5),
+)
+RIM = 3
+LONGEST_M = 1.8e-3  # edge of a triangle at a disc, however short the others are
+CLEAR = 1.52  # no other nodes within so many radii of a *nominal* disc: topology is kept
+# Larger discs, or a smaller core, would let E7..E10 touch.
+LIMITS = {
+    "edge_m": (0.25e-3, 1.0e-3),
+    "disc_diameter_m": (2.0e-3, 2.6e-3),
+    "recess_m": (-0.1e-3, 0.3e-3),
+}
+
+
+@dataclass(frozen=True)
+class FilmMesh:
+    """Triangles of the film; its border is insulated.
+
+    Attributes:
+        nodes: On the core [m], shape (N, 3), sensor frame.
+        normals: Unit normals of the core there, out of it, shape (N, 3).
+        faces: Triangles, counter-clockwise seen from outside, shape (F, 3).
+        terminal: Terminal whose electrode lies under each triangle, -1 for none, shape (F,).
+    """
+
+    nodes: Floats
+    normals: Floats
+    faces: Ints
+    terminal: Ints
+
+    @property
+    def areas(self) -> Floats:
+        """Of the triangles [m^2], shape (F,)."""
+        return np.asarray(np.linalg.norm(face_vectors(self.nodes, self.faces), axis=1))
+
+    def volume(self, film: Floats) -> float:
+        """Fluid under a film of thickness (N,) [m^3], the core's curvature left out."""
+        return float((self.areas * film[self.faces].mean(axis=1)).sum())
+
+
+def film_mesh(
+    core: Core,
+    *,
+    edge_m: float = EDGE_M,
+    disc_diameter_m: float = DISC_DIAMETER_M,
+    recess_m: float = 0.0,
+) -> FilmMesh:
+    """Mesh the wetted surface of a core, from the clamp over the pad to the nail's rim.
+
+    Nodes lie on the rims of the discs, so a disc is a union of triangles of exactly its area, and
+    no result jumps where a disc's diameter changes a little.
+
+    Args:
+        core: The core, in the sensor frame.
+        edge_m: Edge of the triangles between the discs [m].
+        disc_diameter_m: Of the electrodes [m].
+        recess_m: How far the film's floor lies below the core's surface [m]: 0.25 mm makes the
+            radius of the electrode table (5.08 mm) of that of the public part (5.33 mm).
+
+    Raises:
+        ConfigError: An argument is out of range, or the electrodes do not fit onto the core.
+    """
+    given = {"edge_m": edge_m, "disc_diameter_m": disc_diameter_m, "recess_m": recess_m}
+    for name, value in given.items():
+        low, high = LIMITS[name]
+        if not low <= value <= high:
+            raise ConfigError(f"{name} = {value} is not within [{low:g}, {high:g}]", remedy="in m")
+    centres = onto(core, np.concatenate([ELECTRODE_POSITIONS, EXCITATION_POSITIONS]), -recess_m)[0]
+    radius = disc_diameter_m / 2
+    points, disc, about = _disc_points(core, centres, radius, recess_m)
+    # Where discs stand close, a ring's node that comes near to another disc is left out.
+    away = np.linalg.norm(points[:, None] - centres, axis=2)
+    away[np.arange(len(points)), about] = np.inf
+    keep = (disc >= 0) | (away.min(axis=1) > 1.15 * radius)
+    points, disc = points[keep], disc[keep]
+    between = onto(core, _lattice(edge_m), -recess_m)[0]
+    far, _ = cKDTree(centres).query(between)
+    between = between[far > max(CLEAR * DISC_DIAMETER_M / 2, 1.3 * radius + 0.3 * edge_m)]
+    points = np.concatenate([points, between])
+    disc = np.concatenate([disc, np.full(len(between), -1)])
+    faces = _triangles(points, edge_m)
+    used, compact = np.unique(faces, return_inverse=True)
+    faces = compact.reshape(-1, 3).astype(np.int32)
+    points, disc = points[used], disc[used]
+    at = disc[faces]
+    inside = (at[:, 0] >= 0) & (at == at[:, :1]).all(axis=1)
+    terminal = np.where(inside, DISC_TERMINAL[at[:, 0]], -1).astype(np.int32)
+    mesh = FilmMesh(points, onto(core, points, -recess_m)[1], faces, terminal)
+    for i in range(len(centres)):
+        area = mesh.areas[inside & (at[:, 0] == i)].sum() / (np.pi * radius**2)
+        if not 0.97 < area < 1.04:  # curvature makes it up to 2 % larger
+            raise ConfigError(
+                f"electrode disc {i} covers {area:.2f} of its area on the core",
+                remedy="check that the core is in the sensor frame",
+            )
+    return mesh
+
+
+def onto(core: Core, points: Floats, level_m: float = 0.0) -> tuple[Floats, Floats]:
+    """Nearest points of a level of the core's distance, and the unit normals there.
+
+    Args:
+        core: The core.
+        points: Near its surface [m], shape (N, 3).
+        level_m: Distance from the surface, negative inside [m].
+    """
+    points = np.array(points, np.float64)
+    for _ in range(8):
+        value, gradient, _ = core.grid.evaluate(points)
+        square = np.maximum(np.einsum("ni,ni->n", gradient, gradient), 0.25)
+        points -= ((value - level_m) / square)[:, None] * gradient
+    _, gradient, _ = core.grid.evaluate(points)
+    return points, gradient / np.linalg.norm(gradient, axis=1)[:, None]
+
+
+def _disc_points(
+    core: Core, centres: Floats, radius: float, recess: float
+) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+    """Rings about the discs, in which disc each point lies (-1 in none), about which it was laid.
+
+    Points stand in order of rings, then discs.
+    """
+    _, normal = onto(core, centres, -recess)
+    across = np.cross(normal, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    along = np.cross(across, normal)
+    everyone = np.arange(len(centres))
+    about = np.concatenate([everyone, *(np.repeat(everyone, ring[1]) for ring in RINGS)])
+    within = len(centres) * (1 + sum(ring[1] for ring in RINGS[: RIM + 1]))
+    disc = np.where(np.arange(len(about)) < within, about, -1)
+    # On a curved core a disc laid on shrinks by some per cent; it gets its area back.
+    stretch = np.ones(len(centres))
+    for trial in range(3):
+        points = [centres]
+        for share, count, turn in RINGS:
+            angle = 2 * np.pi * (np.arange(count) + turn) / count
+            flat = (
+                np.cos(angle)[:, None] * along[:, None] + np.sin(angle)[:, None] * across[:, None]
+            )
+            way = (share * radius * stretch)[:, None, None] * flat
+            points.append((centres[:, None] + way).reshape(-1, 3))
+        laid = onto(core, np.concatenate(points), -recess)[0]
+        if trial < 2:
+            stretch *= np.sqrt(np.pi * radius**2 / _rim_areas(laid, len(centres)))
+    return laid, disc, about
+
+
+def _rim_areas(laid: Floats, count: int) -> Floats:
+    """Area within the rim of each disc, by triangles from its centre [m^2]."""
+    start = count * (1 + sum(ring[1] for ring in RINGS[:RIM]))
+    rim = laid[start : start + count * RINGS[RIM][1]].reshape(count, -1, 3)
+    middle = laid[:count, None]
+    fan = np.cross(rim - middle, np.roll(rim, -1, axis=1) - middle)
+    return np.asarray(np.linalg.norm(fan, axis=2).sum(axis=1) / 2)
+
+
+def _lattice(edge: float) -> Floats:
+    """Points about `edge` apart on the ventral part of a capsule; rows are mirror-symmetric."""
+    row = edge * np.sqrt(3) / 2
+    rows = np.ceil(-BACK_X_M / row)
+    barrel = np.linspace(BACK_X_M, 0.0, int(rows) + 1)
+    cap = np.linspace(0.0, np.pi / 2, int(np.ceil(RADIUS_M * np.pi / 2 / row)) + 1)[1:]
+    x = np.concatenate([barrel, RADIUS_M * np.sin(cap)])
+    radius = np.concatenate([np.full(len(barrel), RADIUS_M), RADIUS_M * np.cos(cap)])
+    points = []
+    for number, (at, r) in enumerate(zip(x, radius, strict=True)):
+        if r <= TOP_Z_M:  # the whole ring
+            count = max(1, round(2 * np.pi * r / edge))
+            angle = 2 * np.pi * (np.arange(count) + 0.5 * (number % 2)) / count
+        else:
+            widest = np.arccos(-TOP_Z_M / r)
+            count = round(2 * widest * r / edge)
+            angle = np.linspace(-widest, widest, count + 1)
+            if number % 2:  # staggered, its ends on the border all the same
+                middle = (angle[1:] + angle[:-1]) / 2
+                angle = np.concatenate([angle[:1], middle, angle[-1:]])
+        points.append(
+            np.stack([np.full(len(angle), at), r * np.sin(angle), -r * np.cos(angle)], axis=1)
+        )
+    return np.concatenate(points)
+
+
+def _triangles(points: Floats, edge: float) -> Ints:
+    """Delaunay triangles in a conformal picture of the capsule, which keeps their shapes."""
+    x, y, z = points.T
+    angle = np.arctan2(y, -z)
+    polar = np.arctan2(np.hypot(y, z), np.maximum(x, 0.0))
+    away = np.where(x < 0, np.exp(-x / RADIUS_M), np.tan(polar / 2))
+    faces = Delaunay(away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)).simplices
+    corner = points[faces]
+    longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
+    # Across the open back of the capsule.
+    keep = longest < max(2.5 * edge, LONGEST_M)
+    keep &= corner[:, :, 2].mean(axis=1) < TOP_Z_M + 0.5 * edge
+    faces, middle = faces[keep], corner[keep].mean(axis=1)
+    middle[:, 0] = np.maximum(middle[:, 0], 0.0)
+    inwards = np.einsum("fi,fi->f", face_vectors(points, faces), middle) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return _trimmed(points, _flipped(points, np.asarray(faces, np.int32)))
+
+
+def _trimmed(points: Floats, faces: Ints) -> Ints:
+    """Without the flat triangles that Delaunay leaves along a border."""
+    while True:
+        corner = points[faces]
+        longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
+        flat = np.linalg.norm(face_vectors(points, faces), axis=1) < 0.05 * longest**2
+        count = len(points)
+        loose = open_edges(faces).astype(np.int64)
+        key = loose[:, 0] * count + loose[:, 1]
+        own = faces.astype(np.int64) * count + np.roll(faces, -1, axis=1)
+        outer = np.isin(own, key).any(axis=1)
+        if not (flat & outer).any():
+            return faces
+        faces = faces[~(flat & outer)]
+
+
+def _flipped(points: Floats, faces: Ints) -> Ints:
+    """Flip edges until opposite angles add up to less than pi in space, not in the picture.
+
+    (Lawson 1977.) The picture is not conformal on the tip's facet.
+    """
+    faces = faces.copy()
+    for _ in range(30):
+        pairs = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=2)
+        key = pairs.min(axis=2).astype(np.int64) * len(points) + pairs.max(axis=2)
+        order = np.argsort(key.ravel(), kind="stable")
+        twice = np.flatnonzero(np.diff(key.ravel()[order]) == 0)
+        one, other = order[twice], order[twice + 1]
+        sides = points[pairs] - points[faces][:, :, None]
+        cosine = np.einsum("fci,fci->fc", sides[:, :, 0], sides[:, :, 1])
+        cosine /= np.linalg.norm(sides, axis=3).prod(axis=2)
+        angle = np.arccos(np.clip(cosine, -1.0, 1.0)).ravel()
+        excess = angle[one] + angle[other] - np.pi
+        worst = np.argsort(-excess)
+        worst = worst[excess[worst] > 1e-6]
+        if not len(worst):
+            break
+        taken = np.zeros(len(faces), bool)
+        for i in worst:  # each triangle once a round
+            (f, a), (g, b) = divmod(int(one[i]), 3), divmod(int(other[i]), 3)
+            if taken[f] or taken[g]:
+                continue
+            taken[[f, g]] = True
+            top, left, right = faces[f, a], faces[f, (a + 1) % 3], faces[f, (a + 2) % 3]
+            bottom = faces[g, b]
+            faces[f], faces[g] = (top, left, bottom), (top, bottom, right)
+    return faces

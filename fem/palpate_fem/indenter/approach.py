@@ -1,0 +1,184 @@
+"""Where an indenter first touches a surface, and whether it is clear of it.
+
+A gap shrinks by no more than the indenter moves. So it may always move by the smallest gap, and a
+point whose gap is larger than what is left of the way need not be looked at again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from palpate.errors import SimulationError
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.pose import rotation_matrix, to_indenter, unit
+from palpate_fem.indenter.shape import Indenter, Kind
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+_TOUCH = 1e-9  # [m]; gap that counts as none
+_LARGE_M = 1.5e-3  # a face from this size on may be touched far from its corners
+_MOVES = 2000  # a touch at a glancing angle is approached slowly
+_LEVELS = (3, 9, 25)  # points along a face's edge
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """The outer surface of a fingertip.
+
+    Attributes:
+        nodes: Positions [m], shape (V, 3), sensor frame.
+        faces: Triangles or bilinear quadrilaterals, normals outwards, shape (F, 3) or (F, 4).
+    """
+
+    nodes: Floats
+    faces: Ints
+
+    def samples(self, count: int, faces: NDArray[np.intp] | None = None) -> Floats:
+        """Points on the faces, their edges included, (F, S, 3); count of them along an edge."""
+        chosen = self.faces if faces is None else self.faces[faces]
+        part = np.linspace(0.0, 1.0, count)
+        u, v = np.tile(part, count), np.repeat(part, count)
+        if self.faces.shape[1] == 3:
+            keep = u + v <= 1.0 + 1e-12
+            u, v = u[keep], v[keep]
+            weights = np.stack([1.0 - u - v, u, v])
+        else:
+            weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])
+        return np.asarray(np.einsum("ks,fki->fsi", weights, self.nodes[chosen]))
+
+
+def first_contact(
+    indenter: Indenter,
+    quaternion: Floats,
+    target: ArrayLike,
+    direction: ArrayLike,
+    surface: Surface,
+) -> float:
+    """Travel of the tip beyond a target at which the indenter first touches the surface.
+
+    Args:
+        indenter: The indenter, coming from far away.
+        quaternion: Its orientation w x y z, shape (4,).
+        target: Point of the sensor frame through which the tip's line goes [m], shape (3,).
+        direction: Where it moves, sensor frame, shape (3,).
+        surface: What it touches; faces are used, not only their corners.
+
+    Returns:
+        Travel [m], negative where it touches before its tip reaches the target.
+
+    Raises:
+        SimulationError: It passes the surface.
+    """
+    turn = rotation_matrix(quaternion)
+    target = np.asarray(target, np.float64)
+    move = turn.T @ unit(direction)  # per metre, indenter frame
+    corner = surface.nodes[surface.faces]
+    sizes = np.linalg.norm(corner - np.roll(corner, -2, axis=1), axis=2).max(axis=1)
+    large = np.flatnonzero(sizes > _LARGE_M)
+    points = surface.nodes[np.unique(surface.faces)]
+    if len(large):
+        count = min(2 + int(sizes.max() / _LARGE_M), 33)
+        points = np.concatenate([points, surface.samples(count, large).reshape(-1, 3)])
+    points = (points - target) @ turn
+    along = points @ move
+    start = float(along.min()) - _reach(indenter)
+    end = float(along.max()) + _reach(indenter)
+
+    # A few points tell about how far it can go; the rest then is quick.
+    limit = _trace(indenter, points[:: max(1, len(points) // 200)], move, start, end)
+    limit = _trace(indenter, points, move, start, limit)
+    faces, spacing = np.arange(len(surface.faces)), 2.0 * sizes
+    samples = (surface.nodes[surface.faces] - target) @ turn
+    for count in _LEVELS:
+        shifted = (samples - limit * move).reshape(-1, 3)
+        gap = signed_distance(indenter, shifted).reshape(samples.shape[:2]).min(axis=1)
+        near = gap < spacing
+        faces, spacing = faces[near], sizes[faces[near]] / (count - 1)
+        samples = (surface.samples(count, faces) - target) @ turn
+        limit = _trace(indenter, samples.reshape(-1, 3), move, start, limit)
+    if limit >= end:
+        raise SimulationError(
+            f"indenter {indenter.name!r} passes the fingertip without touching it",
+            remedy="aim at a point of the skin, along a direction that leads into it",
+        )
+    return limit
+
+
+def check_clear(indenter: Indenter, pose: Floats, surface: Surface) -> float:
+    """Check that an indenter neither touches the skin nor is within the finger.
+
+    Args:
+        indenter: The indenter.
+        pose: Position [m] and unit quaternion w x y z, sensor frame, shape (7,).
+        surface: Outer surface of the pressurised skin.
+
+    Returns:
+        Gap [m], positive: at corners, middles and edge middles of faces, so a little too large.
+
+    Raises:
+        SimulationError: It does; says by how much.
+    """
+    points = surface.samples(_LEVELS[0]).reshape(-1, 3)
+    gap = float(signed_distance(indenter, to_indenter(pose, points)).min())
+    if gap <= 0.0:
+        raise SimulationError(
+            f"at the first pose indenter {indenter.name!r} is {-gap * 1e3:.3f} mm inside the skin"
+            if gap < 0.0
+            else f"at the first pose indenter {indenter.name!r} touches the skin",
+            remedy=f"begin the path at least {-gap * 1e3 + 0.05:.2f} mm further out",
+        )
+    # Clear of all skin: then all of it is on the same side of the skin as any point of it.
+    inner = rotation_matrix(pose[3:]) @ _point_of(indenter) + pose[:3]
+    corner = surface.nodes[surface.faces]
+    away = inner - corner.mean(axis=1)
+    nearest = int(np.einsum("fi,fi->f", away, away).argmin())
+    normal = np.cross(
+        corner[nearest, 2] - corner[nearest, 0], corner[nearest, -1] - corner[nearest, 1]
+    )
+    if normal @ away[nearest] < 0.0:
+        raise SimulationError(
+            f"at the first pose all of indenter {indenter.name!r} is inside the finger",
+            remedy="begin the path outside; positions are in metres, sensor frame",
+        )
+    return gap
+
+
+def _point_of(indenter: Indenter) -> Floats:
+    """A point within the indenter [m], indenter frame; the tip of a ring is not."""
+    part = indenter.primitives[0]
+    point = np.array(part.centre)
+    if part.kind == Kind.REVOLVED:
+        point[part.axis] += (part.sizes[2] + part.sizes[3]) / 2
+        point[(part.axis + 1) % 3] += (part.sizes[0] + part.sizes[1]) / 2
+    return point
+
+
+def _reach(indenter: Indenter) -> float:
+    """Radius of a ball about the tip that holds the indenter [m]."""
+    far = []
+    for part in indenter.primitives:
+        if part.kind == Kind.BOX:
+            size = float(np.linalg.norm(part.sizes[:3]))
+        else:
+            size = float(np.hypot(part.sizes[1], max(abs(part.sizes[2]), abs(part.sizes[3]))))
+        far.append(float(np.linalg.norm(part.centre)) + size + part.rounding)
+    return max(far) + _TOUCH
+
+
+def _trace(indenter: Indenter, points: Floats, move: Floats, start: float, limit: float) -> float:
+    """Travel at which the first of some points is touched [m]; ``limit`` if none before."""
+    travel = start
+    for _ in range(_MOVES):
+        gap = signed_distance(indenter, points - travel * move)
+        near = gap < limit - travel
+        if not near.any():
+            return limit
+        points, smallest = points[near], float(gap[near].min())
+        if smallest <= _TOUCH:
+            return travel
+        travel += smallest
+    return travel

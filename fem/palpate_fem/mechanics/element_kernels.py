@@ -1,0 +1,252 @@
+# mypy: ignore-errors
+"""Kernels of the skin: incompressible neo-Hooke with one pressure an element (Q1-P0).
+
+Energy of an element, with v its volume and p its pressure (Simo, Taylor and Pister 1985)::
+
+    sum_q w_q mu/2 (J^(-2/3) I1 - 3 + barrier b^2)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
+
+and b = max(0, |ln J| - 0.25), which nothing feels but skin in a pinch (see ``material.py``).
+
+The pressure is condensed: the tangent keeps the size of the displacements, but p is a state of its
+own, so Newton's convergence does not depend on kappa. NumPy twins: ``element.py``.
+
+One thread handles one element; two threads of the host may run two ranges of them at once, so each
+adds into arrays of its own.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from palpate_fem.mechanics.material import BARRIER_FROM
+
+FROM = wp.constant(wp.float64(BARRIER_FROM))
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def beyond(j: wp.float64):
+    """How far ln J is past where the barrier begins, with its sign: b sign(ln J)."""
+    logarithm = wp.log(wp.max(j, wp.float64(1.0e-3)))
+    return wp.sign(logarithm) * wp.max(wp.abs(logarithm) - FROM, wp.float64(0.0))
+
+
+@wp.kernel
+def element_state(
+    # Model:
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    weight: wp.array2d(dtype=wp.float64),
+    mu: wp.float64,
+    barrier: wp.float64,
+    # State in:
+    first: int,
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array(dtype=wp.float64),
+    # Out:
+    volume_out: wp.array(dtype=wp.float64),
+    smallest_jacobian_out: wp.array(dtype=wp.float64),
+    volume_gradient_out: wp.array2d(dtype=wp.vec3d),
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Add internal nodal forces; element volumes, their gradients and the smallest J."""
+    e = first + wp.tid()
+    n = elements.shape[1]
+    pressure = pressure_in[e]
+    volume = wp.float64(0.0)
+    smallest = wp.float64(1.0e30)
+    for a in range(n):
+        volume_gradient_out[e, a] = wp.vec3d()
+    for q in range(weight.shape[1]):
+        f = wp.mat33d()
+        for a in range(n):
+            f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
+        j = wp.determinant(f)
+        smallest = wp.min(smallest, j)
+        w = weight[e, q]
+        volume += w * j
+        inverse_t = wp.transpose(wp.inverse(f))
+        scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+        i1 = wp.ddot(f, f)
+        # w P = scale (F - I1/3 F^-T) + w (p J + mu barrier b sign(ln J)) F^-T
+        along = w * (pressure * j + mu * barrier * beyond(j)) - scale * i1 / wp.float64(3.0)
+        stress = scale * f + along * inverse_t
+        for a in range(n):
+            g = gradient[e, q, a]
+            wp.atomic_add(force_out, elements[e, a], stress * g)
+            volume_gradient_out[e, a] = volume_gradient_out[e, a] + (w * j) * (inverse_t * g)
+    volume_out[e] = volume
+    smallest_jacobian_out[e] = smallest
+
+
+@wp.kernel
+def point_state(
+    # Model:
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    weight: wp.array2d(dtype=wp.float64),
+    mu: wp.float64,
+    barrier: wp.float64,
+    # State in:
+    first: int,
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array(dtype=wp.float64),
+    # Out:
+    spatial_out: wp.array3d(dtype=wp.vec3d),
+    left_out: wp.array3d(dtype=wp.vec3d),
+    right_out: wp.array3d(dtype=wp.vec3d),
+    scale_out: wp.array2d(dtype=wp.vec2d),
+):
+    """Vectors a tangent is made of, per element, quadrature point and node.
+
+    With g = F^-T grad N and h = F grad N: spatial = g, left = -2/3 c h, right = left + (2/9 c I1 +
+    w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J)),
+    c = w mu J^(-2/3).
+    """
+    e = first + wp.tid()
+    n = elements.shape[1]
+    pressure = pressure_in[e]
+    for q in range(weight.shape[1]):
+        f = wp.mat33d()
+        for a in range(n):
+            f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
+        j = wp.determinant(f)
+        w = weight[e, q]
+        inverse_t = wp.transpose(wp.inverse(f))
+        c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+        ci1 = c * wp.ddot(f, f)
+        b = beyond(j)
+        wpj = w * (pressure * j + mu * barrier * b)
+        along = ci1 * wp.float64(2.0) / wp.float64(9.0) + w * pressure * j
+        if b != wp.float64(0.0):
+            along += w * mu * barrier
+        for a in range(n):
+            g = inverse_t * gradient[e, q, a]
+            left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[e, q, a])
+            spatial_out[e, q, a] = g
+            left_out[e, q, a] = left
+            right_out[e, q, a] = left + along * g
+        scale_out[e, q] = wp.vec2d(c, ci1 / wp.float64(3.0) - wpj)
+
+
+@wp.kernel
+def element_tangent(
+    # Model:
+    pair: wp.array3d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    bulk_over_volume: wp.array(dtype=wp.float64),
+    # State in:
+    first: int,
+    spatial_in: wp.array3d(dtype=wp.vec3d),
+    left_in: wp.array3d(dtype=wp.vec3d),
+    right_in: wp.array3d(dtype=wp.vec3d),
+    scale_in: wp.array2d(dtype=wp.vec2d),
+    volume_gradient_in: wp.array2d(dtype=wp.vec3d),
+    # Out:
+    block_out: wp.array(dtype=wp.mat33d),
+):
+    """Add the condensed tangent to the upper node-pair blocks; ``pair`` < 0 is below the diagonal.
+
+    K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga, plus kappa/v0 dv dv.
+    """
+    e = first + wp.tid()
+    n = pair.shape[1]
+    points = spatial_in.shape[1]
+    stiff = bulk_over_volume[e]
+    for a in range(n):
+        for b in range(n):
+            block = pair[e, a, b]
+            if block >= 0:
+                k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
+                diagonal = wp.float64(0.0)
+                for q in range(points):
+                    ga = spatial_in[e, q, a]
+                    gb = spatial_in[e, q, b]
+                    s = scale_in[e, q]
+                    diagonal += s[0] * wp.dot(gradient[e, q, a], gradient[e, q, b])
+                    k += wp.outer(ga, right_in[e, q, b])
+                    k += wp.outer(left_in[e, q, a], gb)
+                    k += wp.outer(s[1] * gb, ga)
+                k += diagonal * wp.identity(n=3, dtype=wp.float64)
+                wp.atomic_add(block_out, block, k)
+
+
+@wp.kernel
+def pressure_update(
+    # Model:
+    elements: wp.array2d(dtype=wp.int32),
+    rest_volume: wp.array(dtype=wp.float64),
+    bulk_over_volume: wp.array(dtype=wp.float64),
+    # State in:
+    volume_in: wp.array(dtype=wp.float64),
+    volume_gradient_in: wp.array2d(dtype=wp.vec3d),
+    change_in: wp.array(dtype=wp.vec3d),
+    # Out:
+    pressure_out: wp.array(dtype=wp.float64),
+):
+    """Element pressures that belong to a change of the nodal positions, to first order.
+
+    The gradients are those of the factorised tangent: pressures and displacements then solve one
+    and the same linear system, which matters because kappa would magnify any difference.
+    """
+    e = wp.tid()
+    v = volume_in[e] - rest_volume[e]
+    for a in range(elements.shape[1]):
+        v += wp.dot(volume_gradient_in[e, a], change_in[elements[e, a]])
+    pressure_out[e] = bulk_over_volume[e] * v
+
+
+@wp.kernel
+def pressure_misfit(
+    # Model:
+    elements: wp.array2d(dtype=wp.int32),
+    rest_volume: wp.array(dtype=wp.float64),
+    bulk_over_volume: wp.array(dtype=wp.float64),
+    # State in:
+    volume_in: wp.array(dtype=wp.float64),
+    volume_gradient_in: wp.array2d(dtype=wp.vec3d),
+    pressure_in: wp.array(dtype=wp.float64),
+    # Out:
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Add the load that condensing the element pressures puts on the nodes."""
+    e = wp.tid()
+    misfit = bulk_over_volume[e] * (volume_in[e] - rest_volume[e]) - pressure_in[e]
+    for a in range(elements.shape[1]):
+        wp.atomic_add(force_out, elements[e, a], misfit * volume_gradient_in[e, a])
+
+
+@wp.kernel
+def element_stress(
+    # Model:
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    weight: wp.array2d(dtype=wp.float64),
+    mu: wp.float64,
+    barrier: wp.float64,
+    # State in:
+    first: int,
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array(dtype=wp.float64),
+    # Out:
+    stress_out: wp.array(dtype=wp.mat33d),
+):
+    """Cauchy stress, mean over the current volume of each element."""
+    e = first + wp.tid()
+    total = wp.mat33d()
+    volume = wp.float64(0.0)
+    for q in range(weight.shape[1]):
+        f = wp.mat33d()
+        for a in range(elements.shape[1]):
+            f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
+        j = wp.determinant(f)
+        b = f * wp.transpose(f)
+        third = wp.trace(b) / wp.float64(3.0)
+        deviator = b - third * wp.identity(n=3, dtype=wp.float64)
+        power = wp.pow(wp.abs(j), wp.float64(-2.0) / wp.float64(3.0))
+        total += (weight[e, q] * mu * power) * deviator
+        # J times the barrier's mean stress; the weights are of the undeformed volume.
+        total += (weight[e, q] * mu * barrier * beyond(j)) * wp.identity(n=3, dtype=wp.float64)
+        volume += weight[e, q] * j
+    stress_out[e] = total / volume + pressure_in[e] * wp.identity(n=3, dtype=wp.float64)

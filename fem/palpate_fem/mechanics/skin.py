@@ -1,0 +1,155 @@
+"""The skin's elements on the device, and the launches of their kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
+from palpate_fem.mechanics import element_kernels
+from palpate_fem.mechanics.reference_element import rest_gradients
+from palpate_fem.mesh.solid import SolidMesh
+
+Floats = NDArray[np.float64]
+
+
+class Skin:
+    """Elements of one mesh with one material; see ``element_kernels``."""
+
+    def __init__(
+        self,
+        mesh: SolidMesh,
+        pairs: NDArray[np.int32],
+        *,
+        shear_modulus_pa: float,
+        bulk_ratio: float,
+        volume_barrier: float,
+    ) -> None:
+        """Prepare the elements.
+
+        Args:
+            mesh: The skin.
+            pairs: Block of each node pair of each element.
+            shear_modulus_pa: Neo-Hookean modulus [Pa].
+            bulk_ratio: Bulk over shear modulus.
+            volume_barrier: See ``NeoHooke.barrier``.
+        """
+        self.mu, self.volume_barrier = shear_modulus_pa, volume_barrier
+        self.gradient_values, self.weight_values = rest_gradients(mesh)
+        self.rest_volume = self.weight_values.sum(axis=1)
+        self.count, nodes = mesh.elements.shape
+        points = self.weight_values.shape[1]
+        self._elements = wp.array(mesh.elements, dtype=wp.int32, device=DEVICE)
+        self._pairs = wp.array(pairs, dtype=wp.int32, device=DEVICE)
+        self._gradient, self._weight = vec3s(self.gradient_values), scalars(self.weight_values)
+        self._rest_volume = scalars(self.rest_volume)
+        self._bulk_over_volume = scalars(bulk_ratio * shear_modulus_pa / self.rest_volume)
+        self._volume, self._jacobian = scalars(np.zeros(self.count)), scalars(np.zeros(self.count))
+        self._volume_gradient = vec3s(np.zeros((self.count, nodes, 3)))
+        self._frozen_gradient = vec3s(np.zeros((self.count, nodes, 3)))
+        # Spatial gradients and their companions, of which the tangent is made.
+        self._parts = [vec3s(np.zeros((self.count, points, nodes, 3))) for _ in range(3)]
+        self._parts.append(wp.zeros((self.count, points), dtype=wp.vec2d, device=DEVICE))
+
+    def add_forces(
+        self, first: int, count: int, position: wp.array, pressure: wp.array, force: wp.array
+    ) -> None:
+        """Add the internal nodal forces of a range of elements."""
+        wp.launch(
+            element_kernels.element_state,
+            dim=count,
+            inputs=[*self._model, first, position, pressure],
+            outputs=[self._volume, self._jacobian, self._volume_gradient, force],
+            device=DEVICE,
+        )
+
+    def add_tangent(
+        self, first: int, count: int, position: wp.array, pressure: wp.array, blocks: wp.array
+    ) -> None:
+        """Add the tangent of a range of elements; after `add_forces` at the same state."""
+        wp.launch(
+            element_kernels.point_state,
+            dim=count,
+            inputs=[*self._model, first, position, pressure],
+            outputs=self._parts,
+            device=DEVICE,
+        )
+        wp.launch(
+            element_kernels.element_tangent,
+            dim=count,
+            inputs=[
+                self._pairs,
+                self._gradient,
+                self._bulk_over_volume,
+                first,
+                *self._parts,
+                self._volume_gradient,
+            ],
+            outputs=[blocks],
+            device=DEVICE,
+        )
+
+    def freeze(self) -> None:
+        """Keep the volume gradients of the tangent that is being factorised."""
+        wp.copy(self._frozen_gradient, self._volume_gradient)
+
+    def updated_pressure(self, moved: wp.array) -> Floats:
+        """Element pressures that go with a change of the nodes, to first order [Pa], (E,)."""
+        pressure = np.zeros(self.count)
+        wp.launch(
+            element_kernels.pressure_update,
+            dim=self.count,
+            inputs=[*self._condensed, moved],
+            outputs=[scalars(pressure)],
+            device=DEVICE,
+        )
+        return pressure
+
+    def add_misfit(self, pressure: Floats, force: wp.array) -> None:
+        """Add the load that condensing the element pressures puts on the nodes."""
+        wp.launch(
+            element_kernels.pressure_misfit,
+            dim=self.count,
+            inputs=[*self._condensed, scalars(pressure)],
+            outputs=[force],
+            device=DEVICE,
+        )
+
+    def stress(self, position: Floats, pressure: Floats) -> Floats:
+        """Cauchy stress, mean over each element [Pa], (E, 3, 3)."""
+        stress = np.zeros((self.count, 3, 3))
+        wp.launch(
+            element_kernels.element_stress,
+            dim=self.count,
+            inputs=[*self._model, 0, vec3s(position), scalars(pressure)],
+            outputs=[mat33s(stress)],
+            device=DEVICE,
+        )
+        return stress
+
+    def strain_error(self, pressure: Floats) -> float:
+        """Largest |v - v0 - v0 p / kappa| / v0."""
+        excess = self._volume.numpy() - self.rest_volume
+        return float(
+            np.max(np.abs(excess - pressure / self._bulk_over_volume.numpy()) / self.rest_volume)
+        )
+
+    def smallest_jacobian(self) -> float:
+        """Smallest determinant of the deformation gradient at any quadrature point."""
+        return float(self._jacobian.numpy().min())
+
+    @property
+    def _model(self) -> list[object]:
+        constants = wp.float64(self.mu), wp.float64(self.volume_barrier)
+        return [self._elements, self._gradient, self._weight, *constants]
+
+    @property
+    def _condensed(self) -> list[wp.array]:
+        return [
+            self._elements,
+            self._rest_volume,
+            self._bulk_over_volume,
+            self._volume,
+            self._frozen_gradient,
+        ]

@@ -1,0 +1,249 @@
+"""The discrete equilibrium of skin, fluid, core and indenter: residual and tangent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
+from palpate_fem.mechanics import contact_kernels, core_kernels, element_kernels, fluid_kernels
+from palpate_fem.mechanics.balance import TRACTION_FLOOR_PA, Balance
+from palpate_fem.mechanics.cavity import Cavity
+from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics.material import VOLUME_BARRIER
+from palpate_fem.mechanics.pattern import make_pattern
+from palpate_fem.mechanics.skin import Skin
+from palpate_fem.mechanics.state import State
+from palpate_fem.mechanics.surface import Surface
+from palpate_fem.mechanics.touch import CoreContact, IndenterContact
+from palpate_fem.mesh.core import DistanceGrid
+from palpate_fem.mesh.solid import SolidMesh
+
+Floats = NDArray[np.float64]
+
+THREADS = 2
+
+
+class System:
+    """Equations of one mesh; the unknowns come and go as `State`."""
+
+    def __init__(
+        self,
+        mesh: SolidMesh,
+        core: DistanceGrid | None,
+        *,
+        shear_modulus_pa: float,
+        bulk_ratio: float,
+        contact: ContactSettings,
+        volume_barrier: float = VOLUME_BARRIER,
+        held: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Prepare the equations.
+
+        Args:
+            mesh: The skin.
+            core: Distance to the core; None = no core.
+            shear_modulus_pa: Neo-Hookean modulus [Pa].
+            bulk_ratio: Bulk over shear modulus.
+            contact: Constants of the contact laws.
+            volume_barrier: See ``NeoHooke.barrier``.
+            held: Prescribed components (V, 3); None = the mesh's fixed nodes. Their positions are
+                those in the state.
+        """
+        # Compiled now: two threads that meet a new kernel would both compile it.
+        for module in (contact_kernels, core_kernels, element_kernels, fluid_kernels):
+            wp.load_module(module, device=DEVICE)
+        self.mesh, self.contact = mesh, contact
+        if held is None:
+            held = np.zeros(mesh.nodes.shape, bool)
+            held[mesh.fixed] = True
+        self.pattern = make_pattern(held, mesh.elements, mesh.outer_faces, mesh.inner_faces)
+        self._held = np.flatnonzero(held)
+        self.load = np.zeros(mesh.nodes.shape)  # dead nodal forces [N]; tests set them
+        self.skin = Skin(
+            mesh,
+            self.pattern.element_pairs,
+            shear_modulus_pa=shear_modulus_pa,
+            bulk_ratio=bulk_ratio,
+            volume_barrier=volume_barrier,
+        )
+        nodes = len(mesh.nodes)
+        self.outer = Surface(mesh.nodes, mesh.outer_faces, self.pattern.outer_pairs)
+        self.inner = Surface(mesh.nodes, mesh.inner_faces, self.pattern.inner_pairs)
+        self.on_indenter = IndenterContact(self.outer, nodes, contact)
+        self.on_core = CoreContact(self.inner, nodes, contact, core)
+        self._cavity = Cavity(self.inner, nodes)
+        # One array a thread: nodal forces of the skin, and node-pair blocks of the tangent without
+        # contact. The tangent of contact is added to a sum of these.
+        self._forces = [np.zeros((nodes, 3)) for _ in range(THREADS)]
+        self._force_arrays = [vec3s(force) for force in self._forces]
+        self._blocks = [np.zeros((self.pattern.blocks, 9)) for _ in range(THREADS)]
+        self._block_arrays = [mat33s(block.reshape(-1, 3, 3)) for block in self._blocks]
+        self._sum = np.zeros((self.pattern.blocks, 9))
+        self._sum_array = mat33s(self._sum.reshape(-1, 3, 3))
+        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="palpate-fem")
+        share = np.zeros(nodes)
+        corners = mesh.elements.shape[1]
+        np.add.at(share, mesh.elements, (self.skin.rest_volume / corners)[:, None])
+        self._drag = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
+        self._at: tuple[wp.array, wp.array, float] | None = None
+
+    def balance(self, state: State, press: Press | None) -> Balance:
+        """Evaluate the equations.
+
+        Args:
+            state: Where. `tangent_values` reads it again: leave it until then as it is.
+            press: Indenter and its pose; None = none.
+        """
+        position, pressure = vec3s(state.position), scalars(state.pressure)
+        self._at = (position, pressure, state.fluid_pressure)
+        half = self.skin.count // 2
+
+        def first_half() -> None:
+            self._forces[0][:] = 0.0
+            self.skin.add_forces(0, half, position, pressure, self._force_arrays[0])
+            self.on_indenter.evaluate(state, press, position)
+
+        def second_half() -> None:
+            self._forces[1][:] = 0.0
+            rest = self.skin.count - half
+            self.skin.add_forces(half, rest, position, pressure, self._force_arrays[1])
+            self._cavity.evaluate(position)
+            self.on_core.evaluate(state, position)
+
+        self._both(first_half, second_half)
+        return self._sum_up(state)
+
+    def tangent_values(self, *, elastic: bool = True, drag: float = 0.0) -> Floats:
+        """Upper triangle of the symmetric tangent at the last `balance`.
+
+        What belongs to this tangent (volume gradients, friction's rest) is kept until the next.
+
+        Args:
+            elastic: Whether skin and fluid are done anew; else they are those of the last time, and
+                only contact is new.
+            drag: Stiffness that holds every node where it is, in units of the skin's own: mu times
+                the edge of the cube that is the node's share of the skin.
+        """
+        if elastic:
+            assert self._at is not None
+            position, pressure, fluid_pressure = self._at
+            half = self.skin.count // 2
+
+            def first_half() -> None:
+                self._blocks[0][:] = 0.0
+                self.skin.add_tangent(0, half, position, pressure, self._block_arrays[0])
+
+            def second_half() -> None:
+                self._blocks[1][:] = 0.0
+                rest = self.skin.count - half
+                self.skin.add_tangent(half, rest, position, pressure, self._block_arrays[1])
+                self._cavity.add_tangent(position, fluid_pressure, self._block_arrays[1])
+
+            self._both(first_half, second_half)
+            self._blocks[0] += self._blocks[1]
+            self.skin.freeze()
+        self._sum[:] = self._blocks[0]
+        for surface in (self.outer, self.inner):
+            surface.add_tangent(self._sum_array)
+            surface.freeze()
+        values = self._sum.reshape(-1)[self.pattern.gather]
+        values[self.pattern.indptr[:-1]] += drag * self._drag  # a row begins with its diagonal
+        return values
+
+    @property
+    def slides(self) -> bool:
+        """Whether the last tangent has an unsymmetric share."""
+        return self.outer.slides
+
+    def rest_product(self, change: Floats) -> Floats:
+        """(Tangent - its symmetric approximation) times a change of the free unknowns, (n,)."""
+        full = np.zeros_like(self.mesh.nodes)
+        full.reshape(-1)[self.pattern.free] = change
+        product = np.zeros_like(full)
+        self.outer.add_rest_product(vec3s(full), vec3s(product))
+        return product.reshape(-1)[self.pattern.free]
+
+    @property
+    def sets_changed(self) -> bool:
+        """Whether a point touches, sticks or slides that did not when the tangent was made."""
+        return self.outer.changed or self.inner.changed
+
+    def updated_pressures(self, change: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Pressures that go with a change (V, 3) from the last evaluated state, to first order.
+
+        Returns:
+            Those of the elements (E,), on the core and on the indenter (faces, points), and the
+            tractions on the indenter (faces, points, 3).
+        """
+        moved = vec3s(change)
+        core, _ = self.inner.updated_pressure(moved)
+        return self.skin.updated_pressure(moved), core, *self.outer.updated_pressure(moved)
+
+    def misfit_force(self, state: State) -> Floats:
+        """Load that condensing the pressures puts on the free unknowns [N], (n,)."""
+        force = np.zeros_like(self.mesh.nodes)
+        array = vec3s(force)
+        self.skin.add_misfit(state.pressure, array)
+        for surface in (self.inner, self.outer):
+            surface.add_load(surface.misfit, array)
+        return force.reshape(-1)[self.pattern.free]
+
+    def coupled_force(self) -> Floats:
+        """Part of `misfit_force` that comes with the friction of grown pressures, (n,).
+
+        Kept apart: a new point's pressure is its depth times an enormous stiffness until the linear
+        solve has answered, and friction must follow the answer, not the question.
+        """
+        force = np.zeros_like(self.mesh.nodes)
+        self.outer.add_load(self.outer.coupled, vec3s(force))
+        return force.reshape(-1)[self.pattern.free]
+
+    def settle(self, state: State, press: Press) -> None:
+        """After an increment: anchors such that each point's spring carries its traction.
+
+        Those of points that slid thereby move along; all others stay, or start where they are.
+        """
+        stretch = state.traction / self.contact.tangential_stiffness
+        state.anchor[:] = press.to_local(self.outer.points_at(state.position) - stretch)
+
+    def _both(self, first: Callable[[], None], second: Callable[[], None]) -> None:
+        """Run two halves at once; Warp launches release the interpreter."""
+        other = self._pool.submit(second)
+        first()
+        other.result()
+
+    def _sum_up(self, state: State) -> Balance:
+        internal = self._forces[0] + self._forces[1]
+        indenter, core = self.on_indenter.force.copy(), self.on_core.force.copy()
+        gradient = self._cavity.gradient.copy()
+        fluid = state.fluid_pressure * gradient
+        free = self.pattern.free
+        external = (indenter + core - fluid - self.load).reshape(-1)[free]
+        return Balance(
+            internal=internal,
+            indenter=indenter,
+            core=core,
+            volume_gradient=gradient,
+            volume=self._cavity.volume,
+            unbalanced=internal.reshape(-1)[free] + external,
+            scale=float(
+                np.linalg.norm(fluid.reshape(-1)[free])
+                + np.linalg.norm(indenter.reshape(-1)[free])
+                + np.linalg.norm(core.reshape(-1)[free])
+                + np.linalg.norm(self.load)
+                + np.linalg.norm(internal.reshape(-1)[self._held])
+            ),
+            strain_error=self.skin.strain_error(state.pressure),
+            gap_error_m=max(
+                self.inner.misfit_of(state.core_pressure) / self.contact.stiffness,
+                self.outer.misfit_of(state.indenter_pressure) / self.contact.stiffness,
+            ),
+            traction_error=self.outer.traction_misfit(state.traction)
+            / max(float(np.abs(state.traction).max(initial=0.0)), TRACTION_FLOOR_PA),
+            smallest_jacobian=self.skin.smallest_jacobian(),
+        )

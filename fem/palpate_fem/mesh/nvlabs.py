@@ -1,0 +1,169 @@
+"""The public BioTac of NVlabs/biotac_sim (MIT) as a solid mesh of wedges, with its core.
+
+The public tetrahedra lock (they inflate at twice the pressure), so only their *inner surface* is
+kept, and the skin is grown from it along smooth normals. Nothing of the files is stored here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.mesh.check import check_mesh
+from palpate_fem.mesh.core import Core, DistanceGrid, volume_inside
+from palpate_fem.mesh.distance import box_around, grid_points, signed_distance, tabulate
+from palpate_fem.mesh.extrude import extrude
+from palpate_fem.mesh.geometry import Geometry, check_limits
+from palpate_fem.mesh.surface import components, edges, enclosed_volume, node_normals, open_edges
+from palpate_fem.mesh.tetfile import REMEDY, boundary, read_obj, read_tet
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+Surface = tuple[Floats, Ints]  # vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3)
+
+SKIN = Path("meshes/biotac/int_ext_skin/int_ext_skin_combined_ftw.tet")
+PARTS = Path("meshes/biotac/bc/top_side_core_bc.obj")
+
+# Mesh axes (X proximal, Y dorsal, Z lateral) to the sensor frame: x = -X + X0, y = Z, z = Y.
+# X0 is the centre of the sphere that fits the core's tip (radius 5.33 mm, r.m.s. 0.016 mm).
+X0_M = -13.96e-3
+DRAWN_THICKNESS_M = 1.57e-3  # of the public skin: what nail and clamp touch is decided with it
+ATTACH_M = 1e-5  # the public model's attachDistance: its skin is glued to what lies so near
+SMOOTHING = 4  # rounds; fewer let the columns cross at the proximal edge, more round it off
+SPACING_M = 0.25e-3
+MARGIN_M = 2.0e-3  # around the core: more than the fluid film is thick anywhere
+ROUNDING_M = 0.15e-3  # standard deviation of the blur that rounds the core's facets
+CLEARANCE_M = 15e-6  # least gap between core and unpressurised skin
+
+
+def to_sensor_frame(points: Floats) -> Floats:
+    """Positions [m] in the files' axes to the sensor frame, shape (N, 3)."""
+    return np.ascontiguousarray(np.stack([X0_M - points[:, 0], points[:, 2], points[:, 1]], axis=1))
+
+
+def read_nvlabs(folder: Path, *, thickness_m: float = 1.57e-3, layers: int = 2) -> Geometry:
+    """Build the fingertip from the public assets.
+
+    Args:
+        folder: Holds ``meshes/biotac``.
+        thickness_m: Thickness of the skin [m].
+        layers: Wedges through the thickness.
+
+    Returns:
+        Skin of wedges and core. The public core starts up to 0.2 mm inside the skin; here it is cut
+        back to where it leaves at least a few micrometres everywhere (`CLEARANCE_M`).
+
+    Raises:
+        ConfigError: A file is missing or damaged, holds no closed bag or no closed core, nail and
+            clamp; or an argument is out of range.
+        SimulationError: The skin cannot be made so thick: elements would be inverted.
+    """
+    check_limits(thickness_m=thickness_m, layers=layers)
+    points, tets = read_tet(folder / SKIN)
+    points = to_sensor_frame(points)
+    cavity, skin = _surfaces(points, boundary(tets, points), folder / SKIN)
+    parts, triangles = read_obj(folder / PARTS)
+    slabs, core = _parts(to_sensor_frame(parts), triangles, folder / PARTS)
+    inner, faces = cavity
+    normal = smooth_normals(inner, faces, SMOOTHING)
+    held = _held(inner + DRAWN_THICKNESS_M * normal, skin, slabs)
+    mesh = extrude(
+        inner,
+        inner + thickness_m * normal,
+        faces,
+        layers=layers,
+        fixed_columns=held,
+        name=f"nvlabs-{thickness_m * 1e3:.3f}mm-{layers}",
+    )
+    check_mesh(mesh)
+    return Geometry(mesh, _core(core, cavity))
+
+
+def _compact(points: Floats, faces: Ints) -> Surface:
+    """Some of a file's faces with only the vertices they use."""
+    used, compact = np.unique(faces, return_inverse=True)
+    return points[used], compact.reshape(-1, 3).astype(np.int32)
+
+
+def _surfaces(points: Floats, faces: Ints, path: Path) -> tuple[Surface, Surface]:
+    """Of the cavity, normals out of it, and of the skin's outside."""
+    loose = open_edges(faces)
+    if len(loose):
+        raise ConfigError(f"{path}: its surface is open at {len(loose)} edges", remedy=REMEDY)
+    label = components(faces, len(points))
+    volumes = {int(i): enclosed_volume(points, faces[label == i]) for i in np.unique(label)}
+    cavities = [i for i, volume in volumes.items() if volume < 0]
+    if len(cavities) != 1:
+        raise ConfigError(f"{path}: it has {len(cavities)} cavities, not one", remedy=REMEDY)
+    cavity = label == cavities[0]
+    return _compact(points, faces[cavity][:, ::-1]), _compact(points, faces[~cavity])
+
+
+def _parts(points: Floats, faces: Ints, path: Path) -> tuple[list[Surface], Surface]:
+    """Nail and clamp, and the core."""
+    label = components(faces, len(points))
+    ids = np.unique(label)
+    if len(ids) != 3 or len(open_edges(faces)):
+        raise ConfigError(
+            f"{path}: it holds {len(ids)} parts, not a closed nail, clamp and core", remedy=REMEDY
+        )
+    *slabs, core = sorted(ids, key=lambda i: enclosed_volume(points, faces[label == i]))
+    return [_compact(points, faces[label == i]) for i in slabs], _compact(
+        points, faces[label == core]
+    )
+
+
+def smooth_normals(points: Floats, faces: Ints, rounds: int) -> Floats:
+    """Normals at the nodes, averaged with their neighbours', shape (V, 3)."""
+    normal = node_normals(points, faces)
+    pairs, _ = edges(faces)
+    for _ in range(rounds):
+        total = normal.copy()
+        np.add.at(total, pairs[:, 0], normal[pairs[:, 1]] / 6)  # mean valence of a triangle mesh
+        normal = total / np.linalg.norm(total, axis=1)[:, None]
+    return normal
+
+
+def _held(outer: Floats, skin: Surface, slabs: list[Surface]) -> Ints:
+    """Columns that end where the public skin touches nail or clamp.
+
+    It is asked of the point of the public skin next to a column's outer node, not of the node: the
+    grown skin lies up to 0.1 mm off the public one, which would need a tolerance of its own. Not of
+    the nearest vertex either: those are 0.9 mm apart, and each would hold or free all around it.
+    """
+    _, foot = signed_distance(outer, *skin)
+    touching = [np.abs(signed_distance(foot, *slab)[0]) < ATTACH_M for slab in slabs]
+    if not all(on_slab.any() for on_slab in touching):
+        raise ConfigError("nail or clamp do not touch the skin", remedy=REMEDY)
+    return np.flatnonzero(np.any(touching, axis=0)).astype(np.int32)
+
+
+def _core(body: Surface, cavity: Surface) -> Core:
+    """The public core, kept within the cavity less a clearance, as a smooth distance."""
+    from scipy import ndimage
+
+    vertices, triangles = body
+    inner, faces = cavity
+    origin, size = box_around(vertices, MARGIN_M, SPACING_M)
+    at = grid_points(origin, SPACING_M, size)
+    core = tabulate(vertices, triangles, at)
+    room = tabulate(inner, faces, at)
+    corner = inner[faces]
+    probes = np.concatenate(
+        [inner, corner.mean(axis=1), (corner + np.roll(corner, 1, 1)).reshape(-1, 3) / 2]
+    )
+    clearance = CLEARANCE_M
+    for _ in range(8):
+        values = ndimage.gaussian_filter(np.maximum(core, room + clearance), ROUNDING_M / SPACING_M)
+        grid = DistanceGrid.sampled(origin, SPACING_M, values)
+        gap = float(grid.evaluate(probes)[0].min())
+        if gap > 0.9 * CLEARANCE_M:
+            return Core(grid, vertices, triangles, volume_inside(values, SPACING_M), "nvlabs")
+        clearance += CLEARANCE_M - gap
+    raise SimulationError(
+        f"the core cannot be cut back: it still starts {-gap * 1e6:.1f} um inside the skin",
+        remedy="check that skin and core belong to the same assets",
+    )

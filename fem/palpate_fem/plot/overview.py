@@ -1,0 +1,128 @@
+"""A store on one page: how the trajectories ended, and with how much force, by indenter."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import DatasetError
+from palpate_fem.plot.curves import travel_m
+from palpate_fem.plot.style import INK, MM, OUTCOME_COLOURS, grid, label, new_figure, save
+from palpate_fem.result import Outcome
+from palpate_fem.store.content import TrajectorySummary
+
+COLUMNS = 5
+"""Small plots side by side: nine indenters are two rows."""
+
+
+def plot_overview(
+    summaries: Sequence[TrajectorySummary], path: Path, *, title: str = ""
+) -> Counter[Outcome]:
+    """Draw all trajectories of a store, simulated or measured.
+
+    Args:
+        summaries: One for each trajectory.
+        path: The PNG to write.
+        title: Above it all.
+
+    Returns:
+        How many trajectories ended in which way.
+
+    Raises:
+        DatasetError: There is no trajectory.
+        StoreDiskError: The disk is full or refuses.
+        MissingExtraError: matplotlib is not installed.
+    """
+    if not summaries:
+        raise DatasetError(
+            f"{title or 'the store'} holds no trajectory", remedy="wait for the first, or run some"
+        )
+    groups: dict[str, list[TrajectorySummary]] = defaultdict(list)
+    for summary in summaries:
+        groups[summary.indenter].append(summary)
+    names = sorted(groups)
+    rows = -(-len(names) // COLUMNS)
+    figure = new_figure(15, 3.2 + 0.3 * len(names) + 2.5 * rows)
+    top, bottom = figure.subfigures(2, 1, height_ratios=[2.0 + 0.3 * len(names), 2.5 * rows])
+    left, middle, right = top.subplots(1, 3, width_ratios=[3, 2, 2])
+    _draw_range(left, names, groups)
+    outcomes = _draw_outcomes(middle, names, groups)
+    _draw_seconds(right, summaries)
+    panels = bottom.subplots(rows, min(COLUMNS, len(names)), squeeze=False, sharex=True).ravel()
+    for axes, name in zip(panels, names, strict=False):
+        for summary in groups[name]:
+            force = np.linalg.norm(summary.force, axis=1)
+            colour = OUTCOME_COLOURS[summary.outcome]
+            axes.plot(
+                MM * travel_m(summary.path, summary.pose), force, color=colour, lw=0.8, alpha=0.7
+            )
+        label(axes, "travel [mm]", "|F| [N]", f"{name} ({len(groups[name])})")
+        axes.tick_params(labelbottom=True)
+        grid(axes)
+    for axes in panels[len(names) :]:
+        axes.set_axis_off()
+    complete = outcomes[Outcome.COMPLETE]
+    figure.suptitle(
+        f"{title}\n{len(summaries)} trajectories, {complete} complete "
+        f"({complete / len(summaries):.1%})".strip(),
+        color=INK,
+        fontsize=12,
+    )
+    save(figure, path)
+    return outcomes
+
+
+def _peak(summary: TrajectorySummary) -> float:
+    return float(np.linalg.norm(summary.force, axis=1).max(initial=0.0))
+
+
+def _draw_range(axes: Any, names: list[str], groups: dict[str, list[TrajectorySummary]]) -> None:
+    for row, name in enumerate(names):
+        peaks = np.array([_peak(summary) for summary in groups[name]])
+        axes.plot([peaks.min(), peaks.max()], [row, row], color="#b9bec7", lw=5, zorder=1)
+        axes.plot(np.median(peaks), row, "|", color=INK, ms=14, mew=2, zorder=3)
+        # Spread a little, so that equal forces do not hide one another.
+        spread = 0.24 * np.sin(2.4 * np.arange(len(peaks)))
+        colours = [OUTCOME_COLOURS[summary.outcome] for summary in groups[name]]
+        axes.scatter(peaks, row + spread, s=14, c=colours, zorder=2)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    label(axes, "largest |F| of a trajectory [N]", "", "force: range, median, each trajectory")
+    axes.grid(visible=True, axis="x", color="#e4e4e8", lw=0.7)
+
+
+def _draw_outcomes(
+    axes: Any, names: list[str], groups: dict[str, list[TrajectorySummary]]
+) -> Counter[Outcome]:
+    total: Counter[Outcome] = Counter(item.outcome for name in names for item in groups[name])
+    left = np.zeros(len(names))
+    for outcome, colour in OUTCOME_COLOURS.items():
+        if not total[outcome]:
+            continue
+        counts = [sum(item.outcome is outcome for item in groups[name]) for name in names]
+        text = f"{outcome.value} ({total[outcome]})"
+        axes.barh(range(len(names)), counts, left=left, color=colour, height=0.6, label=text)
+        left = left + counts
+    axes.set_yticks(range(len(names)), [])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    label(axes, "trajectories", "", "how they ended")
+    axes.legend(fontsize=8, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.07), ncols=3)
+    return total
+
+
+def _draw_seconds(axes: Any, summaries: Sequence[TrajectorySummary]) -> None:
+    seconds = np.array([item.seconds for item in summaries if np.isfinite(item.seconds)])
+    label(axes, "computing time of a trajectory [s]", "trajectories")
+    if not len(seconds):
+        axes.text(0.5, 0.5, "measured", ha="center", transform=axes.transAxes, color=INK)
+        return
+    axes.hist(seconds, bins=30, color="#7aa6c2")
+    axes.set_title(
+        f"median {np.median(seconds):.1f} s, longest {seconds.max():.1f} s", color=INK, fontsize=10
+    )
+    grid(axes)

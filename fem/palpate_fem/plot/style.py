@@ -1,0 +1,66 @@
+"""How our pictures of simulations look. matplotlib is loaded when the first one is drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from palpate.extras import require
+from palpate_fem.result import Outcome
+from palpate_fem.store.files import disk_error
+
+INK = "#30343b"
+GRID = "#e4e4e8"
+SKIN = "#cfdbe6"
+CORE = "#8d97a6"
+INDENTER = "#f0c48a"
+PATCH = "#d1495b"
+AXES = ("x", "y", "z")
+AXIS_COLOURS = ("#d1495b", "#2e8b57", "#2f6fb5")
+OUTCOME_COLOURS = {
+    Outcome.COMPLETE: "#2e8b57",
+    Outcome.FORCE_LIMIT: "#2f6fb5",
+    Outcome.DIVERGED: "#d1495b",
+    Outcome.DEADLINE: "#e09f3e",
+    Outcome.CANCELLED: "#9aa0a8",
+}
+
+MM = 1e3
+"""People read a fingertip in millimetres; only the picture does [mm/m]."""
+
+KPA = 1e-3
+"""[kPa/Pa]."""
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure without a window [inch]."""
+    figures = require("matplotlib.figure", extra="fem")
+    return figures.Figure(figsize=(width, height), layout="constrained", facecolor="white")
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a figure as PNG.
+
+    Raises:
+        StoreDiskError: The disk is full or refuses.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=120, format="png")
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
+def label(axes: Any, across: str, up: str, title: str = "") -> None:
+    """Name the axes and make them quiet."""
+    axes.set_xlabel(across, color=INK, fontsize=9)
+    axes.set_ylabel(up, color=INK, fontsize=9)
+    axes.set_title(title, color=INK, fontsize=10)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(colors=INK, labelsize=8)
+
+
+def grid(axes: Any) -> None:
+    """Lines to read values by."""
+    axes.grid(visible=True, color=GRID, lw=0.7)

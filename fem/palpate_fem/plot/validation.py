@@ -1,0 +1,211 @@
+"""The paper's figures of calibration and validation, with our numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from palpate_fem.calibration.align import Aligned
+from palpate_fem.calibration.result import Calibration
+from palpate_fem.plot.style import AXES, AXIS_COLOURS, GRID, INK, MM, grid, label, new_figure, save
+from palpate_fem.validation.validate import (
+    PAPER_INDENTER_N,
+    PAPER_MEDIAN_N,
+    PAPER_RANGE_N,
+    Compared,
+    Validation,
+)
+
+_PANELS = 4
+_ROWS = 6
+_LEAST_SPAN_N = 1.0
+"""An axis that shows less than this would make much of its noise [N]."""
+_MARKERS = ("o", "s", "^", "D", "v")
+_SENSOR_COLOURS = ("#2f6fb5", "#e09f3e", "#2e8b57", "#8d5fb0", "#d1495b")
+
+
+class _Drawn(Protocol):
+    """What a panel needs of a compared trajectory."""
+
+    @property
+    def sensor(self) -> str: ...
+    @property
+    def pair(self) -> Aligned: ...
+
+
+def plot_calibration(result: Calibration, path: Path, *, title: str = "") -> None:
+    """Calibrated simulation against each sensor's measurement; a row for a trajectory.
+
+    Args:
+        result: Of the calibration.
+        path: The PNG to write; the first six trajectories are drawn.
+        title: Above it all; empty = the parameters.
+
+    Raises:
+        StoreDiskError: The disk is full or refuses.
+        MissingExtraError: matplotlib is not installed.
+    """
+    groups: dict[str, list[Any]] = {}
+    for fit in result.trajectories:
+        groups.setdefault(fit.name.removesuffix(f"/{fit.sensor}"), []).append(fit)
+    rows = list(groups.items())[:_ROWS]
+    figure = new_figure(10, 0.6 + 2.3 * len(rows))
+    figure.suptitle(title or _parameters(result), color=INK, fontsize=11)
+    panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
+    for at, (row, (name, fits)) in enumerate(zip(panels, rows, strict=True)):
+        below = "displacement from 0.5 N [mm]" if at == len(rows) - 1 else ""
+        for axis, panel in enumerate(row):
+            _axis_panel(panel, fits, axis)
+            label(panel, below, "", f"F{AXES[axis]} [N]" if at == 0 else "")
+        row[0].set_ylabel(_broken(name), color=INK, fontsize=8)
+    panels[0][0].legend(frameon=False, fontsize=8)
+    save(figure, path)
+
+
+def _axis_panel(panel: Any, fits: Sequence[_Drawn], axis: int) -> None:
+    """One axis of one trajectory: a line of the simulation, dots of each sensor."""
+    grid(panel)
+    longest = max(fits, key=lambda fit: fit.pair.displacement_m[-1])
+    way = MM * longest.pair.displacement_m
+    panel.plot(way, longest.pair.simulated_n[:, axis], color=INK, lw=1.6, label="simulation")
+    for fit, colour in zip(fits, cycle(_SENSOR_COLOURS), strict=False):
+        panel.plot(
+            MM * fit.pair.displacement_m,
+            fit.pair.measured_n[:, axis],
+            "o",
+            ms=3,
+            color=colour,
+            label=fit.sensor,
+        )
+    low, high = panel.get_ylim()
+    missing = max(_LEAST_SPAN_N - (high - low), 0.0) / 2
+    panel.set_ylim(low - missing, high + missing)
+
+
+def plot_examples(
+    validation: Validation, path: Path, *, names: Iterable[str] = (), seed: int = 0
+) -> None:
+    """Four trajectories, all axes: simulation as lines, sensors as dots.
+
+    Args:
+        validation: With one compared trajectory at least.
+        path: The PNG to write.
+        names: Trajectories to draw, without sensor; none = as in the paper, the one of highest
+            force of each of four random indenters.
+        seed: Of that choice.
+
+    Raises:
+        StoreDiskError: The disk is full or refuses.
+        MissingExtraError: matplotlib is not installed.
+    """
+    chosen = list(names)[:_PANELS] or examples(validation, seed)
+    figure = new_figure(10, 7)
+    figure.suptitle(validation.title, color=INK, fontsize=11)
+    panels = figure.subplots(2, 2).ravel()
+    for panel in panels[len(chosen) :]:
+        panel.set_axis_off()
+    for panel, name in zip(panels, chosen, strict=False):
+        items = [item for item in validation.compared if item.path_name == name]
+        _example_panel(panel, name, items)
+    save(figure, path)
+
+
+def examples(validation: Validation, seed: int = 0) -> list[str]:
+    """The trajectory of highest force of each of four random indenters."""
+    best: dict[str, Compared] = {}
+    for item in validation.compared:
+        known = best.get(item.indenter)
+        if known is None or item.peak_n > known.peak_n:
+            best[item.indenter] = item
+    names = sorted(best)
+    count = min(_PANELS, len(names))
+    drawn = np.random.default_rng(seed).choice(len(names), count, replace=False)
+    return [best[names[i]].path_name for i in sorted(drawn.tolist())]
+
+
+def _example_panel(panel: Any, name: str, items: Sequence[Compared]) -> None:
+    grid(panel)
+    longest = max(items, key=lambda item: item.displacement_m)
+    for axis, colour in enumerate(AXIS_COLOURS):
+        panel.plot(
+            MM * longest.pair.displacement_m,
+            longest.pair.simulated_n[:, axis],
+            color=colour,
+            lw=1.6,
+            label=f"F{AXES[axis]} simulation",
+        )
+        for item, marker in zip(items, cycle(_MARKERS), strict=False):
+            panel.plot(
+                MM * item.pair.displacement_m,
+                item.pair.measured_n[:, axis],
+                marker,
+                ms=3.2,
+                mfc="none",
+                color=colour,
+            )
+    for item, marker in zip(items, cycle(_MARKERS), strict=False):
+        panel.plot([], [], marker, ms=3.2, mfc="none", color=INK, label=item.sensor)
+    error = ", ".join(f"{item.rms_n:.2f}" for item in items)
+    label(panel, "displacement from 0.5 N [mm]", "force [N]", f"{name}: RMS {error} N")
+    panel.legend(frameon=False, fontsize=7)
+
+
+def plot_indenters(validation: Validation, path: Path) -> None:
+    """Mean RMS error of each indenter as bars, beside the paper's range and median.
+
+    Args:
+        validation: With one compared trajectory at least.
+        path: The PNG to write.
+
+    Raises:
+        StoreDiskError: The disk is full or refuses.
+        MissingExtraError: matplotlib is not installed.
+    """
+    rows = validation.by_indenter
+    figure = new_figure(9, 4.6)
+    panel = figure.subplots()
+    low, high = PAPER_RANGE_N
+    at = np.arange(len(rows))
+    panel.axhspan(low, high, color=GRID, zorder=0, label=f"paper: {low:.3f} to {high:.3f} N")
+    panel.axhline(
+        PAPER_MEDIAN_N, color="#8d97a6", lw=1.4, label=f"paper: median {PAPER_MEDIAN_N:.3f} N"
+    )
+    panel.bar(at, [row.rms_n for row in rows], 0.62, color="#9dbfe3", label="ours: mean")
+    panel.axhline(
+        validation.median_n,
+        color="#d1495b",
+        lw=1.4,
+        ls="--",
+        label=f"ours: median {validation.median_n:.3f} N",
+    )
+    for i, row in enumerate(rows):
+        dots = [item.rms_n for item in validation.compared if item.indenter == row.indenter]
+        panel.plot(np.full(len(dots), i), dots, ".", color=INK, ms=4, alpha=0.6)
+        paper = PAPER_INDENTER_N.get(row.indenter)
+        if paper is not None:
+            panel.plot([i - 0.4, i + 0.4], [paper, paper], color=INK, lw=2)
+    names = [f"{row.indenter.replace('_', chr(10))}\nn={row.trajectories}" for row in rows]
+    panel.set_xticks(at, names)
+    label(panel, "", "RMS force error [N], sum of axes", validation.title)
+    panel.legend(frameon=False, fontsize=8)
+    save(figure, path)
+
+
+def _parameters(result: Calibration) -> str:
+    found, rms = result.parameters, sum(result.axis_rms_n)
+    kind = "SELF-TEST on simulations: " if result.self_test else ""
+    return (
+        f"{kind}skin {found.skin_thickness_m * 1e3:.3f} mm,"
+        f" modulus {found.shear_modulus_pa * 1e-3:.1f} kPa,"
+        f" friction {found.friction_coefficient:.3f},"
+        f" fluid {result.fluid_volume_m3 * 1e9:.0f} mm³; RMS {rms:.3f} N"
+    )
+
+
+def _broken(name: str) -> str:
+    """A trajectory's id over several lines."""
+    return name.replace("/", "\n")

@@ -1,0 +1,67 @@
+"""Configuration of the finite-element service: table ``[fem]`` of a profile."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from pydantic import Field
+
+from palpate.config import StrictConfig
+from palpate.names import Name
+from palpate_fem.config import FingertipParameters
+
+DEFAULT_FACTORY = "palpate_fem.service.biotac:biotac"
+
+
+class FingertipTable(StrictConfig):
+    """Parameters where a request names none; None = the paper's, see ``FingertipParameters``."""
+
+    skin_thickness_m: float | None = None
+    shear_modulus_pa: float | None = None
+    friction_coefficient: float | None = None
+    total_thickness_m: float | None = None
+    fluid_volume_m3: float | None = None
+    bulk_ratio: float | None = None
+
+    def parameters(self) -> FingertipParameters:
+        """As the solver takes them.
+
+        Raises:
+            ConfigError: One is out of range.
+        """
+        return FingertipParameters(**self.model_dump(exclude_none=True))
+
+
+class FemConfig(StrictConfig):
+    """How simulations are served.
+
+    Attributes:
+        sensor: Name under which the service answers, in the place of a sensor's.
+        workers: Processes that solve, one trajectory each at a time.
+        threads: Threads that each of them may use; 0 = share the cores of this host.
+        waiting: Requests that may wait for a worker; more are refused.
+        max_steps: Steps that a request may have.
+        max_deadline_s: Longest time that a request may take, waiting included [s].
+        grace_s: A solver that goes on for this long after its deadline is killed [s].
+        keep: Pressurised fingertips that each worker keeps.
+        fingertip: Parameters where a request names none.
+        factory: ``module:function`` that makes fingertips.
+        options: Its keyword arguments.
+    """
+
+    sensor: Name = "twin"
+    workers: int = Field(default=2, ge=1, le=64)
+    threads: int = Field(default=0, ge=0, le=256)
+    waiting: int = Field(default=8, ge=0, le=1000)
+    max_steps: int = Field(default=200, ge=1, lt=10_000)
+    max_deadline_s: float = Field(default=600.0, gt=0, le=86_400)
+    grace_s: float = Field(default=5.0, ge=0.1, le=60)
+    keep: int = Field(default=2, ge=1, le=32)
+    fingertip: FingertipTable = FingertipTable()
+    factory: str = DEFAULT_FACTORY
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    def threads_each(self) -> int:
+        """Threads of each worker."""
+        return self.threads or max(1, (os.cpu_count() or 1) // self.workers)

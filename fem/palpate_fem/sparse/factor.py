@@ -1,0 +1,178 @@
+"""Sparse direct solution of the symmetric tangent."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+
+from palpate.errors import ConfigError, SimulationError
+from palpate_fem.sparse.front import UnsafePivotError
+from palpate_fem.sparse.fronts import Fronts, Places
+
+logger = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.integer[Any]]
+
+SOLVERS = ("auto", "fronts", "fronts-double", "superlu")
+
+
+class Factor(Protocol):
+    """A matrix with a fixed pattern (upper triangle in CSR) that is factorised again and again."""
+
+    name: str
+
+    def factorise(self, values: Floats) -> None:
+        """Factorise the matrix with these values of its upper triangle."""
+
+    def solve(self, right: Floats) -> Floats:
+        """Solve for right-hand sides (n,) or (n, m)."""
+
+    @property
+    def negative(self) -> int:
+        """Negative eigenvalues of the last matrix: directions in which the body is unstable."""
+
+
+def make_factor(
+    indptr: Indices, indices: Indices, *, groups: Indices | None = None, solver: str = "auto"
+) -> Factor:
+    """A solver for one pattern.
+
+    Args:
+        indptr: Upper triangle in CSR, every diagonal entry present.
+        indices: Its columns, sorted.
+        groups: Node of each unknown, (n,); None = each its own.
+        solver: ``fronts`` works in single precision and falls back to double for the matrices that
+            need it, ``fronts-double`` always in double, ``superlu`` is SciPy's; ``auto`` is the
+            first.
+
+    Raises:
+        ConfigError: The named solver is not known.
+    """
+    if solver not in SOLVERS:
+        raise ConfigError(f"no solver {solver!r}", remedy=f"choose {', '.join(SOLVERS)}")
+    if solver == "superlu":
+        return SuperLu(indptr, indices)
+    if groups is None:
+        groups = np.arange(len(indptr) - 1)
+    return Multifrontal(Places(indptr, indices, groups), double=solver == "fronts-double")
+
+
+class Multifrontal:
+    """Fronts in single precision, and in double for matrices that need it."""
+
+    name = "fronts"
+
+    def __init__(self, places: Places, *, double: bool) -> None:
+        self._places = places
+        self._single = None if double else Fronts(places, np.float32)
+        self._double: Fronts | None = None
+        self._current: Fronts | None = None
+
+    def factorise(self, values: Floats) -> None:
+        """See `Factor`; singular or non-finite matrices raise SimulationError."""
+        check_finite(values)
+        self._current = None
+        if self._single is not None:
+            try:
+                self._single.factorise(values)
+            except UnsafePivotError:
+                logger.debug("a pivot is lost in single precision; this matrix is done in double")
+            else:
+                self._current = self._single
+                return
+        if self._double is None:
+            self._double = Fronts(self._places, np.float64)
+        try:
+            self._double.factorise(values)
+        except UnsafePivotError as error:
+            raise SimulationError(
+                "the tangent is singular (a pivot vanishes)",
+                remedy="hold the body, or use smaller increments",
+            ) from error
+        self._current = self._double
+
+    def solve(self, right: Floats) -> Floats:
+        """See `Factor`."""
+        if self._current is None:
+            raise SimulationError("there is no factor to solve with", remedy="factorise first")
+        return self._current.solve(np.asarray(right, np.float64))
+
+    @property
+    def negative(self) -> int:
+        """Negative eigenvalues of the last matrix: directions in which the body is unstable."""
+        return 0 if self._current is None else self._current.negative
+
+    @property
+    def redone(self) -> int:
+        """Fronts that the last factorisation had to redo."""
+        return 0 if self._current is None else self._current.redone
+
+    @property
+    def statistics(self) -> dict[str, float]:
+        """Entries of the factor, its operations [GFlop], and the bytes of its fronts [MiB]."""
+        elimination = self._places.elimination
+        shares = sum(len(front.border) ** 2 for front in elimination.fronts)
+        width = 4.0 if self._current is self._single else 8.0
+        return {
+            "factor_entries": float(elimination.entries),
+            "factor_gflop": elimination.flop / 1e9,
+            "factor_mib": width * (elimination.entries + shares) / 2**20,
+            "factor_fronts": float(len(elimination.fronts)),
+        }
+
+
+class SuperLu:
+    """SciPy's SuperLU: without symmetry, on one core; what the fronts are tested against."""
+
+    name = "superlu"
+
+    def __init__(self, indptr: Indices, indices: Indices) -> None:
+        size = len(indptr) - 1
+        marks = np.arange(1, len(indices) + 1, dtype=np.float64)
+        upper = sp.csr_matrix((marks, indices, indptr), shape=(size, size))
+        full = (upper + sp.triu(upper, 1).T).tocsc()
+        full.sort_indices()
+        self._full = full
+        self._gather = full.data.astype(np.int64) - 1
+        self._factor: Any = None
+
+    def factorise(self, values: Floats) -> None:
+        """See `Factor`."""
+        check_finite(values)
+        self._full.data = values[self._gather]
+        try:
+            self._factor = splu(
+                self._full,
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.01,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise SimulationError(
+                f"SuperLU cannot factorise the tangent: {error}", remedy="use smaller increments"
+            ) from error
+
+    def solve(self, right: Floats) -> Floats:
+        """See `Factor`."""
+        if self._factor is None:
+            raise SimulationError("there is no factor to solve with", remedy="factorise first")
+        return np.asarray(self._factor.solve(right))
+
+    @property
+    def negative(self) -> int:
+        """See `Factor`; exact as long as SuperLU has kept to the diagonal, which it prefers."""
+        return 0 if self._factor is None else int((self._factor.U.diagonal() < 0.0).sum())
+
+
+def check_finite(values: Floats) -> None:
+    """Refuse what no factorisation can use."""
+    if not np.isfinite(values).all():
+        raise SimulationError(
+            "the tangent has entries that are not numbers", remedy="use smaller increments"
+        )

@@ -1,0 +1,191 @@
+"""Multifrontal factorisation that redoes only the fronts whose entries have changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fem.sparse.front import DenseFront
+from palpate_fem.sparse.ordering import plan_elimination
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LANES = 2
+"""Right-hand sides that are solved for together."""
+
+POOL = ThreadPoolExecutor(1, thread_name_prefix="palpate-fronts")
+
+
+class Places:
+    """Where each entry of the matrix goes; the same for every precision."""
+
+    def __init__(self, indptr: NDArray[Any], indices: NDArray[Any], groups: NDArray[Any]) -> None:
+        self.elimination = plan_elimination(indptr, indices, groups)
+        count, fronts = len(indptr) - 1, self.elimination.fronts
+        new = np.empty(count, np.int64)
+        new[self.elimination.order] = np.arange(count)
+        rows = np.repeat(np.arange(count), np.diff(indptr))
+        low = np.minimum(new[rows], new[indices])
+        high = np.maximum(new[rows], new[indices])
+        front_of = np.repeat(np.arange(len(fronts)), [f.last - f.first for f in fronts])[low]
+        own = high < np.array([f.last for f in fronts], np.int64)[front_of]
+        # Entries front after front, those among own unknowns first.
+        self.sorted = np.lexsort((~own, front_of))
+        self.begins = np.searchsorted(front_of[self.sorted], np.arange(len(fronts) + 1))
+        self.own: list[Ints] = []
+        self.below: list[Ints] = []
+        for i, front in enumerate(fronts):
+            mine = self.sorted[self.begins[i] : self.begins[i + 1]]
+            split = int(own[mine].sum())
+            size = front.last - front.first
+            inside, outside = mine[:split], mine[split:]
+            self.own.append((low[inside] - front.first) * size + high[inside] - front.first)
+            row = np.searchsorted(front.border, high[outside])
+            self.below.append((low[outside] - front.first) * len(front.border) + row)
+
+    def in_parent(self, child: int) -> Ints:
+        """Places of a child's border among its parent's own unknowns and border."""
+        fronts = self.elimination.fronts
+        border, parent = fronts[child].border, fronts[fronts[child].parent]
+        size = parent.last - parent.first
+        far = size + np.searchsorted(parent.border, border)
+        return np.where(border < parent.last, border - parent.first, far)
+
+
+class Fronts:
+    """Factor of one matrix in one precision; two threads work on two halves of the tree."""
+
+    def __init__(self, places: Places, kind: type[np.floating[Any]]) -> None:
+        self.places = places
+        tree = places.elimination
+        middle, top = tree.first, tree.first + tree.second
+        self._halves = (range(middle), range(middle, top))
+        self._top = range(top, len(tree.fronts))
+        # Right-hand sides and answers in order of elimination, LANES of them at a time. The second
+        # half has vectors of its own, as both add to what stands above them.
+        self._vectors = [np.zeros((LANES, len(tree.order)), kind) for _ in range(2)]
+        self._begin_of_top = tree.fronts[top].first if top < len(tree.fronts) else len(tree.order)
+        self._dense = [
+            DenseFront(
+                [lane[front.first : front.last] for lane in self._vectors[middle <= i < top]],
+                front.border,
+            )
+            for i, front in enumerate(tree.fronts)
+        ]
+        for child, front in enumerate(tree.fronts):
+            if front.parent >= 0:
+                self._dense[front.parent].take(self._dense[child], places.in_parent(child))
+        self._values: NDArray[Any] | None = None  # that the fronts were made of, front after front
+        self.redone = 0  # fronts of the last factorisation
+
+    @property
+    def negative(self) -> int:
+        """Negative eigenvalues of the matrix."""
+        return sum(front.negative for front in self._dense)
+
+    def factorise(self, values: Floats) -> None:
+        """Factorise, or bring the factor up to date: fronts whose entries are the same are kept.
+
+        Args:
+            values: Entries of the upper triangle.
+
+        Raises:
+            UnsafePivotError: In this precision a pivot cannot be told from zero.
+        """
+        places = self.places
+        arranged = values[places.sorted].astype(self._vectors[0].dtype)
+        changed = self._changed(arranged)
+        self._values = None  # not to be trusted if this fails half-way
+
+        def redo(fronts: range) -> None:
+            for i in fronts:
+                if changed[i]:
+                    mine = arranged[places.begins[i] : places.begins[i + 1]]
+                    own = len(places.own[i])
+                    self._dense[i].fill((places.own[i], mine[:own]), (places.below[i], mine[own:]))
+                    self._dense[i].eliminate()
+
+        self._both(redo)
+        redo(self._top)
+        self._values = arranged
+        self.redone = int(changed.sum())
+
+    def solve(self, right: Floats) -> Floats:
+        """Solve for right-hand sides (n,) or (n, m)."""
+        columns = right.reshape(len(right), -1)
+        answer = np.empty(columns.shape)
+        for begin in range(0, columns.shape[1], LANES):
+            some = slice(begin, begin + LANES)
+            answer[:, some] = self._solve_few(columns[:, some])
+        return answer.reshape(right.shape)
+
+    def _solve_few(self, right: Floats) -> Floats:
+        """Solve for at most LANES columns: each block of the factor is read once for all."""
+        tree, (first, second) = self.places.elimination, self._vectors
+        lanes, top, halves = range(right.shape[1]), self._begin_of_top, self._halves
+        first[: len(lanes)] = right[tree.order].T
+        second[:] = first
+        second[:, top:] = 0.0
+        touched = self._touched(first[: len(lanes)])
+
+        def forward(fronts: range) -> None:
+            vectors = self._vectors[fronts == halves[1]]
+            for i in fronts:
+                if touched[i]:
+                    for lane in lanes:
+                        self._dense[i].forward(lane, vectors[lane])
+
+        def backward(fronts: range) -> None:
+            vectors = self._vectors[fronts == halves[1]]
+            for i in reversed(fronts):
+                for lane in lanes:
+                    self._dense[i].backward(lane, vectors[lane])
+
+        self._both(forward)
+        first[:, top:] += second[:, top:]
+        forward(self._top)
+        backward(self._top)
+        second[:, top:] = first[:, top:]
+        self._both(backward)
+        first[:, self._second_half] = second[:, self._second_half]
+        answer = np.empty((len(tree.order), len(lanes)))
+        answer[tree.order] = first[: len(lanes)].T
+        return answer
+
+    def _touched(self, right: NDArray[Any]) -> NDArray[np.bool_]:
+        """Fronts with something in the right-hand sides, or above such."""
+        marks = np.concatenate(([0], np.cumsum(right.any(axis=0))))
+        fronts = self.places.elimination.fronts
+        ends = np.array([front.last for front in fronts])
+        return self._with_parents(marks[ends] > marks[[front.first for front in fronts]])
+
+    @property
+    def _second_half(self) -> slice:
+        fronts, begin = self.places.elimination.fronts, self._halves[1].start
+        start = fronts[begin].first if begin < len(fronts) else self._begin_of_top
+        return slice(start, self._begin_of_top)
+
+    def _both(self, work: Callable[[range], None]) -> None:
+        """Work on both halves at once."""
+        other = POOL.submit(work, self._halves[1])
+        work(self._halves[0])
+        other.result()
+
+    def _changed(self, arranged: NDArray[Any]) -> NDArray[np.bool_]:
+        """Fronts with new entries, or above such."""
+        places, fronts = self.places, self.places.elimination.fronts
+        if self._values is None:
+            return np.ones(len(fronts), np.bool_)
+        different = np.concatenate(([0], np.cumsum(arranged != self._values)))
+        return self._with_parents(np.diff(different[places.begins]) > 0)
+
+    def _with_parents(self, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        for i, front in enumerate(self.places.elimination.fronts):
+            if marked[i] and front.parent >= 0:
+                marked[front.parent] = True
+        return marked

@@ -1,0 +1,203 @@
+"""Files that are there whole or not at all, and that one writer has at a time.
+
+A file is claimed by a lock on ``NAME.part``, written into it, brought to the disk and renamed. The
+kernel drops a lock with its process, so nothing of a killed writer is in anybody's way.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+from palpate.closing import Closing
+from palpate.errors import DatasetError, ErrorCode
+
+PART = ".part"
+
+
+class StoreTakenError(DatasetError):
+    """Another writer has the store, or has or has finished this trajectory."""
+
+    code = ErrorCode.UNAVAILABLE
+
+
+class StoreDiskError(DatasetError):
+    """The disk is full or refuses; what was finished before is kept."""
+
+    code = ErrorCode.DISK
+
+
+class StoreMismatchError(DatasetError):
+    """What is to be written belongs to another fingertip than the store."""
+
+
+def disk_error(path: Path, error: OSError) -> StoreDiskError:
+    """The error for a disk that does not take a file."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    remedy = "free some space" if full else "check the folder's rights and that its disk is there"
+    return StoreDiskError(
+        f"cannot write {path}: {error.strerror or error}",
+        remedy=f"{remedy} and run the same command again: what was finished before is kept",
+    )
+
+
+class Claim(Closing):
+    """The right to write one file, until the block ends or the process does.
+
+    Args:
+        target: The file; its folder is made.
+        wait: Wait for another claimant instead of raising.
+
+    Attributes:
+        part: What to write into, where :meth:`commit` does not suit.
+
+    Raises:
+        StoreTakenError: Another process or thread has it.
+        StoreDiskError: The folder takes no file.
+    """
+
+    def __init__(self, target: Path, *, wait: bool = False) -> None:
+        self.target = target
+        self.part = target.with_name(target.name + PART)
+        try:
+            _make_folder(target.parent)
+            self._file = self._lock(wait)
+        except OSError as error:
+            raise disk_error(self.part, error) from error
+        self._open = True
+
+    def _lock(self, wait: bool) -> int:
+        while True:
+            file = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+                if _is_at(file, self.part):  # else the one before us renamed or removed it
+                    return file
+            except BlockingIOError as error:
+                os.close(file)
+                raise StoreTakenError(
+                    f"{self.target} is being written by another process",
+                    remedy="leave this one to it and take the next",
+                ) from error
+            except BaseException:
+                os.close(file)
+                raise
+            os.close(file)
+
+    def commit(self, image: bytes) -> None:
+        """Make ``image`` the content of the file, on the disk, and let go of it.
+
+        Raises:
+            StoreDiskError: The disk refused; the file is as before.
+        """
+        self._check_open()
+        try:
+            os.ftruncate(self._file, 0)
+            rest = memoryview(image)
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+        except OSError as error:
+            raise disk_error(self.target, error) from error
+        self.finish()
+
+    def finish(self) -> None:
+        """Make what was written to ``part`` the file, on the disk, and let go of it.
+
+        Raises:
+            StoreDiskError: The disk refused; the file is as before.
+        """
+        self._check_open()
+        try:
+            os.fsync(self._file)
+            os.rename(self.part, self.target)
+            self._open = False
+            os.close(self._file)
+            sync_folder(self.target.parent)
+        except OSError as error:
+            raise disk_error(self.target, error) from error
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise ValueError(f"the claim on {self.target} has ended")
+
+    def close(self) -> None:
+        """Let go of it, unwritten. Nothing if it was written."""
+        if not self._open:
+            return
+        self._open = False
+        self.part.unlink(missing_ok=True)
+        os.close(self._file)
+
+
+class FolderLock:
+    """Keeps a second writer out of a folder; several that all say ``shared`` may be in.
+
+    Args:
+        folder: The folder; it exists.
+        shared: Whether others that say so too may write at the same time.
+
+    Raises:
+        StoreTakenError: Someone else is in.
+        StoreDiskError: The folder takes no file.
+    """
+
+    def __init__(self, folder: Path, *, shared: bool) -> None:
+        path = folder / "lock"
+        try:
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise disk_error(path, error) from error
+        try:
+            fcntl.flock(self._file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except OSError as error:
+            owner = os.pread(self._file, 32, 0).decode("ascii", "replace").strip()
+            os.close(self._file)
+            if not isinstance(error, BlockingIOError):
+                raise disk_error(path, error) from error
+            raise StoreTakenError(
+                f"{folder} is being written by " + (f"process {owner}" if owner else "others"),
+                remedy="wait for its end, write to another store, or let all writers share it",
+            ) from error
+        self._shared = shared
+        if not shared:
+            self._sign(f"{os.getpid()}\n")
+
+    def release(self) -> None:
+        """Let others in."""
+        if not self._shared:
+            self._sign("")
+        os.close(self._file)
+
+    def _sign(self, text: str) -> None:
+        # For the message to a second writer only; on a full disk it stays unsigned.
+        try:
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, text.encode("ascii"), 0)
+        except OSError:
+            return
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring names in a folder to the disk: without it a renamed file may be lost with the power."""
+    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _make_folder(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    _make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    sync_folder(folder.parent)
+
+
+def _is_at(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False

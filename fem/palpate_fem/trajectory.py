@@ -1,0 +1,302 @@
+"""The paper's indentations: where they aim, how they move, and the whole set of them.
+
+Of each of 10 points in a region of the pad there is one indentation along the inward normal, 3 mm
+deep, and four at 30 degrees to it, 1.5 mm deep (paper, "Experimental testing procedure"). The paper
+leaves open and we choose:
+
+* the *sampled region*: x from -11 to 1 mm, at most 4 mm to the side, where the skin faces down:
+  from the core's distal facet over the pad, well within the skin's ends at x = -21 and 7 mm;
+* the azimuths of the angled ones: distal, +y, proximal, -y;
+* the indenter faces where it moves, so that a flat one comes on with an edge when angled, and
+  touches far from the point it aims at, as the paper reports;
+* a path starts just clear of the skin, not 3 mm away, and its 20 steps are equal parts of the depth
+  from first contact on, the displacements to which the paper resamples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from palpate.errors import ConfigError
+from palpate_fem.indenter.approach import Surface, first_contact
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.pose import facing, unit
+from palpate_fem.indenter.shape import Indenter
+from palpate_fem.mesh.surface import node_normals
+
+Floats = NDArray[np.float64]
+
+STEPS = 20  # paper, "Finite element model configuration"
+POINTS = 10  # per indenter; paper, "Experimental testing procedure", as are the next four
+NORMAL_DEPTH_M = 3.0e-3
+ANGLED_DEPTH_M = 1.5e-3
+ANGLE_RAD = math.radians(30.0)
+AZIMUTHS = 4
+_BATCH = 64  # of draws; fixed, so that asking for more points does not change the first ones
+CLEARANCE_M = 0.05e-3  # more than the reach of the softened contact law, which is 40 um
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """Part of the outer surface that is aimed at [m], sensor frame; our choice, see above."""
+
+    x_from_m: float = -11e-3
+    x_to_m: float = 1e-3
+    half_width_m: float = 4e-3
+
+    def holds(self, points: Floats, normals: Floats) -> NDArray[np.bool_]:
+        """Which points are in it, shape (N,): below the axis and facing down."""
+        x, y, z = points.T
+        held = (x >= self.x_from_m) & (x <= self.x_to_m) & (np.abs(y) <= self.half_width_m)
+        return np.asarray(held & (z < 0.0) & (normals[:, 2] < -0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class Indentation:
+    """One planned trajectory.
+
+    Attributes:
+        name: ``<indenter>/<point>/<normal|angled-0..3>``.
+        indenter: Name of the indenter.
+        target: Point that it aims at [m], shape (3,).
+        normal: Outward normal there, shape (3,).
+        direction: Where it moves, shape (3,).
+        contact_m: Travel of the tip beyond the target at first contact [m]; mostly negative.
+        depth_m: Travel from first contact to the last pose [m].
+        path: Poses, the first clear of the skin, shape (K + 1, 7).
+    """
+
+    name: str
+    indenter: str
+    target: Floats
+    normal: Floats
+    direction: Floats
+    contact_m: float
+    depth_m: float
+    path: Floats
+
+
+def press_path(
+    indenter: Indenter,
+    target: ArrayLike,
+    direction: ArrayLike,
+    surface: Surface,
+    *,
+    depth_m: float,
+    steps: int = STEPS,
+    clearance_m: float = CLEARANCE_M,
+) -> Floats:
+    """A straight path into the skin: a pose just clear of it, then equal steps from first contact.
+
+    Args:
+        indenter: The indenter; it faces where it moves.
+        target: Point through which the tip goes [m], shape (3,), sensor frame.
+        direction: Where it moves, shape (3,).
+        surface: Outer surface of the pressurised skin.
+        depth_m: Travel from first contact to the last pose [m].
+        steps: Number K of steps.
+        clearance_m: Travel from the first pose to first contact [m].
+
+    Returns:
+        Poses, shape (K + 1, 7).
+
+    Raises:
+        ConfigError: A value that makes no path.
+        SimulationError: The indenter misses.
+    """
+    return _press(indenter, target, direction, surface, depth_m, steps, clearance_m)[0]
+
+
+def normal_path(
+    indenter: Indenter,
+    target: ArrayLike,
+    normal: ArrayLike,
+    surface: Surface,
+    *,
+    depth_m: float = NORMAL_DEPTH_M,
+    steps: int = STEPS,
+) -> Floats:
+    """`press_path` against the outward normal of the skin."""
+    return press_path(
+        indenter, target, -unit(normal, "normal"), surface, depth_m=depth_m, steps=steps
+    )
+
+
+def angled_path(
+    indenter: Indenter,
+    target: ArrayLike,
+    normal: ArrayLike,
+    surface: Surface,
+    *,
+    azimuth_rad: float,
+    angle_rad: float = ANGLE_RAD,
+    depth_m: float = ANGLED_DEPTH_M,
+    steps: int = STEPS,
+) -> Floats:
+    """`press_path` at an angle to the inward normal; see `angled_direction`."""
+    direction = angled_direction(normal, angle_rad, azimuth_rad)
+    return press_path(indenter, target, direction, surface, depth_m=depth_m, steps=steps)
+
+
+def angled_direction(normal: ArrayLike, angle_rad: float, azimuth_rad: float) -> Floats:
+    """Direction at an angle to the inward normal, shape (3,), sensor frame.
+
+    Args:
+        normal: Outward normal of the skin, shape (3,).
+        angle_rad: Angle to the inward normal.
+        azimuth_rad: Where it moves along the skin: 0 distally, a quarter turn towards +y (on the
+            pad), half a turn proximally.
+    """
+    out = unit(normal, "normal")
+    distal = np.array([1.0, 0.0, 0.0]) - out[0] * out
+    if np.linalg.norm(distal) < 1e-6:  # at the very tip: dorsal takes the place of distal
+        distal = np.array([0.0, 0.0, 1.0]) - out[2] * out
+    distal = unit(distal)
+    along = math.cos(azimuth_rad) * distal + math.sin(azimuth_rad) * np.cross(distal, out)
+    return unit(-math.cos(angle_rad) * out + math.sin(angle_rad) * along)
+
+
+def sample_targets(
+    surface: Surface, count: int, *, seed: int | Sequence[int] = 0, region: Region | None = None
+) -> tuple[Floats, Floats]:
+    """Random points of a region of the surface, evenly by area.
+
+    Args:
+        surface: Outer surface of the pressurised skin.
+        count: Number of points.
+        seed: Same seed and surface, same points; more of them begin with the same.
+        region: Where; None = the sampled region.
+
+    Returns:
+        Points [m] and outward unit normals, both shape (count, 3), sensor frame.
+
+    Raises:
+        ConfigError: The surface has no such region.
+    """
+    region = Region() if region is None else region
+    faces = surface.faces
+    if faces.shape[1] == 4:
+        faces = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
+    corner = surface.nodes[faces]
+    smooth = node_normals(surface.nodes, surface.faces)[faces]
+    inside = region.holds(corner.reshape(-1, 3), smooth.reshape(-1, 3)).reshape(-1, 3).any(axis=1)
+    if not inside.any():
+        raise ConfigError(
+            f"no part of the surface lies in {region}",
+            remedy="give the outer surface in the sensor frame, in metres, normals outwards",
+        )
+    corner, smooth = corner[inside], smooth[inside]
+    area = np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
+    random = np.random.default_rng(seed)
+    points, normals = np.empty((0, 3)), np.empty((0, 3))
+    while len(points) < count:  # faces at the border stick out: draw again what lies there
+        face = random.choice(len(corner), size=_BATCH, p=area / area.sum())
+        weights = random.dirichlet((1.0, 1.0, 1.0), size=_BATCH)
+        drawn = np.einsum("nk,nki->ni", weights, corner[face])
+        normal = np.einsum("nk,nki->ni", weights, smooth[face])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        kept = region.holds(drawn, normal)
+        points, normals = np.vstack([points, drawn[kept]]), np.vstack([normals, normal[kept]])
+    return points[:count], normals[:count]
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """All indentations of the paper on a surface, in order; 450 by default, made when asked for.
+
+    The points of an indenter depend on the seed, the surface and its name alone, and the first ones
+    stay where they are when there are more of them.
+
+    Attributes:
+        surface: Outer surface of the pressurised skin.
+        indenters: Names.
+        points: Points for each indenter.
+        seed: Of the points.
+        steps: Steps of each path.
+        region: Where to aim; None = the sampled region.
+        angled: Angled paths at each point, of the ``AZIMUTHS`` that there are.
+        increment_m: Length of a step [m] instead of ``steps``, as a robot moves; None = ``steps``.
+        overtravel_m: How much deeper than the paper's depths [m]: what a robot that stands wrong by
+            its registration error may reach.
+    """
+
+    surface: Surface
+    indenters: tuple[str, ...] = indenter_names()
+    points: int = POINTS
+    seed: int = 0
+    steps: int = STEPS
+    region: Region | None = None
+    angled: int = AZIMUTHS
+    increment_m: float | None = None
+    overtravel_m: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.indenters) * self.points * (1 + self.angled)
+
+    def __iter__(self) -> Iterator[Indentation]:
+        for name in self.indenters:
+            indenter = make_indenter(name)
+            key = [self.seed, *indenter.name.encode()]
+            targets, normals = sample_targets(
+                self.surface, self.points, seed=key, region=self.region
+            )
+            for point, (target, normal) in enumerate(zip(targets, normals, strict=True)):
+                at = f"{indenter.name}/{point:02d}"
+                inward = angled_direction(normal, 0.0, 0.0)
+                yield self._plan(f"{at}/normal", indenter, target, normal, inward, NORMAL_DEPTH_M)
+                for k in range(self.angled):
+                    towards = angled_direction(normal, ANGLE_RAD, 2.0 * math.pi * k / AZIMUTHS)
+                    yield self._plan(
+                        f"{at}/angled-{k}", indenter, target, normal, towards, ANGLED_DEPTH_M
+                    )
+
+    def _plan(
+        self,
+        name: str,
+        indenter: Indenter,
+        target: Floats,
+        normal: Floats,
+        direction: Floats,
+        depth_m: float,
+    ) -> Indentation:
+        depth_m += self.overtravel_m
+        steps = self.steps if self.increment_m is None else round(depth_m / self.increment_m)
+        path, contact_m = _press(
+            indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
+        )
+        return Indentation(name, indenter.name, target, normal, direction, contact_m, depth_m, path)
+
+
+def _press(
+    indenter: Indenter,
+    target: ArrayLike,
+    direction: ArrayLike,
+    surface: Surface,
+    depth_m: float,
+    steps: int,
+    clearance_m: float,
+) -> tuple[Floats, float]:
+    """`press_path`, and the travel beyond the target at first contact [m]."""
+    if steps < 1:
+        raise ConfigError(f"a path of {steps} steps", remedy="ask for at least one step")
+    for what, value in (("depth_m", depth_m), ("clearance_m", clearance_m)):
+        if not (math.isfinite(value) and value > 0.0):
+            raise ConfigError(f"{what} = {value} is not a length", remedy="give it in metres, > 0")
+    target = np.asarray(target, np.float64)
+    if target.shape != (3,) or not np.isfinite(target).all():
+        raise ConfigError(f"target {target!r} is not a point", remedy="give three finite numbers")
+    direction = unit(direction)
+    quaternion = facing(direction)
+    contact_m = first_contact(indenter, quaternion, target, direction, surface)
+    travel = contact_m + np.concatenate([[-clearance_m], depth_m * np.arange(1, steps + 1) / steps])
+    path = np.empty((steps + 1, 7))
+    path[:, :3] = target + travel[:, None] * direction
+    path[:, 3:] = quaternion
+    return path, contact_m

@@ -1,0 +1,131 @@
+"""Simulations of a store, in the place of a simulation or of a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from palpate.errors import DatasetError
+from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.measured import (
+    MEASURED,
+    SIMULATED,
+    Indentation,
+    is_file_of,
+    read_indentations,
+)
+from palpate_fem.calibration.runs import Simulated, from_rest
+from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.store.content import TrajectorySummary
+from palpate_fem.store.hdf5 import SCHEMA as STORE_SCHEMA
+from palpate_fem.store.read import SimulationStore
+
+_SIDEWAYS_M = 20e-6
+"""Paths of one trajectory lie this close: the robot's repeatability (paper, "testbed design")."""
+_TURNED = np.cos(np.radians(1.0))
+
+
+def measured_from(path: Path) -> tuple[tuple[Indentation, ...], dict[str, str]]:
+    """Trajectories to compare with, from a file of indentations or from a store.
+
+    Args:
+        path: File of schema ``palpate.indentations``, or a store (folder or exported file); a
+            store's trajectories count as measured only if they name a sensor.
+
+    Returns:
+        The trajectories, and name and reason of those that are none.
+
+    Raises:
+        DatasetError: It is neither, or damaged.
+    """
+    if path.is_file() and not is_file_of(path, STORE_SCHEMA):
+        return read_indentations(path), {}
+    store, found, left_out = SimulationStore.open(path), [], {}
+    for name in store.ids():
+        item = store.summary(name)
+        pose, force = item.pose, item.force
+        if not item.sensor and len(pose):
+            # a solver's steps begin at the second pose; at the first it does not touch
+            pose, force = np.concatenate([item.path[:1], pose]), from_rest(force)
+        try:
+            found.append(
+                Indentation(
+                    name,
+                    item.indenter,
+                    item.sensor or "simulated",
+                    pose,
+                    force,
+                    MEASURED if item.sensor else SIMULATED,
+                    "" if item.sensor else str(item.outcome),
+                )
+            )
+        except DatasetError as error:
+            left_out[name] = error.problem
+    return tuple(found), left_out
+
+
+def simulated_from(
+    store: SimulationStore, measured: Sequence[Indentation]
+) -> tuple[dict[str, Simulated], dict[str, str]]:
+    """The stored simulation of each measured trajectory.
+
+    A simulation serves every sensor: ``sphere_medium/03/normal`` is that of
+    ``sphere_medium/03/normal/biotac1``. Its path may begin elsewhere on the same line.
+
+    Args:
+        store: Where simulations are.
+        measured: What they are compared with.
+
+    Returns:
+        Simulations by the name of the measured trajectory, and name and reason of those that
+        cannot be used.
+
+    Raises:
+        DatasetError: The store is damaged.
+    """
+    tip, there = store.fingertip(), set(store.ids())
+    found: dict[str, Simulated] = {}
+    refused: dict[str, str] = {}
+    for item in measured:
+        names = (item.name, item.name.removesuffix(f"/{item.sensor}"))
+        name = next((name for name in names if name in there), None)
+        if name is None:
+            continue
+        summary = store.summary(name)
+        problem = _mismatch(summary, item)
+        if problem:
+            refused[item.name] = problem
+            continue
+        force = from_rest(summary.force)
+        ahead = _direction(item.pose) @ (summary.path[0, :3] - item.pose[0, :3])
+        found[item.name] = Simulated(
+            force,
+            path_lengths(summary.path)[: len(force)] + ahead,
+            tip.total_thickness_m,
+            tip.fluid_volume_m3,
+            summary.outcome,
+            summary.reason,
+        )
+    return found, refused
+
+
+def _mismatch(simulated: TrajectorySummary, item: Indentation) -> str:
+    """Why a simulation is not of this trajectory; empty if it is."""
+    if simulated.indenter != item.indenter:
+        return f"simulated with {simulated.indenter}, measured with {item.indenter}"
+    along = _direction(item.pose)
+    if _direction(simulated.path) @ along < _TURNED:
+        return "simulated along another direction"
+    apart = simulated.path[0, :3] - item.pose[0, :3]
+    sideways = float(np.linalg.norm(apart - (apart @ along) * along))
+    if sideways > _SIDEWAYS_M:
+        return f"simulated {sideways * 1e3:.3f} mm beside the measured path"
+    return ""
+
+
+def _direction(path: Floats) -> Floats:
+    """From the first to the last position, unit length, shape (3,)."""
+    way = path[-1, :3] - path[0, :3]
+    return np.asarray(way / np.linalg.norm(way))

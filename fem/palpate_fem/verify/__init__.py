@@ -1,0 +1,85 @@
+"""``palpate fem verify``: the solver against closed forms, other programs, and itself.
+
+::
+
+    from palpate_fem import verify
+
+    for check in verify.run(only="hertz"):
+        print(check.name, check.value, check.reference, check.passed)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from palpate_fem.verify import (
+    balance,
+    closed_forms,
+    contact,
+    convergence,
+    cycles,
+    element,
+    fluid,
+    friction,
+    public_skin,
+    tangents,
+)
+from palpate_fem.verify.check import Case, Check
+
+__all__ = ["Case", "Check", "run", "suite"]
+
+# Beside a checkout of the project; an installed palpate has none, and its checks are skipped.
+SHARED_DATA = Path(__file__).resolve().parents[5] / "shared" / "data"
+PUBLIC_SKIN = "nvlabs_biotac_mesh"
+
+
+def suite(
+    *, quick: bool = False, only: str = "", shared_data: Path | None = None
+) -> tuple[Case, ...]:
+    """The checks, not yet run; each is called without arguments and gives its `Check`.
+
+    Args:
+        quick: Leave out those that take long.
+        only: Word in the name, whatever its case; empty for all.
+        shared_data: Folder that holds the public BioTac's; None = beside the project.
+    """
+    folder = (shared_data or SHARED_DATA) / PUBLIC_SKIN
+    every = (
+        *tangents.CHECKS,
+        *element.CHECKS,
+        *closed_forms.CHECKS,
+        *convergence.CHECKS,
+        *fluid.CHECKS,
+        *balance.CHECKS,
+        *cycles.CHECKS,
+        *contact.CHECKS,
+        *friction.CHECKS,
+        *public_skin.checks(folder),
+    )
+    word = only.lower()
+    return tuple(case for case in every if word in case.name.lower() and not (quick and case.slow))
+
+
+def run(
+    *,
+    only: str = "",
+    slow: bool = False,
+    shared_data: Path | None = None,
+    on_check: Callable[[Check, int, int], None] | None = None,
+) -> list[Check]:
+    """Run the suite.
+
+    Args:
+        only: See `suite`.
+        slow: Also those that take long.
+        shared_data: See `suite`.
+        on_check: Called after each with it, how many are done, and of how many.
+    """
+    cases = suite(quick=not slow, only=only, shared_data=shared_data)
+    checks = []
+    for case in cases:
+        checks.append(case())
+        if on_check is not None:
+            on_check(checks[-1], len(checks), len(cases))
+    return checks

@@ -1,0 +1,220 @@
+"""Homogeneous stretches, inflated spheres and tubes against textbook formulas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+
+from palpate_fem.verify.body import MU, TIGHT, Body
+from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.meshes import octant, on_planes, quarter_tube, rectangle, slab
+
+INNER_M, OUTER_M = 5.5e-3, 7.07e-3  # a ball of the BioTac's size
+FINEST = (6, 3)  # edges of a patch of the octant, layers
+EVER_FINER = ((2, 1), (4, 2), (8, 4))
+# Thin walls and small strains leave fewer digits: positions are rounded, strains are differences.
+FEWER_DIGITS = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-9)
+
+
+def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measured:
+    """Cauchy stress over mu along x of a cube: l^2 - l^power for J = 1.
+
+    Args:
+        stretch: l.
+        power: Of the stretch across, squared: -1 uniaxial, -4 equibiaxial, -2 pure shear.
+        wide: Whether y is stretched as x is.
+        plane: Whether y keeps its length.
+    """
+    line = np.linspace(0.0, 1e-3, 3)
+    mesh = slab(*rectangle(line, line), line)
+    held, end = on_planes(mesh), np.abs(mesh.nodes - 1e-3) < 1e-9
+    held[end[:, 0], 0] = True
+    held[end[:, 1], 1] = wide or plane
+    goal = mesh.nodes * [stretch, stretch if wide else 1.0, 1.0]
+    body = Body(mesh, held=held, bulk_ratio=1e9)
+    # So small that no point comes to the barrier of a pinch on the way.
+    for share in np.linspace(0.1, 1.0, 10):
+        at = mesh.nodes + share * (goal - mesh.nodes)
+        body.state.position[held] = at[held]
+        balance = body.solve()
+    across = np.ptp(body.state.position[:, 1]) * np.ptp(body.state.position[:, 2])
+    stress = body.reactions(balance)[end[:, 0], 0].sum() / across
+    return Measured(stress / MU, stretch**2 - stretch**power, "sigma / mu")
+
+
+def thick_sphere(stretch: float, ratio: float) -> float:
+    """Inflation of an incompressible neo-Hookean sphere by the stretch of its inner radius.
+
+    p / mu = (2/lb + 1/(2 lb^4)) - (2/la + 1/(2 la^4)) with lb^3 = 1 + (la^3 - 1) / ratio^3.
+    """
+    outer = (1 + (stretch**3 - 1) / ratio**3) ** (1 / 3)
+    return float((2 / outer + 0.5 / outer**4) - (2 / stretch + 0.5 / stretch**4))
+
+
+def thick_tube(stretch: float, ratio: float) -> float:
+    """The same as a tube in plane strain: p / mu = ln(la/lb) + (1/lb^2 - 1/la^2) / 2."""
+    outer = (1 + (stretch**2 - 1) / ratio**2) ** 0.5
+    return float(np.log(stretch / outer) + (outer**-2 - stretch**-2) / 2)
+
+
+@cache
+def blown(
+    edges: int, layers: int, ratio: float, stretches: tuple[float, ...], wedges: bool = False
+) -> dict[float, float]:
+    """Find p / mu of an eighth of a sphere at the volume of each stretch, by volume control."""
+    mesh = octant(edges, INNER_M, INNER_M * ratio, layers, wedges=wedges)
+    body = Body(mesh, held=on_planes(mesh), bulk_ratio=1e6, settings=FEWER_DIGITS)
+    rest = body.system.balance(body.state, None).volume
+    found, last = {}, 1.0
+    for stretch in stretches:
+        for between in np.linspace(last, stretch, 2 + int((stretch - last) / 0.2))[1:]:
+            body.solve(volume=rest * between**3)
+        found[stretch], last = body.state.fluid_pressure / MU, stretch
+    return found
+
+
+STRETCHES = (1.1, 1.25, 1.5, 2.0)
+
+
+def sphere(stretch: float, *, wedges: bool) -> Measured:
+    """Inflation of a thick sphere, B/A = 1.5, with three layers; through its limit point at 1.6."""
+    return Measured(
+        blown(*FINEST, 1.5, STRETCHES, wedges)[stretch], thick_sphere(stretch, 1.5), "p / mu"
+    )
+
+
+def sphere_of_biotac(stretch: float) -> Measured:
+    """The same at the BioTac's size."""
+    ratio = OUTER_M / INNER_M
+    found = blown(*FINEST, ratio, (1.05, 1.1, 1.2, 1.3))
+    return Measured(MU * found[stretch] * 1e-3, MU * thick_sphere(stretch, ratio) * 1e-3)
+
+
+def sphere_order(*, wedges: bool) -> Measured:
+    """Slope of log error over log edge from the two finest of three meshes."""
+    exact = thick_sphere(1.1, 1.5)
+    error = [abs(blown(e, n, 1.5, (1.1,), wedges)[1.1] - exact) for e, n in EVER_FINER]
+    note = "errors " + ", ".join(f"{e / exact:.2%}" for e in error)
+    return Measured(np.log2(error[1] / error[2]), 2.0, note)
+
+
+def balloon(stretch: float) -> Measured:
+    """Ideal balloon, thickness over radius t -> 0: p / mu = 2 t (1/l - 1/l^7)."""
+    thin = 1e-3
+    found = blown(6, 1, 1 + thin, (stretch,))[stretch] / thin
+    return Measured(found, 2 * (1 / stretch - 1 / stretch**7), "p R / (mu t), t / R = 0.001")
+
+
+@cache
+def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[float, float]:
+    """Find p / mu of a tube, B/A = 1.5, whose inner nodes are moved out."""
+    around = 4 * layers
+    mesh = quarter_tube(around, INNER_M, 1.5 * INNER_M, layers)
+    held = on_planes(mesh)
+    held[:, 2] = True
+    bore = np.abs(np.hypot(*mesh.nodes[:, :2].T) - INNER_M) < 1e-9
+    held[bore, :2] = True
+    body = Body(mesh, held=held, bulk_ratio=bulk_ratio, settings=FEWER_DIGITS)
+    found, last = {}, 1.0
+    for stretch in stretches:
+        for between in np.linspace(last, stretch, 2 + int((stretch - last) / 0.1))[1:]:
+            body.state.position[bore, :2] = between * mesh.nodes[bore, :2]
+            balance = body.solve()
+        outward = mesh.nodes[bore, :2] / INNER_M
+        push = float((body.reactions(balance)[bore, :2] * outward).sum())
+        # Of the polygon: what the bore's cross-section grows by when the nodes move.
+        growth = stretch * INNER_M * around * np.sin(np.pi / 2 / around)
+        found[stretch] = push / growth / np.ptp(mesh.nodes[:, 2]) / MU
+        last = stretch
+    return found
+
+
+def tube(stretch: float) -> Measured:
+    """Inflation of a thick tube in plane strain, B/A = 1.5, with three layers."""
+    return Measured(_tube((1.1, 1.5, 2.0), 1e6, 3)[stretch], thick_tube(stretch, 1.5), "p / mu")
+
+
+SMALL = 1e-4  # strain: what is not linear in it is far below the tolerance
+
+
+def bulk_ratio(nu: float) -> float:
+    """Linear elasticity: kappa / mu = 2 (1 + nu) / (3 (1 - 2 nu))."""
+    return 2 * (1 + nu) / 3 / (1 - 2 * nu)
+
+
+def _lame_sphere(nu: float) -> Measured:
+    mesh = octant(8, INNER_M, 1.5 * INNER_M, 4)
+    body = Body(mesh, held=on_planes(mesh), bulk_ratio=bulk_ratio(nu), settings=FEWER_DIGITS)
+    rest = body.system.balance(body.state, None).volume
+    body.solve(volume=rest * (1 + SMALL) ** 3)
+    young, cube = 2 * (1 + nu), 1.5**3  # over mu; B^3 / A^3
+    per_pressure = ((1 - 2 * nu) + (1 + nu) / 2 * cube) / (cube - 1) / young
+    return Measured(body.state.fluid_pressure / MU / SMALL, 1 / per_pressure, "p A / (mu u)")
+
+
+def _lame_tube(nu: float) -> Measured:
+    found = _tube((1 + SMALL,), bulk_ratio(nu), 5)[1 + SMALL] / SMALL
+    square = 1.5**2
+    return Measured(found, 2 * (square - 1) / ((1 - 2 * nu) + square), "p A / (mu u)")
+
+
+@cache
+def lame(shape: str, nu: float) -> Measured:
+    """Lame's thick sphere or tube in plane strain: pressure per small displacement of the bore."""
+    return (_lame_sphere if shape == "sphere" else _lame_tube)(nu)
+
+
+def lame_change(shape: str) -> Measured:
+    """How much the relative error changes from nu = 0.3 to 0.4999: locking would show here."""
+    errors = [m.value / m.reference - 1 for m in (lame(shape, 0.3), lame(shape, 0.4999))]
+    return Measured(errors[1] - errors[0], 0.0, f"errors {errors[0]:.2%}, {errors[1]:.2%}")
+
+
+CHECKS = (
+    Case("closed/uniaxial stretch 1.5", partial(stretched, 1.5, -1, wide=False, plane=False), 1e-8),
+    Case(
+        "closed/equibiaxial stretch 1.5", partial(stretched, 1.5, -4, wide=True, plane=False), 1e-8
+    ),
+    Case(
+        "closed/pure shear stretch 1.5", partial(stretched, 1.5, -2, wide=False, plane=True), 1e-8
+    ),
+    *(
+        Case(f"closed/thick sphere, {kind}, stretch {s}", partial(sphere, s, wedges=wedges), 1e-2)
+        for kind, wedges in (("hexahedra", False), ("wedges", True))
+        for s in STRETCHES
+    ),
+    *(
+        Case(
+            f"closed/thick sphere, {kind}, order",
+            partial(sphere_order, wedges=wedges),
+            0.1,
+            at_least=True,
+        )
+        for kind, wedges in (("hexahedra", False), ("wedges", True))
+    ),
+    *(
+        Case(
+            f"closed/sphere of the BioTac's size, stretch {s}",
+            partial(sphere_of_biotac, s),
+            1e-2,
+            unit="kPa",
+        )
+        for s in (1.05, 1.1, 1.2, 1.3)
+    ),
+    Case("closed/ideal balloon, stretch 1.5", partial(balloon, 1.5), 1e-2),
+    *(
+        Case(f"closed/thick tube, plane strain, stretch {s}", partial(tube, s), 1e-2)
+        for s in (1.1, 1.5, 2.0)
+    ),
+    *(
+        Case(f"closed/Lame {shape}, nu {nu}", partial(lame, shape, nu), 5e-3)
+        for shape in ("sphere", "tube")
+        for nu in (0.3, 0.4999)
+    ),
+    *(
+        Case(f"closed/Lame {shape}, change with nu", partial(lame_change, shape), 5e-3)
+        for shape in ("sphere", "tube")
+    ),
+)

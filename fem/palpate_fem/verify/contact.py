@@ -1,0 +1,198 @@
+"""Frictionless contact against Hertz, the flat punch, Johnson's roll, and two patch tests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fem.indenter.shape import Indenter
+from palpate_fem.mechanics.balance import Balance
+from palpate_fem.mechanics.laws import Press
+from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.verify.body import MU, TIGHT, Body
+from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.meshes import (
+    graded,
+    hollow_sphere,
+    on_planes,
+    quarter_disc,
+    rectangle,
+    slab,
+)
+from palpate_fem.verify.rigid import ball, plane, pose, punch, roll
+
+Floats = NDArray[np.float64]
+
+FAR = 60.0  # size of the body over the contact's: a half-space to 1 %
+GROWTH = 1.5
+ACROSS = 8  # elements from the middle to the edge of contact
+# Rounding in the large far elements is 1e-9 of the small force.
+SETTINGS = replace(TIGHT, tolerance=1e-7, volume_tolerance=1e-9, gap_tolerance_m=1e-12)
+
+
+# Rings and layers are finest, 0.05 of the radius, at the punch's rim, which lies between two rings:
+# there its singular pressure is felt as if the rim were where it is.
+PUNCH_RINGS = (0.3, 0.5, 0.65, 0.775, 0.875, 0.925, 0.975, 1.025, 1.075, 1.125)
+
+
+def _pressed(
+    mesh: SolidMesh, held: NDArray[np.bool_], indenter: Indenter, depth: float
+) -> tuple[Body, Balance]:
+    """Pressed to a depth [m], the deep end held."""
+    held = held.copy()
+    held[mesh.nodes[:, 2] > mesh.nodes[:, 2].max() - 1e-12] = True
+    body = Body(mesh, held=held, settings=SETTINGS)
+    return body, body.solve(Press(indenter, pose((0.0, 0.0, depth)), 0.0))
+
+
+def _quarter(mesh: SolidMesh) -> NDArray[np.bool_]:
+    """Components held on the planes of symmetry x = 0 and y = 0."""
+    held = on_planes(mesh)
+    held[:, 2] = False
+    return held
+
+
+def _mean_square(balance: Balance, distance: Floats) -> float:
+    """Of the distance from the middle, weighted with the nodal forces along z [m^2]."""
+    force = -balance.indenter[:, 2]
+    return float((force * distance**2).sum() / force.sum())
+
+
+@cache
+def hertz(radius: float, depth: float) -> tuple[float, float, float]:
+    """Force [N], contact radius [m] and pressure in the middle [Pa] of a ball on a half-space.
+
+    A quarter. The radius is that of Hertz' pressure with the same mean square distance,
+    a^2 = 5/2 <r^2>, which does not jump from node to node.
+    """
+    a = np.sqrt(radius * depth)
+    radii = graded(a / ACROSS, 1.3 * a, FAR * a, GROWTH)[2:]
+    depths = graded(a / ACROSS, 0.5 * a, FAR * a, GROWTH)
+    mesh = slab(*quarter_disc(radii, 8), depths, name="Hertz")
+    body, balance = _pressed(mesh, _quarter(mesh), ball(radius), depth)
+    contact = np.sqrt(2.5 * _mean_square(balance, np.hypot(*mesh.nodes[:, :2].T)))
+    middle = np.hypot(*mesh.nodes[mesh.outer_faces, :2].transpose(2, 0, 1)) == 0
+    force = -4 * balance.indenter[:, 2].sum()
+    return float(force), float(contact), float(body.state.indenter_pressure[middle].max())
+
+
+def hertz_force(radius: float, depth: float) -> Measured:
+    """Hertz: F = 16/3 mu sqrt(R) d^1.5."""
+    return Measured(hertz(radius, depth)[0], 16 / 3 * MU * np.sqrt(radius) * depth**1.5)
+
+
+def hertz_radius(radius: float, depth: float) -> Measured:
+    """Hertz: a = sqrt(R d)."""
+    return Measured(hertz(radius, depth)[1] * 1e3, np.sqrt(radius * depth) * 1e3)
+
+
+def hertz_pressure(radius: float, depth: float) -> Measured:
+    """Hertz: p0 = 3 F / (2 pi a^2), F and a by their formulas."""
+    force, area = 16 / 3 * MU * np.sqrt(radius) * depth**1.5, np.pi * radius * depth
+    return Measured(hertz(radius, depth)[2] * 1e-3, 1.5e-3 * force / area)
+
+
+def flat_punch() -> Measured:
+    """Sneddon: F = 8 mu a d under a flat-ended cylinder."""
+    a, depth = 1e-3, 1e-5
+    outside = PUNCH_RINGS[-1] + graded(0.05, 0.05, FAR, GROWTH)[1:]
+    radii = a * np.concatenate([PUNCH_RINGS, outside])
+    mesh = slab(*quarter_disc(radii, 8), a * graded(0.05, 0.1, FAR, GROWTH), name="punch")
+    _, balance = _pressed(mesh, _quarter(mesh), punch(a, 1e-3 * a), depth)
+    return Measured(-4 * balance.indenter[:, 2].sum(), 8 * MU * a * depth)
+
+
+@cache
+def line_contact() -> tuple[float, float, float, float]:
+    """Roll on a half-space in plane strain: force a length [N/m], a [m], p0 [Pa], radius [m].
+
+    a^2 = 4 <x^2> of Johnson's pressure p0 sqrt(1 - x^2 / a^2).
+    """
+    radius, depth, width = 3.5e-3, 5e-5, 1e-4
+    a = 2.0e-4
+    x = graded(a / ACROSS, 1.3 * a, FAR * a, GROWTH)
+    mesh = slab(
+        *rectangle(x, np.array([0.0, width])),
+        graded(a / ACROSS, 0.5 * a, FAR * a, GROWTH),
+        name="line",
+    )
+    held = _quarter(mesh)
+    held[:, 1] = True
+    body, balance = _pressed(mesh, held, roll(radius, 1e-2), depth)
+    force = -2 * float(balance.indenter[:, 2].sum()) / width
+    contact = 2 * np.sqrt(_mean_square(balance, mesh.nodes[:, 0]))
+    return force, float(contact), float(body.state.indenter_pressure.max()), radius
+
+
+def line_contact_width() -> Measured:
+    """Johnson: a = sqrt(F R / (pi mu)) at the measured force."""
+    force, contact, _, radius = line_contact()
+    return Measured(contact * 1e3, np.sqrt(force * radius / np.pi / MU) * 1e3, f"{force:.2f} N/m")
+
+
+def line_contact_pressure() -> Measured:
+    """Johnson: p0 = 2 F / (pi a), a by its formula."""
+    force, _, pressure, radius = line_contact()
+    return Measured(pressure * 1e-3, 2e-3 * force / np.pi / np.sqrt(force * radius / np.pi / MU))
+
+
+def contact_patch(shake: float) -> Measured:
+    """A block squeezed by a plane: the same pressure everywhere.
+
+    Args:
+        shake: By how much of an edge the surface's nodes are moved at random along it.
+    """
+    line = np.linspace(0.0, 1e-3, 6)
+    points, quads = rectangle(line, line)
+    inside = ((points > 0) & (points < 1e-3)).all(axis=1)
+    random = np.random.default_rng(2)
+    points[inside] += random.uniform(-1, 1, (int(inside.sum()), 2)) * shake * line[1]
+    mesh = slab(points, quads, line[:3])
+    held = _quarter(mesh)
+    held[mesh.nodes[:, 2] == line[2], 2] = True
+    body = Body(mesh, held=held)
+    body.solve(Press(plane(), pose((0.0, 0.0, 0.05 * line[2])), 0.0))
+    pressure = body.state.indenter_pressure
+    spread = float(np.abs(pressure / pressure.mean() - 1).max())
+    return Measured(spread, note=f"mean {pressure.mean() * 1e-3:.3f} kPa")
+
+
+def free_slide() -> Measured:
+    """A coarse ball dragged over a frictionless plane: tangential over normal force.
+
+    Barriers between facets fail this ("No Free Slide"); a plane's normal is the same everywhere.
+    """
+    mesh = hollow_sphere(4, 3e-3, 4e-3, 1)
+    held = np.zeros(mesh.nodes.shape, bool)
+    held[mesh.inner_nodes] = True
+    body, worst = Body(mesh, held=held), 0.0
+    press = Press(plane(), pose((0.0, 0.0, -4e-3)), 0.0)
+    for k in range(1, 9):
+        balance = body.solve(press.at(pose((1e-4 * k, 0.5e-4 * k, -4e-3 + min(k, 2) * 1e-4))))
+        x, y, z = -balance.indenter.sum(axis=0)
+        worst = max(worst, float(np.hypot(x, y) / z))
+    return Measured(worst, note=f"{z:.3f} N")
+
+
+SPHERES = ((3.5e-3, "3.5"), (1.75e-3, "1.75"))
+DEPTH_M = 1e-4
+CHECKS = (
+    *(
+        Case(f"contact/Hertz {what}, R {name} mm", partial(law, radius, DEPTH_M), tolerance, unit)
+        for radius, name in SPHERES
+        for what, law, tolerance, unit in (
+            ("force", hertz_force, 3e-2, "N"),
+            ("contact radius", hertz_radius, 5e-2, "mm"),
+            ("pressure", hertz_pressure, 5e-2, "kPa"),
+        )
+    ),
+    Case("contact/flat punch, force", flat_punch, 5e-2, "N"),
+    Case("contact/line contact, half width", line_contact_width, 5e-2, "mm"),
+    Case("contact/line contact, pressure", line_contact_pressure, 5e-2, "kPa"),
+    Case("contact/patch test, even quads", partial(contact_patch, 0.0), 1e-6),
+    Case("contact/patch test, distorted quads", partial(contact_patch, 0.2), 1e-6),
+    Case("contact/free slide of facets on a plane", free_slide, 1e-6),
+)

@@ -1,0 +1,180 @@
+"""Coulomb friction of a block on a plane: stick, slip, ramp, reversal, and no creep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import SimulationError
+from palpate_fem.indenter.pose import rotation_matrix
+from palpate_fem.mechanics.laws import Press
+from palpate_fem.mechanics.newton import NewtonSettings
+from palpate_fem.verify.body import BULK_RATIO, TIGHT, Body
+from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.meshes import rectangle, slab
+from palpate_fem.verify.rigid import about_y, plane, pose
+
+Floats = NDArray[np.float64]
+
+FRICTION = 0.186
+SIDE_M, HEIGHT_M = 4e-3, 1e-3
+WEIGHT_N = 0.05
+PRESS_M, SLIDE_M = 3e-5, 1e-3  # by the plane
+# Near the slip angle nothing but a little elasticity is left; what does not converge soon, slides.
+NEAR_SLIP = replace(TIGHT, tolerance=1e-11, gap_tolerance_m=1e-15, iterations=25)
+
+
+class Block:
+    """A flat block whose lower side lies on a plane, all of it turned about y by an angle [rad].
+
+    Its upper side is clamped, tied along x and y, or free.
+    """
+
+    def __init__(
+        self,
+        *,
+        clamped: bool = False,
+        tied: bool = False,
+        angle: float = 0.0,
+        edges: int = 4,
+        bulk_ratio: float = BULK_RATIO,
+        settings: NewtonSettings = TIGHT,
+    ) -> None:
+        line = np.linspace(-SIDE_M / 2, SIDE_M / 2, edges + 1)
+        mesh = slab(*rectangle(line, line), np.linspace(0.0, HEIGHT_M, 3), name="block")
+        self.top = mesh.nodes[:, 2] == HEIGHT_M
+        self.turn = rotation_matrix(about_y(angle))
+        mesh = replace(mesh, nodes=mesh.nodes @ self.turn.T)
+        held = np.zeros(mesh.nodes.shape, bool)
+        held[self.top] = (clamped or tied, clamped or tied, clamped)
+        self.angle = angle
+        self.body = Body(mesh, held=held, bulk_ratio=bulk_ratio, settings=settings)
+        self.press = Press(plane(), self.pose(0.0, 0.0), FRICTION)
+        self.body.settle(self.press)
+
+    def pose(self, along: float, up: float) -> Floats:
+        """Of the plane, moved along itself and against the block [m]."""
+        return pose(self.turn @ [along, 0.0, up], about_y(self.angle))
+
+    def slide(self, along: float, up: float) -> tuple[float, float]:
+        """Move the plane there; its push on the block along and across itself [N]."""
+        balance = self.body.solve(self.press.at(self.pose(along, up)))
+        push = -balance.indenter.sum(axis=0) @ self.turn
+        self.balance = balance
+        return float(push[0]), float(push[2])
+
+    def weigh(self, slope: float) -> None:
+        """Its weight, evenly over its volume, as on a ramp that falls towards +x [rad]."""
+        mesh, volume = self.body.mesh, self.body.system.skin.rest_volume
+        share = np.zeros(len(mesh.nodes))
+        np.add.at(share, mesh.elements, (volume / volume.sum() / 8)[:, None])
+        down = np.array([np.sin(slope), 0.0, -np.cos(slope)])
+        self.body.system.load[:] = WEIGHT_N * share[:, None] * down
+
+
+@cache
+def dragged(angle: float) -> tuple[float, float]:
+    """A clamped block, pressed, dragged along and back, on a plane turned by an angle.
+
+    Returns:
+        Tangential over normal force while it slides forth, and back.
+    """
+    block = Block(clamped=True, angle=angle)
+    for along, up in ((0.0, 1e-5), (0.0, PRESS_M), (1e-5, PRESS_M)):
+        block.slide(along, up)
+    for k in range(1, 8):
+        along, across = block.slide(SLIDE_M * k / 7, PRESS_M)
+    forth = along / across
+    for share in (0.99, 0.95, 0.9, 0.75, 0.6, 0.45, 0.3, 0.15, 0.0):
+        along, across = block.slide(share * SLIDE_M, PRESS_M)
+    return forth, along / across
+
+
+def stick() -> Measured:
+    """Half way to its slip angle a block hangs in the springs of sticking: way = T / (k area).
+
+    Of a material that does not bulge under its weight (nu = 0), so that no point slides.
+    """
+    block, slope = Block(bulk_ratio=2 / 3), np.arctan(FRICTION) / 2
+    block.weigh(0.0)
+    block.slide(0.0, 1e-6)
+    before = block.body.contact_points()
+    block.weigh(slope)
+    along, _ = block.slide(0.0, 1e-6)
+    moved = (block.body.contact_points() - before)[..., 0]
+    way = (block.body.system.outer.area_values * moved).sum() / SIDE_M**2
+    expected = -along / block.body.contact.tangential_stiffness / SIDE_M**2
+    return Measured(way * 1e9, expected * 1e9, "mean of the sole")
+
+
+def slip_at(angle: float) -> Measured:
+    """Steady sliding: T = mu N."""
+    return Measured(dragged(angle)[0], FRICTION, "T / N")
+
+
+def reversal(angle: float) -> Measured:
+    """Dragged back the force turns round: T = -mu N."""
+    return Measured(dragged(angle)[1], -FRICTION, "T / N")
+
+
+def slip_angle() -> Measured:
+    """The steepest ramp on which a free block lies still: atan(mu); at 30 degrees it does not."""
+    block = Block(settings=NEAR_SLIP)
+    block.weigh(0.0)
+    block.slide(0.0, 1e-6)
+    still, slides = 0.0, np.radians(30.0)
+    while slides - still > 1e-8:
+        middle = (still + slides) / 2
+        block.weigh(middle)
+        kept = block.body.state.copy()
+        try:
+            block.slide(0.0, 1e-6)
+            still = middle
+        except SimulationError:
+            block.body.state, slides = kept, middle
+    return Measured(np.degrees(still), np.degrees(np.arctan(FRICTION)))
+
+
+def tether() -> Measured:
+    """What holds a block on a ramp of 30 degrees that slips under it: W (sin - mu cos)."""
+    slope = np.radians(30.0)
+    block = Block(tied=True)
+    block.weigh(slope)
+    for k in range(8):
+        block.slide(-1e-4 * k, 1e-6)
+    # Weight that lies on tied nodes goes into the tether without being seen by the sole.
+    load = block.body.system.load[block.top].sum(axis=0)
+    pull = load[0] - block.body.reactions(block.balance)[:, 0].sum()
+    return Measured(pull, WEIGHT_N * (np.sin(slope) - FRICTION * np.cos(slope)))
+
+
+def no_creep(increments: int) -> Measured:
+    """A block at 95 % of its slip angle, solved again and again from a disturbed state."""
+    block = Block(edges=2, settings=replace(TIGHT, tolerance=1e-10, gap_tolerance_m=1e-13))
+    for share in (0.0, 0.5, 0.95):
+        block.weigh(np.arctan(FRICTION) * share)
+        block.slide(0.0, 1e-6)
+    random, start = np.random.default_rng(7), block.body.state.position.copy()
+    for _ in range(increments):
+        block.body.state.position += random.normal(scale=1e-8, size=start.shape)
+        block.slide(0.0, 1e-6)
+    way = float(np.abs(block.body.state.position - start).max())
+    return Measured(way * 1e9, 0.0, f"{increments} increments")
+
+
+CHECKS = (
+    Case("friction/stick below the limit", stick, 1e-6, "nm"),
+    *(
+        Case(
+            f"friction/{what}, plane at {degrees} degrees", partial(law, np.radians(degrees)), 1e-6
+        )
+        for degrees in (0, 30)
+        for what, law in (("slip at T = mu N", slip_at), ("reversal", reversal))
+    ),
+    Case("friction/slip angle of a ramp", slip_angle, 1e-6, "degrees"),
+    Case("friction/tether on a ramp of 30 degrees", tether, 1e-6, "N"),
+    Case("friction/no creep under load", partial(no_creep, 1000), 1.0, "nm"),
+)

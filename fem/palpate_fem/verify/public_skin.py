@@ -1,0 +1,104 @@
+"""The public BioTac skin filled by 430 mm^3: figures that must not change.
+
+The skin is held as `read_nvlabs` holds it; there is no core. Independent reference: the public
+tetrahedra, quadratic with element pressure (P2-P0), and wedges of another program grown from the
+same inner surface (the project's reference notes on finite elements, section 0.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from palpate_fem.mesh.nvlabs import SKIN, read_nvlabs
+from palpate_fem.verify.body import TIGHT, Body
+from palpate_fem.verify.check import Absent, Case, Measured
+
+FILLED_M3 = (60e-9, 150e-9, 250e-9, 350e-9, 430e-9)
+QUADRATIC_KPA = 26.58  # P2-P0 on the public tetrahedra
+WEDGES_KPA = {1: 26.6, 2: 26.8, 3: 26.8}  # by layers, kappa / mu = 1e3
+# By kappa / mu, over that at 1e3, two layers.
+SOFTER = {1e2: 26.58 / 26.82, 1e5: 26.86 / 26.82}
+SETTINGS = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-8, largest_move_m=0.25e-3)
+
+
+@cache
+def filled(folder: Path, layers: int, bulk_ratio: float) -> tuple[float, float]:
+    """Fluid pressure [kPa] and thickness [mm] at the last of `FILLED_M3`.
+
+    Args:
+        folder: Holds ``meshes/biotac``.
+        layers: Wedges through the skin.
+        bulk_ratio: kappa / mu.
+
+    Raises:
+        Absent: The public files are not there.
+    """
+    if not (folder / SKIN).is_file():
+        raise Absent(f"no public BioTac in {folder.name}; its files are not part of palpate")
+    mesh = read_nvlabs(folder, layers=layers).mesh
+    body = Body(mesh, bulk_ratio=bulk_ratio, settings=SETTINGS)
+    rest = body.system.balance(body.state, None).volume
+    for more in FILLED_M3:
+        body.solve(volume=rest + more)
+    thickness = float(np.ptp(body.state.position[:, 2])) * 1e3
+    return body.state.fluid_pressure * 1e-3, thickness
+
+
+def pressure(folder: Path, layers: int) -> Measured:
+    """By layers, against wedges of another program."""
+    found, thickness = filled(folder, layers, 1e3)
+    return Measured(found, WEDGES_KPA[layers], f"{thickness:.2f} mm thick")
+
+
+def against_quadratic(folder: Path) -> Measured:
+    """Against quadratic tetrahedra, which do not lock; on the public tetrahedra themselves."""
+    return Measured(filled(folder, 2, 1e3)[0], QUADRATIC_KPA, "P2-P0")
+
+
+def layers_agree(folder: Path) -> Measured:
+    """Largest deviation of one or two layers from three."""
+    found = [filled(folder, layers, 1e3)[0] for layers in WEDGES_KPA]
+    note = ", ".join(f"{p:.2f}" for p in found) + " kPa"
+    return Measured(max(abs(p / found[-1] - 1) for p in found), 0.0, note)
+
+
+def bulk_modulus(folder: Path, ratio: float) -> Measured:
+    """Pressure at another kappa over that at 1e3 mu: an element that locks would show more."""
+    found = filled(folder, 2, ratio)[0]
+    return Measured(found / filled(folder, 2, 1e3)[0], SOFTER[ratio], f"{found:.2f} kPa")
+
+
+def checks(folder: Path) -> tuple[Case, ...]:
+    """All of them.
+
+    Args:
+        folder: Holds ``meshes/biotac``; where it is absent they are skipped.
+    """
+    return (
+        Case("skin/filled by 430 mm^3, 2 layers", partial(pressure, folder, 2), 1e-2, "kPa"),
+        Case("skin/against quadratic tetrahedra", partial(against_quadratic, folder), 1e-2, "kPa"),
+        *(
+            Case(
+                f"skin/filled by 430 mm^3, {layers} layers",
+                partial(pressure, folder, layers),
+                1e-2,
+                "kPa",
+                slow=True,
+            )
+            for layers in (1, 3)
+        ),
+        Case("skin/layers agree", partial(layers_agree, folder), 8e-3, slow=True),
+        *(
+            Case(
+                f"skin/kappa / mu = {ratio:g} over 1000",
+                partial(bulk_modulus, folder, ratio),
+                1e-3,
+                slow=True,
+            )
+            for ratio in SOFTER
+        ),
+    )

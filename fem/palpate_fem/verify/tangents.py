@@ -1,0 +1,198 @@
+"""Forces and tangents against central differences: element, fluid, core, gap, stick and slip."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from palpate_fem.indenter.distance import distance
+from palpate_fem.mechanics.balance import Balance
+from palpate_fem.mechanics.laws import Press
+from palpate_fem.verify.body import MU, Body
+from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.finger import round_core
+from palpate_fem.verify.meshes import hollow_sphere, octant
+from palpate_fem.verify.rigid import ball, pose
+
+Floats = NDArray[np.float64]
+
+INNER_M, OUTER_M = 5.5e-3, 7.07e-3
+CORE_M = 5.49e-3
+STEP_M = 1e-8  # of the differences: (step / radius)^2 and rounding / step are both below 1e-9
+FRICTION = 0.2
+TOLERANCE = 1e-6
+# Turned, so that no axis is special.
+TURN = np.array([1.0, 0.1, 0.2, 0.0]) / np.linalg.norm([1.0, 0.1, 0.2, 0.0])
+
+
+def _shaken(*, wedges: bool = False, core: bool = False) -> tuple[Body, Floats]:
+    """A body whose nodes are moved at random, none held, and a random direction (V, 3)."""
+    mesh = octant(3, INNER_M, OUTER_M, 2, wedges=True) if wedges else hollow_sphere(
+        8, INNER_M, OUTER_M, 1
+    )  # fmt: skip
+    body = Body(mesh, bulk_ratio=1e2, core=round_core(CORE_M, 0.5e-3) if core else None)
+    random = np.random.default_rng(5)
+    body.state.position += random.normal(scale=3e-5, size=mesh.nodes.shape)
+    _follow(body, None)
+    return body, random.normal(size=mesh.nodes.shape)
+
+
+def _follow(body: Body, press: Press | None) -> None:
+    """Pressures and tractions that obey their laws exactly where the nodes are.
+
+    The solver's tangent is that of the equations with these unknowns eliminated; here they are, by
+    the laws as NumPy says them.
+    """
+    state, skin, contact = body.state, body.system.skin, body.contact
+    f = np.einsum("eai,eqaj->eqij", state.position[body.mesh.elements], skin.gradient_values)
+    volume = (skin.weight_values * np.linalg.det(f)).sum(axis=1)
+    state.pressure = body.bulk * (volume / skin.rest_volume - 1)
+    if body.system.on_core.core is not None:
+        inside = body.system.inner
+        corners = state.position[body.mesh.inner_faces]
+        points = np.einsum("qa,fai->fqi", inside.shape_values, corners)
+        gap = body.system.on_core.core.evaluate(points)[0].reshape(points.shape[:2])
+        state.core_pressure = contact.stiffness * np.maximum(-gap, 0.0)
+    if press is None:
+        return
+    points = body.contact_points()
+    local = press.to_local(points).reshape(-1, 3)
+    gap, normal, _ = (part.reshape(*points.shape[:2], -1) for part in distance(
+        press.indenter, local
+    ))  # fmt: skip
+    state.indenter_pressure = contact.stiffness * np.maximum(-gap[..., 0], 0.0)
+    if press.friction == 0.0:
+        return
+    arm = local.reshape(points.shape) - state.anchor
+    way = arm - (arm * normal).sum(axis=2, keepdims=True) * normal
+    length = np.linalg.norm(way, axis=2)
+    limit = press.friction * state.indenter_pressure
+    size = np.minimum(contact.tangential_stiffness * length, limit)
+    state.traction = (size / np.maximum(length, 1e-300))[..., None] * way @ press.rotation.T
+
+
+def _product(body: Body, press: Press | None, direction: Floats) -> Floats:
+    """The solver's tangent times a direction (V, 3)."""
+    system = body.system
+    system.balance(body.state, press)
+    pattern = system.pattern
+    upper = sp.csr_matrix((system.tangent_values(), pattern.indices, pattern.indptr))
+    flat = direction.ravel()
+    product = upper @ flat + sp.triu(upper, 1).T @ flat
+    if system.slides:
+        product = product + system.rest_product(flat)
+    return np.asarray(product).reshape(-1, 3)
+
+
+def _difference(
+    body: Body, press: Press | None, direction: Floats, pick: Callable[[Balance], Floats]
+) -> Floats:
+    """Central difference of nodal forces along a direction."""
+    kept, ends = body.state, []
+    for sign in (1.0, -1.0):
+        body.state = kept.copy()
+        body.state.position += sign * STEP_M * direction
+        _follow(body, press)
+        ends.append(pick(body.system.balance(body.state, press)).copy())
+    body.state = kept
+    return np.asarray((ends[0] - ends[1]) / (2 * STEP_M))
+
+
+def _off(found: Floats, expected: Floats) -> Measured:
+    return Measured(float(np.abs(found - expected).max() / np.abs(expected).max()))
+
+
+def element_force(*, wedges: bool) -> Measured:
+    """Nodal forces are the derivative of the mixed energy by the nodes."""
+    body, direction = _shaken(wedges=wedges)
+    state = body.state
+    force = body.system.balance(state, None).internal
+    up, down = (
+        body.energy_at(state.position + sign * STEP_M * direction, state.pressure)
+        for sign in (1.0, -1.0)
+    )
+    slope = (up - down) / (2 * STEP_M)
+    return Measured(abs(float((force * direction).sum()) / slope - 1))
+
+
+def element_tangent(*, wedges: bool) -> Measured:
+    """The condensed tangent is the derivative of the nodal forces, element pressures following."""
+    body, direction = _shaken(wedges=wedges)
+    expected = _difference(body, None, direction, lambda balance: balance.internal)
+    return _off(_product(body, None, direction), expected)
+
+
+def fluid_gradient() -> Measured:
+    """dV/dx by the differences of the cavity's volume."""
+    body, direction = _shaken()
+    state, volumes = body.state.copy(), []
+    for sign in (1.0, -1.0):
+        state.position = body.state.position + sign * 1e-7 * direction
+        volumes.append(body.system.balance(state, None).volume)
+    gradient = body.system.balance(body.state, None).volume_gradient
+    slope = (volumes[0] - volumes[1]) / 2e-7
+    return Measured(abs(float((gradient * direction).sum()) / slope - 1))
+
+
+def fluid_tangent() -> Measured:
+    """The follower pressure's tangent -p d2V/dx2 by the differences of dV/dx."""
+    body, direction = _shaken()
+    without = _product(body, None, direction)
+    body.state.fluid_pressure = MU
+    found = _product(body, None, direction) - without
+    expected = _difference(body, None, direction, lambda b: -MU * b.volume_gradient)
+    return _off(found, expected)
+
+
+def core_tangent() -> Measured:
+    """Contact with the tabulated core, its curvature included."""
+    body, direction = _shaken(core=True)
+    expected = _difference(body, None, direction, lambda balance: balance.core)
+    with_core = _product(body, None, direction)
+    body.system.on_core.core = None
+    return _off(with_core - _product(body, None, direction), expected)
+
+
+def contact_tangent(friction: float, slip_m: float) -> Measured:
+    """Contact with a ball: gap and curvature, then friction by an arm of anchors ``slip_m``."""
+    body, direction = _shaken()
+    press = Press(ball(3.5e-3), pose((1e-4, 2e-4, -OUTER_M + 3e-4), TURN), friction)
+    body.state.anchor[:] = press.to_local(body.contact_points() - slip_m * np.array([1, 0.3, 0.1]))
+    _follow(body, press)
+    expected = _difference(body, press, direction, lambda balance: balance.indenter)
+    found = _product(body, press, direction) - _product(body, None, direction)
+    limit = friction * body.state.indenter_pressure
+    touching = body.state.indenter_pressure > 0
+    slides = touching & (np.linalg.norm(body.state.traction, axis=2) > 0.999 * limit)
+    note = f"{touching.sum()} points touch"
+    if friction:
+        note += f", {slides.sum()} slide"
+    return Measured(_off(found, expected).value, note=note)
+
+
+CHECKS = (
+    *(
+        Case(f"element/{what}, {kind}", partial(law, wedges=wedges), TOLERANCE)
+        for kind, wedges in (("hexahedra", False), ("wedges", True))
+        for what, law in (
+            ("force is the energy's gradient", element_force),
+            ("tangent by differences", element_tangent),
+        )
+    ),
+    Case("fluid/volume gradient by differences", fluid_gradient, TOLERANCE),
+    Case("fluid/tangent by differences", fluid_tangent, TOLERANCE),
+    Case("contact/tangent by differences, core", core_tangent, TOLERANCE),
+    Case("contact/tangent by differences, gap", partial(contact_tangent, 0.0, 0.0), TOLERANCE),
+    Case(
+        "friction/tangent by differences, stick",
+        partial(contact_tangent, FRICTION, 1e-7),
+        TOLERANCE,
+    ),
+    Case(
+        "friction/tangent by differences, slip", partial(contact_tangent, FRICTION, 3e-3), TOLERANCE
+    ),
+)

@@ -1,0 +1,148 @@
+"""BioTacs on a CAN bus, a frame for each sampled channel (format A, hardware reference 2.1).
+
+Whether SynTouch's interface sends exactly this is a well-founded inference, never confirmed by a
+public capture of a BioTac: the public driver of the format is for the NumaTac.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from palpate_gateway.biotac.device import FingerDevice, FingerOptions
+from palpate_gateway.biotac.line_slots import LineSlots
+from palpate_gateway.biotac.slot_link import SlotSource
+from palpate_gateway.ports.can_bus import CanBus
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.protocols.can_slots import CAN_FINGERS_MAX, SEQUENCES, CanSlotDecoder
+from palpate_gateway.protocols.places import Floats
+from palpate_gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.timing.clock_map import Heard
+
+_LATE_S = 2e-4
+"""Whoever waits for the end of a round wakes by so much after it [s]."""
+
+_SCATTER_S = 3e-3
+"""The slots of a round are not waited for longer than this, however late the last ones came [s]."""
+
+_UNKNOWN_S = 2e-3
+"""How long slots wait for more while nobody knows where in the round they stand [s]."""
+
+
+class CanOptions(FingerOptions):
+    """Options of the ``biotac_can`` driver.
+
+    Attributes:
+        interface: python-can's kind of bus.
+        channel: Which bus.
+        bitrate: [bit/s]; 0 = as the bus is set up.
+        bus_options: More of python-can's options.
+        can_id: Identifier of the BioTacs' frames; None = any frame that holds a sampled channel.
+        fingers: Words in each frame.
+        slot_rate_hz: Slots each second.
+        sequence: Order of sampling; ``learn`` = from the stream, which takes 30 ms at the start.
+        gather_s: How long slots may wait for the end of their sampling round [s]: who wakes for
+            each of 4400 does little else. 0 = not at all.
+    """
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int = Field(default=0, ge=0)
+    bus_options: dict[str, Any] = Field(default_factory=dict)
+    can_id: int | None = Field(default=None, ge=0, le=0x7FF)
+    fingers: int = Field(default=CAN_FINGERS_MAX, ge=1, le=CAN_FINGERS_MAX)
+    slot_rate_hz: float = Field(default=ch.SLOT_RATE_HZ, gt=0.0, le=10_000.0)
+    sequence: Literal[
+        "learn", "biotac_e1_first", "biotac_pac_first", "biotac_sp_e1_first", "biotac_sp_pac_first"
+    ] = "learn"
+    gather_s: float = Field(default=0.02, ge=0.0, le=0.1)
+
+
+class CanSource(SlotSource):
+    """The bus as a line of slots."""
+
+    def __init__(self, options: CanOptions) -> None:
+        self.slot_period_s = 1.0 / options.slot_rate_hz
+        self._bus = CanBus(
+            options.interface,
+            options.channel,
+            bitrate=options.bitrate,
+            options=options.bus_options,
+        )
+        self._gather_s = options.gather_s
+        self._ends_s = 0.0
+        self._decoder = CanSlotDecoder(fingers=options.fingers, can_id=options.can_id)
+        self._clock = SlotClock(
+            slot_rate_hz=options.slot_rate_hz,
+            sequence=None if options.sequence == "learn" else SEQUENCES[options.sequence],
+        )
+
+    def open(self) -> None:
+        """See ``SlotSource``."""
+        self._bus.open()
+
+    def close(self) -> None:
+        """See ``SlotSource``."""
+        self._bus.close()
+
+    def read(self, timeout_s: float) -> LineSlots | None:
+        """See ``SlotSource``."""
+        batch = self._bus.read(timeout_s, gather_s=self._until_the_end_s())
+        data, size, arrival_ns = batch.data, batch.size, batch.arrival_ns
+        ours = self._decoder.ours(batch.can_id)
+        if ours is not None:
+            data, size, arrival_ns = data[ours], size[ours], arrival_ns[ours]
+        words = self._decoder.decode(data, size)
+        stamps_s = arrival_ns[words.index].astype(np.float64) * 1e-9
+        places = self._clock.place_all(words.channel, stamps_s)
+        slots = LineSlots.placed(words, places, len(self._clock.sequence))
+        if slots is not None:
+            self._note_times(slots, stamps_s[places.kept])
+        return slots
+
+    def _note_times(self, slots: LineSlots, stamps_s: Floats) -> None:
+        late_s = stamps_s - slots.time_s
+        soonest = int(np.argmin(late_s))
+        self.heard = Heard(float(slots.time_s[soonest]), round(1e9 * float(stamps_s[soonest])))
+        left = slots.size - 1 - int(slots.position[-1]) or slots.size
+        scatter_s = min(float(late_s.max() - late_s[soonest]), _SCATTER_S)
+        ends_s = float(slots.time_s[-1]) + left * self.slot_period_s
+        self._ends_s = ends_s + float(late_s[soonest]) + scatter_s + _LATE_S
+
+    def _until_the_end_s(self) -> float:
+        """How long it takes until the sampling round that has begun is over [s]."""
+        left_s = self._ends_s - time.monotonic()
+        return min(left_s if left_s > 0.0 else _UNKNOWN_S, self._gather_s)
+
+    def serial(self, finger: int) -> str:
+        """The format does not tell serial numbers."""
+        return ""
+
+    def counters(self, finger: int) -> Mapping[str, int]:
+        """See ``SlotSource``."""
+        return {
+            **self._bus.counters,
+            **self._decoder.counters,
+            **self._clock.counters,
+            **self._decoder.finger_counters[finger],
+        }
+
+
+class BiotacCan(FingerDevice):
+    """One BioTac of a CAN bus; several of one bus share it."""
+
+    options_class = CanOptions
+
+    def __init__(self, options: CanOptions) -> None:
+        super().__init__("biotac_can", f"BioTac on CAN {options.channel}", options)
+        self._can = options
+
+    def _line(self) -> tuple[object, object, SlotSource, int]:
+        options = self._can
+        key = (options.interface, options.channel, options.can_id)
+        settings = options.model_dump(exclude={"port", "serial"})
+        return key, settings, CanSource(options), options.fingers

@@ -1,0 +1,263 @@
+"""A BioTac polled by a PIC32 board (format B, hardware reference 2.2): a legacy route.
+
+Its records have neither sync bytes nor a checksum, and the words lost their parity on the board. A
+stream out of step shows only by impossible values or times, often a record late: so each record is
+delivered when the next one has proved to be in step. Then the stream is stopped, drained, started.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+from pydantic import Field
+
+from palpate.config import StrictConfig
+from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.messages import COUNTS_MAX, PAC_SAMPLES, Origin, SensorType
+from palpate_gateway.biotac.sensor_type import TypeOption
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.ports.serial_port import SerialPort, settle
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.protocols import pic32 as ask
+from palpate_gateway.protocols.pic32 import Layout, Pic32Decoder, Pic32Record, Pic32Sample
+from palpate_gateway.readings import ElectrodeReading, Reading
+from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.timing.sample_clock import SampleClock, Verdict
+
+VALIDITY = (1 << (ch.FIRST_PAC_BIT + 1)) - 1
+"""Electrodes, PDC, TAC, TDC and the one PAC sample of a record."""
+
+_TICKS_PER_US = round(1e-6 / ask.TICK_S)
+_WRAP_US = (1 << 32) // _TICKS_PER_US
+_QUIET_S = 0.05
+_DRAIN_S = 1.0
+_FIRST_S = 1.0
+_SILENCE_S = 0.3
+"""Silence after which the board is taken to have restarted, which ends its stream [s]."""
+
+
+class Pic32Options(StrictConfig):
+    """Options of the ``biotac_pic32`` driver.
+
+    Attributes:
+        port: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
+        baud: [bit/s].
+        rts_cts: Hardware flow control, which the board uses.
+        layout: Order of the values, which changed between versions of the firmware and which
+            nothing in the stream tells: older ones have ``electrodes_first``.
+        serial: Serial number to publish, which the board does not tell; empty = the port.
+        sensor_type: Kind of finger; the board polls 19 electrodes only, so never ``biotac_sp``.
+    """
+
+    port: str = Field(min_length=1)
+    baud: int = Field(default=ask.BAUD, gt=0)
+    rts_cts: bool = True
+    layout: Layout = Layout.PAC_FIRST
+    serial: str = ""
+    sensor_type: TypeOption = "auto"
+
+
+class BiotacPic32(Device):
+    """One BioTac at 100 Hz.
+
+    The board polls every channel once a frame: ``pac[0]`` is that one PAC sample, the other 21 are
+    0 and their validity bits clear. When in a frame each channel is polled is not known; the slot
+    period is the one that shares a frame's 10 ms among 44 slots.
+    """
+
+    options_class = Pic32Options
+
+    def __init__(self, options: Pic32Options) -> None:
+        if options.sensor_type == "biotac_sp":
+            raise ConfigError(
+                f"BioTac on PIC32 {options.port}: its record holds 19 electrodes, a BioTac SP has "
+                f"{ch.ELECTRODES_SP}",
+                remedy="read an SP by biotac_can or biotac_bridge",
+            )
+        super().__init__(
+            DeviceInfo(
+                driver="biotac_pic32",
+                sensor_type=SensorType.BIOTAC,
+                model=f"BioTac on PIC32 {options.port}",
+                rate_hz=ask.RATE_HZ,
+                live=True,
+                finite=False,
+                origin=Origin.LIVE,
+            )
+        )
+        self._options = options
+        self._port = SerialPort(options.port, options.baud, rts_cts=options.rts_cts)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget what an earlier connection told."""
+        self._decoder = Pic32Decoder(self._options.layout)
+        self._clock = SampleClock(1e6 / ask.RATE_HZ, _WRAP_US)
+        self._counts: Counter[str] = Counter(
+            frames=0, realigned=0, doubted=0, absent=0, saturated_samples=0
+        )
+        self._absent = False
+        self._held: tuple[Pic32Sample, int, float] | None = None
+        self._last_tick: int | None = None
+        self._heard_s = time.monotonic()
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Events since it was opened last.
+
+        ``doubted`` records were dropped to be sure, ``absent`` ones because nobody was there.
+        """
+        return {**self._decoder.counters, **self._clock.counters, **self._counts}
+
+    def _open(self) -> DeviceIdentity:
+        self._begin()
+        self._port.open()
+        try:
+            self._start()
+            self._wait_for_record()
+        except BaseException:
+            self._close()
+            raise
+        name = self._options.serial or self._options.port
+        return DeviceIdentity(name, 1.0 / ch.SLOT_RATE_HZ)
+
+    def _start(self) -> None:
+        """Stop whatever runs, drain the line, start."""
+        self._port.write(ask.stop_request())
+        began_s = time.monotonic()
+        settle(self._port, _QUIET_S, _DRAIN_S)
+        if time.monotonic() - began_s >= _DRAIN_S:
+            raise DeviceError(
+                f"{self.info.model}: it goes on sending after command 'q'",
+                remedy="check the direction host to board, and RTS/CTS",
+            )
+        self._decoder.reset()
+        self._held = None
+        self._clock.pause()
+        self._port.write(ask.start_request())
+        self._heard_s = time.monotonic()
+
+    def _wait_for_record(self) -> None:
+        until = time.monotonic() + _FIRST_S
+        while self._held is None:
+            left_s = until - time.monotonic()
+            if left_s <= 0.0:
+                if self._absent:
+                    raise self._nobody()
+                raise DeviceError(
+                    f"{self.info.model}: no record within {_FIRST_S:g} s of command 'r' "
+                    f"({self._decoder.pending} bytes came)",
+                    remedy="check power, cable, baud and RTS/CTS",
+                )
+            try:
+                self._receive(min(left_s, _SILENCE_S))
+            except DeviceTimeout:
+                self._start()  # a board that is booting does not hear
+
+    def _nobody(self) -> DeviceLost:
+        return DeviceLost(
+            f"{self.info.model}: no finger answers (every value is 0)",
+            remedy="check its plug and cable; it is looked for again by itself",
+        )
+
+    def _close(self) -> None:
+        with contextlib.suppress(DeviceError):  # it may be gone
+            self._port.write(ask.stop_request())
+        self._port.close()
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        until = time.monotonic() + timeout_s
+        while True:
+            left_s = max(until - time.monotonic(), 0.0)
+            patience_s = max(self._heard_s + _SILENCE_S - time.monotonic(), 0.0)
+            try:
+                readings = self._receive(min(left_s, patience_s))
+            except DeviceTimeout:
+                if time.monotonic() - self._heard_s < _SILENCE_S:
+                    raise
+                if self._absent:
+                    raise self._nobody() from None
+                raise DeviceLost(
+                    f"{self.info.model}: no record for {_SILENCE_S:g} s",
+                    remedy="check its power and cable; it is started again by itself",
+                ) from None
+            if readings:
+                return readings
+            if time.monotonic() >= until:
+                raise DeviceTimeout(
+                    f"{self.info.model}: no record within {timeout_s:g} s",
+                    remedy="bytes come, but no record in step: check baud and cable",
+                )
+
+    def _receive(self, timeout_s: float) -> list[Reading]:
+        """Read the port once; the readings that are sure now."""
+        readings: list[Reading] = []
+        records = self._decoder.feed(self._port.read(timeout_s))
+        in_step = all(self._take(record, readings) for record in records)
+        if self._decoder.ended and in_step:
+            self._release(readings)  # the end record proves it
+        if not in_step or self._decoder.misaligned or self._decoder.ended:
+            self._counts["doubted"] += self._held is not None
+            self._counts["realigned"] += 1
+            self._start()
+        return readings
+
+    def _take(self, record: Pic32Record, readings: list[Reading]) -> bool:
+        """Hold a record and release the one before it; False if the stream is out of step."""
+        now_s = time.monotonic()
+        verdict = self._clock.take(record.tick // _TICKS_PER_US % _WRAP_US, now_s)
+        if verdict in (Verdict.DOUBTFUL, Verdict.RESTARTED):
+            return False
+        if verdict is Verdict.NEW:
+            # The reading waited for this record, whose arrival tells the clock.
+            self._release(readings, Heard(self._clock.time_s, time.monotonic_ns()))
+            self._absent = _is_absent(record.sample)
+            self._counts["absent"] += self._absent
+            if not self._absent:
+                self._counts["saturated_samples"] += _saturated(record.sample)
+                self._held = (record.sample, self._clock.tick, self._clock.time_s)
+        if not self._absent:
+            self._heard_s = now_s
+        return True
+
+    def _release(self, readings: list[Reading], heard: Heard | None = None) -> None:
+        if self._held is None:
+            return
+        (sample, tick, time_s), self._held = self._held, None
+        missed = 0 if self._last_tick is None else tick - self._last_tick - 1
+        self._last_tick = tick
+        self._counts["frames"] += 1
+        pac = np.zeros(PAC_SAMPLES, np.uint16)
+        pac[0] = sample.pac
+        readings.append(
+            ElectrodeReading(
+                tick=tick,
+                time_s=time_s,
+                missed_before=missed,
+                electrodes=np.array(sample.electrodes, np.uint16),
+                pdc=sample.pdc,
+                pac=pac,
+                tac=sample.tac,
+                tdc=sample.tdc,
+                validity=VALIDITY,
+                heard=heard,
+            )
+        )
+
+
+def _values(sample: Pic32Sample) -> tuple[int, ...]:
+    return (sample.pac, sample.pdc, sample.tac, sample.tdc, *sample.electrodes)
+
+
+def _is_absent(sample: Pic32Sample) -> bool:
+    """Whether no finger answered: its words are 00 00, and the board strips the wrong parity."""
+    return not any(_values(sample))
+
+
+def _saturated(sample: Pic32Sample) -> int:
+    """How many channels are at an end of their range."""
+    return sum(value in (0, COUNTS_MAX) for value in _values(sample))

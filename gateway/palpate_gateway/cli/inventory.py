@@ -1,0 +1,145 @@
+"""``palpate gateway list``: drivers, serial ports and CAN interfaces of this host."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import typer
+
+from palpate.errors import MissingExtraError, PalpateError
+from palpate.extras import require
+from palpate_gateway.drivers import driver_names, load_driver
+
+BY_ID = Path("/dev/serial/by-id")
+"""Names of serial ports that stay the same when plugs change places."""
+
+_PACKAGE_OF = {
+    "palpate_gateway.ports.can_bus": "can",
+    "palpate_gateway.ports.serial_port": "serial",
+}
+_DISTRIBUTION = {"can": "python-can", "serial": "pyserial"}
+
+_NOT_HARDWARE = frozenset({"virtual", "udp_multicast", "serial", "socketcand"})
+"""What python-can offers on every host, or finds only by listening on the network for seconds."""
+
+_DETECT_S = 2.0
+
+
+def list_command(*, as_json: bool) -> None:
+    """Print all of it."""
+    drivers = [_about(name) for name in driver_names()]
+    found = {"drivers": drivers, "serial_ports": _serial_ports(), "can_interfaces": _can_buses()}
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+        return
+    typer.echo("drivers")
+    width = max(len(str(driver["name"])) for driver in drivers)
+    for driver in drivers:
+        missing = driver["missing"]
+        state = f"not installed: {missing}" if missing else "ready"
+        typer.echo(f"  {driver['name']:{width}}  {driver['about']}  [{state}]")
+    typer.echo("\nserial ports")
+    _show(found["serial_ports"], ("by_id", "port", "what"))
+    typer.echo("\nCAN interfaces")
+    _show(found["can_interfaces"], ("interface", "channel", "more"))
+
+
+def _show(found: list[dict[str, str]] | str, keys: tuple[str, ...]) -> None:
+    if isinstance(found, str):
+        typer.echo(f"  {found}")
+    elif not found:
+        typer.echo("  none found")
+    else:
+        for one in found:
+            typer.echo("  " + "  ".join(one[key] for key in keys if one[key]))
+
+
+def _about(name: str) -> dict[str, str]:
+    """Name of a driver, a line on it, and what of its extra is missing."""
+    try:
+        module = importlib.import_module(load_driver(name).__module__)
+    except PalpateError as error:
+        return {"name": name, "about": error.problem, "missing": error.remedy}
+    line = (module.__doc__ or "").strip().partition("\n")[0]
+    needs = sorted({_PACKAGE_OF[part] for part in _parts(module) if part in _PACKAGE_OF})
+    missing = [one for one in needs if importlib.util.find_spec(one) is None]
+    told = ", ".join(_DISTRIBUTION[one] for one in missing)
+    return {
+        "name": name,
+        # Where the protocol is described is of no use to who looks for a driver.
+        "about": re.sub(r" \([^()]*hardware reference[^()]*\)", "", line).rstrip("."),
+        "missing": f'{told}; pip install "palpate[gateway]"' if missing else "",
+    }
+
+
+def _parts(module: ModuleType, seen: set[str] | None = None) -> Iterator[str]:
+    """Names of the gateway's modules that a module is made of, itself included."""
+    seen = {module.__name__} if seen is None else seen
+    yield module.__name__
+    for value in list(vars(module).values()):
+        name = value.__name__ if isinstance(value, ModuleType) else _home(value)
+        if name.startswith("palpate_gateway.") and name not in seen:
+            seen.add(name)
+            yield from _parts(importlib.import_module(name), seen)
+
+
+def _home(value: Any) -> str:
+    home = getattr(value, "__module__", "")
+    return home if isinstance(home, str) else ""
+
+
+def _serial_ports() -> list[dict[str, str]] | str:
+    """Ports with their steady names; why there can be none."""
+    try:
+        list_ports = require("serial.tools.list_ports", extra="gateway")
+    except MissingExtraError as error:
+        return str(error)
+    steady = {link.resolve(): link for link in sorted(BY_ID.glob("*"))} if BY_ID.is_dir() else {}
+    ports = []
+    for port in sorted(list_ports.comports(), key=lambda one: str(one.device)):
+        link = steady.get(Path(port.device).resolve())
+        what = "" if port.description == "n/a" else str(port.description)
+        ports.append({"by_id": str(link or ""), "port": str(port.device), "what": what})
+    return ports
+
+
+def _can_buses() -> list[dict[str, str]] | str:
+    """Adapters that python-can sees; why there can be none."""
+    try:
+        can = require("can", extra="gateway")
+    except MissingExtraError as error:
+        return str(error)
+    # Each kind that lacks its vendor's library says so in the log, which nobody asked for.
+    log = logging.getLogger("can")
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    found = []
+    try:
+        for kind in sorted(set(can.VALID_INTERFACES) - _NOT_HARDWARE):
+            found += _configs(can, kind)
+    finally:
+        log.setLevel(before)
+    return found
+
+
+def _configs(can: ModuleType, kind: str) -> list[dict[str, str]]:
+    try:
+        configs = can.detect_available_configs(kind, timeout=_DETECT_S)
+    except Exception:
+        # Whatever the driver of a vendor raises: it has no adapter to offer.
+        return []
+    out = []
+    for config in configs:
+        more = {key: value for key, value in config.items() if key not in ("interface", "channel")}
+        told = " ".join(f"{key}={value}" for key, value in more.items())
+        channel = str(config.get("channel", ""))
+        out.append({"interface": kind, "channel": channel, "more": told})
+    return out

@@ -1,0 +1,153 @@
+"""Whether a sensor is still: what moves is touched, or was just now.
+
+PAC is the dynamic part of the fluid's pressure: whoever touches the skin shakes it, even a hand
+that holds on. PDC creeps while skin and fluid relax. Electrodes vary and shift. What is still need
+not be untouched: a stand that presses is as still as nothing (see ``untouched``).
+
+Limits come from the real captures in docs/tare-and-health.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate_gateway.condition.blocks import Block, Floats
+
+MAX_SD_COUNTS = 25.0
+"""An electrode that varies more than this is being touched [counts]. A settled sensor has 0.5; the
+public capture, with its pauses of a quarter second, has up to 13."""
+
+MAX_PAC_SD_COUNTS = 9.0
+"""PAC that varies more is being touched [counts]: the real capture has 4 at rest, and 19 at the
+quietest while a hand holds the finger."""
+
+MAX_PDC_SD_COUNTS = 1.5
+"""PDC that varies more is creeping or touched [counts]: real sensors have 0.6 at rest and 1.6 at
+the quietest while they are held."""
+
+_SHIFT_COUNTS = 2.0
+_SHIFT_NOISE = 2.0
+"""Electrodes that shift by more than this much, and their noise this many times, are moving."""
+
+WINDOW_BLOCKS = 3
+"""Blocks that are looked at together: 0.6 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillLimits:
+    """What a still sensor does not exceed.
+
+    Attributes:
+        electrode_sd: Standard deviation of any electrode [counts].
+        pac_sd: Standard deviation of PAC [counts]; infinity = it is not looked at.
+        pdc_sd: Standard deviation of PDC [counts]; infinity = it is not looked at.
+    """
+
+    electrode_sd: float = MAX_SD_COUNTS
+    pac_sd: float = MAX_PAC_SD_COUNTS
+    pdc_sd: float = MAX_PDC_SD_COUNTS
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks for a touch in a window of frames.
+
+    Attributes:
+        frames: Frames in the window.
+        electrode: The electrode that varies most, from 0.
+        electrode_sd: Its standard deviation [counts].
+        shift: How much the second half of the window differs from the first, as the root mean
+            square of all electrodes [counts].
+        noise: Shift that noise alone would give [counts].
+        pac_sd: Standard deviation of PAC [counts].
+        pdc_sd: Standard deviation of PDC [counts].
+    """
+
+    frames: int
+    electrode: int
+    electrode_sd: float
+    shift: float
+    noise: float
+    pac_sd: float
+    pdc_sd: float
+
+    def motion(self, limits: StillLimits) -> str:
+        """What moves, for people; empty = the sensor is still."""
+        over = f"over {self.frames} frames, at most"
+        if self.electrode_sd > limits.electrode_sd:
+            return (
+                f"E{self.electrode + 1} varies by {self.electrode_sd:.0f} counts (sd) {over} "
+                f"{limits.electrode_sd:g} are allowed"
+            )
+        if self.pac_sd > limits.pac_sd:
+            return (
+                f"PAC varies by {self.pac_sd:.0f} counts (sd) {over} {limits.pac_sd:g} are allowed"
+            )
+        if self.pdc_sd > limits.pdc_sd:
+            return (
+                f"PDC varies by {self.pdc_sd:.1f} counts (sd) {over} {limits.pdc_sd:g} are allowed"
+            )
+        most = _SHIFT_COUNTS + _SHIFT_NOISE * self.noise
+        # Who looks at the electrodes' variation only has asked for just that.
+        if math.isfinite(limits.pdc_sd) and self.shift > most:
+            return (
+                f"electrodes shift by {self.shift:.1f} counts (rms) {over} {most:.1f} are allowed"
+            )
+        return ""
+
+
+def evidence_of(electrodes: Floats, pac: Floats, pdc: Floats) -> Evidence:
+    """Evidence of whole frames.
+
+    Args:
+        electrodes: Raw counts, shape ``(N, E)``; at least two frames.
+        pac: Valid samples of PAC, any shape; may be none.
+        pdc: Raw counts, shape ``(N,)``.
+    """
+    frames, half = len(electrodes), len(electrodes) // 2
+    step = electrodes[frames - half :].mean(axis=0) - electrodes[:half].mean(axis=0)
+    pac_sd = float(pac.std()) if pac.size else 0.0
+    return _evidence(frames, half, electrodes.var(axis=0), step, pac_sd, float(pdc.std()))
+
+
+def evidence_of_blocks(blocks: Sequence[Block], usable: npt.NDArray[np.bool_]) -> Evidence:
+    """Evidence of consecutive blocks.
+
+    Args:
+        blocks: At least two.
+        usable: Electrodes that are looked at, bool, shape ``(E,)``; at least one.
+    """
+    count, half, frames = len(blocks), len(blocks) // 2, blocks[0].frames
+    means = np.array([block.mean for block in blocks])
+    inside = np.array([block.variance for block in blocks])
+    mean = np.add.reduce(means) / count
+    variance = np.add.reduce(inside + np.square(means - mean)) / count * usable
+    step = (np.add.reduce(means[-half:]) - np.add.reduce(means[:half])) / half * usable
+    pac = [(block.pac_mean, block.pac_variance) for block in blocks if block.pac_seen]
+    pdc = [(block.pdc_mean, block.pdc_variance) for block in blocks if block.slow_seen[0]]
+    return _evidence(
+        count * frames, half * frames, variance, step, _pooled_sd(pac), _pooled_sd(pdc)
+    )
+
+
+def _evidence(
+    frames: int, half: int, variance: Floats, step: Floats, pac_sd: float, pdc_sd: float
+) -> Evidence:
+    worst = int(variance.argmax())
+    # Of two means of as many frames; what is left out has neither noise nor shift.
+    noise = math.sqrt(2.0 * float(np.add.reduce(variance)) / len(variance) / half)
+    shift = math.sqrt(float(step @ step) / len(step))
+    return Evidence(frames, worst, math.sqrt(float(variance[worst])), shift, noise, pac_sd, pdc_sd)
+
+
+def _pooled_sd(parts: Sequence[tuple[float, float]]) -> float:
+    """Standard deviation of parts of equal size, from mean and variance of each."""
+    if not parts:
+        return 0.0
+    mean = sum(one for one, _ in parts) / len(parts)
+    return math.sqrt(sum(inside + (one - mean) ** 2 for one, inside in parts) / len(parts))

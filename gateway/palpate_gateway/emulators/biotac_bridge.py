@@ -1,0 +1,250 @@
+"""A microcontroller bridge in software, on a serial line (format D, hardware reference 2.6).
+
+Written from the page and the byte table of the format, with a COBS and a CRC of its own. What they
+leave open is decided here: one sequence counts the packets of all types; a HELLO and a STATUS carry
+the time of the next slot; what is not sent has been counted.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import time
+from collections.abc import Sequence
+from typing import ClassVar
+
+from palpate_gateway.emulators.biotac_slots import (
+    ELECTRODES,
+    WORD_FAULTS,
+    CountSource,
+    SlotBlocks,
+    idle_counts,
+    round_of,
+)
+from palpate_gateway.emulators.crc16 import crc16_x25
+from palpate_gateway.emulators.emulator import Emulator, tell_lead
+from palpate_gateway.emulators.serial_line import SerialLine
+
+__all__ = ["HELLO", "SLOTS", "STATUS", "BiotacBridgeEmulator", "crc16_x25", "stuffed"]
+
+HELLO, SLOTS, STATUS = 1, 2, 3
+"""Types of packets."""
+
+SLOTS_PER_PACKET = (22, 44)
+"""Fewest and most slots of a packet: 5 to 10 ms."""
+
+_VERSION = 1
+_TICK_S = 1e-3
+_STOPPED_S = 1.0
+
+
+class BiotacBridgeEmulator(Emulator):
+    """The bridge and its fingers.
+
+    Faults of words: ``SlotBlocks.with_faults``; the first two are also counted in the next STATUS.
+    Faults of packets with slots, and of the line:
+
+    * ``crc``: one bit of each packet is wrong;
+    * ``cut``: packets come without their ends, and take the next one with them;
+    * ``junk``: noise comes before each;
+    * ``lost``: they do not come; ``overrun``: the same, and the next STATUS counts their slots;
+    * ``repeated``: each comes twice;
+    * ``silence``: nothing comes, and the sampling goes on;
+    * ``unplug``: the line is gone; when it is back, numbers and times have gone on;
+    * ``restart``: nothing comes, then all of it begins anew: numbers, time, the round, HELLO;
+    * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
+
+    Args:
+        fingers: Fingers that it samples.
+        counts: What they measure.
+        serials: Their serial numbers; () = ``BT-EMU-1`` and so on.
+        source: Its source id.
+        baud: Its speed [bit/s].
+        path: Name of the line; "" = a new one.
+        slot_rate_hz: Slots each second.
+        slots_per_packet: Slots of a packet, 22..44.
+        pac_first: Whether a sampling round begins with PAC.
+        electrodes: 19, or 24 of the BioTac SP.
+        hello_s: Time between two HELLOs [s].
+        status_s: Time between two STATUSes [s].
+        sequence: Number of the first packet after the start.
+        clock_us: Its clock at the start [us].
+        drift_ppm: How much too fast its clock is while it drifts [1e-6].
+    """
+
+    faults: ClassVar[frozenset[str]] = frozenset(
+        "crc cut junk lost overrun repeated silence restart unplug clock_drift".split()
+    ) | frozenset(WORD_FAULTS)
+
+    def __init__(
+        self,
+        *,
+        fingers: int = 3,
+        counts: CountSource = idle_counts,
+        serials: Sequence[str] = (),
+        source: int = 1,
+        baud: int = 460800,
+        path: str = "",
+        slot_rate_hz: float = 4400.0,
+        slots_per_packet: int = 44,
+        pac_first: bool = False,
+        electrodes: int = ELECTRODES,
+        hello_s: float = 2.0,
+        status_s: float = 1.0,
+        sequence: int = 0,
+        clock_us: int = 0,
+        drift_ppm: float = 200.0,
+    ) -> None:
+        super().__init__(slot_rate_hz)
+        fewest, most = SLOTS_PER_PACKET
+        if not fewest <= slots_per_packet <= most:
+            raise ValueError(f"slots_per_packet {slots_per_packet} is not in {fewest}..{most}")
+        self._fingers, self._counts, self._source = fingers, counts, source
+        self._serials = serials or [f"BT-EMU-{finger + 1}" for finger in range(fingers)]
+        self._line = SerialLine(baud, path)
+        order = round_of(electrodes, pac_first=pac_first)
+        self._round, self._slots = len(order), SlotBlocks(counts, fingers, order)
+        self._together = slots_per_packet
+        self._hello_slots = max(1, round(hello_s * slot_rate_hz))
+        self._status_slots = max(1, round(status_s * slot_rate_hz))
+        self._drift = drift_ppm * 1e-6
+        self._random = random.Random(4)
+        self._began_s = self._due_s = 0.0
+        self._boot()
+        self._sequence, self._clock_us = sequence, float(clock_us)
+
+    @property
+    def address(self) -> str:
+        """The line's name."""
+        return self._line.path
+
+    def _boot(self) -> None:
+        self._slot = self._sequence = 0
+        self._clock_us = 0.0
+        self.parity_errors = [0] * self._fingers
+        self.error_words = self.overruns = 0
+        self._next_hello, self._next_status = 0, self._status_slots
+
+    def _listen(self) -> None:
+        self._line.plug()
+
+    def _hang_up(self) -> None:
+        self._line.close()
+
+    def _serve(self) -> None:
+        # The next slot is sampled at this time.
+        self._began_s = self._due_s = time.monotonic()
+        tell_lead(self._counts, self._began_s)
+        starts = True
+        while not self._stop.is_set():
+            self._line.keep_plugged(not self.faulty("unplug"))
+            now_s = time.monotonic()
+            if self.faulty("restart"):
+                self._boot()
+                self._due_s, starts = now_s, True
+                self._stop.wait(_TICK_S)
+                continue
+            if starts:
+                self._line.write(b"\0")  # ends whatever noise the start has made
+                starts = False
+            drift = self._drift if self.faulty("clock_drift") else 0.0
+            step_s = 1.0 / (self.rate_hz * (1.0 + drift))
+            if now_s - self._due_s > _STOPPED_S:  # this process stood still
+                self._due_s = now_s
+            while now_s - self._due_s >= self._together * step_s and not self._stop.is_set():
+                self._announce()
+                self._sample(step_s)
+            self._stop.wait(_TICK_S)
+
+    def _announce(self) -> None:
+        """Send what is due besides slots."""
+        if self._slot >= self._next_hello:
+            self._next_hello = self._slot + self._hello_slots
+            body = struct.pack("<BHB", self._fingers, round(self.rate_hz), self._round)
+            for serial in self._serials:
+                body += struct.pack("<16s4s", serial.encode("ascii"), b"0203")
+            self._tell(HELLO, body)
+        if self._slot >= self._next_status:
+            self._next_status = self._slot + self._status_slots
+            numbers = (*self.parity_errors, self.error_words, self.overruns)
+            self._tell(STATUS, struct.pack(f"<B{len(numbers)}I", self._fingers, *numbers))
+
+    def _tell(self, kind: int, body: bytes) -> None:
+        packet = self._packet(kind, body)
+        if not self.faulty("silence"):
+            self._line.write(stuffed(packet))
+
+    def _sample(self, step_s: float) -> None:
+        time_s = self._due_s - self._began_s
+        payloads = self._slots.block(self._slot, self._together, time_s, step_s)
+        if not self.sound:
+            for k in range(self._together):
+                wrong = {fault for fault in WORD_FAULTS if self.faulty(fault)}
+                if wrong:
+                    self._count(wrong)
+                    at_s = time_s + k * step_s
+                    payloads[k] = self._slots.with_faults(self._slot + k, at_s, wrong)
+        body = bytes([self._together, self._fingers]) + b"".join(payloads)
+        self._send(self._packet(SLOTS, body))
+        self._slot += self._together
+        self._due_s += self._together * step_s
+        self._clock_us += 1e6 * self._together / self.rate_hz
+
+    def _count(self, wrong: set[str]) -> None:
+        """What the bridge sees of wrong words."""
+        if "absent" in wrong and self._fingers == 1:
+            return
+        if "error_word" in wrong:
+            self.error_words += 1
+        elif "parity" in wrong:
+            self.parity_errors[0] += 1
+
+    def _packet(self, kind: int, body: bytes) -> bytes:
+        sequence, self._sequence = self._sequence, (self._sequence + 1) % 2**16
+        ticks = round(self._clock_us) % 2**32
+        packet = struct.pack("<4BHI", _VERSION, kind, self._source, 0, sequence, ticks) + body
+        return packet + struct.pack("<H", crc16_x25(packet))
+
+    def _send(self, packet: bytes) -> None:
+        """A packet with slots."""
+        wire = stuffed(packet)
+        if not self.sound:
+            if self.faulty("silence") or self.faulty("lost"):
+                return
+            if self.faulty("overrun"):
+                self.overruns += self._together
+                return
+            if self.faulty("crc"):
+                wrong = bytearray(packet)
+                wrong[self._random.randrange(len(wrong))] ^= 1 << self._random.randrange(8)
+                self._line.write(stuffed(bytes(wrong)))
+                return
+            if self.faulty("cut"):
+                self._line.write(wire[: self._random.randrange(1, len(packet))])
+                return
+            if self.faulty("junk"):
+                noise = self._random.randbytes(self._random.randint(1, 60))
+                self._line.write(noise + b"\0")
+            if self.faulty("repeated"):
+                self._line.write(wire)
+        before = self._line.overrun
+        self._line.write(wire)
+        if self._line.overrun > before:
+            self.overruns += self._together
+        else:
+            self.sent += self._together
+
+
+def stuffed(packet: bytes) -> bytes:
+    """A packet by COBS, with its end.
+
+    Each run of bytes without a zero is preceded by its length and one; the longest run is 254.
+    """
+    out = bytearray()
+    for run in packet.split(b"\0"):
+        rest = run
+        while len(rest) >= 254:
+            out += b"\xff" + rest[:254]
+            rest = rest[254:]
+        out += bytes([len(rest) + 1]) + rest
+    return bytes(out) + b"\0"

@@ -1,0 +1,181 @@
+"""The contract of an emulator: a device in software, at a real address, that misbehaves on request.
+
+Emulators are written from the byte tables of the protocol page and import nothing of
+``palpate_gateway.protocols``: a decoder that misreads the page must not agree with its own mirror
+image.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Self
+
+Wrench = tuple[float, float, float, float, float, float]
+"""Fx Fy Fz [N] Tx Ty Tz [N m]."""
+
+WrenchSource = Callable[[float], Sequence[float]]
+"""Wrench at a time of the emulator's own [s], which counts from its start."""
+
+
+class HostTimed:
+    """A source that goes by the host's clock, so that several emulators play one scene.
+
+    Attributes:
+        lead_s: The host's monotonic time less the emulator's own [s], as its emulator tells it.
+    """
+
+    lead_s = 0.0
+
+
+class Emulator(ABC):
+    """Serves one device from a thread of its own until it is stopped.
+
+    Args:
+        rate_hz: Samples each second.
+    """
+
+    faults: ClassVar[frozenset[str]]
+    """Names of the faults that it can have."""
+
+    def __init__(self, rate_hz: float) -> None:
+        if not 0.0 < rate_hz <= 100_000.0:
+            raise ValueError(f"rate_hz {rate_hz} is not in 0..100000")
+        self.rate_hz = rate_hz
+        self.sent = 0
+        """Samples that were sent whole and right."""
+        self._until: dict[str, float] = {}
+        self._held_s: float | None = None
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    @abstractmethod
+    def address(self) -> str:
+        """What a user would give a driver, e.g. a device file or ``host:port``."""
+
+    def inject(self, fault: str, duration_s: float = 0.0) -> None:
+        """Have a fault for a time; 0 = once, at the next sample.
+
+        Raises:
+            ValueError: It has no such fault.
+        """
+        self._check(fault)
+        with self._lock:
+            self._until[fault] = time.monotonic() + duration_s if duration_s > 0.0 else 0.0
+
+    def faulty(self, fault: str) -> bool:
+        """Whether to have a fault now; one that was asked for once is had once."""
+        with self._lock:
+            until = self._until.get(fault)
+            if until is None:
+                return False
+            if until == 0.0 or time.monotonic() >= until:
+                del self._until[fault]
+            return until == 0.0 or time.monotonic() < until
+
+    def end(self, fault: str) -> None:
+        """End a fault now, or take it back if it has not come yet.
+
+        Raises:
+            ValueError: It has no such fault.
+        """
+        self._check(fault)
+        with self._lock:
+            self._until.pop(fault, None)
+
+    @property
+    def sound(self) -> bool:
+        """Whether it has no fault now, and none to come; cheap, for it is asked at each sample."""
+        return not self._until
+
+    def held(self, t: float) -> float:
+        """When to measure: now, or while the fault ``stuck`` lasts, when it began."""
+        if self.sound or not self.faulty("stuck"):
+            self._held_s = None
+            return t
+        if self._held_s is None:
+            self._held_s = t
+        return self._held_s
+
+    def _check(self, fault: str) -> None:
+        if fault not in self.faults:
+            raise ValueError(f"fault {fault!r} is none of {', '.join(sorted(self.faults))}")
+
+    def start(self) -> None:
+        """Begin to serve; the address is valid afterwards."""
+        self._listen()
+        self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End; twice is harmless."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(5.0)
+            self._thread = None
+            self._hang_up()
+
+    @abstractmethod
+    def _listen(self) -> None:
+        """Open what clients connect to."""
+
+    @abstractmethod
+    def _serve(self) -> None:
+        """Serve until ``self._stop`` is set."""
+
+    @abstractmethod
+    def _hang_up(self) -> None:
+        """Close everything."""
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.stop()
+
+
+def tell_lead(source: object, lead_s: float) -> None:
+    """Tell a source that goes by the host's clock how far that is ahead of the emulator's [s]."""
+    if isinstance(source, HostTimed):
+        source.lead_s = lead_s
+
+
+def no_load(t: float) -> Wrench:
+    """Nothing is felt."""
+    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def slow_press(t: float) -> Wrench:
+    """A wrench that changes slowly: a press of 4 N every five seconds, with some shear."""
+    share = max(0.0, 1.0 - abs(t % 5.0 - 2.5) / 1.5)
+    return (0.5 * share, -0.25 * share, 4.0 * share, 0.004 * share, -0.008 * share, 0.001 * share)
+
+
+class Pace:
+    """Ticks at a rate, without drift; after a pause it goes on from now.
+
+    Args:
+        rate_hz: Ticks each second.
+        stop: Ends the wait.
+    """
+
+    def __init__(self, rate_hz: float, stop: threading.Event) -> None:
+        self._period_s, self._stop = 1.0 / rate_hz, stop
+        self.fast = 0.0
+        """Share by which it is faster than its rate."""
+        self._next_s = time.monotonic()
+
+    def wait(self) -> float:
+        """Until the next tick, or until told to stop; when it was due [s, monotonic]."""
+        self._next_s += self._period_s / (1.0 + self.fast)
+        left_s = self._next_s - time.monotonic()
+        if left_s > 0.0:
+            self._stop.wait(left_s)
+        elif left_s < -0.5:
+            self._next_s = time.monotonic()
+        return self._next_s

@@ -1,0 +1,251 @@
+"""Sensors that speak RDT in software (hardware reference 3.2, 3.3).
+
+ATI Net F/T, ATI Axia (Schunk FTN), OnRobot HEX. Requests and records are datagrams; what a count is
+worth stands on a page served over HTTP, except for the HEX, whose scale is fixed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import struct
+import time
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from palpate_gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press, tell_lead
+from palpate_gateway.emulators.rdt_products import LATCHED, PRODUCTS, page
+from palpate_gateway.emulators.web_page import WebPage
+
+__all__ = ["LATCHED", "RdtEmulator", "record"]
+
+_STOP, _START_MANY = 0x0000, 0x0003
+_RESET_LATCH, _BIAS, _FILTER, _PERIOD = 0x0041, 0x0042, 0x0081, 0x0082
+_HEADER = 0x1234
+_REQUEST = struct.Struct(">HHI")
+_RECORD = struct.Struct(">IIIiiiiii")
+_MOST_REQUESTS = 64
+
+
+def record(rdt_sequence: int, ft_sequence: int, status: int, counts: Sequence[int]) -> bytes:
+    """One record as it is on the wire."""
+    return _RECORD.pack(
+        rdt_sequence & 0xFFFFFFFF, ft_sequence & 0xFFFFFFFF, status & 0xFFFFFFFF, *counts
+    )
+
+
+class RdtEmulator(Emulator):
+    """Sends to whoever asked last.
+
+    Faults:
+
+    * ``lost``: records do not come, and their numbers are missing; ``repeated``: each datagram
+      comes twice; ``late``: records are held back until one comes after them;
+    * ``cut``: datagrams come halved; ``junk``: others of odd lengths come before them;
+    * ``silence``: nothing comes, and nobody is heard; ``deaf``: only the latter;
+    * ``restart``: the stream, the zero and the counter are forgotten;
+    * ``unplug``: nobody listens at its address; the stream goes on afterwards;
+    * ``overload``, ``error``: bits of the status, the latter with all loads zero; ``latched``: the
+      status of a threshold that was passed, until it is reset;
+    * ``stuck``: records repeat what was felt when it began;
+    * ``clock_drift``: the internal counter runs at another speed than the records.
+
+    Args:
+        product: ``netft``, ``axia`` or ``hex``.
+        source: What it feels.
+        rate_hz: Records each second; 0 = the product's default.
+        counter_hz: Rate of the internal counter; 0 = the product's.
+        host: Address to listen at.
+        port: For datagrams; 0 = any free one.
+        http_port: For the page; 0 = any free one.
+        counts_per: Counts of a force unit and of a torque unit; the HEX has its own.
+        units: Force and torque unit on the page, each with its worth [N] and [N m].
+        together: Records in a datagram where the start request asks for several.
+        first_counter: The internal counter at power-up.
+        drift_ppm: How much too fast the counter is while it drifts [1e-6].
+    """
+
+    faults: ClassVar[frozenset[str]] = frozenset(
+        {
+            *("cut", "junk", "lost", "repeated", "late", "silence", "deaf", "restart", "unplug"),
+            *("overload", "error", "latched", "stuck", "clock_drift"),
+        }
+    )
+
+    def __init__(
+        self,
+        product: str = "netft",
+        source: WrenchSource = slow_press,
+        *,
+        rate_hz: float = 0.0,
+        counter_hz: float = 0.0,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        http_port: int = 0,
+        counts_per: tuple[float, float] = (1e6, 1e6),
+        units: tuple[tuple[str, float], tuple[str, float]] = (("N", 1.0), ("Nm", 1.0)),
+        together: int = 10,
+        first_counter: int = 0,
+        drift_ppm: float = 200.0,
+    ) -> None:
+        self._product = PRODUCTS[product]
+        super().__init__(rate_hz or self._product.rate_hz)
+        self._counter_hz = counter_hz or self._product.counter_hz
+        self._source, self._together, self._first_counter = source, together, first_counter
+        self._host, self._port, self._drift = host, port, drift_ppm * 1e-6
+        self.page = WebPage(host, http_port, "/netftapi2.xml")
+        if self._product.has_page:
+            self.page.content = page(self._product.name, counts_per, (units[0][0], units[1][0]))
+            force, torque = counts_per[0] / units[0][1], counts_per[1] / units[1][1]
+        else:
+            force, torque = 10_000.0, 100_000.0
+        self._counts_per_si = np.array([force] * 3 + [torque] * 3)
+        self.requests: list[tuple[int, int]] = []
+        """The last requests, command and count."""
+        self._random = random.Random(1)
+        self._first_rate_hz = self.rate_hz
+        self._socket: socket.socket | None = None
+        self._elapsed_s = 0.0
+        self._power_up()
+
+    @property
+    def address(self) -> str:
+        """``host:port`` for datagrams."""
+        return f"{self._host}:{self._port}"
+
+    def _power_up(self) -> None:
+        self.filter = 4
+        self._set_rate(self._first_rate_hz)
+        self._counter_s = 0.0
+        self._client: tuple[str, int] | None = None
+        self._left: int | None = None
+        self._at_once = 1
+        self._sequence = 0
+        self._bias = np.zeros(6)
+        self._packet: list[bytes] = []
+        self._held: bytes | None = None
+        self._status = 0
+
+    def _set_rate(self, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+        self._pace = Pace(rate_hz, self._stop)
+
+    def _listen(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((self._host, self._port))
+        self._socket.setblocking(False)
+        self._port = self._socket.getsockname()[1]
+        self.page.open()
+
+    def _hang_up(self) -> None:
+        self.page.close()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _serve(self) -> None:
+        self._set_rate(self.rate_hz)
+        began_s = time.monotonic()
+        while not self._stop.is_set():
+            due_s = self._pace.wait()
+            step_s = 1.0 / self.rate_hz
+            behind_s = time.monotonic() - began_s - self._elapsed_s
+            if behind_s > 0.6:
+                # This process stood still; a device's clock would not have.
+                step_s = behind_s
+            self._elapsed_s += step_s
+            tell_lead(self._source, due_s - self._elapsed_s)
+            self._counter_s += step_s * (1.0 + self._drift * self.faulty("clock_drift"))
+            if self.faulty("restart"):
+                self._power_up()
+            if self.faulty("unplug"):
+                self._hang_up()
+                continue
+            if self._socket is None:
+                self._listen()
+            assert self._socket is not None
+            with contextlib.suppress(OSError):  # E.g. the client's port is closed.
+                self._take_requests(self._socket)
+            with contextlib.suppress(OSError):
+                self._stream(self._socket)
+
+    def _take_requests(self, link: socket.socket) -> None:
+        while True:
+            data, client = link.recvfrom(2048)
+            if self.faulty("deaf") or self.faulty("silence") or len(data) != _REQUEST.size:
+                continue
+            header, command, count = _REQUEST.unpack(data)
+            if header == _HEADER:
+                self.requests = [*self.requests, (command, count)][-_MOST_REQUESTS:]
+                self._obey(command, count, client)
+
+    def _obey(self, command: int, count: int, client: tuple[str, int]) -> None:
+        if command in self._product.starts:
+            self._client, self._left = client, count or None
+            self._at_once = self._together if command == _START_MANY else 1
+            self._sequence, self._packet = 0, []
+        elif command == _STOP:
+            self._client = None
+        elif command == _BIAS:
+            set_it = self._product.has_page or count == 0xFF
+            self._bias = self._felt() if set_it else np.zeros(6)
+        elif command == _RESET_LATCH:
+            self._status = 0
+        elif not self._product.has_page and command == _FILTER and count <= 6:
+            self.filter = count
+        elif not self._product.has_page and command == _PERIOD and count <= 255:
+            if count == 0:
+                self._client = None
+                return
+            self._set_rate(1000.0 / count)
+
+    def _stream(self, link: socket.socket) -> None:
+        if self._client is None:
+            return
+        self._sequence += 1
+        whole = self._record()
+        if self._left is not None:
+            self._left -= 1
+        ends, client = self._left == 0, self._client
+        if ends:
+            self._client = None
+        if self.faulty("silence") or self.faulty("lost"):
+            return
+        if self.faulty("junk"):
+            link.sendto(self._random.randbytes(self._random.choice((1, 8, 35, 37, 100))), client)
+        if self.faulty("late"):
+            self._held = whole
+            return
+        self._packet.append(whole)
+        if len(self._packet) < self._at_once and not ends:
+            return
+        packet, self._packet = b"".join(self._packet), []
+        if self.faulty("cut"):
+            link.sendto(packet[: len(packet) // 2 - 1], client)
+            return
+        link.sendto(packet, client)
+        self.sent += len(packet) // _RECORD.size
+        if self.faulty("repeated"):
+            link.sendto(packet, client)
+        if self._held is not None:
+            link.sendto(self._held, client)
+            self._held = None
+
+    def _record(self) -> bytes:
+        if self.faulty("latched"):
+            self._status = LATCHED
+        status, values = self._status, self._felt() - self._bias
+        if self.faulty("overload"):
+            status |= self._product.overload
+        if self.faulty("error"):
+            # Without its transducer or its supply there is nothing to measure.
+            status, values = status | self._product.error, np.zeros(6)
+        counts = np.clip(np.rint(values * self._counts_per_si), -(2**31), 2**31 - 1)
+        ticks = self._first_counter + round(self._counter_s * self._counter_hz)
+        return record(self._sequence, ticks, status, [int(count) for count in counts])
+
+    def _felt(self) -> np.ndarray:
+        return np.asarray(self._source(self.held(self._elapsed_s)), np.float64)

@@ -1,0 +1,249 @@
+"""A CAN bus by python-can, whatever carries it: SocketCAN, a serial adapter, multicast, a log.
+
+Messages come in batches, since a BioTac sends 4400 of them a second. Where the bus is a socket they
+are taken from it directly; python-can's own reading costs three times as much, and loses them when
+other threads are busy (see ``datagrams``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import ConfigError, DeviceError, DeviceLost
+from palpate.extras import require
+from palpate_gateway.ports.can_frames import (
+    BUS_OFF,
+    CanFrame,
+    CanFrames,
+    FrameKind,
+    MulticastReader,
+    Reader,
+    from_message,
+    from_socketcan,
+)
+from palpate_gateway.ports.datagrams import BATCH, Datagrams, available
+from palpate_gateway.ports.port import silent
+from palpate_gateway.timing.kernel_stamps import KernelStamps
+
+_BUFFER = 4 << 20
+"""What the system shall keep while this process does not read [bytes]: its usual 0.2 MB are full
+after 60 ms of three BioTacs."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanBatch:
+    """Data frames in order of their coming, as arrays.
+
+    Attributes:
+        can_id: Identifiers, int64, shape ``(N,)``.
+        size: Bytes of data, int64, shape ``(N,)``.
+        data: Data, zeros behind them, uint8, shape ``(N, 8)``.
+        arrival_ns: When they came by the host's monotonic clock [ns], int64, shape ``(N,)``.
+    """
+
+    can_id: npt.NDArray[np.int64]
+    size: npt.NDArray[np.int64]
+    data: npt.NDArray[np.uint8]
+    arrival_ns: npt.NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.can_id)
+
+    def messages(self) -> Iterator[tuple[int, bytes, int]]:
+        """Identifier, data and time of arrival [ns] of each."""
+        rows = zip(self.data, self.size.tolist(), strict=True)
+        data = [row[:size].tobytes() for row, size in rows]
+        return zip(self.can_id.tolist(), data, self.arrival_ns.tolist(), strict=True)
+
+
+class CanBus:
+    """One bus; opening and closing twice is harmless.
+
+    Args:
+        interface: python-can's name of the kind of bus, e.g. ``socketcan``.
+        channel: E.g. ``can0``.
+        bitrate: [bit/s]; 0 = as the bus is set up.
+        options: More of python-can's options.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        *,
+        bitrate: int = 0,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        self.name = f"{interface}:{channel}"
+        self._arguments = {**(options or {}), "interface": interface, "channel": channel}
+        if bitrate:
+            self._arguments["bitrate"] = bitrate
+        self._bus: Any = None
+        self._can: Any = None
+        self._direct: tuple[Datagrams, Reader] | None = None
+        self._stamps = KernelStamps()
+        self._end: DeviceLost | None = None
+        self.counters: dict[str, int] = {"error_frames": 0, "other_frames": 0}
+
+    def open(self) -> None:
+        """Join the bus, or do nothing if joined.
+
+        Raises:
+            ConfigError: python-can knows no such interface or option.
+            DeviceError: The bus is not there or not up.
+            MissingExtraError: python-can is not installed.
+        """
+        if self._bus is not None:
+            return
+        self._can = can = require("can", extra="gateway")
+        self.counters = dict.fromkeys(self.counters, 0)
+        try:
+            self._bus = can.Bus(**self._arguments)
+        except (can.CanInterfaceNotImplementedError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{self.name}: {error}",
+                remedy="see python-can's list of interfaces and their options",
+            ) from error
+        except (can.CanError, OSError, ImportError) as error:
+            raise DeviceError(
+                f"{self.name}: cannot join the bus: {error}",
+                remedy="bring it up (ip link set can0 up type can bitrate 1000000), check its name",
+            ) from error
+
+        self._stamps, self._end = KernelStamps(), None
+        self._direct = self._find_socket()
+
+    def _find_socket(self) -> tuple[Datagrams, Reader] | None:
+        """The bus's socket with a larger buffer, and how to read it; None if it must be asked."""
+        kind = self._arguments["interface"]
+        known = kind in ("socketcan", "udp_multicast")
+        if not known or self._arguments.get("fd") or not available():
+            return None
+        descriptor = self._bus.fileno()
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as same:
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        return Datagrams(descriptor), from_socketcan if kind == "socketcan" else MulticastReader()
+
+    def close(self) -> None:
+        """Leave the bus; never raises."""
+        bus, self._bus = self._bus, None
+        direct, self._direct = self._direct, None
+        if direct is not None:
+            direct[0].close()
+        if bus is not None:
+            # Whatever a driver of an unplugged adapter raises: it is closed.
+            with contextlib.suppress(Exception):
+                bus.shutdown()
+
+    def read(self, timeout_s: float, *, gather_s: float = 0.0) -> CanBatch:
+        """At least one data frame, and those that came with it.
+
+        Args:
+            timeout_s: How long to wait for the first [s].
+            gather_s: Let so much time pass first [s]; the bus keeps meanwhile what comes.
+
+        Raises:
+            DeviceTimeout: None came.
+            DeviceLost: The bus is gone, or off after too many errors.
+        """
+        self._opened()
+        if self._end is not None:
+            raise self._end
+        if gather_s:
+            time.sleep(gather_s)
+        until = time.monotonic() + timeout_s
+        while True:
+            try:
+                frames, arrivals_ns = self._frames(max(0.0, until - time.monotonic()))
+            except (self._can.CanError, OSError, ValueError) as error:
+                raise self._lost(str(error)) from error
+            kept = frames.kind == FrameKind.DATA
+            if not kept.all():
+                self._note(frames)
+                frames, arrivals_ns = frames.those(kept), arrivals_ns[kept]
+            if len(arrivals_ns):
+                return CanBatch(frames.can_id, frames.size, frames.data, arrivals_ns)
+            if self._end is not None:
+                raise self._end
+            if time.monotonic() >= until:
+                raise silent(self.name, timeout_s)
+
+    def _frames(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
+        """Frames of any kind that came, with their times of arrival; none if none came."""
+        if self._direct is None:
+            return self._asked(wait_s)
+        datagrams, reader = self._direct
+        ready, _, _ = select.select([datagrams], [], [], wait_s)
+        if not ready:
+            return CanFrames.of([]), np.zeros(0, np.int64)
+        waiting = datagrams.take()
+        now_ns = time.monotonic_ns()
+        return reader(waiting), self._stamps.monotonic_of_all(waiting.stamp_ns, now_ns)
+
+    def _asked(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
+        frames: list[CanFrame] = []
+        arrivals_ns: list[int] = []
+        while len(frames) < BATCH:
+            try:
+                message = self._bus.recv(0.0 if frames else wait_s)
+            except (self._can.CanError, OSError, ValueError) as error:
+                if not frames:
+                    raise
+                # What came before it is delivered first.
+                self._end = self._lost(str(error))
+                break
+            if message is None:
+                break
+            now_ns = time.monotonic_ns()
+            arrivals_ns.append(self._stamps.monotonic_ns(message.timestamp, now_ns))
+            frames.append(from_message(message))
+        return CanFrames.of(frames), np.array(arrivals_ns, np.int64)
+
+    def _note(self, frames: CanFrames) -> None:
+        """Count frames that hold no data."""
+        errors = frames.kind == FrameKind.ERROR
+        self.counters["other_frames"] += int((frames.kind == FrameKind.OTHER).sum())
+        self.counters["error_frames"] += int(errors.sum())
+        if (frames.can_id[errors] & BUS_OFF).any() or (errors.any() and self._is_off()):
+            # It says so once and is then silent for ever: it must be opened again.
+            self._end = self._lost("it is off after too many errors (bus off)")
+
+    def _is_off(self) -> bool:
+        with contextlib.suppress(NotImplementedError):
+            return bool(self._bus.state is self._can.BusState.ERROR)
+        return False
+
+    def write(self, can_id: int, data: bytes) -> None:
+        """Send a data frame with a standard identifier.
+
+        Raises:
+            DeviceLost: The bus is gone, or takes nothing.
+        """
+        bus = self._opened()
+        message = self._can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        try:
+            bus.send(message, timeout=0.2)
+        except (self._can.CanError, OSError, ValueError) as error:
+            raise self._lost(str(error)) from error
+
+    def _opened(self) -> Any:
+        if self._bus is None:
+            raise DeviceError(f"{self.name} is not open", remedy="call open() first")
+        return self._bus
+
+    def _lost(self, why: str) -> DeviceLost:
+        return DeviceLost(
+            f"CAN bus {self.name} is gone: {why}",
+            remedy="check adapter, wiring and the terminators at both ends; it is opened again by "
+            "itself",
+        )

@@ -1,0 +1,78 @@
+"""The contract of a port that carries bytes.
+
+Rules of ``read``, the same for serial lines and sockets:
+
+* at least one byte, as soon as there is one;
+* ``DeviceTimeout`` if nothing came in time: try again;
+* ``DeviceLost`` if the port is gone: close, open again.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Self
+
+from palpate.errors import DeviceTimeout
+
+
+class Port(ABC):
+    """A way to a device. Opening and closing twice is harmless; a closed one opens afresh.
+
+    Attributes:
+        name: What a person calls it, e.g. ``/dev/ttyUSB0`` or ``192.168.1.30:1000``.
+    """
+
+    name: str
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect, or do nothing if connected.
+
+        Raises:
+            DeviceError: It cannot be opened; says why and what to do.
+            MissingExtraError: It needs a package that is not installed.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect, or do nothing if not connected; never raises."""
+
+    @abstractmethod
+    def read(self, timeout_s: float) -> bytes:
+        """What has come; see the rules at the top of this file.
+
+        Args:
+            timeout_s: How long to wait for the first byte [s].
+        """
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """Send all of it.
+
+        Raises:
+            DeviceLost: The port is gone.
+        """
+
+    def discard_input(self) -> int:
+        """Throw away what has come and was not read; how many bytes."""
+        count = 0
+        while True:
+            try:
+                count += len(self.read(0.0))
+            except DeviceTimeout:
+                return count
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+
+def silent(name: str, timeout_s: float) -> DeviceTimeout:
+    """The error of a port on which nothing came."""
+    return DeviceTimeout(
+        f"{name}: nothing came within {timeout_s:g} s",
+        remedy="check power and cable; it is read again by itself",
+    )

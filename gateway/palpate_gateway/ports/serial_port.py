@@ -1,0 +1,142 @@
+"""A serial line by pyserial: UART, USB-CDC, an RFC 2217 server or a pseudo terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import time
+from typing import Any
+
+from palpate.errors import DeviceError, DeviceLost
+from palpate.extras import require
+from palpate_gateway.ports.port import Port, silent
+
+_AT_ONCE = 65536
+"""Largest piece of input that is taken in one go [bytes]."""
+
+_REMEDIES = {
+    errno.ENOENT: "plug it in, or name another port (palpate gateway list shows what is there)",
+    errno.EACCES: "join the group that may use it (dialout, see the udev rules), or start as root",
+    errno.EBUSY: "another program has it open: end that one",
+    errno.EAGAIN: "another program has it open: end that one",
+}
+
+
+class SerialPort(Port):
+    """A serial line, for this process alone.
+
+    Args:
+        name: Device file or pyserial URL, e.g. ``/dev/serial/by-id/usb-...`` (which stays the same
+            when plugs change places) or ``socket://host:port``.
+        baud: Rate [bit/s]; nominal on USB-CDC.
+        rts_cts: Hardware flow control.
+    """
+
+    def __init__(self, name: str, baud: int, *, rts_cts: bool = False) -> None:
+        self.name = name
+        self._baud, self._rts_cts = baud, rts_cts
+        self._line: Any = None
+        self._file = False
+        self._broken: tuple[type[Exception], ...] = (OSError,)
+
+    def open(self) -> None:
+        """See ``Port``."""
+        if self._line is not None:
+            return
+        serial = require("serial", extra="gateway")
+        # Unplugging shows as either of them (pyserial issues 341, 331, 86).
+        self._broken = (serial.SerialException, OSError, TypeError)
+        options: dict[str, Any] = {"baudrate": self._baud, "timeout": 0, "rtscts": self._rts_cts}
+        if "://" not in self.name:
+            options["exclusive"] = True
+        try:
+            line = serial.serial_for_url(self.name, **options)
+        except (serial.SerialException, OSError, ValueError) as error:
+            number = getattr(error, "errno", None) or 0
+            raise DeviceError(
+                f"{self.name}: cannot be opened: {error}",
+                remedy=_REMEDIES.get(number, "check its name, and that nothing else has it open"),
+            ) from error
+        # USB adapters else hold bytes back for 16 ms; pseudo terminals and URLs know no such mode.
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            line.set_low_latency_mode(True)
+        self._line = line
+        self._file = os.name == "posix" and "://" not in self.name
+
+    def close(self) -> None:
+        """See ``Port``."""
+        line, self._line = self._line, None
+        if line is not None:
+            with contextlib.suppress(*self._broken):
+                line.close()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See ``Port``."""
+        line = self._opened()
+        try:
+            data = self._take(line, timeout_s)
+        except self._broken as error:
+            if isinstance(error, DeviceError):
+                raise
+            raise self._lost(error) from error
+        if not data:
+            raise silent(self.name, timeout_s)
+        return data
+
+    def _take(self, line: Any, timeout_s: float) -> bytes:
+        """What has come, at least one byte; nothing if none came in time."""
+        if self._file:
+            # pyserial sets the whole line up anew for each other timeout: it stays 0.
+            ready, _, _ = select.select([line], [], [], timeout_s)
+            return bytes(line.read(_AT_ONCE)) if ready else b""
+        waiting = line.in_waiting
+        if waiting:
+            line.timeout = 0
+            return bytes(line.read(min(waiting, _AT_ONCE)))
+        # One byte wakes us; the rest of what came with it is taken along below.
+        line.timeout = timeout_s
+        first = line.read(1)
+        line.timeout = 0
+        return bytes(first + line.read(min(line.in_waiting, _AT_ONCE))) if first else b""
+
+    def write(self, data: bytes) -> None:
+        """See ``Port``."""
+        line = self._opened()
+        try:
+            line.write(data)
+            line.flush()
+        except self._broken as error:
+            raise self._lost(error) from error
+
+    def _opened(self) -> Any:
+        if self._line is None:
+            raise DeviceError(f"{self.name} is not open", remedy="call open() first")
+        return self._line
+
+    def _lost(self, error: BaseException) -> DeviceLost:
+        return DeviceLost(
+            f"{self.name} is gone: {error}",
+            remedy="plug it in again; it is opened again by itself",
+        )
+
+
+def settle(port: Port, quiet_s: float, longest_s: float) -> int:
+    """Throw away input until the line is quiet; how many bytes.
+
+    Args:
+        port: Open.
+        quiet_s: The line is quiet when nothing came for this long [s].
+        longest_s: Give up after this long [s].
+
+    Raises:
+        DeviceLost: The port is gone.
+    """
+    count, until = 0, time.monotonic() + longest_s
+    while time.monotonic() < until:
+        try:
+            count += len(port.read(quiet_s))
+        except TimeoutError:
+            return count
+    return count

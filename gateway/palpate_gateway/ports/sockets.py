@@ -1,0 +1,158 @@
+"""Devices on the network: a TCP stream, and datagrams over UDP.
+
+When something arrived the kernel knows best: this process may have been asleep, or busy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import struct
+import sys
+import time
+from abc import abstractmethod
+from typing import NamedTuple
+
+from palpate.errors import DeviceError, DeviceLost
+from palpate_gateway.ports.port import Port, silent
+from palpate_gateway.timing.kernel_stamps import KernelStamps
+
+CONNECT_S = 0.5
+"""How long a device may take to accept a connection [s]: to one that is off, a request is repeated
+after a second only, and a new one is there sooner."""
+
+_WRITE_S = 2.0
+
+_AT_ONCE = 65536
+_RECEIVE_BUFFER = 1 << 20
+"""Datagrams of a second at 7 kHz fit: a pause of this process must not lose any."""
+
+_STAMP = getattr(socket, "SO_TIMESTAMPNS", 35)
+"""Asks Linux for the wall time at which it received what is read; also the type of its answer."""
+_TIMESPEC = struct.Struct("@ll")
+_STAMP_SPACE = 64
+
+
+class Received(NamedTuple):
+    """What has come, and when by the host's monotonic clock [ns]; of a stream the end of it."""
+
+    data: bytes
+    arrival_ns: int
+
+
+class _SocketPort(Port):
+    """What both kinds share."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.name = f"{host}:{port}"
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+        self._stamps: KernelStamps | None = None
+
+    def open(self) -> None:
+        """See ``Port``."""
+        if self._socket is None:
+            try:
+                self._socket = self._connect()
+                self._ask_for_stamps(self._socket)
+            except OSError as error:
+                raise DeviceError(
+                    f"{self.name}: no connection: {error}",
+                    remedy="check address, port, cable and that the device has power; it serves "
+                    "one client at a time",
+                ) from error
+
+    @abstractmethod
+    def _connect(self) -> socket.socket: ...
+
+    def _ask_for_stamps(self, link: socket.socket) -> None:
+        self._stamps = None
+        if sys.platform.startswith("linux"):
+            with contextlib.suppress(OSError):
+                link.setsockopt(socket.SOL_SOCKET, _STAMP, 1)
+                self._stamps = KernelStamps()
+
+    def close(self) -> None:
+        """See ``Port``."""
+        link, self._socket = self._socket, None
+        if link is not None:
+            with contextlib.suppress(OSError):
+                link.close()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See ``Port``; of UDP one datagram."""
+        return self.receive(timeout_s).data
+
+    def receive(self, timeout_s: float) -> Received:
+        """As ``read``, with the time of arrival."""
+        link = self._opened()
+        try:
+            ready, _, _ = select.select([link], [], [], timeout_s)
+            if not ready:
+                raise silent(self.name, timeout_s)
+            received = self._take(link)
+        except DeviceError:
+            raise
+        except (OSError, ValueError) as error:
+            raise self._lost(str(error)) from error
+        if not received.data and link.type == socket.SOCK_STREAM:
+            raise self._lost("the device closed the connection")
+        return received
+
+    def _take(self, link: socket.socket) -> Received:
+        if self._stamps is None:
+            return Received(link.recv(_AT_ONCE), time.monotonic_ns())
+        data, extras, _, _ = link.recvmsg(_AT_ONCE, _STAMP_SPACE)
+        arrival_ns = time.monotonic_ns()
+        for level, kind, value in extras:
+            if level == socket.SOL_SOCKET and kind == _STAMP and len(value) == _TIMESPEC.size:
+                seconds, rest_ns = _TIMESPEC.unpack(value)
+                stamp_ns = seconds * 1_000_000_000 + rest_ns
+                return Received(data, self._stamps.monotonic_of_ns(stamp_ns, arrival_ns))
+        return Received(data, arrival_ns)
+
+    def write(self, data: bytes) -> None:
+        """See ``Port``."""
+        link = self._opened()
+        try:
+            link.sendall(data)
+        except OSError as error:
+            raise self._lost(str(error)) from error
+
+    def _opened(self) -> socket.socket:
+        if self._socket is None:
+            raise DeviceError(f"{self.name} is not open", remedy="call open() first")
+        return self._socket
+
+    def _lost(self, why: str) -> DeviceLost:
+        return DeviceLost(
+            f"{self.name} is gone: {why}",
+            remedy="check its address, cable and power; it is opened again by itself",
+        )
+
+
+class TcpPort(_SocketPort):
+    """A TCP connection to a device."""
+
+    def _connect(self) -> socket.socket:
+        link = socket.create_connection(self._address, timeout=CONNECT_S)
+        link.settimeout(_WRITE_S)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # A device whose power is cut never closes its connection; the kernel asks after it.
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        return link
+
+
+class UdpPort(_SocketPort):
+    """Datagrams to and from one device; those of others are not seen."""
+
+    def _connect(self) -> socket.socket:
+        link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+            link.connect(self._address)
+        except OSError:
+            link.close()
+            raise
+        return link

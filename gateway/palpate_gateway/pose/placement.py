@@ -1,0 +1,138 @@
+"""How robot, BioTac and indenter hang together: from poses of the flange to poses of the tip.
+
+::
+
+    carries = "indenter"   pose_sensor_indenter = base_sensor^-1  *  base_flange  *  flange_indenter
+    carries = "biotac"     pose_sensor_indenter = (base_flange * flange_sensor)^-1  *  base_indenter
+
+``base_flange`` is what the robot tells; the others do not move and are options. The indenter's
+frame has its origin in the tip, and presses along its +z.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, model_validator
+
+from palpate.config import StrictConfig
+from palpate.messages import Pose
+from palpate_gateway.pose.rigid import compose, inverse, is_unit, length_of, normalised
+from palpate_gateway.readings import PoseReading
+from palpate_gateway.timing.clock_map import Heard
+
+_NEEDED = {
+    "indenter": ("base_sensor", "flange_indenter"),
+    "biotac": ("flange_sensor", "base_indenter"),
+}
+
+
+class PoseOptions(StrictConfig):
+    """A pose that does not change; its key says of what and in what.
+
+    Attributes:
+        position_m: Origin of the second frame in the first [m].
+        orientation_wxyz: Unit quaternion of the second frame in the first.
+    """
+
+    position_m: tuple[float, float, float]
+    orientation_wxyz: tuple[float, float, float, float]
+
+    @model_validator(mode="after")
+    def _is_pose(self) -> PoseOptions:
+        if not all(map(math.isfinite, self.position_m)):
+            raise ValueError(f"position_m {self.position_m} is not finite")
+        if not is_unit(self.orientation_wxyz):
+            raise ValueError(
+                f"orientation_wxyz {self.orientation_wxyz} has length "
+                f"{length_of(self.orientation_wxyz):.4g}, not 1: give a unit quaternion w x y z"
+            )
+        return self
+
+    @property
+    def pose(self) -> Pose:
+        """The same as a value."""
+        return normalised(Pose(self.position_m, self.orientation_wxyz))
+
+
+def _check_indenter(name: str) -> str:
+    if not (0 < len(name) <= 64 and name.isascii() and name.isprintable()):
+        raise ValueError("an indenter's name is 1-64 printable ASCII characters")
+    return name
+
+
+class PlacementOptions(StrictConfig):
+    """What every driver of robot poses has to know.
+
+    Attributes:
+        indenter: Standard name, e.g. ``"sphere_7mm"``.
+        carries: What is fixed to the flange; the other one does not move.
+        base_sensor: BioTac's sensor frame in the robot's base; the robot carries the indenter.
+        flange_indenter: Indenter, origin at its tip, in the flange; the same.
+        flange_sensor: BioTac's sensor frame in the flange; the robot carries the BioTac.
+        base_indenter: Indenter in the robot's base; the same.
+    """
+
+    indenter: Annotated[str, AfterValidator(_check_indenter)]
+    carries: Literal["indenter", "biotac"] = "indenter"
+    base_sensor: PoseOptions | None = None
+    flange_indenter: PoseOptions | None = None
+    flange_sensor: PoseOptions | None = None
+    base_indenter: PoseOptions | None = None
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> PlacementOptions:
+        needed = _NEEDED[self.carries]
+        both = f"where the robot carries the {self.carries}, give {needed[0]} and {needed[1]}"
+        for name in sorted({name for pair in _NEEDED.values() for name in pair}):
+            given = getattr(self, name) is not None
+            if given is not (name in needed):
+                raise ValueError(f"{name} is {'of no use' if given else 'missing'}: {both}")
+        return self
+
+
+class Placement:
+    """The transformation that `PlacementOptions` describe."""
+
+    def __init__(self, options: PlacementOptions) -> None:
+        first, second = (getattr(options, name).pose for name in _NEEDED[options.carries])
+        self._indenter = options.indenter
+        self._before = inverse(first)
+        self._after = second
+        self._robot_moves_sensor = options.carries == "biotac"
+
+    def tip(self, base_flange: Pose) -> Pose:
+        """Pose of the indenter in the sensor frame.
+
+        Args:
+            base_flange: Of the flange in the robot's base; finite, with a unit quaternion but for
+                rounding.
+        """
+        moving = normalised(base_flange)
+        if self._robot_moves_sensor:
+            moving = inverse(moving)
+        return normalised(compose(compose(self._before, moving), self._after))
+
+    def reading(
+        self,
+        base_flange: Pose,
+        *,
+        tick: int,
+        time_s: float,
+        missed_before: int = 0,
+        heard: Heard | None = None,
+    ) -> PoseReading:
+        """A reading of the tip; whether it touches is not known."""
+        tip = self.tip(base_flange)
+        return PoseReading(
+            tick=tick,
+            time_s=time_s,
+            indenter=self._indenter,
+            position=np.array(tip.position),
+            orientation=np.array(tip.orientation),
+            in_contact=None,
+            missed_before=missed_before,
+            heard=heard,
+        )

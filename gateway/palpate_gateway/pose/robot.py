@@ -1,0 +1,176 @@
+"""Poses of the indenter from a user's robot, whose program tells its flange over Zenoh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+from pydantic import Field, field_validator, model_validator
+
+from palpate.bus import Delivery, Received, Session, Subscriber
+from palpate.bus.topics import ROBOT_POSE
+from palpate.config import LinkConfig, TlsConfig, endpoint_host_port
+from palpate.errors import DeviceLost, DeviceTimeout, LinkError, StreamTimeout
+from palpate.messages import Origin, RobotPoseFrame
+from palpate.names import Name
+from palpate_gateway.device import BusDevice, DeviceIdentity, DeviceInfo
+from palpate_gateway.pose.placement import Placement, PlacementOptions
+from palpate_gateway.pose.track import PoseTrack, Verdict
+from palpate_gateway.readings import PoseReading, Reading
+from palpate_gateway.timing.clock_map import Heard
+
+_BATCH = 64
+"""Most readings in one answer of ``read``."""
+
+
+class PoseZenohOptions(PlacementOptions):
+    """Options of the ``pose_zenoh`` driver.
+
+    Attributes:
+        robot: Name under which the robot's program publishes.
+        rate_hz: How often it does [Hz]; three periods without a pose, and 50 ms, are a silence.
+        station: Station on which it publishes; empty = the gateway's own.
+        connect: Endpoint of the router; empty = the gateway's own.
+        tls: Certificates for that router.
+        timeout_s: How long joining the bus may take [s].
+    """
+
+    robot: Name
+    rate_hz: float = Field(default=ROBOT_POSE.rate_hz, gt=0.0, le=10_000.0)
+    station: Name | None = None
+    connect: str = ""
+    tls: TlsConfig | None = None
+    timeout_s: float = Field(default=2.0, gt=0.0, le=60.0)
+
+    @field_validator("connect")
+    @classmethod
+    def _is_endpoint(cls, value: str) -> str:
+        if value:
+            endpoint_host_port(value)
+        return value
+
+    @model_validator(mode="after")
+    def _tls_has_a_router(self) -> PoseZenohOptions:
+        if self.tls is not None and not self.connect:
+            raise ValueError("tls is for the router that connect names, and connect is empty")
+        return self
+
+
+class PoseZenoh(BusDevice):
+    """One robot's poses as a live device with a place of its own on the bus."""
+
+    options_class = PoseZenohOptions
+
+    def __init__(self, options: PoseZenohOptions) -> None:
+        super().__init__(
+            DeviceInfo(
+                driver="pose_zenoh",
+                sensor_type=None,
+                model=f"robot {options.robot}, {options.indenter}",
+                rate_hz=options.rate_hz,
+                live=True,
+                finite=False,
+                origin=Origin.LIVE,
+            )
+        )
+        self._options = options
+        self._placement = Placement(options)
+        self._track = PoseTrack()
+        self._session: Session | None = None
+        self._subscriber: Subscriber[RobotPoseFrame] | None = None
+        self._counts = {"samples": 0, "wrong_robot": 0}
+        self._heard: Mapping[str, int] = {}
+        self._began_ns: int | None = None
+        self._restarted = False
+        self.join(LinkConfig(), "lab")
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Poses that became readings, those that did not by reason, and those that were lost."""
+        subscriber = self._subscriber  # another thread may close it meanwhile
+        heard = self._heard if subscriber is None else subscriber.counters
+        refused = {name: n for name, n in heard.items() if name.startswith("rejected_")}
+        overflow = {"queue_overflow": heard.get("overflow", 0)}
+        return {**self._counts, **self._track.counters, **overflow, **refused}
+
+    def join(self, link: LinkConfig, station: str) -> None:
+        """See ``BusDevice``; what the options say goes before."""
+        options = self._options
+        own = LinkConfig()
+        changes: dict[str, object] = {"wait_for_router_s": options.timeout_s, "listen": own.listen}
+        if options.connect:
+            changes |= {"connect": (options.connect,), "tls": options.tls}
+        self._link = link.model_copy(update=changes)
+        self._station = options.station or station
+
+    def _open(self) -> DeviceIdentity:
+        self._track.begin()
+        self._counts = dict.fromkeys(self._counts, 0)
+        self._heard = {}
+        self._began_ns = None
+        self._restarted = False
+        try:
+            self._session = Session.open(self._link, station=self._station)
+        except LinkError as error:
+            raise DeviceLost(error.problem, remedy=error.remedy) from error
+        self._subscriber = self._session.subscriber(
+            ROBOT_POSE, sensor=self._options.robot, delivery=Delivery.QUEUE
+        )
+        return DeviceIdentity(self._options.robot, slot_period_s=1.0 / self._options.rate_hz)
+
+    def _close(self) -> None:
+        if self._subscriber is not None:
+            self._heard = self._subscriber.counters
+        session, self._session, self._subscriber = self._session, None, None
+        if session is not None:
+            session.close()
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        assert self._subscriber is not None
+        until = time.monotonic() + timeout_s
+        readings: list[Reading] = []
+        while len(readings) < _BATCH and not self._restarted:
+            left_s = 0.0 if readings else max(until - time.monotonic(), 0.0)
+            try:
+                received = self._subscriber.next(left_s)
+            except StreamTimeout as error:
+                if readings:
+                    break
+                raise DeviceTimeout(
+                    f"robot {self._options.robot!r} told no new pose within {timeout_s:g} s",
+                    remedy="check that its program runs, and its name, station and router: "
+                    "palpate topic list",
+                ) from error
+            reading = self._reading(received)
+            if reading is not None:
+                readings.append(reading)
+        if not readings:
+            raise DeviceLost(
+                f"the program of robot {self._options.robot!r} began anew",
+                remedy="nothing, if it was restarted; if not, two programs use this name",
+            )
+        self._counts["samples"] += len(readings)
+        return readings
+
+    def _reading(self, received: Received[RobotPoseFrame]) -> PoseReading | None:
+        """The tip; None, and counted, where a pose is out of place."""
+        frame = received.message
+        if frame.robot != self._options.robot:
+            self._counts["wrong_robot"] += 1
+            return None
+        verdict = self._track.take(frame)
+        if verdict is not Verdict.NEW:
+            # Its clock may be another one now: the host's map of it has to begin anew, too.
+            self._restarted = verdict is Verdict.RESTARTED
+            return None
+        if self._began_ns is None:
+            self._began_ns = frame.time_ns
+        # Since the first pose: a clock that counts from 1970 has no digits to spare.
+        time_s = (frame.time_ns - self._began_ns) * 1e-9
+        return self._placement.reading(
+            frame.pose_base_flange,
+            tick=frame.sequence,
+            time_s=time_s,
+            missed_before=self._track.missed_before,
+            heard=Heard(time_s, received.received_monotonic_ns),
+        )

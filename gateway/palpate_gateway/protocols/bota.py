@@ -1,0 +1,236 @@
+"""Bota Systems SensONE and Rokubi on a serial line (hardware reference 3.6).
+
+The sensor speaks text until it is told to run, then it sends frames of 37 bytes. Commands have no
+line end. The letters, lists and defaults are the page's; the numbers' format of offsets and matrix
+rows is that of the maker's ROS 2 driver (one source).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.resync import FrameFinder
+
+FRAME_BYTES = 37
+
+_HEAD = b"\xaa"
+_FIELDS = struct.Struct("<H6fIf")
+
+STATUS_NAMES = ("app took too long", "overrange", "invalid", "raw")
+"""Meaning of the status bits, lowest first."""
+
+OVERRANGE = 1 << 1
+INVALID = 1 << 2
+
+
+@dataclass(frozen=True, slots=True)
+class BotaFrame:
+    """One frame.
+
+    Attributes:
+        status: Status word, see ``status_names``.
+        wrench: Fx Fy Fz [N] Tx Ty Tz [N m] as sent; need not be finite.
+        device_time_us: The device's clock [us]; wraps at 2**32, after 71.6 minutes.
+        temperature_c: Temperature [degrees C].
+    """
+
+    status: int
+    wrench: tuple[float, ...]
+    device_time_us: int
+    temperature_c: float
+
+
+def status_names(status: int) -> tuple[str, ...]:
+    """Names of the bits that are set; a bit without a meaning is called by its number."""
+    names = dict(enumerate(STATUS_NAMES))
+    return tuple(names.get(bit, f"bit {bit}") for bit in range(16) if status >> bit & 1)
+
+
+def _is_good(frame: bytes) -> bool:
+    return crc16_x25(frame[1:-2]) == int.from_bytes(frame[-2:], "little")
+
+
+class BotaDecoder:
+    """Frames out of a serial line; the text before them is junk to it.
+
+    ``counters["not_finite"]`` counts good frames with a value that is no number; they are returned.
+    """
+
+    def __init__(self) -> None:
+        self._finder = FrameFinder({_HEAD: FRAME_BYTES}, _is_good)
+        self.counters = self._finder.counters
+        self.counters["not_finite"] = 0
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that has begun."""
+        return self._finder.pending
+
+    def reset(self) -> None:
+        """A new connection: partial bytes are counted as junk, counters are kept."""
+        self._finder.reset()
+
+    def feed(self, data: bytes) -> list[BotaFrame]:
+        """Take bytes as they come; return the frames that are now whole."""
+        return [self._read(frame) for frame in self._finder.feed(data)]
+
+    def _read(self, frame: bytes) -> BotaFrame:
+        status, *wrench, time_us, temperature_c = _FIELDS.unpack_from(frame, 1)
+        finite = all(map(math.isfinite, (*wrench, temperature_c)))
+        self.counters["not_finite"] += not finite
+        return BotaFrame(status, tuple(wrench), time_us, temperature_c)
+
+
+class Format(IntEnum):
+    """What the sensor sends while it runs; ``BotaDecoder`` reads the binary one."""
+
+    BINARY = 0
+    CSV = 1
+
+
+class BareCommand(StrEnum):
+    """Commands without parameters."""
+
+    CONFIG = "C"
+    RUN = "R"
+    SAVE = "s"
+    LOAD = "l"
+    PRINT = "w"
+    SOFT_RESET = "I"
+    HARD_RESET = "#"
+
+
+BOOT_TEXT = b"App Init"
+"""What the sensor writes when it has started."""
+
+BAUD_CODES = {9600: 0, 57600: 1, 115200: 2, 230400: 3, 460800: 4}
+
+BAUDS_TO_PROBE = (460800, 230400)
+"""Defaults of the maker's Python example and of its ROS 2 driver: they differ by product."""
+
+SINC_LENGTHS = (51, 64, 128, 205, 256, 512)
+"""Lengths of the sinc filter that the maker lists."""
+
+SINC_STEP_S = 19.53125e-6
+"""Period of the frames per unit of sinc length [s]."""
+
+_WITH_REPLY = frozenset(b"CRcfbm")
+_ACK = re.compile(rb"r,(\d{1,9}),([ -~]),(\d{1,9})")
+_REMEMBERED_BYTES = 256
+
+
+def period_s(sinc: int) -> float:
+    """Time between two frames [s] at a sinc length; about 1, 1.25, 2.5, 4, 5, 10 ms."""
+    return SINC_STEP_S * _one_of(SINC_LENGTHS, sinc, "sinc length")
+
+
+def bare_request(command: BareCommand) -> bytes:
+    """A command without parameters."""
+    return command.value.encode("ascii")
+
+
+def communication_request(
+    *,
+    baud: int,
+    temperature_compensation: bool = False,
+    calibrated: bool = True,
+    data_format: Format = Format.BINARY,
+) -> bytes:
+    """Set what is sent and how fast.
+
+    Args:
+        baud: One of ``BAUD_CODES``.
+        temperature_compensation: Correct for temperature in the sensor.
+        calibrated: Send newtons, not raw gauges.
+        data_format: Binary frames or text.
+    """
+    code = BAUD_CODES[_one_of(BAUD_CODES, baud, "baud")]
+    values = (int(temperature_compensation), int(calibrated), int(data_format), code)
+    return b"c,%d,%d,%d,%d" % values
+
+
+def filter_request(
+    sinc: int, *, chop: bool = False, fast: bool = False, fir: bool = False
+) -> bytes:
+    """Set the filter; the sinc length (one of ``SINC_LENGTHS``) sets the rate too."""
+    _one_of(SINC_LENGTHS, sinc, "sinc length")
+    return b"f,%d,%d,%d,%d" % (sinc, chop, fast, not fir)
+
+
+def offsets_request(offsets: Sequence[float]) -> bytes:
+    """Set the six offsets Fx Fy Fz [N] Tx Ty Tz [N m]."""
+    return ("b," + _six(offsets, "offsets", 3)).encode("ascii")
+
+
+def matrix_row_request(row: int, values: Sequence[float]) -> bytes:
+    """Set row 0..5 of the calibration matrix, six values."""
+    _one_of(range(6), row, "matrix row")
+    return (f"m{row}," + _six(values, "values", 6)).encode("ascii")
+
+
+def expected_reply(request: bytes) -> bytes | None:
+    """Reply that says the request was taken; None where the page names none."""
+    letter = request[:1]
+    return b"r,0,%b,0" % letter if letter and letter[0] in _WITH_REPLY else None
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """A reply ``r,<number>,<command>,<code>``.
+
+    Attributes:
+        command: First letter of the request.
+        code: 0 = taken.
+    """
+
+    command: str
+    code: int
+
+
+def find_ack(text: bytes) -> Ack | None:
+    """First reply in the text, so that a refusal can be told from silence."""
+    found = _ACK.search(text)
+    return Ack(found[2].decode("ascii"), int(found[3])) if found else None
+
+
+class TextWait:
+    """Waits for a text, and gives what follows it untouched: after ``R`` that is frames.
+
+    Args:
+        text: The text to wait for; not empty, at most 64 bytes.
+    """
+
+    def __init__(self, text: bytes) -> None:
+        if not 1 <= len(text) <= 64:
+            raise ValueError(f"a text of {len(text)} bytes is not in 1..64")
+        self._text = text
+        self._done = False
+        self.heard = b""
+        """Last bytes before the text came, at most 256: what to show when it does not come."""
+
+    def feed(self, data: bytes) -> bytes | None:
+        """Take bytes as they come; None until the text has come, then the bytes after it."""
+        if self._done:
+            return bytes(data)
+        before, found, after = (self.heard + data).partition(self._text)
+        self.heard = before[-_REMEMBERED_BYTES:]
+        self._done = bool(found)
+        return after if found else None
+
+
+def _one_of(known: Sequence[int] | dict[int, int] | range, value: int, name: str) -> int:
+    if value not in known:
+        raise ValueError(f"{name} {value} is not one of {', '.join(map(str, known))}")
+    return value
+
+
+def _six(values: Sequence[float], name: str, digits: int) -> str:
+    if len(values) != 6 or not all(map(math.isfinite, values)):
+        raise ValueError(f"{name} {tuple(values)} are not six finite numbers")
+    return ",".join(f"{value:.{digits}f}" for value in values)

@@ -1,0 +1,293 @@
+"""Packets of a microcontroller bridge (format D, hardware reference 2.6): this project's own.
+
+A packet is a header, a body and CRC-16/X-25 over both, all little-endian, stuffed by COBS and ended
+by 0. The slots travel verbatim, as in format A, so that parity, error words and absence stay
+visible to the host. ``encode`` is what the reference firmware does; it should send one zero first.
+
+    header   u8 version, u8 type, u8 source, u8 flags, u16 sequence, u32 device time [us]
+    HELLO    u8 fingers n, u16 slots per second, u8 slots per frame, n x (16 B serial, 4 B firmware)
+    SLOTS    u8 count k, u8 fingers n, k x (command byte, n x 2 bytes)
+    STATUS   u8 fingers n, n x u32 parity errors, u32 error words, u32 overruns
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from palpate_gateway.protocols.bridge_track import PacketTrack
+from palpate_gateway.protocols.can_slots import FINGERS_MAX
+from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.cobs import Packet, PacketSplitter, encode_packet
+from palpate_gateway.protocols.spi import printable_prefix
+
+VERSION = 1
+
+SLOTS_MAX = 255
+"""Slots that the count of a packet can tell; 22 to 44 are meant."""
+
+_HEADER = struct.Struct("<BBBBHI")
+_HELLO = struct.Struct("<BHB")
+_FINGER = struct.Struct("<16s4s")
+_SLOTS = struct.Struct("<BB")
+_CRC = struct.Struct("<H")
+_LONGEST = _HEADER.size + _SLOTS.size + SLOTS_MAX * (1 + 2 * FINGERS_MAX) + _CRC.size
+
+
+class PacketType(IntEnum):
+    """What the body of a packet is."""
+
+    HELLO = 1
+    SLOTS = 2
+    STATUS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Head of every packet.
+
+    Attributes:
+        source: Which bridge, 0..255.
+        flags: Not used yet, 0..255.
+        sequence: Number of the packet modulo 65536, counted for each source over all types.
+        device_time_us: Time of the first slot, or of sending where there is none, modulo 2**32.
+    """
+
+    source: int
+    flags: int
+    sequence: int
+    device_time_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Finger:
+    """Who a finger is: serial (up to 16 ASCII) and firmware (up to 4); empty if unknown."""
+
+    serial: str
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """What the bridge says of itself at start and every few seconds.
+
+    Attributes:
+        slot_rate_hz: Slots per second, 0..65535.
+        slots_per_frame: Slots after which the sequence begins again, 0..255.
+        fingers: The fingers in order of the ports, 1..5.
+    """
+
+    slot_rate_hz: int
+    slots_per_frame: int
+    fingers: tuple[Finger, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SlotGroup:
+    """Consecutive slots.
+
+    Attributes:
+        fingers: Words in each slot, 1..5.
+        payloads: Command byte and words as clocked from SPI; ``can_slots.SlotDecoder`` reads them.
+    """
+
+    fingers: int
+    payloads: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Counters of the bridge since its start, each modulo 2**32.
+
+    Attributes:
+        parity_errors: Words of wrong parity of each finger, 1..5 fingers.
+        error_words: Error words of all fingers.
+        overruns: Packets or slots that the bridge had to drop.
+    """
+
+    parity_errors: tuple[int, ...]
+    error_words: int
+    overruns: int
+
+
+Body = Hello | SlotGroup | Status
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeRecord:
+    """One good packet.
+
+    Attributes:
+        header: Its header, raw.
+        body: Its body.
+        lost_before: Packets of this source that are missing directly before.
+        epoch: Counts the starts of this source, and connections; times of two do not compare.
+        time_us: Unwrapped device time of this epoch [us].
+    """
+
+    header: Header
+    body: Body
+    lost_before: int
+    epoch: int
+    time_us: int
+
+
+def encode(header: Header, body: Body) -> bytes:
+    """A packet as it goes over the wire, with its delimiter.
+
+    Raises:
+        ValueError: A field does not fit; names it and its range.
+    """
+    kind, tail = _encode_body(body)
+    head = _HEADER.pack(
+        VERSION,
+        kind,
+        _within("source", header.source, 0xFF),
+        _within("flags", header.flags, 0xFF),
+        _within("sequence", header.sequence, 0xFFFF),
+        _within("device_time_us", header.device_time_us, 0xFFFFFFFF),
+    )
+    data = head + tail
+    return encode_packet(data + _CRC.pack(crc16_x25(data)))
+
+
+def _encode_body(body: Body) -> tuple[PacketType, bytes]:
+    if isinstance(body, Hello):
+        count = _within("fingers", len(body.fingers), FINGERS_MAX, least=1)
+        rate_hz = _within("slot_rate_hz", body.slot_rate_hz, 0xFFFF)
+        slots = _within("slots_per_frame", body.slots_per_frame, 0xFF)
+        fingers = [
+            _FINGER.pack(_text("serial", one.serial, 16), _text("firmware", one.firmware, 4))
+            for one in body.fingers
+        ]
+        return PacketType.HELLO, _HELLO.pack(count, rate_hz, slots) + b"".join(fingers)
+    if isinstance(body, SlotGroup):
+        count = _within("fingers", body.fingers, FINGERS_MAX, least=1)
+        slots = _within("number of payloads", len(body.payloads), SLOTS_MAX)
+        for payload in body.payloads:
+            _within("length of a payload", len(payload), 1 + 2 * count, least=1 + 2 * count)
+        return PacketType.SLOTS, _SLOTS.pack(slots, count) + b"".join(body.payloads)
+    count = _within("fingers", len(body.parity_errors), FINGERS_MAX, least=1)
+    counters = (*body.parity_errors, body.error_words, body.overruns)
+    for counter in counters:
+        _within("counter", counter, 0xFFFFFFFF)
+    return PacketType.STATUS, struct.pack(f"<B{count + 2}I", count, *counters)
+
+
+def _within(name: str, value: int, most: int, *, least: int = 0) -> int:
+    if not least <= value <= most:
+        raise ValueError(f"{name} {value} is not in {least}..{most}")
+    return value
+
+
+def _text(name: str, text: str, size: int) -> bytes:
+    if not text.isascii() or len(text) > size:
+        raise ValueError(f"{name} {text!r} is not 0..{size} ASCII characters")
+    return text.encode("ascii")
+
+
+def decode_body(kind: int, data: bytes) -> Body | None:
+    """The body of a packet; None if its type is unknown or its length or count of fingers wrong."""
+    if kind == PacketType.SLOTS and len(data) >= _SLOTS.size:
+        slots, count = _SLOTS.unpack_from(data)
+        size = 1 + 2 * count
+        if not 1 <= count <= FINGERS_MAX or len(data) != _SLOTS.size + slots * size:
+            return None
+        starts = range(_SLOTS.size, len(data), size)
+        return SlotGroup(count, tuple(data[at : at + size] for at in starts))
+    if kind == PacketType.HELLO and len(data) >= _HELLO.size:
+        count, rate_hz, slots = _HELLO.unpack_from(data)
+        if not 1 <= count <= FINGERS_MAX or len(data) != _HELLO.size + count * _FINGER.size:
+            return None
+        names = _FINGER.iter_unpack(data[_HELLO.size :])
+        fingers = tuple(Finger(printable_prefix(a), printable_prefix(b)) for a, b in names)
+        return Hello(rate_hz, slots, fingers)
+    if kind == PacketType.STATUS and data:
+        count = data[0]
+        if not 1 <= count <= FINGERS_MAX or len(data) != 1 + 4 * (count + 2):
+            return None
+        *parity_errors, error_words, overruns = struct.unpack_from(f"<{count + 2}I", data, 1)
+        return Status(tuple(parity_errors), error_words, overruns)
+    return None
+
+
+class BridgeDecoder:
+    """Good packets out of a stream, with what is missing between them.
+
+    Bytes of the returned packets, ``counters["junk_bytes"]`` and ``pending`` are all bytes fed. The
+    slots of damaged packets are not guessed.
+    """
+
+    def __init__(self) -> None:
+        self._splitter = PacketSplitter(_LONGEST)
+        self._tracks: dict[int, PacketTrack] = {}
+        self._epochs: dict[int, int] = {}
+        self.counters = self._splitter.counters
+        self.counters |= dict.fromkeys(
+            ("packets", "short_packets", "crc_errors", "unknown_versions", "unknown_types"), 0
+        )
+        self.counters |= dict.fromkeys(
+            ("bad_bodies", "lost_packets", "repeated_packets", "restarts"), 0
+        )
+
+    @property
+    def pending(self) -> int:
+        """Bytes of the packet that has begun."""
+        return self._splitter.pending
+
+    def reset(self) -> None:
+        """The connection is new: nothing is known of the bridges behind it."""
+        self._splitter.reset()
+        self._tracks.clear()
+
+    def feed(self, data: bytes) -> list[BridgeRecord]:
+        """Take bytes as they come; return the packets that are now whole."""
+        records = []
+        for packet in self._splitter.feed(data):
+            record = self._record(packet)
+            if record is None:
+                self.counters["junk_bytes"] += packet.wire_bytes
+            else:
+                records.append(record)
+        self.counters["packets"] += len(records)
+        return records
+
+    def _record(self, packet: Packet) -> BridgeRecord | None:
+        data = packet.data[: -_CRC.size]
+        flaw = ""
+        if len(data) < _HEADER.size:
+            flaw = "short_packets"
+        elif _CRC.pack(crc16_x25(data)) != packet.data[-_CRC.size :]:
+            flaw = "crc_errors"
+        if flaw:
+            self.counters[flaw] += not packet.first
+            return None
+        version, kind, source, flags, sequence, time_us = _HEADER.unpack_from(data)
+        if version != VERSION:
+            self.counters["unknown_versions"] += 1
+            return None
+        header = Header(source, flags, sequence, time_us)
+        body = decode_body(kind, data[_HEADER.size :])
+        lost = self._follow(header, hello=kind == PacketType.HELLO)
+        if lost is None:
+            self.counters["repeated_packets"] += 1
+            return None
+        self.counters["lost_packets"] += lost
+        if body is None:
+            known = kind in PacketType.__members__.values()
+            self.counters["bad_bodies" if known else "unknown_types"] += 1
+            return None
+        time_us = self._tracks[source].time_us
+        return BridgeRecord(header, body, lost, self._epochs[source], time_us)
+
+    def _follow(self, header: Header, *, hello: bool) -> int | None:
+        """How many packets are missing before this one; None if it is a repetition."""
+        sequence, time_us = header.sequence, header.device_time_us
+        track = self._tracks.get(header.source)
+        if track is not None and not track.has_restarted(sequence, time_us, hello=hello):
+            return track.follow(sequence, time_us)
+        self.counters["restarts"] += track is not None
+        self._tracks[header.source] = PacketTrack(sequence, time_us)
+        self._epochs[header.source] = self._epochs.get(header.source, -1) + 1
+        return 0

@@ -1,0 +1,291 @@
+"""The place of slots that carry no number, from the order of their channels and their stamps.
+
+A slot is known by its channel, PAC by standing between the others. A frame ends where the cycle of
+channels begins again (hardware reference 2.1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.protocols.can_slots import SlotOrder, learn_order
+from palpate_gateway.protocols.places import Floats, Ints, Place, Places
+from palpate_gateway.protocols.silences import Silences
+
+_LEARNT_FROM = 128
+"""Slots in a row that must repeat before their order is believed: two cycles of up to 64."""
+
+_SCATTER_S = 2e-3
+"""No stamp is too early by more than this [s]."""
+
+
+class SlotClock:
+    """Gives slots without numbers their frame, position and time.
+
+    The position follows from the order of the channels; PAC is taken for the next one until a
+    channel with one place says better. How many whole frames are gone follows from the stamps, see
+    ``Silences``; where that has to be waited for, the times of four frames are early.
+
+    Slots before the first whole frame, and before the sequence is known, are not placed.
+    ``counters["lost_frames"]`` counts whole cycles, ``counters["lost_slots"]`` the slots beside.
+
+    Args:
+        slot_rate_hz: Slots per second of the sender's clock; if it is wrong by many percent, a
+            silence is misjudged: compare ``measured_rate_hz``.
+        sequence: Channels of a frame in order; None learns them from the stream, E1 first.
+        exact: The stamps are the sender's own times of sampling, so that they tell every loss at
+            once; ``reset`` when its clock begins anew.
+    """
+
+    def __init__(
+        self,
+        *,
+        slot_rate_hz: float = ch.SLOT_RATE_HZ,
+        sequence: Sequence[int] | None = None,
+        exact: bool = False,
+    ) -> None:
+        if not (math.isfinite(slot_rate_hz) and slot_rate_hz > 0):
+            raise ValueError(f"slot rate {slot_rate_hz} Hz is not positive")
+        self._period_s = 1.0 / slot_rate_hz
+        self._exact = exact
+        self._learns = sequence is None
+        self._order = None if sequence is None else SlotOrder(sequence)
+        self._seen: deque[int] = deque(maxlen=_LEARNT_FROM)
+        self._doubt = self._learns
+        self._run = -1
+        self._base = 0  # number of the first frame of this run
+        self._resume_s: float | None = None  # end of the last frame of the run before
+        self._silences: Silences | None = None  # none between two runs
+        self._origin_s = 0.0  # time of index 0, the first slot of the first frame
+        self._begun = (0, 0.0)  # index and stamp
+        self._index = 0  # of the last slot, with lost ones
+        self._last_s = 0.0
+        self._sure = (0, 0.0)  # index and stamp of the last slot whose channel has one place
+        self._since = 0  # slots after it
+        self._frame = 0  # of the last slot that was placed, in this run
+        self.counters: dict[str, int] = dict.fromkeys(
+            ("placed", "unplaced", "foreign", "late", "lost_slots", "lost_frames"), 0
+        )
+
+    @property
+    def sequence(self) -> tuple[int, ...]:
+        """Channels of a frame in order; empty while they are being learnt."""
+        return () if self._order is None else self._order.channels
+
+    @property
+    def measured_rate_hz(self) -> float | None:
+        """Slots per second of the stamps in this run; None in its first second."""
+        index, stamp_s = self._begun
+        if self._silences is None or self._last_s - stamp_s < 1.0:
+            return None
+        return (self._index - index) / (self._last_s - stamp_s)
+
+    def place(self, channel: int, stamp_s: float) -> Place | None:
+        """Place the next slot; None if it has no place.
+
+        Args:
+            channel: Its channel index.
+            stamp_s: When it came [s], by a clock without steps.
+        """
+        self._learn(channel)
+        order = self._order
+        if order is None:
+            self.counters["unplaced"] += 1
+            return None
+        if channel not in order.channels:
+            self.counters["foreign"] += 1
+            self._begin_doubt()
+            return None
+        if self._silences is None:
+            if channel in order.anchors:
+                self._begin(order, order.anchors[channel], stamp_s)
+        elif not self._advance(order, self._silences, channel, stamp_s):
+            self.counters["late"] += 1
+            return None
+        if self._silences is None or self._index < 0:
+            self.counters["unplaced"] += 1
+            return None
+        frame, position = divmod(self._index, order.size)
+        if frame < self._frame:  # PAC had run ahead over the edge
+            self.counters["late"] += 1
+            return None
+        self._frame = frame
+        self.counters["placed"] += 1
+        time_s = stamp_s if self._exact else self._time_s(self._index)
+        return Place(self._run, self._base + frame, position, time_s)
+
+    def place_all(self, channels: Ints, stamps_s: Floats) -> Places:
+        """Place slots, leaving out what has no place: the same as one by one, and faster.
+
+        Args:
+            channels: Their channel indices, int64, shape ``(N,)``.
+            stamps_s: When they came [s], shape ``(N,)``.
+        """
+        if len(channels) and (steady := self._steady(channels, stamps_s)) is not None:
+            return steady
+        stamped = zip(channels.tolist(), stamps_s.tolist(), strict=True)
+        places = [self.place(*slot) for slot in stamped]
+        kept = [number for number, place in enumerate(places) if place is not None]
+        told = [(p.run, p.frame, p.position) for p in places if p is not None]
+        run, frame, position = np.array(told, np.int64).reshape(-1, 3).T
+        times = np.array([p.time_s for p in places if p is not None], np.float64)
+        return Places(np.array(kept, np.int64), run, frame, position, times)
+
+    def _steady(self, channels: Ints, stamps_s: Floats) -> Places | None:
+        """Places of slots that are just the next ones, in order and in time; None if they are not.
+
+        One by one a slot costs 10 us; a hand brings 8800 a second.
+        """
+        order, silences = self._order, self._silences
+        if order is None or silences is None or self._doubt or self._index < 0:
+            return None
+        if self._index != self._sure[0] + self._since:  # PAC has run ahead
+            return None
+        size, number = order.size, len(channels)
+        if (self._index + 1) // size < self._frame:  # and had run ahead over the edge
+            return None
+        index = np.arange(self._index + 1, self._index + 1 + number)
+        position = index % size
+        if not np.array_equal(channels, order.cycle[position]):
+            return None
+        times_s: Floats
+        if self._exact:
+            expected_s = self._last_s + (index - self._index) * self._period_s
+            if np.abs(stamps_s - expected_s).max() > 0.25 * self._period_s:
+                return None
+            times_s = stamps_s
+        else:
+            times_s = self._origin_s + index.astype(np.float64) * self._period_s
+            if not silences.pass_over(stamps_s, stamps_s - times_s):
+                return None
+        if self._learns:
+            self._seen.extend(channels.tolist())
+        self._index = int(index[-1])
+        self._last_s = float(stamps_s[-1])
+        sure = np.flatnonzero(order.is_anchor[position])
+        if len(sure):
+            last = int(sure[-1])
+            self._sure = (int(index[last]), float(stamps_s[last]))
+            self._since = number - 1 - last
+        else:
+            self._since += number
+        frame = index // size
+        self._frame = int(frame[-1])
+        self.counters["placed"] += number
+        run = np.full(number, self._run)
+        return Places(np.arange(number), run, self._base + frame, position, times_s)
+
+    def reset(self) -> None:
+        """The connection is new: a new run begins, and a learnt sequence is learnt again."""
+        self._end_run()
+        if self._learns:
+            self._order = None
+            self._doubt = True
+            self._seen.clear()
+
+    def _time_s(self, index: int) -> float:
+        return self._origin_s + index * self._period_s
+
+    def _learn(self, channel: int) -> None:
+        self._seen.append(channel)
+        if not self._doubt or len(self._seen) < _LEARNT_FROM:
+            return
+        order = learn_order(tuple(self._seen))
+        if order is None:
+            # To compare again with each further slot would take more time than there is.
+            for _ in range(_LEARNT_FROM // 2):
+                self._seen.popleft()
+            return
+        self._doubt = False
+        if self._order is None or order.channels != self._order.channels:
+            self._end_run()
+            self._order = order
+
+    def _begin_doubt(self) -> None:
+        """The order may have changed: 128 slots from here on say whether it has."""
+        if self._learns and not self._doubt:
+            self._doubt = True
+            self._seen.clear()
+
+    def _begin(self, order: SlotOrder, position: int, stamp_s: float) -> None:
+        frame_s = order.size * self._period_s
+        # What is left of the frame that has begun stands before index 0 and is not placed.
+        self._index = position - order.size if position else 0
+        self._origin_s = stamp_s - self._index * self._period_s
+        self._begun = self._sure = (self._index, stamp_s)
+        self._last_s = stamp_s
+        self._since = 0
+        self._frame = 0
+        self._silences = Silences(frame_s, stamp_s)
+        self._run += 1
+        if self._resume_s is not None:
+            missed = math.floor((self._origin_s - self._resume_s) / frame_s + 0.5)
+            self.counters["lost_frames"] += max(missed, 0)
+            self._base += max(missed, 0)
+
+    def _end_run(self) -> None:
+        if self._order is not None and self._silences is not None and self._index >= 0:
+            # PAC may have run ahead over the edge, and what came then is placed.
+            frames = max(self._index // self._order.size, self._frame) + 1
+            self._base += frames
+            rest = frames * self._order.size - self._index
+            begun_s = self._last_s if self._exact else self._time_s(self._index)
+            self._resume_s = begun_s + rest * self._period_s
+        self._silences = None
+
+    def _advance(self, order: SlotOrder, silences: Silences, channel: int, stamp_s: float) -> bool:
+        """Go on to the next slot; False if it is a past one."""
+        anchored = channel in order.anchors
+        target = self._target(order, channel, stamp_s)
+        if not self._exact and self._is_early(order, silences, target, stamp_s):
+            return False
+        missing = 0
+        if anchored:
+            missing = max(target - self._sure[0] - 1 - self._since, 0)
+            self._sure = (target, stamp_s)
+            self._since = 0
+        else:
+            self._since += 1
+        before, self._index, self._last_s = self._index, target, stamp_s
+        frames, slots = divmod(missing, order.size) if self._exact else (0, missing)
+        if not self._exact:
+            certain = target == self._sure[0] + self._since
+            frames, shift_s = silences.judge(
+                stamp_s,
+                stamp_s - self._time_s(target),
+                broken=slots > 0,
+                edge=certain and target // order.size > before // order.size,
+            )
+            self._origin_s += shift_s
+            self._index += frames * order.size
+            self._sure = (self._sure[0] + frames * order.size, self._sure[1])
+        self.counters["lost_frames"] += frames
+        self.counters["lost_slots"] += slots
+        if slots > 0:
+            self._begin_doubt()
+        return True
+
+    def _target(self, order: SlotOrder, channel: int, stamp_s: float) -> int:
+        """Index that the slot seems to have."""
+        size = order.size
+        anchored = channel in order.anchors
+        index, last_s = self._sure if anchored else (self._index, self._last_s)
+        if self._exact:
+            expected = (stamp_s - last_s) / self._period_s
+            return index + order.steps_near(index % size, channel, expected)
+        target = index + order.steps(index % size, channel)
+        ahead = self._index - target
+        # PAC may have run ahead, by a repetition or else by more than half a frame.
+        return target + (ahead + size // 2) // size * size if ahead >= 0 else target
+
+    def _is_early(self, order: SlotOrder, silences: Silences, target: int, stamp_s: float) -> bool:
+        """Whether a slot comes too early for its place far ahead, so that it is a past one."""
+        if 2 * (target - self._index) <= max(order.size, 2):
+            return False
+        leeway_s = max(order.size * self._period_s / 2, _SCATTER_S)
+        return stamp_s - self._time_s(target) < silences.usual_s - leeway_s

@@ -1,0 +1,298 @@
+"""Replay of a vendor text log (SynTouch GUI or Cheetah library), plain or gzip, as a device.
+
+The file is streamed. Damage is reported with its line, after every whole frame before it has been
+delivered. Slots with a bad parity flag make their channel invalid and are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from palpate.config import StrictConfig
+from palpate.errors import ConfigError, RecordingError
+from palpate.messages import Origin, SensorType
+from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading, Reading
+from palpate_gateway.recordings.text_log_bytes import LineBlocks
+from palpate_gateway.recordings.text_log_header import LogHeader, split_header
+from palpate_gateway.recordings.text_log_rows import count_columns, parse_rows
+
+
+class TextLogOptions(StrictConfig):
+    """Options of the ``text_log`` driver.
+
+    Attributes:
+        path: The log, plain or gzip.
+        port: Port of the finger, from 1; 0 = the only one that carries data.
+        serial: Serial number to publish; empty = the header's.
+    """
+
+    path: Path
+    port: int = Field(default=0, ge=0, le=5)
+    serial: str = ""
+
+
+class TextLogReader:
+    """Slots of one finger of a log.
+
+    Args:
+        path: The log.
+        port: Port of the finger, from 1; 0 = the only one that carries data.
+        block_bytes: Least size of the blocks it is read in [bytes].
+
+    Raises:
+        RecordingError: The file cannot be read, is empty, or is not a log of a BioTac with 19
+            electrodes or 24; or the port carries no data.
+        ConfigError: Several ports carry data and none was chosen.
+    """
+
+    def __init__(self, path: Path, *, port: int = 0, block_bytes: int = 1 << 18) -> None:
+        self.path = path
+        self.damage: RecordingError | None = None
+        """Why the rows ended early, if they did; set when ``blocks`` is exhausted."""
+        self._lines = LineBlocks(path, block_bytes=block_bytes)
+        self._blocks = iter(self._lines)
+        first = next(self._blocks, b"") or self._lines.unfinished
+        if not first:
+            raise self._lines.damage or RecordingError(
+                f"{path}: the file is empty", remedy="record or copy the log again"
+            )
+        self.header, offset = split_header(str(path), first)
+        self._line = 1 + self.header.lines
+        rows = first[offset:]
+        # A header may fill the first block, and the only row may lack its line end.
+        rows = rows or next(self._blocks, b"") or self._lines.unfinished
+        if not rows.strip():
+            raise self._lines.damage or RecordingError(
+                f"{path}: the log has a header and no rows", remedy="record or copy it again"
+            )
+        self._columns = count_columns(str(path), rows.split(b"\n", 1)[0], self._line)
+        self._ports = (self._columns - 4) // 2
+        self._slots_before = 0
+        self._frame_before: int | None = None
+        self._pending = self._parse(rows) if rows.endswith(b"\n") else self._end()
+        if not len(self._pending):
+            raise self.damage or RecordingError(
+                f"{path}: the log has no rows", remedy="record or copy it again"
+            )
+        self._rebuild_time = len(self._pending) > 1 and not self._pending[:, 0].any()
+        self.port = self._choose_port(port)
+        self.sensor_type = self._find_type()
+        """Kind of sensor, by the channels that were sampled."""
+
+    @property
+    def slot_period_s(self) -> float:
+        """Time between two slots [s]."""
+        return 1.0 / self.header.sample_rate_hz
+
+    @property
+    def timed(self) -> bool:
+        """Whether the log tells times; else they are made by counting slots."""
+        return not self._rebuild_time
+
+    def blocks(self) -> Iterator[SlotBlock]:
+        """Slots in order; afterwards ``damage`` says whether the log was whole."""
+        if len(self._pending):
+            yield self._slots(self._pending)
+        while self.damage is None:
+            data = next(self._blocks, None)
+            if data is None:
+                break
+            table = self._parse(data)
+            if len(table):
+                yield self._slots(table)
+        if self.damage is None:
+            table = self._end()
+            if len(table):
+                yield self._slots(table)
+
+    def _parse(self, data: bytes) -> npt.NDArray[np.float64]:
+        rows = parse_rows(str(self.path), data, self._columns, self._line)
+        self._line += data.count(b"\n")
+        self.damage = rows.damage
+        return rows.table
+
+    def _end(self) -> npt.NDArray[np.float64]:
+        """The last line where it has no line end, and what the end of the file says."""
+        nothing = np.empty((0, self._columns))
+        rest, self._lines.unfinished = self._lines.unfinished, b""
+        self.damage = self._lines.damage
+        if self.damage is not None or not rest.strip():
+            return nothing
+        # The last column is one digit, so a line with all its columns is whole.
+        if len(rest.split()) == self._columns:
+            return self._parse(rest + b"\n")
+        shown = rest[:40].decode("latin-1")
+        self.damage = RecordingError(
+            f"{self.path}, line {self._line}: the last line is cut: {shown!r}",
+            remedy="the log is truncated; copy it again from its source (all whole frames before "
+            "the cut were delivered)",
+        )
+        return nothing
+
+    def _slots(self, table: npt.NDArray[np.float64]) -> SlotBlock:
+        frame = table[:, 2].astype(np.int64)
+        time_s = table[:, 0]
+        if self._rebuild_time:
+            time_s = self._rebuilt_time(frame)
+        column = 4 + 2 * (self.port - 1)
+        return SlotBlock(
+            channel=table[:, 3].astype(np.int64),
+            value=table[:, column].astype(np.uint16),
+            good=table[:, column + 1] == 0,
+            time_s=time_s,
+            batch=table[:, 1].astype(np.int64),
+            frame=frame,
+            position=np.full(len(table), UNKNOWN, np.int64),
+        )
+
+    def _rebuilt_time(self, frame: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        """Times on the slot grid, with room for the frames that the counter says are missing."""
+        before = frame[0] if self._frame_before is None else self._frame_before
+        missing = np.maximum(np.diff(frame, prepend=before) - 1, 0)
+        index = self._slots_before + np.arange(len(frame))
+        index = index + self.sensor_type.layout.slots * np.cumsum(missing)
+        self._slots_before = int(index[-1]) + 1
+        self._frame_before = int(frame[-1])
+        return np.asarray(index * self.slot_period_s, np.float64)
+
+    def _choose_port(self, port: int) -> int:
+        good = [p + 1 for p in range(self._ports) if (self._pending[:, 5 + 2 * p] == 0).any()]
+        carrying = ", ".join(map(str, good)) or "none"
+        if port > self._ports:
+            raise RecordingError(
+                f"{self.path}: the log has no port {port}, it has {self._ports}",
+                remedy=f"ports that carry data: {carrying}",
+            )
+        if port and port not in good:
+            raise RecordingError(
+                f"{self.path}: every slot of port {port} has wrong parity, so no sensor was there",
+                remedy=f"ports that carry data: {carrying}",
+            )
+        if not good:
+            raise RecordingError(
+                f"{self.path}: every slot of all {self._ports} ports has wrong parity",
+                remedy="no sensor was connected when this log was recorded; record it again",
+            )
+        if not port and len(good) > 1:
+            raise ConfigError(
+                f"{self.path}: {len(good)} fingers are in this log, at ports {carrying}",
+                remedy="choose one with the option port",
+            )
+        return port or good[0]
+
+    def _find_type(self) -> SensorType:
+        """Judge the number of electrodes by the rows: neither header nor serial tells it.
+
+        The public capture has a serial that starts with BTSP (24 electrodes) and the 19-electrode
+        layout, so the layout decides what kind of sensor it is.
+        """
+        counters = self._pending[:, 1:3]
+        frames = 1 + int(np.count_nonzero((np.diff(counters, axis=0) != 0).any(axis=1)))
+        seen = {int(c) for c in np.unique(self._pending[:, 3]) if c >= ch.FIRST_ELECTRODE}
+        last = max(seen, default=0)
+        kind = SensorType.BIOTAC
+        if last >= ch.FIRST_ELECTRODE + ch.ELECTRODES:
+            kind = SensorType.BIOTAC_SP
+        if frames == 1 and len(self._pending) < kind.layout.slots:
+            return kind  # cut inside its first frame, which is reported as such
+        wanted = {c for c in ch.channels_of(kind.layout) if c >= ch.FIRST_ELECTRODE}
+        if seen == wanted:
+            return kind
+        absent = ", ".join(ch.channel_name(c) for c in sorted(wanted - seen))
+        raise RecordingError(
+            f"{self.path}: the log has {len(seen)} electrodes, not {len(wanted)} ({absent} never "
+            f"occur in its first {frames} frames)",
+            remedy="palpate reads logs of BioTacs sampled with all 19 electrodes, and of BioTacs "
+            "SP with all 24; record with the full sequence of 44 or 54 slots",
+        )
+
+
+class TextLog(Device):
+    """A vendor text log as a finite device; it delivers as fast as it is read."""
+
+    options_class = TextLogOptions
+
+    def __init__(self, options: TextLogOptions) -> None:
+        super().__init__(
+            DeviceInfo(
+                driver="text_log",
+                sensor_type=SensorType.BIOTAC,
+                model=f"vendor text log {options.path.name}",
+                rate_hz=ch.frame_rate_hz(SensorType.BIOTAC.layout),
+                live=False,
+                finite=True,
+                origin=Origin.REPLAYED,
+            )
+        )
+        self._options = options
+        self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)
+        self._reader: TextLogReader | None = None
+        self._blocks: Iterator[SlotBlock] = iter(())
+
+    @property
+    def header(self) -> LogHeader:
+        """The header of the open log."""
+        _ = self.identity
+        return LogHeader() if self._reader is None else self._reader.header
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Counters of the assembler, and parity errors by channel where there are any."""
+        by_channel = {
+            f"parity_errors_{name.lower().replace(' ', '_')}": count
+            for name, count in self._assembler.parity_errors_by_channel.items()
+        }
+        return self._assembler.counters | by_channel
+
+    def _open(self) -> DeviceIdentity:
+        reader = TextLogReader(self._options.path, port=self._options.port)
+        self._reader = reader
+        self._assembler = FrameAssembler(
+            reader.slot_period_s, reader.sensor_type.layout, timed=reader.timed
+        )
+        self._blocks = reader.blocks()
+        return DeviceIdentity(
+            serial=self._options.serial
+            or reader.header.serial(reader.port)
+            or f"unknown-port{reader.port}",
+            slot_period_s=reader.slot_period_s,
+            start_wall_ns=reader.header.started_wall_ns,
+            sensor_type=reader.sensor_type,
+        )
+
+    def _close(self) -> None:
+        self._reader = None
+        self._blocks = iter(())
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        for block in self._blocks:
+            frames = self._assembler.push(block)
+            if frames:
+                return list(frames)
+        return list(self._last_frames())
+
+    def _last_frames(self) -> list[ElectrodeReading]:
+        """What is left at the end of the file; damage is raised once, then the source has ended."""
+        if self._reader is None:
+            return []
+        damage, self._reader.damage = self._reader.damage, None
+        if damage is None and self._assembler.ends_inside_frame:
+            damage = RecordingError(
+                f"{self._options.path}: the log ends inside a frame, after "
+                f"{self._assembler.pending_slots} slots",
+                remedy="the log is truncated; copy it again from its source (all whole frames "
+                "before the cut were delivered)",
+            )
+        if damage is not None:
+            self._assembler.discard_pending()
+            raise damage
+        return self._assembler.finish()

@@ -1,0 +1,131 @@
+"""What a sensor's thread tells of it: its state, its faults, refused tares; each once."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from palpate.errors import DeviceError, DeviceTimeout, PalpateError
+from palpate.health import Health
+from palpate.messages import ChannelFault, FaultKind, SensorState
+from palpate_gateway.condition.channel_health import REMEDIES, describe
+from palpate_gateway.condition.condition import Condition
+
+_log = logging.getLogger(__name__)
+
+_LOOK_S = 0.2
+"""The condition is judged anew as often [s]."""
+
+_LOG_AGAIN_S = 60.0
+"""A sensor that stays away is logged again after this time [s]: attempts follow closely."""
+
+_FORCES_OFF = "when nothing touches the BioTac, take its zero again: palpate tare {name}"
+
+
+class SensorReport:
+    """Tells ``Health`` how a sensor does; belongs to one thread.
+
+    Args:
+        name: The sensor's name.
+        health: Told.
+    """
+
+    def __init__(self, name: str, health: Health) -> None:
+        self._name, self._health = name, health
+        self._state = SensorState.UNKNOWN
+        self._looked_s = 0.0
+        self._told_faults: frozenset[tuple[FaultKind, str]] = frozenset()
+        self._zero_lost = False
+        self._refused = False
+        self._lost_by, self._log_again_s = "", 0.0
+        self.untrue = False
+        """Whether it delivers what is not so: dead or stuck channels, forces without their zero."""
+
+    def starts(self) -> None:
+        """It is about to be opened."""
+        self._tell(SensorState.STARTING)
+
+    def delivers(self, condition: Condition | None, *, zero_lost: bool) -> None:
+        """Readings were published."""
+        now_s = time.monotonic()
+        back = self._state in (SensorState.STARTING, SensorState.LOST)
+        if not back and now_s - self._looked_s < _LOOK_S:
+            return
+        self._looked_s = now_s
+        self._lost_by = ""
+        faults = () if condition is None else condition.faults
+        message = "" if condition is None else condition.message
+        self.untrue = zero_lost or (condition is not None and condition.untrue)
+        if zero_lost:
+            state = SensorState.ZERO_LOST
+            message = "it was opened again: the zero that it had may be gone"
+        elif condition is not None and condition.warming:
+            state = SensorState.WARMING
+        else:
+            state = SensorState.LIVE
+        self._tell(state, faults, message)
+        self._tell_faults(faults)
+        self._tell_zero(zero_lost=zero_lost)
+
+    def is_silent(self, silent_s: float) -> None:
+        """Nothing comes."""
+        error = DeviceTimeout(
+            f"sensor {self._name!r} is lost: silent for {1e3 * silent_s:.0f} ms",
+            remedy="check its power and cable; it is read on by itself",
+        )
+        self._tell(SensorState.LOST, message=f"silent for {1e3 * silent_s:.0f} ms")
+        self._health.fail(error)
+
+    def is_lost(self, error: DeviceError, backoff_s: float) -> None:
+        """It is gone, or cannot be opened."""
+        self._tell(SensorState.LOST, message=error.problem)
+        self._health.fail(error)
+        now_s = time.monotonic()
+        if error.problem != self._lost_by or now_s >= self._log_again_s:
+            self._lost_by, self._log_again_s = error.problem, now_s + _LOG_AGAIN_S
+            _log.warning("sensor %s lost, open again in %.1f s: %s", self._name, backoff_s, error)
+
+    def ended(self, error: PalpateError | None) -> None:
+        """It will deliver no more."""
+        self._tell(SensorState.ENDED, message="" if error is None else error.problem)
+        if error is not None:
+            self._health.fail(error)
+            _log.error("sensor %s: %s", self._name, error)
+
+    def tare_refused(self, error: DeviceError | None) -> None:
+        """Why the last attempt to tare failed; None = there was none, or it succeeded."""
+        if error is None:
+            self._refused = False
+        elif not self._refused:
+            self._refused = True
+            self._health.fail(error, degraded=False)
+            _log.warning("sensor %s: %s", self._name, error)
+
+    def _tell(
+        self, state: SensorState, faults: tuple[ChannelFault, ...] = (), message: str = ""
+    ) -> None:
+        self._state = state
+        self._health.set_sensor_state(self._name, state, faults=faults, message=message)
+
+    def _tell_faults(self, faults: tuple[ChannelFault, ...]) -> None:
+        """Saturation comes and goes with the load: its counter and the state tell enough."""
+        present = frozenset((fault.kind, name) for fault in faults for name in fault.channels)
+        new = {kind for kind, _ in present - self._told_faults} - {FaultKind.SATURATED}
+        self._told_faults = present
+        for fault in faults:
+            if fault.kind in new:
+                error = DeviceError(
+                    f"sensor {self._name!r}: {describe([fault])}", remedy=REMEDIES[fault.kind]
+                )
+                self._health.fail(error, degraded=fault.kind is not FaultKind.ODD)
+                _log.warning("%s", error)
+
+    def _tell_zero(self, *, zero_lost: bool) -> None:
+        if zero_lost and not self._zero_lost:
+            error = DeviceError(
+                f"sensor {self._name!r} was opened again: the zero that it had may be gone",
+                remedy=_FORCES_OFF.format(name=self._name),
+            )
+            self._health.fail(error)
+            _log.warning("%s", error)
+        self._zero_lost = zero_lost

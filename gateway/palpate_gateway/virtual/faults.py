@@ -1,0 +1,195 @@
+"""What goes wrong with a finger, on demand: faults as they show on a real one's wire.
+
+A fault acts on finished readings, so the finger itself goes on: what is lost is lost, and the truth
+(wrench, pose, field) stays true. Times count from the opening of the device; a restart does not
+stop them.
+
+========= =========================================== ==================================
+kind      what is seen                                ``value``
+========= =========================================== ==================================
+stuck     electrodes repeat what they last read
+saturated electrodes read 4095
+dead      electrodes read 0
+invalid   parity errors: one bit wrong, validity off
+noise     more noise on electrodes                    standard deviation [counts], 50
+jump      electrodes read a constant more             that constant [counts], 100
+lost      electrode frames are lost                   share of them, 1
+silence   nothing comes; ``read`` times out
+restart   ``DeviceLost``; opened again, the device
+          counts from 0 and the play goes on
+========= =========================================== ==================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from palpate.config import StrictConfig
+from palpate.messages import COUNTS_MAX
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading, Reading
+
+Kind = Literal[
+    "stuck", "saturated", "dead", "invalid", "noise", "jump", "lost", "silence", "restart"
+]
+
+_VALUES = {"noise": 50.0, "jump": 100.0, "lost": 1.0}
+_WHOLE_DEVICE = ("lost", "silence", "restart")
+_ADC_BITS = 12
+
+
+class Fault(StrictConfig):
+    """One fault.
+
+    Attributes:
+        kind: What happens; see the table above.
+        at_s: When it begins, from the opening of the device [s].
+        for_s: How long it lasts [s]; 0 = for ever. Of a restart: how long the device is away, 0 =
+            it is back at once.
+        electrode: Which electrode, 1..19; None = all 19.
+        value: Size; None = the one of the table.
+    """
+
+    kind: Kind
+    at_s: float = Field(ge=0.0)
+    for_s: float = Field(default=0.0, ge=0.0)
+    electrode: int | None = Field(default=None, ge=1, le=ch.ELECTRODES)
+    value: float | None = Field(default=None, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Fault:
+        if self.electrode is not None and self.kind in _WHOLE_DEVICE:
+            raise ValueError(
+                f"a fault {self.kind!r} has no electrode: it concerns the whole device"
+            )
+        if self.value is not None:
+            if self.kind not in _VALUES:
+                raise ValueError(f"a fault {self.kind!r} has no value")
+            if self.value < 0.0 and self.kind != "jump":
+                raise ValueError(f"the value of a fault {self.kind!r} is not negative")
+            if self.value > 1.0 and self.kind == "lost":
+                raise ValueError("the value of a fault 'lost' is a share, 0 to 1")
+        return self
+
+
+class _Acting:
+    """One fault as it goes along."""
+
+    def __init__(self, fault: Fault, rate_hz: float, seed: list[int]) -> None:
+        self.kind = fault.kind
+        self.first = math.ceil(fault.at_s * rate_hz - 1e-6)
+        frames = max(1, round(fault.for_s * rate_hz)) if fault.for_s else None
+        self.end = math.inf if frames is None else self.first + frames
+        self.away = frames or 0
+        self.random = np.random.default_rng(seed)
+        self.value = _VALUES.get(fault.kind, 0.0) if fault.value is None else fault.value
+        self._which = (
+            slice(None) if fault.electrode is None else slice(fault.electrode - 1, fault.electrode)
+        )
+        self._held: npt.NDArray[np.uint16] | None = None
+
+    def on(self, tick: int) -> bool:
+        return self.first <= tick < self.end
+
+    def change(self, reading: ElectrodeReading) -> ElectrodeReading:
+        """The reading with this fault of its electrodes."""
+        counts = reading.electrodes.copy()
+        part = counts[self._which]  # a view
+        validity = reading.validity
+        if self.kind == "stuck":
+            if self._held is None:
+                self._held = part.copy()
+            part[:] = self._held
+        elif self.kind == "saturated":
+            part[:] = COUNTS_MAX
+        elif self.kind == "dead":
+            part[:] = 0
+        elif self.kind == "invalid":
+            flipped = self.random.integers(_ADC_BITS, size=len(part))
+            part ^= np.left_shift(1, flipped).astype(np.uint16)
+            for bit in range(ch.ELECTRODES)[self._which]:
+                validity &= ~(1 << bit)
+        else:
+            more = (
+                self.random.normal(0.0, self.value, len(part))
+                if self.kind == "noise"
+                else self.value
+            )
+            part[:] = np.clip(np.rint(part + more), 0, COUNTS_MAX)
+        return replace(reading, electrodes=counts, validity=validity)
+
+
+class FaultLine:
+    """All faults of one run; takes the readings in order of time.
+
+    Args:
+        faults: The faults; on one frame they act in this order.
+        rate_hz: Frames per second [Hz].
+        seed: Of what is random in them.
+    """
+
+    def __init__(self, faults: Sequence[Fault], rate_hz: float, seed: int) -> None:
+        acting = [_Acting(fault, rate_hz, [seed, 4, k]) for k, fault in enumerate(faults)]
+        self._restarts = [one for one in acting if one.kind == "restart"]
+        self._silences = [one for one in acting if one.kind == "silence"]
+        self._others = [one for one in acting if one.kind not in ("restart", "silence")]
+        self.counters = {f"fault_{fault.kind}_frames": 0 for fault in faults}
+        """Frames that each kind of fault has touched; a restart counts once."""
+        if any(one.kind == "invalid" for one in acting):
+            self.counters["parity_errors"] = 0
+
+    def clear_counters(self) -> None:
+        """Count from 0 again, as a device that was opened again does."""
+        self.counters = dict.fromkeys(self.counters, 0)
+
+    def restart(self, tick: int) -> int | None:
+        """Whether the device restarts at this frame: frames it is then away, or None."""
+        for one in self._restarts:
+            if tick >= one.first:
+                self._restarts.remove(one)
+                self.counters["fault_restart_frames"] += 1
+                return one.away
+        return None
+
+    def silent(self, tick: int) -> bool:
+        """Whether nothing comes at this frame."""
+        if any(one.on(tick) for one in self._silences):
+            self.counters["fault_silence_frames"] += 1
+            return True
+        return False
+
+    def apply(self, tick: int, group: tuple[Reading, ...]) -> tuple[Reading, ...]:
+        """The readings of one instant as they come out; lost electrodes are left out."""
+        now = [one for one in self._others if one.on(tick)]
+        if not now:
+            return group
+        out: list[Reading] = []
+        for reading in group:
+            changed = (
+                self._changed(reading, now) if isinstance(reading, ElectrodeReading) else reading
+            )
+            if changed is not None:
+                out.append(changed)
+        return tuple(out)
+
+    def _changed(self, reading: ElectrodeReading, now: list[_Acting]) -> ElectrodeReading | None:
+        lost = False
+        for one in now:
+            if one.kind == "lost":
+                hit = one.random.random() < one.value
+                lost |= hit
+                self.counters["fault_lost_frames"] += hit
+                continue
+            before = reading.validity
+            reading = one.change(reading)
+            self.counters[f"fault_{one.kind}_frames"] += 1
+            if one.kind == "invalid":
+                self.counters["parity_errors"] += (before & ~reading.validity).bit_count()
+        return None if lost else reading

@@ -1,0 +1,272 @@
+"""Bota SensONE and Rokubi over a serial line (hardware reference 3.6).
+
+The sensor streams by itself once it has booted; it is told to stop for its settings only. It
+numbers nothing, so samples are counted, and restarts seen, by its clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.ports.serial_port import SerialPort, settle
+from palpate_gateway.protocols import bota as ask
+from palpate_gateway.protocols.bota import BareCommand, BotaDecoder, BotaFrame
+from palpate_gateway.readings import WrenchReading
+from palpate_gateway.timing.sample_clock import SampleClock, Verdict
+from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
+
+_ANSWER_S = 1.0
+_CALLS, _CALL_S = 3, 0.2
+"""How often to call at a speed before the next, and how long to wait each time [s]."""
+
+_QUIET_S = 0.03
+_SILENCE_S = 0.3
+"""Silence after which the sensor is taken to have restarted [s]."""
+
+_BITS_PER_BYTE = 10
+_WRAP_US = 1 << 32
+_RAW = 1 << ask.STATUS_NAMES.index("raw")
+_ZERO_S = 0.2
+_NO_OFFSETS = (0.0,) * 6
+
+
+class BotaOptions(WrenchOptions):
+    """Options of the ``wrench_bota`` driver.
+
+    Attributes:
+        port: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
+        baud: As the sensor is set [bit/s]; 0 = try 460800, then 230400.
+        rate_hz: Samples each second: 100, 200, 250, 400, 800 or 1000 (nominal).
+        chop: The sensor's chopping.
+        fast: Its fast settling.
+        fir: Its FIR filter.
+        temperature_compensation: Corrected for temperature in the sensor.
+        boot_s: How long it may take to boot [s].
+    """
+
+    port: str = Field(min_length=1)
+    baud: int = 0
+    rate_hz: float = Field(default=400.0, gt=0.0, allow_inf_nan=False)
+    chop: bool = False
+    fast: bool = False
+    fir: bool = False
+    temperature_compensation: bool = False
+    boot_s: float = Field(default=4.0, ge=0.0, le=60.0)
+
+    @model_validator(mode="after")
+    def _fits(self) -> BotaOptions:
+        true_hz = 1.0 / ask.period_s(sinc_of(self.rate_hz))
+        if abs(true_hz / self.rate_hz - 1.0) > 0.02:
+            known = ", ".join(f"{1.0 / ask.period_s(sinc):.0f}" for sinc in ask.SINC_LENGTHS)
+            raise ValueError(f"rate_hz {self.rate_hz:g} is none of {known}")
+        if self.baud:
+            ask.communication_request(baud=self.baud)
+            if (highest_hz := _highest_hz(self.baud)) < true_hz:
+                raise ValueError(
+                    f"rate_hz {self.rate_hz:g} is above {highest_hz:.0f} for {self.baud} bit/s"
+                )
+        return self
+
+
+def sinc_of(rate_hz: float) -> int:
+    """The filter's length whose rate is nearest."""
+    return min(ask.SINC_LENGTHS, key=lambda sinc: abs(math.log(rate_hz * ask.period_s(sinc))))
+
+
+def _highest_hz(baud: int) -> float:
+    return baud / (_BITS_PER_BYTE * ask.FRAME_BYTES)
+
+
+class WrenchBota(WrenchDevice):
+    """A SensONE or Rokubi."""
+
+    options_class = BotaOptions
+
+    def __init__(self, options: BotaOptions) -> None:
+        self._sinc = sinc_of(options.rate_hz)
+        period_s = ask.period_s(self._sinc)
+        super().__init__("wrench_bota", f"Bota on {options.port}", 1.0 / period_s, options)
+        self._options = options
+        self._period_us = 1e6 * period_s
+        self._baud = options.baud  # 0 while it is not known
+        self._port = SerialPort(options.port, options.baud or ask.BAUDS_TO_PROBE[0])
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget what an earlier connection told."""
+        self._decoder = BotaDecoder()
+        self._boot = ask.TextWait(ask.BOOT_TEXT)
+        self._early = b""
+        self._clock = SampleClock(self._period_us, _WRAP_US)
+
+    def zero(self) -> None:
+        """See ``WrenchDevice``; the stream pauses for it.
+
+        Offsets are added to what the sensor measures, and those that it has cannot be asked for: so
+        they are cleared first. That they were taken the right way is seen in the samples after it.
+        """
+        self._set_offsets(_NO_OFFSETS)
+        before, noise = self._mean()
+        self._set_offsets(tuple(-float(value) for value in before))
+        after, _ = self._mean()
+        left = np.abs(after) > 0.5 * np.abs(before) + 5.0 * noise + 1e-3
+        if left.any():
+            self._set_offsets(_NO_OFFSETS)
+            raise DeviceError(
+                f"{self.info.model}: after taking zero it still tells {np.round(after, 4)}",
+                remedy="leave the load unchanged while zero is taken",
+            )
+
+    def _connect(self) -> str:
+        self._begin()
+        baud = self._find()
+        if _highest_hz(baud) < self.info.rate_hz:
+            raise DeviceError(
+                f"{self.info.model}: {baud} bit/s carry {_highest_hz(baud):.0f} samples/s, "
+                f"not {self.info.rate_hz:.0f}",
+                remedy="lower rate_hz, or set the sensor to 460800 bit/s",
+            )
+        options = self._options
+        self._ask(
+            ask.communication_request(
+                baud=baud, temperature_compensation=options.temperature_compensation
+            )
+        )
+        self._ask(
+            ask.filter_request(self._sinc, chop=options.chop, fast=options.fast, fir=options.fir)
+        )
+        self._run()
+        return options.port
+
+    def _find(self) -> int:
+        """Open the port at the sensor's baud and bring it into its configuration."""
+        bauds = (self._options.baud,) if self._options.baud else ask.BAUDS_TO_PROBE
+        began_s = time.monotonic()
+        until = began_s + self._options.boot_s
+        while True:
+            # A sensor that comes back is at the speed at which it was; probing others takes time.
+            known = self._baud if time.monotonic() - began_s < self._options.boot_s / 2 else 0
+            for baud in (known,) if known else bauds:
+                self._port.close()
+                self._port = SerialPort(self._options.port, baud)
+                self._port.open()
+                for _ in range(_CALLS):
+                    with contextlib.suppress(DeviceTimeout):
+                        self._configure(_CALL_S)
+                        self._baud = baud
+                        return baud
+            if time.monotonic() >= until:
+                raise DeviceTimeout(
+                    f"{self.info.model}: command 'C' was not answered at "
+                    f"{' or '.join(map(str, bauds))} bit/s",
+                    remedy="check its power, the cable (RS-422: A and B) and baud",
+                )
+
+    def _configure(self, within_s: float = _ANSWER_S) -> None:
+        self._ask(ask.bare_request(BareCommand.CONFIG), within_s)
+        # Answers to earlier calls, and what was on its way of the stream.
+        settle(self._port, _QUIET_S, _ANSWER_S)
+
+    def _run(self) -> None:
+        self._early = self._ask(ask.bare_request(BareCommand.RUN))
+        self._decoder.reset()
+        self._boot = ask.TextWait(ask.BOOT_TEXT)
+        self._clock.pause()
+        self._silent_since = None
+
+    def _close(self) -> None:
+        # It streams on, as it does by itself after power came: nothing has to be told.
+        self._port.close()
+
+    def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
+        frames = self._unless_silent(self._frames, timeout_s, _SILENCE_S)
+        return [reading for frame in frames if (reading := self._take(frame)) is not None]
+
+    def _frames(self, timeout_s: float) -> list[BotaFrame]:
+        data, self._early = self._early, b""
+        data = data or self._port.read(timeout_s)
+        if self._boot.feed(data) is not None:
+            raise self._restarted("it wrote its boot text")
+        return self._decoder.feed(data)
+
+    def _take(self, frame: BotaFrame) -> WrenchReading | None:
+        """The reading of a frame, if it is a new one that can be trusted."""
+        verdict = self._clock.take(frame.device_time_us, time.monotonic())
+        if verdict is Verdict.RESTARTED:
+            raise self._restarted("its clock began anew")
+        if verdict is not Verdict.NEW:
+            return None
+        if told := frame.status & ~ask.OVERRANGE:
+            for name in ask.status_names(told):
+                self._counts["status_" + name.replace(" ", "_")] += 1
+        if frame.status & (ask.INVALID | _RAW):
+            self._counts["invalid_samples"] += 1
+            return None
+        return self._reading(
+            frame.wrench,
+            time_s=self._clock.time_s,
+            tick=self._clock.tick,
+            overload=bool(frame.status & ask.OVERRANGE),
+        )
+
+    def _restarted(self, how: str) -> DeviceLost:
+        self._counts["restarts"] += 1
+        return DeviceLost(
+            f"{self.info.model}: it has restarted: {how}",
+            remedy="check its power; it is set up and started again by itself",
+        )
+
+    def _mean(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and scatter of the next samples."""
+        count = max(8, round(_ZERO_S * self.info.rate_hz))
+        frames: list[BotaFrame] = []
+        until = time.monotonic() + 2.0 + count / self.info.rate_hz
+        while len(frames) < count:
+            frames += self._frames(max(until - time.monotonic(), 0.0))
+        values = np.array([frame.wrench for frame in frames], np.float64)
+        if any(frame.status for frame in frames) or not np.isfinite(values).all():
+            raise DeviceError(
+                f"{self.info.model}: its samples cannot be trusted now", remedy="see its status"
+            )
+        return values.mean(axis=0), values.std(axis=0)
+
+    def _set_offsets(self, offsets: Sequence[float]) -> None:
+        self._configure()
+        self._ask(ask.offsets_request(offsets))
+        self._run()
+
+    def _ask(self, request: bytes, within_s: float = _ANSWER_S) -> bytes:
+        """What came after the reply to a request.
+
+        Raises:
+            DeviceTimeout: None came.
+            DeviceError: It refuses.
+        """
+        self._port.write(request)
+        what = f"{self.info.model}: command {request.decode('ascii')!r}"
+        wait = ask.TextWait(ask.expected_reply(request) or b"\n")
+        until = time.monotonic() + within_s
+        while (left_s := until - time.monotonic()) > 0.0:
+            with contextlib.suppress(DeviceTimeout):
+                after = wait.feed(self._port.read(left_s))
+                if after is not None:
+                    return after
+                ack = ask.find_ack(wait.heard)
+                if ack is not None and ack.command == chr(request[0]) and ack.code:
+                    raise DeviceError(
+                        f"{what} was refused (code {ack.code})",
+                        remedy="choose another rate or filter that this model has",
+                    )
+        raise DeviceTimeout(
+            f"{what} was not answered; came: {wait.heard[-40:]!r}", remedy="check cable and baud"
+        )
+
+    def _protocol_counters(self) -> Mapping[str, int]:
+        return {**self._decoder.counters, **self._clock.counters}

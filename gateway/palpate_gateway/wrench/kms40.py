@@ -1,0 +1,282 @@
+"""Weiss Robotics KMS 40: text over TCP (hardware reference 3.1).
+
+Samples hold no counter and no usable time, so the host's time counts, and a lost sample cannot be
+told from one that came late. Neither do they say whether they can be trusted: the device is asked
+for its flags now and then, while it streams.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping, Sequence
+
+from pydantic import Field, model_validator
+
+from palpate.errors import DeviceError, DeviceTimeout
+from palpate_gateway.ports.port import silent
+from palpate_gateway.ports.sockets import Received, TcpPort
+from palpate_gateway.protocols import kms40_requests as ask
+from palpate_gateway.protocols.kms40 import (
+    FAULTS,
+    ForceLine,
+    KmsDecoder,
+    Refusal,
+    Reply,
+    SystemFlags,
+    flag_names,
+    over_range_axes,
+    parse_flags,
+)
+from palpate_gateway.readings import WrenchReading
+from palpate_gateway.timing.arrivals import Arrivals
+from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
+
+_ANSWER_S = 2.0
+_GREET_S = 0.25
+_GOODBYE_S = 0.3
+_PATIENCE_S = 0.25
+"""Silence after which the stream is started again, unless it is that slow by itself [s]."""
+
+_EXPECTED = (
+    SystemFlags.CALIBRATION_VALID
+    | SystemFlags.STABLE
+    | SystemFlags.TARE_ON
+    | SystemFlags.FILTER_ON
+    | SystemFlags.ACQUISITION_RUNNING
+    | SystemFlags.SCRIPT_RUNNING
+)
+"""Flags of a healthy device."""
+
+
+class Kms40Options(WrenchOptions):
+    """Options of the ``wrench_kms40`` driver.
+
+    Attributes:
+        host: Address; two factory settings are known, 192.168.1.30 and 192.168.0.30.
+        port: TCP port.
+        rate_hz: Samples each second, 500 divided by a whole number.
+        filter_number: Number in the device's table of filters; None = as it is set.
+        flags_every_s: How often to ask for overload and faults [s]; 0 = never. Samples that come
+            between a fault and the next answer are published.
+    """
+
+    host: str = Field(min_length=1)
+    port: int = Field(default=ask.PORT, ge=1, le=65535)
+    rate_hz: float = Field(default=ask.BASE_RATE_HZ, ge=1.0, le=ask.BASE_RATE_HZ)
+    filter_number: int | None = Field(default=None, ge=0, le=ask.FILTER_MAX)
+    flags_every_s: float = Field(default=1.0, ge=0.0, le=60.0)
+
+    @model_validator(mode="after")
+    def _has_divider(self) -> Kms40Options:
+        divider = ask.divider_of_rate(self.rate_hz)
+        near = ask.rate_of_divider(divider)
+        if abs(near / self.rate_hz - 1.0) > 1e-3:
+            below = ask.rate_of_divider(divider + 1)
+            raise ValueError(
+                f"rate_hz {self.rate_hz:g} is not 500 divided by a whole number; the nearest are "
+                f"{below:g} and {near:g}"
+            )
+        return self
+
+
+class WrenchKms40(WrenchDevice):
+    """A KMS 40 on the network."""
+
+    options_class = Kms40Options
+
+    def __init__(self, options: Kms40Options) -> None:
+        self._divider = ask.divider_of_rate(options.rate_hz)
+        rate_hz = ask.rate_of_divider(self._divider)
+        model = f"Weiss KMS 40 at {options.host}"
+        super().__init__("wrench_kms40", model, rate_hz, options)
+        self._filter, self._flags_every_s = options.filter_number, options.flags_every_s
+        self._tells_time = False
+        self._port = TcpPort(options.host, options.port)
+        self._patience_s = max(_PATIENCE_S, 5.0 / rate_hz)
+        self._arrivals = Arrivals(1.0 / rate_hz)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget what an earlier connection told."""
+        self._decoder = KmsDecoder()
+        self._flags = SystemFlags(0)
+        # What the flags mean for a sample: asked 500 times a second, told once.
+        self._faulty = self._over_range = False
+        self._flags_due_s = 0.0
+        self._flags_asked = False
+        self._heard_s = time.monotonic()
+        self._arrivals.begin()
+
+    def zero(self) -> None:
+        """See ``WrenchDevice``; the stream pauses for it, and what it held is thrown away."""
+        self._ask(ask.stop_request(), "L0")
+        try:
+            self._ask(ask.tare_request(), "TARE", "1")
+        finally:
+            self._ask(ask.start_request(), "L1")
+            self._arrivals.begin()
+
+    def _keeps_zero(self) -> bool:
+        return bool(self._flags & SystemFlags.TARE_ON)
+
+    def _connect(self) -> str:
+        self._begin()
+        self._port.open()
+        self._greet()
+        self._ask(ask.query_request(ask.Query.IDENTITY), "ID")
+        serial = self._ask(ask.query_request(ask.Query.SERIAL_NUMBER), "SN")
+        if not serial:
+            raise DeviceError(
+                f"{self.info.model}: it tells no serial number",
+                remedy="check that this is a KMS 40",
+            )
+        self._ask(ask.mask_request(), "LMASK", "{1,1,1,1,1,1}")
+        if self._filter is not None:
+            self._ask(ask.filter_request(self._filter), "FLT", str(self._filter))
+        self._ask(ask.divider_request(self._divider), "LDIV", str(self._divider))
+        self._ask(ask.quiet_request(), "VL", "0")
+        if self._flags_every_s:
+            self._check_flags()
+        self._ask(ask.start_request(), "L1")
+        return serial
+
+    def _greet(self) -> None:
+        """Stop what it streams to whom it streamed before; a device that is busy may not hear."""
+        until = time.monotonic() + _ANSWER_S
+        while True:
+            left_s = until - time.monotonic()
+            try:
+                self._ask(ask.stop_request(), "L0", within_s=min(_GREET_S, left_s))
+                return
+            except DeviceTimeout:
+                if left_s <= _GREET_S:
+                    raise
+
+    def _check_flags(self) -> None:
+        self._ask(ask.query_request(ask.Query.FLAGS), "FLAGS")
+        faults = self._flags & FAULTS
+        if faults:
+            raise DeviceError(
+                f"{self.info.model}: it reports {', '.join(flag_names(faults))}",
+                remedy="its forces cannot be trusted: see to supply, temperature and calibration",
+            )
+        self._flags_due_s = time.monotonic() + self._flags_every_s
+
+    def _close(self) -> None:
+        # Waiting for the echo: a socket closed with unread input would take the request back.
+        with contextlib.suppress(DeviceError):
+            self._ask(ask.stop_request(), "L0", within_s=_GOODBYE_S)
+        self._port.close()
+
+    def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
+        until = time.monotonic() + timeout_s
+        while True:
+            left_s = max(until - time.monotonic(), 0.0)
+            try:
+                received = self._port.receive(min(left_s, self._patience_s))
+            except DeviceTimeout:
+                received = None
+            readings = [] if received is None else self._readings(received)
+            self._keep_going()
+            if received is not None:
+                return readings
+            if time.monotonic() >= until:
+                raise silent(self.info.model, round(timeout_s, 3))
+
+    def _readings(self, received: Received) -> list[WrenchReading]:
+        records = self._decoder.feed(received.data)
+        count = sum(isinstance(record, ForceLine) for record in records)
+        times_ns = iter(self._arrivals.times_ns(count, received.arrival_ns) if count else ())
+        readings = []
+        for record in records:
+            if isinstance(record, Reply):
+                self._note(record)
+            if not isinstance(record, ForceLine):
+                continue
+            self._heard_s = time.monotonic()
+            arrival_ns = next(times_ns)
+            if self._faulty:
+                self._counts["invalid_samples"] += 1
+                continue
+            reading = self._reading(
+                (*record.force, *record.torque),
+                arrival_ns=arrival_ns,
+                overload=self._over_range,
+            )
+            if reading is not None:
+                readings.append(reading)
+        return readings
+
+    def _keep_going(self) -> None:
+        """Ask for the stream if there is none, and for the flags if it is time."""
+        now_s = time.monotonic()
+        if now_s - self._heard_s >= self._patience_s:
+            self._heard_s = now_s
+            self._counts["streams_restarted"] += 1
+            self._port.write(ask.start_request())
+        if self._flags_every_s and now_s >= self._flags_due_s:
+            self._flags_due_s = now_s + self._flags_every_s
+            self._counts["flags_unanswered"] += self._flags_asked
+            self._flags_asked = True
+            self._port.write(ask.query_request(ask.Query.FLAGS))
+
+    def _note(self, reply: Reply) -> None:
+        if reply.name != ask.Query.FLAGS:
+            return
+        self._flags_asked = False
+        flags = parse_flags(reply.value)
+        if flags is None:
+            self._counts["bad_flags"] += 1
+            return
+        self._flags = flags
+        self._faulty, self._over_range = bool(flags & FAULTS), bool(over_range_axes(flags))
+        for name in flag_names(flags & ~_EXPECTED):
+            self._counts["status_" + name.replace(" ", "_")] += 1
+        if not flags & SystemFlags.CALIBRATION_VALID:
+            self._counts["status_calibration_not_valid"] += 1
+
+    def _ask(
+        self, request: bytes, name: str, wanted: str | None = None, *, within_s: float = _ANSWER_S
+    ) -> str:
+        """The value that a request is answered with; samples that come before it are thrown away.
+
+        Raises:
+            DeviceTimeout: No answer came.
+            DeviceError: It refuses, or answers with another value than wanted.
+        """
+        self._port.write(request)
+        asked = f"{self.info.model}: {request.decode('ascii').strip()}"
+        until = time.monotonic() + within_s
+        while (left_s := until - time.monotonic()) > 0.0:
+            try:
+                data = self._port.read(left_s)
+            except DeviceTimeout:
+                break
+            for record in self._decoder.feed(data):
+                if isinstance(record, Refusal):
+                    raise DeviceError(
+                        f"{asked} was refused: {record.meaning} (error {record.code})",
+                        remedy="check that this is a KMS 40 whose firmware knows the command",
+                    )
+                if not isinstance(record, Reply):
+                    continue
+                self._note(record)
+                if record.name == name:
+                    self._heard_s = time.monotonic()
+                    return self._checked(record.value, wanted, asked)
+        raise DeviceTimeout(
+            f"{asked} was not answered within {within_s:g} s",
+            remedy="check that this is a KMS 40 and that nobody else is connected to it",
+        )
+
+    def _checked(self, value: str, wanted: str | None, asked: str) -> str:
+        if wanted is not None and value.replace(" ", "") != wanted:
+            raise DeviceError(
+                f"{asked} was answered with {value[:40]!r} instead of {wanted!r}",
+                remedy="the device cannot be set so: choose another rate or filter",
+            )
+        return value
+
+    def _protocol_counters(self) -> Mapping[str, int]:
+        return self._decoder.counters

@@ -1,0 +1,25 @@
+"""What every room of palpate shares: messages, wire codec, bus, files, and the robot's client.
+
+A robot needs one name::
+
+    from palpate import Client
+"""
+
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from palpate.client import Client
+
+__all__ = ["Client", "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded on demand, so that `palpate --help` and pure data modules start without Zenoh.
+    if name == "Client":
+        from palpate.client import Client
+
+        return Client
+    if name == "__version__":
+        return version("palpate")
+    raise AttributeError(f"module 'palpate' has no attribute {name!r}")

@@ -1,0 +1,185 @@
+"""Electrodes, wrench and pose brought to the same instants.
+
+::
+
+    clock = common_clock(frames, wrenches, poses)
+    at_ns = electrode_instants(frames, clock)                 # (N, 19), each electrode's own
+    force, known = linear(at_ns, times_of(wrenches, clock), forces)
+    turned, known = slerp(at_ns, times_of(poses, clock), orientations)
+
+Between two readings values run straight, orientations along the shorter arc. Nothing is invented:
+before the first reading, after the last, and across a gap of more than three periods there is no
+value. One host's streams meet on its monotonic clock, others on wall clocks (docs/time.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate.messages import ElectrodeFrame, Stamp
+from palpate.sampling import sample_offsets
+
+Times = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+Known = npt.NDArray[np.bool_]
+
+GAP_PERIODS = 3.0
+"""A stream that is silent for longer has lost readings [periods]."""
+
+_STRAIGHT = 1.0 - 1e-9
+"""Quaternions with a larger product are so near that a line is the arc."""
+
+
+class Stamped(Protocol):
+    """A message with a stamp."""
+
+    @property
+    def stamp(self) -> Stamp:
+        """When it was taken."""
+        ...
+
+
+class Clock(Enum):
+    """Which of a stamp's times is compared."""
+
+    MONOTONIC = "monotonic"
+    WALL = "wall"
+
+
+def common_clock(*streams: Iterable[Stamped]) -> Clock:
+    """The monotonic clock if all messages were stamped by the same one, else wall clocks."""
+    ids = {message.stamp.clock_id for stream in streams for message in stream}
+    return Clock.MONOTONIC if len(ids) <= 1 else Clock.WALL
+
+
+def times_of(stream: Iterable[Stamped], clock: Clock) -> Times:
+    """Times of messages [ns], int64, shape ``(N,)``."""
+    stamps = [message.stamp for message in stream]
+    told = [s.monotonic_ns if clock is Clock.MONOTONIC else s.wall_ns for s in stamps]
+    return np.array(told, np.int64)
+
+
+def electrode_instants(frames: Sequence[ElectrodeFrame], clock: Clock) -> Times:
+    """When each electrode of each frame was sampled [ns], int64, shape ``(N, E)``.
+
+    Raises:
+        DatasetError: The frames are of different types of sensors.
+    """
+    if len({frame.sensor_type for frame in frames}) > 1:
+        raise DatasetError(
+            "frames of sensors with different numbers of electrodes",
+            remedy="align one sensor's frames at a time",
+        )
+    offsets = np.array([sample_offsets(frame).electrodes for frame in frames], np.int64)
+    return np.asarray(times_of(frames, clock)[:, None] + offsets)
+
+
+def frame_instants(frames: Sequence[ElectrodeFrame], clock: Clock) -> Times:
+    """Mean instant of each frame's electrodes [ns], int64, shape ``(N,)``."""
+    middles = np.array([sample_offsets(frame).middle_ns for frame in frames], np.int64)
+    return np.asarray(times_of(frames, clock) + middles)
+
+
+def linear(
+    at_ns: Times, times_ns: Times, values: npt.ArrayLike, *, period_s: float | None = None
+) -> tuple[Values, Known]:
+    """Values at other times, straight between neighbours.
+
+    Args:
+        at_ns: When [ns], of any shape.
+        times_ns: When the values were taken [ns], shape ``(N,)``, in any order.
+        values: Shape ``(N, K)``.
+        period_s: Of the stream [s]; None = the median of its gaps.
+
+    Returns:
+        Values of shape ``(*at_ns.shape, K)``, NaN where there is none; and where there is one.
+
+    Raises:
+        DatasetError: Times and values do not belong together.
+    """
+    around = _Around(at_ns, times_ns, values, period_s)
+    share = around.share[..., None]
+    mixed = (1.0 - share) * around.before + share * around.after
+    # A reading counts at its own time even if the next one holds no number.
+    mixed = np.where(share > 0.0, mixed, around.before)
+    return np.where(around.known[..., None], mixed, np.nan), around.known
+
+
+def slerp(
+    at_ns: Times, times_ns: Times, quaternions: npt.ArrayLike, *, period_s: float | None = None
+) -> tuple[Values, Known]:
+    """Orientations at other times, with constant speed along the shorter arc between neighbours.
+
+    Args:
+        at_ns: When [ns], of any shape.
+        times_ns: When they were taken [ns], shape ``(N,)``, in any order.
+        quaternions: Unit quaternions, shape ``(N, 4)``; either sign means the same.
+        period_s: Of the stream [s]; None = the median of its gaps.
+
+    Returns:
+        Unit quaternions of shape ``(*at_ns.shape, 4)``, NaN where there is none; and where there is
+        one.
+
+    Raises:
+        DatasetError: Times and quaternions do not belong together.
+    """
+    around = _Around(at_ns, times_ns, quaternions, period_s)
+    product = np.sum(around.before * around.after, axis=-1, keepdims=True)
+    after = np.where(product < 0.0, -around.after, around.after)
+    product = np.clip(np.abs(product), 0.0, 1.0)
+    angle = np.arccos(product)
+    near = product > _STRAIGHT
+    sine = np.where(near, 1.0, np.sin(angle))
+    share = around.share[..., None]
+    weight_before = np.where(near, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
+    weight_after = np.where(near, share, np.sin(share * angle) / sine)
+    mixed = weight_before * around.before + weight_after * after
+    mixed /= np.linalg.norm(mixed, axis=-1, keepdims=True)
+    return np.where(around.known[..., None], mixed, np.nan), around.known
+
+
+class _Around:
+    """Readings directly before and after some times, and how far between them each lies."""
+
+    def __init__(
+        self, at_ns: Times, times_ns: Times, values: npt.ArrayLike, period_s: float | None
+    ) -> None:
+        times, rows = np.asarray(times_ns, np.int64), np.asarray(values, np.float64)
+        if times.ndim != 1 or rows.ndim != 2 or len(rows) != len(times) or not len(times):
+            raise DatasetError(
+                f"{times.shape} times and {rows.shape} values are no stream",
+                remedy="give one time and one row of values for each reading, one reading at least",
+            )
+        order = np.argsort(times, kind="stable")
+        times, rows = times[order], rows[order]
+        at = np.asarray(at_ns, np.int64)
+        lower = np.searchsorted(times, at, side="right") - 1
+        upper = np.minimum(lower + 1, len(times) - 1)
+        inside = lower >= 0
+        lower = np.maximum(lower, 0)
+        past_ns, gap_ns = at - times[lower], times[upper] - times[lower]
+        # Whole nanoseconds are subtracted before anything becomes a float.
+        self.share = np.where(gap_ns > 0, past_ns / np.maximum(gap_ns, 1), 0.0)
+        narrow = gap_ns <= longest_gap_ns(times, period_s)
+        self.known: Known = inside & ((past_ns == 0) | (gap_ns > 0) & narrow)
+        self.share = np.where(self.known, self.share, 0.0)
+        self.before, self.after = rows[lower], rows[upper]
+
+
+def longest_gap_ns(times_ns: Times, period_s: float | None = None) -> float:
+    """How far apart two readings may be for a value between them [ns].
+
+    Args:
+        times_ns: Of the stream, in order [ns].
+        period_s: Its period [s]; None = the median of its gaps.
+    """
+    if period_s is None:
+        steps = np.diff(times_ns)
+        return GAP_PERIODS * float(np.median(steps)) if len(steps) else 0.0
+    return GAP_PERIODS * 1e9 * period_s

@@ -1,0 +1,29 @@
+"""The bus: typed publishers, subscribers, queries, presence. Only here is Zenoh known.
+
+Rules that were learned by running it (docs/adr/0004-keys-and-qos.md): callbacks only enqueue;
+sensor streams drop rather than block; a query is always answered; plain TCP, never ``lowlatency``.
+"""
+
+from palpate.bus.link import Session
+from palpate.bus.opening import run_router
+from palpate.bus.presence import Alive, Asking, Presence
+from palpate.bus.publish import Publisher
+from palpate.bus.queues import Delivery
+from palpate.bus.streams import MAX_REPLY_BYTES, Answer
+from palpate.bus.subscribe import Received, Sample, Subscriber, Tap
+
+__all__ = [
+    "MAX_REPLY_BYTES",
+    "Alive",
+    "Answer",
+    "Asking",
+    "Delivery",
+    "Presence",
+    "Publisher",
+    "Received",
+    "Sample",
+    "Session",
+    "Subscriber",
+    "Tap",
+    "run_router",
+]

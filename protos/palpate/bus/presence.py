@@ -1,0 +1,123 @@
+"""Presence: who is alive, and who is ready, by liveliness tokens."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import zenoh
+
+from palpate.bus.topics import live_key
+from palpate.closing import Closing
+
+_LOOK_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Alive:
+    """A process that is there, and whether it is ready to serve."""
+
+    station: str
+    service: str
+    instance: str
+    ready: bool
+
+
+class Presence(Closing):
+    """Declares that this process is alive, and when it says so, ready.
+
+    Both vanish for others within milliseconds when the process dies, and within the link's lease
+    when its host freezes.
+    """
+
+    def __init__(self, session: zenoh.Session, station: str, service: str, instance: str) -> None:
+        self._liveliness = session.liveliness()
+        self._ready_key = live_key(station, service, instance, "ready")
+        self._alive = self._liveliness.declare_token(live_key(station, service, instance, "alive"))
+        self._ready: zenoh.LivelinessToken | None = None
+
+    def ready(self) -> None:
+        """Declare that this process serves."""
+        if self._ready is None:
+            self._ready = self._liveliness.declare_token(self._ready_key)
+
+    def not_ready(self) -> None:
+        """Withdraw it; done first when a process stops."""
+        if self._ready is not None:
+            self._ready.undeclare()
+            self._ready = None
+
+    def close(self) -> None:
+        """Withdraw both."""
+        self.not_ready()
+        self._alive.undeclare()
+
+
+def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> list[Alive]:
+    """Everyone who is alive at a station (``"*"`` = any)."""
+    found: dict[tuple[str, str, str], bool] = {}
+    key = live_key(station, "*", "*", "*")
+    for reply in session.liveliness().get(key, timeout=timeout_s):
+        if reply.ok is None:
+            continue
+        *_, where, service, instance, what = str(reply.ok.key_expr).split("/")
+        name = (where, service, instance)
+        found[name] = found.get(name, False) or what == "ready"
+    return [Alive(*name, ready) for name, ready in sorted(found.items())]
+
+
+class Asking(Closing):
+    """A caller's token: while it is there, somebody waits for the answer."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._token = session.liveliness().declare_token(key)
+
+    def close(self) -> None:
+        """Withdraw it."""
+        try:
+            self._token.undeclare()
+        except zenoh.ZError:  # the session is gone, and the token with it
+            return
+
+
+class Departures(Closing):
+    """Calls ``on_gone``, in a thread of its own, with the key of every token that is gone for good.
+
+    A token of the same key that is there again, from a caller that asked a second time, is none
+    that has gone.
+
+    Args:
+        session: The bus.
+        key: Which tokens, with a ``"*"``.
+        on_gone: What to call.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, on_gone: Callable[[str], None]) -> None:
+        self._session = session
+        self._on_gone = on_gone
+        self._vanished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._worker = threading.Thread(target=self._run, name=f"departures {key}", daemon=True)
+        self._worker.start()
+        self._subscriber = session.liveliness().declare_subscriber(
+            key, self._on_sample, history=True
+        )
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._vanished.put(str(sample.key_expr))
+
+    def _run(self) -> None:
+        while (key := self._vanished.get()) is not None:
+            try:
+                if not any(self._session.liveliness().get(key, timeout=_LOOK_S)):
+                    self._on_gone(key)
+            except zenoh.ZError:  # the session is closing
+                return
+
+    def close(self) -> None:
+        """Watch no longer."""
+        self._subscriber.undeclare()
+        self._vanished.put(None)
+        self._worker.join(timeout=2)

@@ -1,0 +1,279 @@
+"""Subscribing: typed messages for one topic, or undecoded samples of many (a tap)."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import zenoh
+
+from palpate import clock
+from palpate.bus.queues import Delivery, Waiting, waiting_for
+from palpate.bus.topics import Address, Topic, check_schema, parse_key
+from palpate.closing import Closing
+from palpate.errors import StaleError, StreamTimeout, WireError
+from palpate.messages import Origin
+
+M = TypeVar("M")
+
+
+@dataclass(frozen=True, slots=True)
+class Received(Generic[M]):
+    """A valid message and how it came.
+
+    Attributes:
+        message: The message.
+        payload: Its bytes as they arrived.
+        station: Station that published it.
+        sensor: Sensor, or ``service/instance`` for a service's topic.
+        received_monotonic_ns: Arrival in this process, host monotonic clock [ns].
+    """
+
+    message: M
+    payload: bytes
+    station: str
+    sensor: str
+    received_monotonic_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """An undecoded message: what a recorder writes."""
+
+    topic: str
+    station: str
+    sensor: str
+    key: str
+    encoding: str
+    payload: bytes
+    received_monotonic_ns: int
+    received_wall_ns: int
+
+    @property
+    def schema(self) -> str:
+        """Full name of the message, from the encoding."""
+        return self.encoding.partition(";")[2]
+
+
+class Subscriber(Generic[M], Closing):
+    """Receives one topic. Made by ``Session.subscriber``; use it from one thread.
+
+    ``counters``: ``received``, ``delivered``, ``dropped`` (newest wins), ``overflow``,
+    ``lost_on_bus`` (holes in the sequence that nobody here dropped), ``reordered``, ``restarts``
+    of the sender, and ``rejected_<reason>``.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        topic: Topic[M],
+        key: str,
+        *,
+        delivery: Delivery,
+        capacity: int,
+        depth: int = 1,
+    ) -> None:
+        self.topic = topic
+        self.key = key
+        self._counters: Counter[str] = Counter()
+        self._waiting: Waiting[tuple[zenoh.Sample, int]] = waiting_for(
+            delivery, capacity, self._counters, depth=depth
+        )
+        self._newest: dict[str, tuple[zenoh.Sample, int]] = {}
+        self._addresses: dict[str, Address] = {}
+        self._last: dict[str, tuple[int, int, int]] = {}
+        self._subscriber = session.declare_subscriber(key, self._on_sample)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        # Zenoh's thread: enqueue and nothing else; an exception here would vanish.
+        now_ns = time.monotonic_ns()
+        key = str(sample.key_expr)
+        item = (sample, now_ns)
+        self._counters["received"] += 1
+        self._newest[key] = item
+        self._waiting.put(key, item)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Events since it was declared."""
+        return dict(self._counters)
+
+    def next(self, timeout_s: float) -> Received[M]:
+        """The next valid message that was not delivered yet; invalid ones are counted and skipped.
+
+        Raises:
+            StreamTimeout: None came within ``timeout_s``.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            item = self._waiting.get(max(0.0, deadline - time.monotonic()))
+            if item is None:
+                raise StreamTimeout(
+                    f"no {self.topic.name} on {self.key} within {timeout_s:g} s",
+                    remedy="check that its publisher runs: palpate status",
+                )
+            try:
+                received = self._decode(*item[0])
+            except WireError as error:
+                self._counters[f"rejected_{error.reason}"] += 1
+                continue
+            if self._in_order(received, item[1]):
+                self._counters["delivered"] += 1
+                return received
+
+    def latest(self, max_age_s: float, *, sensor: str | None = None) -> Received[M]:
+        """The newest message, if it is young enough; nothing is consumed.
+
+        The age counts from the stamp (when the sensor was read), not from arrival.
+
+        Args:
+            max_age_s: The oldest that may be returned [s].
+            sensor: Which sensor, where the subscription covers several.
+
+        Raises:
+            StaleError: It is older, invalid, or none ever came.
+        """
+        candidates = [
+            item
+            for key, item in list(self._newest.items())
+            if sensor is None or self._address(key).sensor == sensor
+        ]
+        if not candidates:
+            raise StaleError(
+                f"no {self.topic.name} on {self.key} has ever arrived",
+                remedy="check that its publisher runs: palpate status",
+            )
+        sample, received_ns = max(candidates, key=lambda item: item[1])
+        try:
+            received = self._decode(sample, received_ns)
+        except WireError as error:
+            raise StaleError(
+                f"the newest {self.topic.name} is invalid: {error.problem}", remedy=error.remedy
+            ) from error
+        stamp = self.topic.stamp_of(received.message)
+        age_s = (time.monotonic_ns() - received_ns) * 1e-9 if stamp is None else clock.age_s(stamp)
+        if age_s > max_age_s:
+            raise StaleError(
+                f"the newest {self.topic.name} is {age_s:.3f} s old, {max_age_s:g} s is allowed",
+                remedy="do not act on it; check the sensor: palpate status",
+            )
+        return received
+
+    def _address(self, key: str) -> Address:
+        address = self._addresses.get(key)
+        if address is None:
+            address = self._addresses[key] = parse_key(key)
+        return address
+
+    def _decode(self, sample: zenoh.Sample, received_ns: int) -> Received[M]:
+        check_schema(str(sample.encoding), self.topic.codec.schema)
+        address = self._address(str(sample.key_expr))
+        payload = sample.payload.to_bytes()
+        message = self.topic.codec.decode(payload)
+        return Received(message, payload, address.station, address.sensor, received_ns)
+
+    def _in_order(self, received: Received[M], lost_here: int) -> bool:
+        """Account for holes, restarts and duplicates; False = do not deliver."""
+        stamp = self.topic.stamp_of(received.message)
+        if stamp is None:
+            return True
+        source = f"{received.station}/{received.sensor}"
+        last = self._last.get(source)
+        if last is not None:
+            sequence, monotonic_ns, lost_here_before = last
+            step = stamp.sequence - sequence
+            if step <= 0:
+                # A restarted gateway counts from 1 again, with a later clock. A replayed record
+                # starts over with its old clock.
+                restarted = (
+                    stamp.monotonic_ns > monotonic_ns
+                    or stamp.origin is Origin.REPLAYED
+                    or step < -1000
+                )
+                if not restarted or (step == 0 and stamp.monotonic_ns == monotonic_ns):
+                    self._counters["reordered"] += 1
+                    return False
+                self._counters["restarts"] += 1
+            elif self.topic.contiguous and step > 1:
+                # What this queue dropped was not lost on the bus.
+                lost = step - 1 - (lost_here - lost_here_before)
+                if lost > 0:
+                    self._counters["lost_on_bus"] += lost
+        self._last[source] = (stamp.sequence, stamp.monotonic_ns, lost_here)
+        return True
+
+    def close(self) -> None:
+        """Undeclare; a blocked sender is released."""
+        self._waiting.close()
+        self._subscriber.undeclare()
+
+
+class Tap(Closing):
+    """Receives undecoded samples of several topics in order of arrival. Made by ``Session.tap``."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        topics: Sequence[tuple[Topic[Any], str]],
+        *,
+        delivery: Delivery,
+        capacity: int,
+    ) -> None:
+        self._counters: Counter[str] = Counter()
+        self._waiting: Waiting[tuple[zenoh.Sample, int, int]] = waiting_for(
+            delivery, capacity, self._counters
+        )
+        # By default each subscriber calls back from a thread of its own, and a frame may overtake
+        # the tare that was sent before it. Called from the link's thread, arrival is the order.
+        in_order = zenoh.handlers.Callback(self._on_sample, indirect=False)
+        self._subscribers = [session.declare_subscriber(key, in_order) for _, key in topics]
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        monotonic_ns, wall_ns = clock.now()
+        self._counters["received"] += 1
+        self._waiting.put(str(sample.key_expr), (sample, monotonic_ns, wall_ns))
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """``received``, ``dropped``, ``overflow``, ``rejected_key``."""
+        return dict(self._counters)
+
+    def next(self, timeout_s: float) -> Sample:
+        """The next sample.
+
+        Raises:
+            StreamTimeout: None came within ``timeout_s``.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            item = self._waiting.get(max(0.0, deadline - time.monotonic()))
+            if item is None:
+                raise StreamTimeout(
+                    f"no message within {timeout_s:g} s", remedy="check what runs: palpate status"
+                )
+            sample, monotonic_ns, wall_ns = item[0]
+            key = str(sample.key_expr)
+            try:
+                address = parse_key(key)
+            except WireError as error:
+                self._counters[f"rejected_{error.reason}"] += 1
+                continue
+            return Sample(
+                address.topic,
+                address.station,
+                address.sensor,
+                key,
+                str(sample.encoding),
+                sample.payload.to_bytes(),
+                monotonic_ns,
+                wall_ns,
+            )
+
+    def close(self) -> None:
+        """Undeclare; a blocked sender is released."""
+        self._waiting.close()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()

@@ -1,0 +1,76 @@
+"""Tares by id: frames name the baseline they belong to, consumers look it up once."""
+
+from __future__ import annotations
+
+import threading
+
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import TARE
+from palpate.codec import TARE as TARE_CODEC
+from palpate.codec import TARE_REQUEST
+from palpate.errors import StreamTimeout
+from palpate.messages import NO_TARE, Tare, TareRequest
+
+_KEPT = 1024
+
+
+class TareBook:
+    """Knows every tare of a station: fed by the tare stream, and by asking the gateway on a miss.
+
+    Args:
+        session: The bus.
+        query_timeout_s: How long a question to the gateway may take [s].
+    """
+
+    def __init__(self, session: Session, *, query_timeout_s: float = 0.2) -> None:
+        self._session = session
+        self._timeout_s = query_timeout_s
+        self._known: dict[tuple[str, int], Tare] = {}
+        self._lock = threading.Lock()
+        self._stream = session.subscriber(TARE, delivery=Delivery.QUEUE, capacity=_KEPT)
+
+    def baseline(self, sensor: str, tare_id: int) -> Tare:
+        """The tare of this id.
+
+        Args:
+            sensor: Name of the sensor in the key.
+            tare_id: From a frame; not ``NO_TARE``.
+
+        Raises:
+            LinkError: It is not known here and no gateway answers.
+            StreamTimeout: The gateway does not answer in time.
+            RemoteError: The gateway does not know it either.
+        """
+        tare = self._known.get((sensor, tare_id))
+        if tare is not None:
+            return tare
+        self._drain()
+        tare = self._known.get((sensor, tare_id))
+        if tare is None:
+            tare = self._session.query(
+                "tare",
+                sensor=sensor,
+                request=TareRequest(tare_id=tare_id),
+                request_codec=TARE_REQUEST,
+                reply_codec=TARE_CODEC,
+                timeout_s=self._timeout_s,
+            )
+            self.remember(sensor, tare)
+        return tare
+
+    def remember(self, sensor: str, tare: Tare) -> None:
+        """Keep a tare; the oldest is forgotten beyond a thousand."""
+        if tare.tare_id == NO_TARE:
+            return
+        with self._lock:
+            self._known[sensor, tare.tare_id] = tare
+            while len(self._known) > _KEPT:
+                self._known.pop(next(iter(self._known)))
+
+    def _drain(self) -> None:
+        while True:
+            try:
+                received = self._stream.next(timeout_s=0)
+            except StreamTimeout:
+                return
+            self.remember(received.sensor, received.message)

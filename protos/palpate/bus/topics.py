@@ -1,0 +1,268 @@
+"""The topic table: every stream of the bus, its key, message, rate and manners.
+
+Keys (docs/adr/0004-keys-and-qos.md)::
+
+    palpate/@v1/<station>/<sensor>/<stream>                          sensor streams
+    palpate/@v1/<station>/@service/<service>/<instance>/<endpoint>   what a process says and answers
+    palpate/@v1/@live/<station>/<service>/<instance>/<alive|ready>   presence (liveliness tokens)
+    palpate/@v1/@asking/<station>/<digest of a request's id>          a caller still waits (token)
+
+``@v1`` is a verbatim chunk: ``*`` and ``**`` never match it, so a future contract cannot be taken
+for this one by accident.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Generic, TypeVar
+
+from palpate import codec
+from palpate.codec import Codec
+from palpate.errors import WireError
+from palpate.messages import (
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    FieldFrame,
+    IndenterPoseFrame,
+    RobotPoseFrame,
+    SimulationProgress,
+    Stamp,
+    Status,
+    SynthesisEstimate,
+    Tare,
+    WrenchFrame,
+)
+from palpate.names import check_name
+
+M = TypeVar("M")
+
+CONTRACT_VERSION = 1
+"""Major version of the wire contract; it stands in keys, schemas and bundles."""
+
+ROOT = f"palpate/@v{CONTRACT_VERSION}"
+LIVE_ROOT = f"{ROOT}/@live"
+ASKING_ROOT = f"{ROOT}/@asking"
+ENCODING_PREFIX = "application/protobuf;"
+
+
+class Priority(IntEnum):
+    """Zenoh priorities in use; the numbers are Zenoh's."""
+
+    REAL_TIME = 1
+    DATA_HIGH = 4
+    DATA = 5
+    BACKGROUND = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Topic(Generic[M]):
+    """One stream.
+
+    Attributes:
+        name: Last chunk of its key.
+        codec: Its message.
+        rate_hz: Usual rate [Hz]; 0 = on events.
+        priority: Zenoh priority.
+        recorded: Whether the recorder keeps it.
+        contiguous: Whether its stamps' sequences have no holes unless the bus lost something.
+        per_service: Whether its key names a service instead of a sensor.
+        doc: One line for people.
+    """
+
+    name: str
+    codec: Codec[M]
+    rate_hz: float
+    priority: Priority
+    recorded: bool
+    contiguous: bool
+    doc: str
+    per_service: bool = False
+
+    @property
+    def encoding(self) -> str:
+        """Zenoh encoding of its payloads."""
+        return ENCODING_PREFIX + self.codec.schema
+
+    def stamp_of(self, message: M) -> Stamp | None:
+        """Stamp of a message; an estimate's is its source's. None where it has none."""
+        stamp = getattr(message, "stamp", None)
+        if stamp is None:
+            stamp = getattr(message, "source", None)
+        return stamp if isinstance(stamp, Stamp) else None
+
+
+_RT = Priority.REAL_TIME
+ELECTRODES: Topic[ElectrodeFrame] = Topic(
+    "electrodes", codec.ELECTRODE_FRAME, 100, _RT, True, True, "raw counts of one BioTac"
+)
+WRENCH: Topic[WrenchFrame] = Topic(
+    "wrench", codec.WRENCH_FRAME, 100, _RT, True, True, "force and torque on the BioTac"
+)
+POSE: Topic[IndenterPoseFrame] = Topic(
+    "pose", codec.INDENTER_POSE_FRAME, 100, _RT, True, True, "where the indenter is"
+)
+ROBOT_POSE: Topic[RobotPoseFrame] = Topic(
+    "robot_pose",
+    codec.ROBOT_POSE_FRAME,
+    250,
+    _RT,
+    True,
+    False,
+    "where a robot's flange is, told by its program",
+)
+FIELD_TRUTH: Topic[FieldFrame] = Topic(
+    "field_truth",
+    codec.FIELD_FRAME,
+    20,
+    Priority.DATA_HIGH,
+    True,
+    False,
+    "known displacement of each skin node",
+)
+TARE: Topic[Tare] = Topic(
+    "tare", codec.TARE, 0, Priority.DATA_HIGH, True, False, "a new baseline of one sensor"
+)
+FEATURES: Topic[FeatureEstimate] = Topic(
+    "features", codec.FEATURE_ESTIMATE, 100, _RT, True, False, "contact location and net force"
+)
+FIELD: Topic[FieldEstimate] = Topic(
+    "field",
+    codec.FIELD_ESTIMATE,
+    20,
+    Priority.DATA_HIGH,
+    True,
+    False,
+    "displacement of each skin node",
+)
+SYNTHESIS: Topic[SynthesisEstimate] = Topic(
+    "synthesis", codec.SYNTHESIS_ESTIMATE, 100, _RT, True, False, "tared counts from a field"
+)
+SIMULATION_PROGRESS: Topic[SimulationProgress] = Topic(
+    "simulation_progress",
+    codec.SIMULATION_PROGRESS,
+    0,
+    Priority.DATA,
+    False,
+    False,
+    "how far a finite-element simulation is",
+)
+STATUS: Topic[Status] = Topic(
+    "status",
+    codec.STATUS,
+    1,
+    Priority.BACKGROUND,
+    True,
+    False,
+    "what a process says of itself",
+    per_service=True,
+)
+
+TOPICS: dict[str, Topic[Any]] = {
+    topic.name: topic
+    for topic in (
+        ELECTRODES,
+        WRENCH,
+        POSE,
+        ROBOT_POSE,
+        FIELD_TRUTH,
+        TARE,
+        FEATURES,
+        FIELD,
+        SYNTHESIS,
+        SIMULATION_PROGRESS,
+        STATUS,
+    )
+}
+"""All streams by name."""
+
+SCHEMAS: dict[str, Codec[Any]] = {item.schema: item for item in codec.CODECS}
+"""All codecs by the full name of their message."""
+
+
+def sensor_key(station: str, sensor: str, stream: str) -> str:
+    """Key of a sensor's stream or endpoint; ``"*"`` for any station or sensor."""
+    return f"{ROOT}/{_chunk(station, 'station')}/{_chunk(sensor, 'sensor')}/{stream}"
+
+
+def service_key(station: str, service: str, instance: str, endpoint: str) -> str:
+    """Key of what a process says or answers; ``"*"`` for any."""
+    return (
+        f"{ROOT}/{_chunk(station, 'station')}/@service/"
+        f"{_chunk(service, 'service')}/{_chunk(instance, 'instance')}/{endpoint}"
+    )
+
+
+def live_key(station: str, service: str, instance: str, what: str) -> str:
+    """Key of a liveliness token; ``"*"`` for any."""
+    return (
+        f"{LIVE_ROOT}/{_chunk(station, 'station')}/"
+        f"{_chunk(service, 'service')}/{_chunk(instance, 'instance')}/{what}"
+    )
+
+
+def asking_key(station: str, request_id: str) -> str:
+    """Key of the token of a caller that waits for the answer to ``request_id``; ``"*"`` for any.
+
+    The id may be any text, so its digest stands in the key.
+    """
+    digest = "*" if request_id == "*" else hashlib.sha256(request_id.encode()).hexdigest()[:32]
+    return f"{ASKING_ROOT}/{_chunk(station, 'station')}/{digest}"
+
+
+def _chunk(name: str, what: str) -> str:
+    return name if name == "*" else check_name(name, what)
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """What a key says: station, sensor (or ``service/instance``) and topic."""
+
+    station: str
+    sensor: str
+    topic: str
+
+
+def parse_key(key: str) -> Address:
+    """Split a stream's key.
+
+    Raises:
+        WireError: It is not a key of this contract (reason ``"key"``).
+    """
+    chunks = key.split("/")
+    if len(chunks) == 5 and key.startswith(ROOT):
+        return Address(chunks[2], chunks[3], chunks[4])
+    if len(chunks) == 7 and key.startswith(ROOT) and chunks[3] == "@service":
+        return Address(chunks[2], f"{chunks[4]}/{chunks[5]}", chunks[6])
+    raise WireError(
+        f"key {key!r} is not {ROOT}/<station>/<sensor>/<stream>",
+        remedy="publish under the keys of docs/adr/0004-keys-and-qos.md",
+        reason="key",
+    )
+
+
+def check_schema(encoding: str, wanted: str) -> None:
+    """Check the encoding of a payload.
+
+    Raises:
+        WireError: Another schema (reason ``"schema"``), or one of a future contract
+            (reason ``"future_contract"``).
+    """
+    if encoding == ENCODING_PREFIX + wanted:
+        return
+    schema = encoding.removeprefix(ENCODING_PREFIX)
+    package, _, message = schema.rpartition(".")
+    version = package.removeprefix("palpate.v")
+    if package.startswith("palpate.v") and version.isdigit() and int(version) > CONTRACT_VERSION:
+        raise WireError(
+            f"{message} comes in contract v{version}, this palpate speaks v{CONTRACT_VERSION}",
+            remedy="upgrade palpate on this host: pip install --upgrade palpate",
+            reason="future_contract",
+        )
+    raise WireError(
+        f"payload is {encoding!r}, not {ENCODING_PREFIX + wanted!r}",
+        remedy="publish the message that the key promises, with its encoding",
+        reason="schema",
+    )

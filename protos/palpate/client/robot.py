@@ -1,0 +1,323 @@
+"""What a robot uses: features and fields now, tare, who is alive, telling its own pose.
+
+Five lines::
+
+    from palpate.client import Client
+
+    with Client() as robot:
+        estimate = robot.features("finger", max_age_s=0.05)
+        print(estimate.force, estimate.contact_location)
+
+Every failure is a ``PalpateError``: nothing hangs, nothing old is returned as fresh.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, TypeVar
+
+from palpate.bus import Alive, Delivery, Received, Session, Subscriber
+from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
+from palpate.client.robot_poses import RobotPosePublisher
+from palpate.client.simulations import OnProgress, OnStep, ask_simulation
+from palpate.closing import Closing
+from palpate.codec import (
+    FIELD_ESTIMATE,
+    FIELD_FRAME,
+    FIELD_REQUEST,
+    MODEL_METADATA,
+    SERVICE_REQUEST,
+    SIMULATION_CANCEL_REPLY,
+    SIMULATION_CANCEL_REQUEST,
+    STATUS,
+    SYNTHESIS_ESTIMATE,
+    TARE,
+    TARE_REQUEST,
+    WRENCH_ZERO,
+    WRENCH_ZERO_REQUEST,
+)
+from palpate.config import DEFAULT_ROUTER, LinkConfig, TlsConfig
+from palpate.errors import PalpateError, StaleError
+from palpate.messages import (
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    FieldFrame,
+    FieldRequest,
+    ModelMetadata,
+    ServiceRequest,
+    SimulationCancelRequest,
+    SimulationReply,
+    SimulationRequest,
+    Status,
+    SynthesisEstimate,
+    Tare,
+    TareRequest,
+    WrenchZero,
+    WrenchZeroRequest,
+    as_field_frame,
+)
+
+M = TypeVar("M")
+
+
+class Client(Closing):
+    """A robot's view of a station.
+
+    Args:
+        connect: Endpoint of the router.
+        station: Name of the station.
+        timeout_s: How long joining the bus, and by default a question, may take [s].
+        tls: Certificates, for a router on another host.
+
+    Raises:
+        LinkError: No router at ``connect``.
+    """
+
+    def __init__(
+        self,
+        connect: str = DEFAULT_ROUTER,
+        *,
+        station: str = "lab",
+        timeout_s: float = 2.0,
+        tls: TlsConfig | None = None,
+    ) -> None:
+        self._timeout_s = timeout_s
+        self._subscribers: dict[tuple[str, str], Subscriber[Any]] = {}
+        self._publishers: list[RobotPosePublisher] = []
+        link = LinkConfig(connect=(connect,), wait_for_router_s=timeout_s, tls=tls)
+        self.session = Session.open(link, station=station)
+
+    def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
+        """Contact location and force of one finger now.
+
+        The first call subscribes and waits up to the client's timeout for a first estimate.
+
+        Args:
+            sensor: Name of the sensor.
+            max_age_s: The oldest reading that may be used [s], by the time it was taken.
+
+        Raises:
+            StaleError: There is none so young.
+        """
+        return self._latest(FEATURES, sensor, max_age_s)
+
+    def electrodes(self, sensor: str, *, max_age_s: float = 0.05) -> ElectrodeFrame:
+        """Raw counts of one finger now; see ``features``."""
+        return self._latest(ELECTRODES, sensor, max_age_s)
+
+    def field(self, sensor: str, *, max_age_s: float = 0.2) -> FieldEstimate:
+        """Displacement of each skin node now; see ``features``."""
+        return self._latest(FIELD, sensor, max_age_s)
+
+    def synthesis(self, sensor: str, *, max_age_s: float = 0.2) -> SynthesisEstimate:
+        """Synthesised tared counts now; see ``features``."""
+        return self._latest(SYNTHESIS, sensor, max_age_s)
+
+    def estimate_field(
+        self, sensor: str, frame: ElectrodeFrame | None = None, *, timeout_s: float | None = None
+    ) -> FieldEstimate:
+        """Ask for the displacement of each skin node of one frame, however old it is.
+
+        Args:
+            sensor: Name of the sensor.
+            frame: The frame; None = the sensor's newest, see ``electrodes``.
+            timeout_s: How long it may take [s]; None = the client's timeout.
+
+        Raises:
+            LinkError: No field service runs.
+            RemoteError: It has no field for this frame, e.g. because the frame is not tared.
+            StaleError: No frame is given and none is young enough.
+        """
+        return self.session.query(
+            "estimate",
+            service="field",
+            request=FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
+            request_codec=FIELD_REQUEST,
+            reply_codec=FIELD_ESTIMATE,
+            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+        )
+
+    def synthesise(
+        self, field: FieldFrame | FieldEstimate, *, timeout_s: float | None = None
+    ) -> SynthesisEstimate:
+        """Ask for the tared counts that go with a field.
+
+        Args:
+            field: Known or estimated, on the mesh of the served bundle.
+            timeout_s: How long it may take [s]; None = the client's timeout.
+
+        Raises:
+            LinkError: No synthesis service runs.
+            RemoteError: It has no answer for this field, e.g. because the mesh is another.
+        """
+        return self.session.query(
+            "synthesise",
+            service="synthesis",
+            request=as_field_frame(field),
+            request_codec=FIELD_FRAME,
+            reply_codec=SYNTHESIS_ESTIMATE,
+            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+        )
+
+    def next_features(self, sensor: str, *, timeout_s: float = 1.0) -> Received[FeatureEstimate]:
+        """Wait for the next estimate that was not returned yet.
+
+        Raises:
+            StreamTimeout: None came in time.
+        """
+        return self._subscriber(FEATURES, sensor).next(timeout_s)
+
+    def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
+        """Tell where the flange of a robot is: ``put`` it from the control loop.
+
+        A gateway with the driver ``pose_zenoh`` makes poses of the indenter of it.
+
+        Args:
+            robot: Name of the robot, as the gateway's option ``robot`` has it.
+        """
+        self._publishers.append(RobotPosePublisher(self.session, robot))
+        return self._publishers[-1]
+
+    def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
+        """Take the untouched finger as zero now.
+
+        Args:
+            sensor: Name of the sensor.
+            frames: Frames to average; 0 = the gateway's own number.
+            timeout_s: How long it may take [s].
+
+        Raises:
+            RemoteError: The gateway refuses, e.g. because the finger is touched.
+        """
+        return self.session.query(
+            "tare",
+            sensor=sensor,
+            request=TareRequest(frames=frames),
+            request_codec=TARE_REQUEST,
+            reply_codec=TARE,
+            timeout_s=timeout_s,
+        )
+
+    def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
+        """Take the present load of a force/torque sensor as zero.
+
+        Args:
+            sensor: Name of the sensor.
+            readings: How many to average before and after; 0 = the gateway's own number.
+            timeout_s: How long it may take [s].
+
+        Raises:
+            LinkError: Nobody serves a force/torque sensor of this name.
+            RemoteError: The gateway refuses, e.g. because the load is not still.
+        """
+        return self.session.query(
+            "zero",
+            sensor=sensor,
+            request=WrenchZeroRequest(readings=readings),
+            request_codec=WRENCH_ZERO_REQUEST,
+            reply_codec=WRENCH_ZERO,
+            timeout_s=timeout_s,
+        )
+
+    def simulate(
+        self,
+        request: SimulationRequest,
+        *,
+        sensor: str = "twin",
+        timeout_s: float = 60.0,
+        on_progress: OnProgress | None = None,
+        on_step: OnStep | None = None,
+    ) -> SimulationReply:
+        """Indent the finite-element fingertip.
+
+        Args:
+            request: What to simulate; ``palpate.client.simulations.straight_path`` makes paths.
+            sensor: Name under which the service serves.
+            timeout_s: How long it may take, time in the queue included [s]. What has converged by
+                then is returned, and ``outcome`` says that it is not all.
+            on_progress: Called, in this thread, whenever the service says how far it is.
+            on_step: Called, in this thread, with number and values of each step as it converges.
+
+        Raises:
+            LinkError: No finite-element service runs.
+            RemoteError: It refuses (``retry_after_s`` says when to ask again), or cannot go on.
+                Steps that had converged were given to ``on_step``.
+        """
+        return ask_simulation(
+            self.session,
+            request,
+            sensor=sensor,
+            timeout_s=timeout_s,
+            on_progress=on_progress,
+            on_step=on_step,
+        )
+
+    def cancel_simulation(
+        self, request_id: str, *, sensor: str = "twin", timeout_s: float = 5.0
+    ) -> bool:
+        """Stop a simulation; whoever asked for it gets what has converged.
+
+        Returns:
+            Whether it was waiting or running.
+        """
+        return self.session.query(
+            "simulate_cancel",
+            sensor=sensor,
+            request=SimulationCancelRequest(request_id),
+            request_codec=SIMULATION_CANCEL_REQUEST,
+            reply_codec=SIMULATION_CANCEL_REPLY,
+            timeout_s=timeout_s,
+        ).found
+
+    def model(self, *, service: str = "features") -> ModelMetadata:
+        """What the served bundle says of itself."""
+        return self.session.query(
+            "model",
+            service=service,
+            request=ServiceRequest(),
+            request_codec=SERVICE_REQUEST,
+            reply_codec=MODEL_METADATA,
+            timeout_s=self._timeout_s,
+        )
+
+    def alive(self) -> list[Alive]:
+        """Who is there, and who is ready."""
+        return self.session.alive()
+
+    def status(self) -> list[Status]:
+        """What every process of the station says of itself; broken answers are left out."""
+        answers = self.session.query_all(
+            "status",
+            request=ServiceRequest(),
+            request_codec=SERVICE_REQUEST,
+            reply_codec=STATUS,
+            timeout_s=self._timeout_s,
+        )
+        return [answer for answer in answers if not isinstance(answer, PalpateError)]
+
+    def close(self) -> None:
+        """Leave the bus."""
+        for publisher in self._publishers:
+            publisher.close()
+        self.session.close()
+
+    def _subscriber(self, topic: Topic[M], sensor: str) -> Subscriber[M]:
+        key = (topic.name, sensor)
+        if key not in self._subscribers:
+            self._subscribers[key] = self.session.subscriber(
+                topic, sensor=sensor, delivery=Delivery.NEWEST
+            )
+        return self._subscribers[key]
+
+    def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
+        first = (topic.name, sensor) not in self._subscribers
+        subscriber = self._subscriber(topic, sensor)
+        deadline = time.monotonic() + (self._timeout_s if first else 0.0)
+        while True:
+            try:
+                return subscriber.latest(max_age_s).message
+            except StaleError:
+                if time.monotonic() >= deadline:
+                    raise
+                time.sleep(0.005)

@@ -1,0 +1,81 @@
+"""Values to bytes and back, checked both ways. One ``Codec`` for each message of ``palpate.v1``."""
+
+from palpate.codec.base import Codec
+from palpate.codec.estimates import FEATURE_ESTIMATE, FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
+from palpate.codec.frames import (
+    ELECTRODE_FRAME,
+    FIELD_FRAME,
+    INDENTER_POSE_FRAME,
+    WRENCH_FRAME,
+)
+from palpate.codec.robot import ROBOT_POSE_FRAME
+from palpate.codec.sensors import WRENCH_ZERO, WRENCH_ZERO_REQUEST
+from palpate.codec.service import (
+    ERROR,
+    FIELD_REQUEST,
+    MODEL_METADATA,
+    SERVICE_REQUEST,
+    STATUS,
+    TARE,
+    TARE_REQUEST,
+)
+from palpate.codec.simulation import (
+    SIMULATION_CANCEL_REPLY,
+    SIMULATION_CANCEL_REQUEST,
+    SIMULATION_PROGRESS,
+    SIMULATION_REQUEST,
+)
+from palpate.codec.simulation_reply import SIMULATION_REPLY
+
+CODECS = (
+    ELECTRODE_FRAME,
+    WRENCH_FRAME,
+    INDENTER_POSE_FRAME,
+    ROBOT_POSE_FRAME,
+    FIELD_FRAME,
+    FEATURE_ESTIMATE,
+    FIELD_ESTIMATE,
+    SYNTHESIS_ESTIMATE,
+    TARE,
+    TARE_REQUEST,
+    WRENCH_ZERO,
+    WRENCH_ZERO_REQUEST,
+    FIELD_REQUEST,
+    SERVICE_REQUEST,
+    STATUS,
+    MODEL_METADATA,
+    ERROR,
+    SIMULATION_REQUEST,
+    SIMULATION_PROGRESS,
+    SIMULATION_REPLY,
+    SIMULATION_CANCEL_REQUEST,
+    SIMULATION_CANCEL_REPLY,
+)
+"""All codecs of the contract."""
+
+__all__ = [
+    "CODECS",
+    "ELECTRODE_FRAME",
+    "ERROR",
+    "FEATURE_ESTIMATE",
+    "FIELD_ESTIMATE",
+    "FIELD_FRAME",
+    "FIELD_REQUEST",
+    "INDENTER_POSE_FRAME",
+    "MODEL_METADATA",
+    "ROBOT_POSE_FRAME",
+    "SERVICE_REQUEST",
+    "SIMULATION_CANCEL_REPLY",
+    "SIMULATION_CANCEL_REQUEST",
+    "SIMULATION_PROGRESS",
+    "SIMULATION_REPLY",
+    "SIMULATION_REQUEST",
+    "STATUS",
+    "SYNTHESIS_ESTIMATE",
+    "TARE",
+    "TARE_REQUEST",
+    "WRENCH_FRAME",
+    "WRENCH_ZERO",
+    "WRENCH_ZERO_REQUEST",
+    "Codec",
+]

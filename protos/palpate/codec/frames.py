@@ -1,0 +1,194 @@
+"""Codec of frames: what a gateway publishes. Hot path: checks are inlined on purpose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from palpate.codec.base import Codec, codec_of
+from palpate.codec.checks import (
+    check_digest,
+    check_field,
+    check_serial,
+    field_from_wire,
+    pose_values,
+    reject,
+    splice,
+    stamp_from_wire,
+    stamp_to_wire,
+    vector3_from_wire,
+    vector3_to_wire,
+)
+from palpate.errors import WireError
+from palpate.messages import (
+    COUNTS_MAX,
+    ElectrodeFrame,
+    FieldFrame,
+    IndenterPoseFrame,
+    SensorType,
+    WrenchFrame,
+)
+from palpate.v1 import frames_pb2
+
+_SENSOR_TYPES = {
+    int(kind): (kind, kind.layout.electrodes, kind.layout.pac_samples, kind.layout.slots)
+    for kind in SensorType
+}
+_HIGH = slice(1, None, 2)  # high bytes of little-endian uint16: >= 16 means more than 12 bits
+
+
+def _check_counts(raw: bytes, count: int, what: str) -> None:
+    if len(raw) != 2 * count:
+        reject(f"{what}_count", f"{what} has {len(raw) / 2:g} values, not {count}")
+    if max(raw[_HIGH]) > 15:
+        at = next(i for i, high in enumerate(raw[_HIGH]) if high > 15)
+        reject("counts_range", f"{what}[{at}] exceeds 12 bits ({COUNTS_MAX} counts)")
+
+
+def electrodes_from_wire(msg: frames_pb2.ElectrodeFrame) -> ElectrodeFrame:
+    """Check and convert an electrode frame."""
+    kind = _SENSOR_TYPES.get(msg.sensor_type)
+    if kind is None:
+        reject("sensor_type", f"sensor_type {msg.sensor_type} is not known")
+    sensor_type, count, pac_samples, bits = kind
+    electrodes, pac = msg.electrodes, msg.pac
+    _check_counts(electrodes, count, "electrode")
+    _check_counts(pac, pac_samples, "pac")
+    pdc, tac, tdc = msg.pdc, msg.tac, msg.tdc
+    if pdc > COUNTS_MAX or tac > COUNTS_MAX or tdc > COUNTS_MAX:
+        reject("counts_range", f"pdc {pdc}, tac {tac} or tdc {tdc} exceeds {COUNTS_MAX} counts")
+    validity, slot_period_ns = msg.validity, msg.slot_period_ns
+    if validity >> bits:
+        reject("validity", f"validity {validity:#x} has bits beyond the {bits} channels")
+    if slot_period_ns == 0:
+        reject("slot_period", "slot_period_ns is 0")
+    return ElectrodeFrame(
+        stamp_from_wire(msg.stamp),
+        check_serial(msg.sensor_serial),
+        sensor_type,
+        np.frombuffer(electrodes, "<u2"),
+        pdc,
+        np.frombuffer(pac, "<u2"),
+        tac,
+        tdc,
+        validity,
+        slot_period_ns,
+        msg.tare_id,
+    )
+
+
+def _electrodes_encode(frame: ElectrodeFrame) -> bytes:
+    _, count, pac_samples, bits = _SENSOR_TYPES[frame.sensor_type]
+    electrodes, pac = frame.electrodes, frame.pac
+    if electrodes.dtype != np.uint16 or pac.dtype != np.uint16:
+        reject("dtype", f"electrodes {electrodes.dtype} and pac {pac.dtype} must be uint16")
+    electrode_bytes, pac_bytes = electrodes.tobytes(), pac.tobytes()
+    _check_counts(electrode_bytes, count, "electrode")
+    _check_counts(pac_bytes, pac_samples, "pac")
+    if frame.validity >> bits:
+        reject("validity", f"validity {frame.validity:#x} has bits beyond the {bits} channels")
+    if frame.slot_period_ns <= 0:
+        reject("slot_period", f"slot_period_ns is {frame.slot_period_ns}")
+    if not (0 <= frame.pdc <= COUNTS_MAX and 0 <= frame.tac <= COUNTS_MAX):
+        reject("counts_range", f"pdc {frame.pdc} or tac {frame.tac} is not 0..{COUNTS_MAX}")
+    if not 0 <= frame.tdc <= COUNTS_MAX:
+        reject("counts_range", f"tdc {frame.tdc} is not 0..{COUNTS_MAX}")
+    msg = frames_pb2.ElectrodeFrame(
+        sensor_serial=check_serial(frame.sensor_serial),
+        sensor_type=int(frame.sensor_type),  # type: ignore[arg-type]
+        electrodes=electrode_bytes,
+        pdc=frame.pdc,
+        pac=pac_bytes,
+        tac=frame.tac,
+        tdc=frame.tdc,
+        validity=frame.validity,
+        slot_period_ns=frame.slot_period_ns,
+        tare_id=frame.tare_id,
+    )
+    stamp_to_wire(frame.stamp, msg.stamp)
+    return msg.SerializeToString()
+
+
+def _wrench_from_wire(msg: frames_pb2.WrenchFrame) -> WrenchFrame:
+    return WrenchFrame(
+        stamp_from_wire(msg.stamp),
+        check_serial(msg.sensor_serial),
+        vector3_from_wire(msg.force, "force"),
+        vector3_from_wire(msg.torque, "torque"),
+        msg.overload,
+    )
+
+
+def _wrench_encode(frame: WrenchFrame) -> bytes:
+    msg = frames_pb2.WrenchFrame(
+        sensor_serial=check_serial(frame.sensor_serial), overload=frame.overload
+    )
+    stamp_to_wire(frame.stamp, msg.stamp)
+    vector3_to_wire(frame.force, msg.force, "force")
+    vector3_to_wire(frame.torque, msg.torque, "torque")
+    return msg.SerializeToString()
+
+
+def _pose_from_wire(msg: frames_pb2.IndenterPoseFrame) -> IndenterPoseFrame:
+    pose = msg.pose_sensor_indenter
+    values = pose_values(
+        (pose.px, pose.py, pose.pz, pose.qw, pose.qx, pose.qy, pose.qz), "pose_sensor_indenter"
+    )
+    if msg.in_contact and msg.contact_unknown:
+        reject("contact", "in_contact is true and contact_unknown too")
+    return IndenterPoseFrame(
+        stamp_from_wire(msg.stamp),
+        check_serial(msg.indenter, "indenter"),
+        np.array(values[:3]),
+        np.array(values[3:]),
+        None if msg.contact_unknown else msg.in_contact,
+    )
+
+
+def _pose_encode(frame: IndenterPoseFrame) -> bytes:
+    if frame.position.shape != (3,) or frame.orientation.shape != (4,):
+        raise WireError(
+            f"pose has shapes {frame.position.shape} and {frame.orientation.shape}",
+            remedy="give position (3,) and quaternion w x y z (4,)",
+            reason="shape",
+        )
+    values = pose_values((*frame.position.tolist(), *frame.orientation.tolist()), "pose")
+    msg = frames_pb2.IndenterPoseFrame(
+        indenter=check_serial(frame.indenter, "indenter"),
+        in_contact=bool(frame.in_contact),
+        contact_unknown=frame.in_contact is None,
+    )
+    stamp_to_wire(frame.stamp, msg.stamp)
+    pose = msg.pose_sensor_indenter
+    pose.px, pose.py, pose.pz, pose.qw, pose.qx, pose.qy, pose.qz = values
+    return msg.SerializeToString()
+
+
+def _field_from_wire(msg: frames_pb2.FieldFrame) -> FieldFrame:
+    return FieldFrame(
+        stamp_from_wire(msg.stamp),
+        check_serial(msg.sensor_serial),
+        check_digest(msg.mesh_sha256, "mesh_sha256"),
+        field_from_wire(msg.displacement, 3, "displacement"),
+    )
+
+
+def _field_encode(frame: FieldFrame) -> bytes:
+    msg = frames_pb2.FieldFrame(
+        sensor_serial=check_serial(frame.sensor_serial),
+        mesh_sha256=check_digest(frame.mesh_sha256, "mesh_sha256"),
+    )
+    stamp_to_wire(frame.stamp, msg.stamp)
+    displacement = check_field(frame.displacement, 3, "displacement")
+    return msg.SerializeToString() + splice(4, displacement)
+
+
+ELECTRODE_FRAME: Codec[ElectrodeFrame] = codec_of(
+    frames_pb2.ElectrodeFrame, _electrodes_encode, electrodes_from_wire
+)
+WRENCH_FRAME: Codec[WrenchFrame] = codec_of(
+    frames_pb2.WrenchFrame, _wrench_encode, _wrench_from_wire
+)
+INDENTER_POSE_FRAME: Codec[IndenterPoseFrame] = codec_of(
+    frames_pb2.IndenterPoseFrame, _pose_encode, _pose_from_wire
+)
+FIELD_FRAME: Codec[FieldFrame] = codec_of(frames_pb2.FieldFrame, _field_encode, _field_from_wire)

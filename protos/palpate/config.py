@@ -1,0 +1,155 @@
+"""Configuration shared by all rooms: strict models, and how a process joins the bus."""
+
+from __future__ import annotations
+
+import difflib
+import ipaddress
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from palpate.errors import ConfigError
+
+C = TypeVar("C", bound=BaseModel)
+
+DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
+
+
+class StrictConfig(BaseModel):
+    """Base of all configuration: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", str_strip_whitespace=True)
+
+
+class TlsConfig(StrictConfig):
+    """Certificates for mutual TLS (Zenoh ``transport/link/tls``)."""
+
+    root_ca_certificate: Path
+    certificate: Path
+    private_key: Path
+
+
+class LinkConfig(StrictConfig):
+    """How a process joins the bus.
+
+    Attributes:
+        connect: Endpoints of routers, e.g. ``tcp/127.0.0.1:7447``.
+        listen: Endpoints for direct links from peers; port 0 = any free one.
+        direct: Whether processes link to one another directly (least latency). False = all data
+            through the router: one path, so that nothing is overtaken while a direct link comes
+            up. A lossless replay needs that.
+        wait_for_router_s: How long opening waits for a router [s]; negative = for ever (services).
+        lease_s: A peer silent for this long is gone [s].
+        tls: Certificates; required for any listener that is not loopback.
+    """
+
+    connect: tuple[str, ...] = (DEFAULT_ROUTER,)
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    direct: bool = True
+    wait_for_router_s: float = -1.0
+    lease_s: float = Field(default=2.0, gt=0.1)
+    tls: TlsConfig | None = None
+
+    @field_validator("connect", "listen")
+    @classmethod
+    def _endpoints(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for endpoint in value:
+            endpoint_host_port(endpoint)
+        return value
+
+    @model_validator(mode="after")
+    def _exposed_listener_needs_tls(self) -> LinkConfig:
+        for endpoint in self.listen:
+            host, _ = endpoint_host_port(endpoint)
+            if not is_loopback(host) and (self.tls is None or not endpoint.startswith("tls/")):
+                raise ValueError(
+                    f"listener {endpoint!r} is reachable from other hosts without mutual TLS: "
+                    "use tls/HOST:PORT with [link.tls] certificates, or listen on 127.0.0.1"
+                )
+        return self
+
+
+def endpoint_host_port(endpoint: str) -> tuple[str, int]:
+    """Host and port of a Zenoh endpoint such as ``tcp/127.0.0.1:7447``.
+
+    Raises:
+        ValueError: It is not ``tcp/HOST:PORT`` or ``tls/HOST:PORT``.
+    """
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if protocol not in ("tcp", "tls") or not host or not port.isdigit() or int(port) > 65535:
+        raise ValueError(f"endpoint {endpoint!r} is not tcp/HOST:PORT or tls/HOST:PORT")
+    return host.strip("[]"), int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether ``host`` can be reached from this host only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def parse_config(model: type[C], values: Mapping[str, Any], *, where: str) -> C:
+    """Build a configuration and translate what is wrong with it.
+
+    Args:
+        model: The configuration's class.
+        values: Its keys and values, e.g. a TOML table.
+        where: File or table the values come from, for the error.
+
+    Raises:
+        ConfigError: Names ``where``, the key, and for an unknown key the nearest known one.
+    """
+    try:
+        return model.model_validate(dict(values))
+    except ValidationError as error:
+        raise config_error(model, error, where=where) from error
+
+
+def config_error(model: type[BaseModel], error: ValidationError, *, where: str) -> ConfigError:
+    """Translate pydantic's first complaint into one line that names file, key and remedy."""
+    first = error.errors()[0]
+    path = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = _known_keys(model, first["loc"])
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.5)
+        remedy = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(sorted(known))}"
+        return ConfigError(f"{where}: unknown key {path!r}", remedy=remedy)
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if first["type"] == "missing":
+        return ConfigError(f"{where}: key {path!r} is missing{more}", remedy=f"set {path}")
+    message = first["msg"].removeprefix("Value error, ")
+    return ConfigError(
+        f"{where}: {path or 'configuration'} = {first['input']!r}: {message}{more}",
+        remedy=f"correct {path or 'it'} in {where}",
+    )
+
+
+def _known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Keys of the (nested) model in which the last part of ``loc`` was not known."""
+    current: Any = model
+    for part in loc[:-1]:
+        if isinstance(part, int):
+            continue
+        field = current.model_fields.get(part)
+        nested = None if field is None else _nested_model(field.annotation)
+        if nested is None:
+            return []
+        current = nested
+    return list(current.model_fields)
+
+
+def _nested_model(annotation: Any) -> type[BaseModel] | None:
+    """The model inside ``X``, ``X | None``, ``tuple[X, ...]`` or ``list[X]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        found = _nested_model(inner)
+        if found is not None:
+            return found
+    return None

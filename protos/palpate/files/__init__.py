@@ -1,0 +1,1 @@
+"""Files that palpate writes and reads: records, tapes and model bundles."""

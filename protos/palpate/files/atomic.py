@@ -1,0 +1,34 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from palpate.errors import DatasetError
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """A place beside a file, to write to; it gets the file's name when the block ends well.
+
+    Args:
+        path: The file; its folder is made. One that is there stays until then.
+
+    Raises:
+        DatasetError: The disk refused.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise DatasetError(
+            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):  # its folder may be what could not be made
+            partial.unlink(missing_ok=True)

@@ -1,0 +1,111 @@
+"""Messages as Python values: what the wire of ``palpate.v1`` means, with shapes and units.
+
+SI units, sensor frame (docs/conventions.md) unless a name says otherwise. Values are frozen; arrays
+are not copied on construction and must not be written to afterwards. The codec checks them.
+"""
+
+from palpate.messages.estimates import (
+    FeatureEstimate,
+    FieldEstimate,
+    SynthesisEstimate,
+    as_field_frame,
+)
+from palpate.messages.frames import (
+    COUNTS_MAX,
+    NO_TARE,
+    PAC_SAMPLES,
+    CountArray,
+    ElectrodeFrame,
+    FieldFrame,
+    FloatArray,
+    IndenterPoseFrame,
+    Origin,
+    SensorType,
+    Stamp,
+    WrenchFrame,
+)
+from palpate.messages.layout import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+from palpate.messages.robot import RobotPoseFrame
+from palpate.messages.sensors import (
+    ChannelFault,
+    FaultKind,
+    SensorState,
+    SensorStatus,
+    WrenchZero,
+    WrenchZeroRequest,
+)
+from palpate.messages.service import (
+    ErrorReply,
+    FieldRequest,
+    ModelMetadata,
+    ServiceRequest,
+    ServiceState,
+    Status,
+    Tare,
+    TareRequest,
+    TensorInfo,
+)
+from palpate.messages.simulation import (
+    DoubleArray,
+    Pose,
+    SimulationCancelReply,
+    SimulationCancelRequest,
+    SimulationConvergence,
+    SimulationOutcome,
+    SimulationParameters,
+    SimulationPhase,
+    SimulationProgress,
+    SimulationReply,
+    SimulationRequest,
+    SimulationStep,
+)
+
+__all__ = [
+    "BIOTAC_LAYOUT",
+    "BIOTAC_SP_LAYOUT",
+    "COUNTS_MAX",
+    "NO_TARE",
+    "PAC_SAMPLES",
+    "ChannelFault",
+    "CountArray",
+    "DoubleArray",
+    "ElectrodeFrame",
+    "ErrorReply",
+    "FaultKind",
+    "FeatureEstimate",
+    "FieldEstimate",
+    "FieldFrame",
+    "FieldRequest",
+    "FloatArray",
+    "FrameLayout",
+    "IndenterPoseFrame",
+    "ModelMetadata",
+    "Origin",
+    "Pose",
+    "RobotPoseFrame",
+    "SensorState",
+    "SensorStatus",
+    "SensorType",
+    "ServiceRequest",
+    "ServiceState",
+    "SimulationCancelReply",
+    "SimulationCancelRequest",
+    "SimulationConvergence",
+    "SimulationOutcome",
+    "SimulationParameters",
+    "SimulationPhase",
+    "SimulationProgress",
+    "SimulationReply",
+    "SimulationRequest",
+    "SimulationStep",
+    "Stamp",
+    "Status",
+    "SynthesisEstimate",
+    "Tare",
+    "TareRequest",
+    "TensorInfo",
+    "WrenchFrame",
+    "WrenchZero",
+    "WrenchZeroRequest",
+    "as_field_frame",
+]

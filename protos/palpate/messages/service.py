@@ -1,0 +1,167 @@
+"""What services say and are asked: tare, status, model metadata, typed error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from palpate.errors import ErrorCode
+from palpate.messages.frames import NO_TARE, ElectrodeFrame, FloatArray, Stamp
+from palpate.messages.sensors import SensorStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Tare:
+    """The untouched state of one sensor.
+
+    Attributes:
+        tare_id: Unique per gateway run and sensor, never ``NO_TARE``.
+        stamp: Stamp of the last frame averaged.
+        sensor_serial: Serial number of the sensor.
+        electrodes: Mean raw counts (the baseline), float32, shape ``(19,)`` (SP: 24).
+        electrodes_sd: Standard deviation of the averaged frames [counts], the same shape.
+        pdc: Mean raw PDC [counts].
+        pac: Mean raw PAC [counts].
+        tac: Mean raw TAC [counts].
+        tdc: Mean raw TDC [counts].
+        frames_averaged: How many frames went in.
+    """
+
+    tare_id: int
+    stamp: Stamp
+    sensor_serial: str
+    electrodes: FloatArray
+    electrodes_sd: FloatArray
+    pdc: float
+    pac: float
+    tac: float
+    tdc: float
+    frames_averaged: int
+
+
+@dataclass(frozen=True, slots=True)
+class TareRequest:
+    """Tare now (``tare_id = NO_TARE``), or tell me the tare of this id."""
+
+    tare_id: int = NO_TARE
+    frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class FieldRequest:
+    """Ask a field service for the field of one frame.
+
+    Attributes:
+        sensor: Name of the sensor in the key of its streams; its gateway knows the frame's tare.
+        frame: Raw counts of one sampling round.
+    """
+
+    sensor: str
+    frame: ElectrodeFrame
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceRequest:
+    """Ask a service for its status or its model's metadata."""
+
+
+class ServiceState(IntEnum):
+    """What a process says of itself."""
+
+    STARTING = 1
+    READY = 2
+    DEGRADED = 3
+    FINISHED = 4
+    STOPPING = 5
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorReply:
+    """A typed error as a message.
+
+    Attributes:
+        code: What kind.
+        message: What was wrong, naming the thing.
+        remedy: What to do.
+        retry_after_s: Ask again after this time [s]; 0 = do not.
+    """
+
+    code: ErrorCode
+    message: str
+    remedy: str
+    retry_after_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a process says of itself: once a second, when a state changes, and when asked.
+
+    Attributes:
+        service: ``gateway``, ``features``, ``recorder``, ...
+        instance: Name of this process among several of its kind.
+        state: See ``ServiceState``.
+        monotonic_ns: Host monotonic clock [ns].
+        wall_ns: Host wall clock [ns since the Unix epoch].
+        uptime_s: Since the process was ready to count [s].
+        version: Version of palpate.
+        counters: Events since the start.
+        gauges: Present values; the name ends in the unit.
+        sensors: Sensors it serves.
+        message: One line for people.
+        last_error: The last thing that went wrong, if any.
+        sensor_states: Of a gateway: each of its sensors.
+    """
+
+    service: str
+    instance: str
+    state: ServiceState
+    monotonic_ns: int
+    wall_ns: int
+    uptime_s: float
+    version: str
+    counters: Mapping[str, int] = field(default_factory=dict)
+    gauges: Mapping[str, float] = field(default_factory=dict)
+    sensors: Sequence[str] = ()
+    message: str = ""
+    last_error: ErrorReply | None = None
+    sensor_states: Sequence[SensorStatus] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TensorInfo:
+    """Name, type, shape (-1 = any batch size) and unit of one input or output of a model."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModelMetadata:
+    """What a served bundle says of itself.
+
+    Attributes:
+        name: Name of the bundle.
+        version: Its version.
+        task: ``"features"``, ``"field"`` or ``"synthesis"``.
+        bundle_sha256: Digest of its manifest, 32 bytes.
+        contract_version: Version of the bundle contract it was written for.
+        inputs: Inputs of the model.
+        outputs: Outputs of the model.
+        training_data_sha256: Digest of the data set it was trained on, hex.
+        metrics: Held-out results; the name ends in the unit.
+        trained_on: One line for people.
+    """
+
+    name: str
+    version: int
+    task: str
+    bundle_sha256: bytes
+    contract_version: int
+    inputs: Sequence[TensorInfo]
+    outputs: Sequence[TensorInfo]
+    training_data_sha256: str
+    metrics: Mapping[str, float]
+    trained_on: str

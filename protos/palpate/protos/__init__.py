@@ -1,1 +1,0 @@
-"""The language of the rooms: messages, topics, codec, session, bundle and record contracts."""

@@ -1,0 +1,203 @@
+"""How a record is laid out. With ``view`` and ``field_view`` the only place that knows Rerun."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.anatomy import ELECTRODE_POSITIONS, SP_ELECTRODE_POSITIONS
+from palpate.extras import require
+from palpate.messages import SensorType
+from palpate_services import anatomy
+
+TIMELINE = "sensor_time"
+SEQUENCE = "seq"
+
+AXES = ("x", "y", "z")
+AXIS_COLOURS = ((236, 98, 66), (74, 186, 118), (66, 146, 246))
+TRUTH_COLOUR = (236, 236, 240)
+ESTIMATE_COLOUR = (255, 196, 61)
+ERROR_COLOUR = (214, 120, 222)
+QUIET_COLOUR = (120, 144, 170)
+BACKGROUND = (24, 26, 31)
+
+FIELD_FULL_M = 2e-3
+"""Displacement drawn in the last colour; the same in every file, so that files can be compared."""
+
+_FULL_SCALE_COUNTS = 400.0
+"""Tared counts at which an electrode is drawn in full colour."""
+
+MAX_SENSORS = 8
+"""Tabs in one view; more sensors are recorded but not laid out."""
+
+
+_POSITIONS = {
+    SensorType.BIOTAC: ELECTRODE_POSITIONS,
+    SensorType.BIOTAC_SP: SP_ELECTRODE_POSITIONS,
+}
+
+
+def electrode_names(count: int) -> list[str]:
+    """E1, E2, ..."""
+    return [f"E{at + 1}" for at in range(count)]
+
+
+def electrode_colours(count: int) -> list[tuple[int, int, int]]:
+    """One colour an electrode, in order around the colour circle."""
+    wheel = (colorsys.hls_to_rgb(at / count, 0.62, 0.65) for at in range(count))
+    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
+
+
+def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
+    """Colours of electrodes by their tared counts: cool where lowered, warm where raised.
+
+    Args:
+        tared: Tared counts, shape ``(N, 19)`` (SP: 24).
+
+    Returns:
+        Packed RGBA, uint32, of the same shape.
+    """
+    strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
+    rest = np.array([150.0, 156.0, 166.0])
+    full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))
+    rgb = (rest + strength * (full - rest)).astype(np.uint32)
+    packed = (rgb[..., 0] << 24) | (rgb[..., 1] << 16) | (rgb[..., 2] << 8) | 255
+    shades: npt.NDArray[np.uint32] = packed.astype(np.uint32)
+    return shades
+
+
+def blueprint(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
+    """Layout for these sensors: one tab each, fingertip left, signals right.
+
+    Args:
+        sensors: Types of the sensors by name, in order of their tabs.
+        with_fields: Those of them that have fields, which get a row more.
+    """
+    rrb = require("rerun.blueprint", extra="services")
+    tabs = [
+        _sensor_tab(rrb, sensor, kind, fields=sensor in with_fields)
+        for sensor, kind in [*sensors.items()][:MAX_SENSORS]
+    ]
+    return rrb.Blueprint(
+        tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any:
+    def plot(origin: str, name: str, *, legend: bool = True) -> Any:
+        return rrb.TimeSeriesView(
+            origin=f"{sensor}/{origin}",
+            name=name,
+            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+            plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
+            background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),
+        )
+
+    def body(origin: str, name: str) -> Any:
+        return rrb.Spatial3DView(
+            origin=f"{sensor}/{origin}",
+            name=name,
+            background=BACKGROUND,
+            line_grid=rrb.LineGrid3D(visible=False),
+            # From the side of the pad, tip to the left, as one looks at one's own finger.
+            eye_controls=rrb.EyeControls3D(
+                position=(0.009, -0.020, -0.024),
+                look_target=(-0.0055, 0.0, -0.003),
+                eye_up=(0.0, 0.0, 1.0),
+            ),
+        )
+
+    finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
+    signals = rrb.Vertical(
+        plot("electrodes", f"Electrodes E1-E{kind.electrode_count} [counts]", legend=False),
+        rrb.Horizontal(
+            plot("pdc", "PDC, static pressure [counts]", legend=False),
+            plot("pac", "PAC, vibration [counts]", legend=False),
+        ),
+        row_shares=[3, 2],
+    )
+    forces = rrb.Vertical(
+        *(plot(f"force/{axis}", f"Force {axis} [N]") for axis in AXES),
+        row_shares=[1, 1, 1],
+    )
+    errors = rrb.Vertical(
+        plot("error/force", "Error of the force [N]", legend=False),
+        plot("error/location", "Error of the contact location [m]", legend=False),
+    )
+    rows = [
+        rrb.Horizontal(finger, signals, column_shares=[2, 3]),
+        rrb.Horizontal(forces, errors, column_shares=[3, 2]),
+    ]
+    if fields:
+        scale = f"grey 0 mm to yellow {1e3 * FIELD_FULL_M:g} mm"
+        skins = [body(f"field/{of}", f"Skin, {of}: {scale}") for of in ("truth", "estimate")]
+        compared = rrb.Vertical(
+            plot("electrodes/tared", "Electrodes, measured and tared [counts]", legend=False),
+            plot("synthesised", "Electrodes, synthesised from a field [counts]", legend=False),
+        )
+        rows.insert(1, rrb.Horizontal(*skins, compared, column_shares=[1, 1, 1]))
+    return rrb.Vertical(*rows, row_shares=[1] * len(rows), name=sensor)
+
+
+def fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[str, Any]]:
+    """What never changes, as entity (below the sensor) and value: names, colours, the body.
+
+    The electrodes of a BioTac SP are drawn in the frame of their table and without a body, whose
+    shape no source tells.
+
+    Args:
+        kind: Type of the sensor.
+        again: Instead of those of another type: the finger was exchanged.
+    """
+    rr = require("rerun", extra="services")
+
+    def line(names: str | list[str], colours: Sequence[Any], width: float) -> Any:
+        return rr.SeriesLines(names=names, colors=colours, widths=[width] * len(colours))
+
+    names, wheel = electrode_names(kind.electrode_count), electrode_colours(kind.electrode_count)
+    yield "electrodes/raw", line(names, wheel, 1.2)
+    yield "electrodes/tared", line(names, wheel, 1.2)
+    yield "synthesised", line(names, wheel, 1.2)
+    yield "pdc", line("PDC", [QUIET_COLOUR], 1.5)
+    yield "pac", line("PAC", [QUIET_COLOUR], 1.0)
+    for axis, colour in zip(AXES, AXIS_COLOURS, strict=True):
+        # The thin truth is drawn over the thick estimate: what sticks out is the error.
+        yield f"force/{axis}/truth", line(f"{axis} truth", [TRUTH_COLOUR], 1.0)
+        yield f"force/{axis}/estimate", line(f"{axis} estimate", [colour], 3.0)
+    for what in ("force", "location"):
+        yield f"error/{what}", line(f"{what} error", [ERROR_COLOUR], 1.2)
+    if kind is SensorType.BIOTAC:
+        yield from _body(rr)
+    elif again:
+        yield "finger/core", rr.Mesh3D.cleared()
+        yield "finger/skin", rr.LineStrips3D.cleared()
+    yield "finger/electrodes", rr.Points3D(_POSITIONS[kind], radii=[7.5e-4])
+    for name, colour, point_m, arrow_m in (
+        ("truth", TRUTH_COLOUR, 7e-4, 2.4e-4),
+        ("estimate", ESTIMATE_COLOUR, 9e-4, 3e-4),
+    ):
+        contact = rr.Points3D.from_fields(colors=[colour], radii=[point_m])
+        yield f"finger/contact/{name}", contact
+        yield f"finger/force/{name}", rr.Arrows3D.from_fields(colors=[colour], radii=[arrow_m])
+
+
+def _body(rr: Any) -> Iterator[tuple[str, Any]]:
+    vertices, triangles, normals = anatomy.core_mesh()
+    core = rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=triangles,
+        vertex_normals=normals,
+        albedo_factor=(120, 130, 148),
+    )
+    skin = rr.LineStrips3D(anatomy.skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
+    yield "finger/core", core
+    yield "finger/skin", skin

@@ -1,0 +1,117 @@
+"""Configuration of estimating services and of the recorder: one table of a profile each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from palpate.config import StrictConfig
+from palpate.names import Name
+
+DEFAULT_BUNDLE = "features-virtual"
+
+
+class AnswererConfig(StrictConfig):
+    """What every service that answers messages with estimates is told.
+
+    Attributes:
+        bundle: Name of a packaged bundle (newest version), ``name:version``, or the path of a
+            bundle's folder.
+        sensors: Sensors to serve; empty = every sensor of the station.
+        delivery: ``newest`` answers the newest message and counts what it skipped (live);
+            ``every`` answers each and slows the source down (lossless replay).
+        keep_newest: Messages per sensor that may wait with ``newest``: a service that was held up
+            for less than this many catches up without loss; ``max_age_s`` still holds.
+        max_age_s: A live or simulated message older than this gets no estimate [s]; None = no
+            limit.
+        accept_replayed: Whether replayed messages are answered; a live station says no.
+        drain_s: How long a stopping service still answers what has already come [s].
+    """
+
+    bundle: str
+    sensors: tuple[Name, ...] = ()
+    delivery: Literal["newest", "every"] = "newest"
+    keep_newest: int = Field(default=3, ge=1, le=100)
+    max_age_s: float | None = Field(default=0.03, gt=0)
+    accept_replayed: bool = False
+    drain_s: float = Field(default=2.0, ge=0, le=30)
+
+
+class ElectrodesConfig(AnswererConfig):
+    """What a service is told that starts from electrodes.
+
+    Attributes:
+        tare_timeout_s: How long one frame may wait for a tare that nobody has announced [s].
+    """
+
+    tare_timeout_s: float = Field(default=0.2, gt=0, le=10)
+
+
+class FeaturesConfig(ElectrodesConfig):
+    """How electrodes become features."""
+
+    bundle: str = DEFAULT_BUNDLE
+
+
+class FieldConfig(ElectrodesConfig):
+    """How electrodes become displacement fields.
+
+    Attributes:
+        rate_hz: Fields a second and sensor at most [Hz], by the clock of the frames: the first
+            frame of each period is answered; None = every frame.
+    """
+
+    bundle: str = "field-twin"
+    keep_newest: int = Field(default=1, ge=1, le=100)
+    max_age_s: float | None = Field(default=0.1, gt=0)
+    rate_hz: float | None = Field(default=20.0, gt=0, le=1000)
+
+
+class SynthesisConfig(AnswererConfig):
+    """How displacement fields become electrodes.
+
+    Attributes:
+        source: ``truth`` takes fields that are known (``field_truth``), ``estimate`` those that
+            the field service estimates (``field``).
+    """
+
+    bundle: str = "synthesis-twin"
+    keep_newest: int = Field(default=1, ge=1, le=100)
+    max_age_s: float | None = Field(default=0.2, gt=0)
+    source: Literal["truth", "estimate"] = "truth"
+
+
+class RecorderConfig(StrictConfig):
+    """What is recorded, and where.
+
+    Attributes:
+        out: Folder of the records; made if absent.
+        topics: Names of the topics to record; empty = every recorded topic of the contract.
+        sensor: One sensor to record, or ``*`` for all.
+        delivery: ``queue`` drops (and counts) when the disk cannot follow (live); ``every`` slows
+            the source down instead (lossless replay).
+        capacity: Messages that may wait for the disk.
+        rrd: Whether a Rerun view is written beside each record.
+        rrd_max_bytes: A view larger than this is closed, the record goes on [bytes].
+        bundles: Bundles, by name or folder, that hold the meshes of the fields to draw, beside the
+            packaged ones.
+        min_free_bytes: Recording pauses while the disk has less free than this [bytes].
+        rotate_bytes: Start a new record at this size [bytes]; None = never.
+        rotate_s: Start a new record after this time [s]; None = never.
+        drain_s: How long a stopping recorder still writes what has already come [s].
+    """
+
+    out: Path = Path("runs")
+    topics: tuple[str, ...] = ()
+    sensor: str = "*"
+    delivery: Literal["queue", "every"] = "queue"
+    capacity: int = Field(default=50_000, ge=16)
+    rrd: bool = True
+    rrd_max_bytes: int = Field(default=2 * 1024**3, ge=1024**2)
+    bundles: tuple[str, ...] = ()
+    min_free_bytes: int = Field(default=256 * 1024**2, ge=0)
+    rotate_bytes: int | None = Field(default=None, ge=64 * 1024)
+    rotate_s: float | None = Field(default=None, ge=1)
+    drain_s: float = Field(default=5.0, ge=0, le=60)

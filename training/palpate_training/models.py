@@ -1,0 +1,91 @@
+"""The paper's fully connected network, with its normalisation inside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from palpate_training.dataset import ELECTRODES
+
+PAPER_WIDTHS = (256, 128, 128)
+"""Hidden layers of the paper's MLP."""
+
+Activation = Literal["silu", "relu"]
+"""The paper does not state its activation. SiLU won on validation blocks (training/LOG.md)."""
+
+_SMALLEST_SD = 1e-6
+"""Keeps a channel that never moves (a dead electrode) from dividing by zero."""
+
+
+class Mlp(nn.Module):
+    """Tared counts ``(N, 19)`` -> one quantity, by default ``(N, 3)``, in its own unit.
+
+    Standardisation of the inputs and of the outputs are constants of the graph, so whoever runs
+    it needs to know nothing about the training data.
+
+    Args:
+        widths: Hidden layers.
+        inputs: Number of input channels.
+        activation: After each hidden layer.
+        outputs: Number of output channels.
+    """
+
+    input_mean: Tensor
+    input_sd: Tensor
+    output_mean: Tensor
+    output_sd: Tensor
+
+    def __init__(
+        self,
+        widths: Sequence[int] = PAPER_WIDTHS,
+        inputs: int = ELECTRODES,
+        activation: Activation = "silu",
+        outputs: int = 3,
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for before, after in zip((inputs, *widths[:-1]), widths, strict=True):
+            layers += [nn.Linear(before, after), nn.SiLU() if activation == "silu" else nn.ReLU()]
+        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+        self.register_buffer("input_mean", torch.zeros(inputs))
+        self.register_buffer("input_sd", torch.ones(inputs))
+        self.register_buffer("output_mean", torch.zeros(outputs))
+        self.register_buffer("output_sd", torch.ones(outputs))
+
+    def forward(self, tared_counts: Tensor) -> Tensor:
+        """Estimate of the quantity, shape ``(N, outputs)``."""
+        scaled = (tared_counts - self.input_mean) / self.input_sd
+        estimate: Tensor = self.layers(scaled) * self.output_sd + self.output_mean
+        return estimate
+
+    def normalise_from(
+        self, inputs: npt.NDArray[np.float32], targets: npt.NDArray[np.float32]
+    ) -> None:
+        """Set the constants from training rows: inputs ``(N, I)`` and targets ``(N, O)``."""
+        for values, mean, sd in (
+            (inputs, self.input_mean, self.input_sd),
+            (targets, self.output_mean, self.output_sd),
+        ):
+            mean.copy_(torch.from_numpy(values.mean(axis=0, dtype=np.float64)))
+            spread = np.maximum(values.std(axis=0, dtype=np.float64), _SMALLEST_SD)
+            sd.copy_(torch.from_numpy(spread))
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of trained parameters; the paper's network has 54,915."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+
+def predict(
+    net: nn.Module, inputs: npt.NDArray[np.float32], *, batch_rows: int = 8192
+) -> npt.NDArray[np.float32]:
+    """Run a network over rows: ``(N, I)`` -> ``(N, O)``."""
+    net.eval()
+    with torch.inference_mode():
+        parts = [net(part).numpy() for part in torch.split(torch.from_numpy(inputs), batch_rows)]
+    return np.concatenate(parts)

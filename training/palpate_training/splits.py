@@ -1,0 +1,165 @@
+"""Train, validation, test: whole blocks, groups or sensors, never single rows.
+
+Neighbouring rows of a recording are nearly copies of one another, so a split by rows flatters
+every model (the idle drift of an untouched sensor alone correlates with force). There is no
+function here that could make one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+
+Rows = npt.NDArray[np.int64]
+Labels = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Row numbers of each side; ``guard`` rows are on none.
+
+    Attributes:
+        train: Rows to fit on.
+        validation: Rows to choose on (early stop, settings).
+        test: Rows to report on.
+        guard: Rows left out because they lie next to another side.
+    """
+
+    train: Rows
+    validation: Rows
+    test: Rows
+    guard: Rows
+
+
+def cut_into_blocks(rows: int, blocks: int) -> Labels:
+    """Number the contiguous pieces of one recording, of equal length to within a row.
+
+    Args:
+        rows: Rows of the recording.
+        blocks: How many pieces.
+
+    Returns:
+        Block of every row, ``0 .. blocks - 1``, shape ``(rows,)``.
+    """
+    return (np.arange(rows, dtype=np.int64) * blocks // rows).astype(np.int32)
+
+
+def contiguous_folds(
+    block: Labels, recording: Labels, *, folds: int = 5, guard_rows: int = 100
+) -> list[Split]:
+    """Hold out whole blocks; every block is tested in exactly one fold.
+
+    In each recording the blocks are counted in order of time: fold ``k`` tests those with
+    ``i % folds == k`` and validates on those with ``i % (2 * folds) == (k + 2) % (2 * folds)``.
+
+    Args:
+        block: Block of every row, shape ``(N,)``.
+        recording: Recording of every row, shape ``(N,)``; rows in order of time.
+        folds: Number of folds, at least 3.
+        guard_rows: Rows left out on either side of a border between two sides.
+
+    Returns:
+        One split for each fold.
+    """
+    if folds < 3:
+        raise ValueError(f"folds must be at least 3, not {folds}")
+    position = np.empty(len(block), dtype=np.int64)
+    for one in np.unique(recording):
+        rows = np.flatnonzero(recording == one)
+        starts, inverse = np.unique(block[rows], return_inverse=True)
+        if len(starts) < 2 * folds:
+            raise DatasetError(
+                f"recording {one} has {len(starts)} blocks, {folds} folds need {2 * folds}",
+                remedy="cut the recording into more blocks, or ask for fewer folds",
+            )
+        first_row = np.array([rows[inverse == i][0] for i in range(len(starts))])
+        position[rows] = np.argsort(np.argsort(first_row))[inverse]
+    splits = []
+    for fold in range(folds):
+        test = position % folds == fold
+        validation = position % (2 * folds) == (fold + 2) % (2 * folds)
+        split = _guarded(validation, test, recording, guard_rows)
+        if not (len(split.train) and len(split.validation)):
+            raise DatasetError(
+                f"fold {fold}: a guard of {guard_rows} rows leaves nothing to train or validate on",
+                remedy="cut the recordings into fewer, longer blocks",
+            )
+        splits.append(split)
+    return splits
+
+
+def unseen_sensor(
+    sensor: Labels, block: Labels, *, test_sensor: int, guard_rows: int = 100
+) -> Split:
+    """Train on the other sensors, test on all rows of one that was never seen.
+
+    Args:
+        sensor: Sensor of every row, shape ``(N,)``.
+        block: Block of every row, shape ``(N,)``; each tenth block of the others validates.
+        test_sensor: The sensor to hold out.
+        guard_rows: Rows left out between training and validation.
+    """
+    test = sensor == test_sensor
+    if not test.any() or test.all():
+        raise DatasetError(
+            f"sensor {test_sensor} cannot be held out: it has {test.sum()} of {len(test)} rows",
+            remedy="use a data set with at least two sensors",
+        )
+    seen = np.unique(block[~test])
+    validation = np.isin(block, seen[2::10] if len(seen) > 2 else seen[-1:]) & ~test
+    return _guarded(validation, test, sensor, guard_rows)
+
+
+def by_group(
+    group: Labels, *, test_share: float = 0.2, validation_share: float = 0.1, seed: int = 0
+) -> Split:
+    """Deal whole groups (presses, trajectories) to test, validation and train.
+
+    Args:
+        group: Group of every row, shape ``(N,)``.
+        test_share: Share of the groups to test on.
+        validation_share: Share of the groups to validate on.
+        seed: Seed of the deal.
+    """
+    groups = np.unique(group)
+    if len(groups) < 3:
+        raise DatasetError(
+            f"{len(groups)} groups cannot be dealt to train, validation and test",
+            remedy="record more presses: at least three, better a hundred",
+        )
+    dealt = np.random.default_rng(seed).permutation(groups)
+    tests = max(1, round(test_share * len(groups)))
+    validations = max(1, round(validation_share * len(groups)))
+    test = np.isin(group, dealt[:tests])
+    validation = np.isin(group, dealt[tests : tests + validations])
+    # No guard: a group starts and ends without contact, so neighbours across it share nothing.
+    return _guarded(validation, test, group, guard_rows=0)
+
+
+def _guarded(validation: Mask, test: Mask, recording: Labels, guard_rows: int) -> Split:
+    near_test = _near(test, recording, guard_rows)
+    near_validation = _near(validation, recording, guard_rows)
+    train = ~test & ~validation & ~near_test & ~near_validation
+    validation = validation & ~near_test
+    guard = ~train & ~validation & ~test
+    return Split(*(np.flatnonzero(side) for side in (train, validation, test, guard)))
+
+
+def _near(mask: Mask, recording: Labels, distance: int) -> Mask:
+    """Rows within ``distance`` rows of a marked row of the same recording."""
+    near = mask.copy()
+    if distance == 0:
+        return near
+    for one in np.unique(recording):
+        rows = np.flatnonzero(recording == one)
+        marked = np.concatenate([[0], np.cumsum(mask[rows])])
+        index = np.arange(len(rows))
+        low = np.maximum(index - distance, 0)
+        high = np.minimum(index + distance + 1, len(rows))
+        near[rows] = marked[high] > marked[low]
+    return near
