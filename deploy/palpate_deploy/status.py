@@ -10,8 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from palpate.bus import Alive, Session
-from palpate.codec import SERVICE_REQUEST, STATUS
+from palpate.bus import Alive, Session, endpoints
 from palpate.config import LinkConfig
 from palpate.errors import PalpateError
 from palpate.messages import (
@@ -62,13 +61,7 @@ _TROUBLE = (
 
 def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status]:
     """What every process of the station says of itself; broken answers are left out."""
-    answers = session.query_all(
-        "status",
-        request=ServiceRequest(),
-        request_codec=SERVICE_REQUEST,
-        reply_codec=STATUS,
-        timeout_s=timeout_s,
-    )
+    answers = session.query_all(endpoints.STATUS, ServiceRequest(), timeout_s=timeout_s)
     return [answer for answer in answers if not isinstance(answer, PalpateError)]
 
 

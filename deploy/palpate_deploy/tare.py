@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.bus import Session
-from palpate.codec import TARE, TARE_REQUEST, WRENCH_ZERO, WRENCH_ZERO_REQUEST
+from palpate.bus import Session, endpoints
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import FloatArray, Tare, TareRequest, WrenchZero, WrenchZeroRequest
@@ -37,23 +36,13 @@ def take_tare(
 
 def _ask_tare(session: Session, sensor: str, frames: int, timeout_s: float) -> Tare:
     return session.query(
-        "tare",
-        sensor=sensor,
-        request=TareRequest(frames=frames),
-        request_codec=TARE_REQUEST,
-        reply_codec=TARE,
-        timeout_s=timeout_s,
+        endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
     )
 
 
 def _ask_zero(session: Session, sensor: str, readings: int, timeout_s: float) -> WrenchZero:
     return session.query(
-        "zero",
-        sensor=sensor,
-        request=WrenchZeroRequest(readings=readings),
-        request_codec=WRENCH_ZERO_REQUEST,
-        reply_codec=WRENCH_ZERO,
-        timeout_s=timeout_s,
+        endpoints.ZERO, WrenchZeroRequest(readings=readings), sensor=sensor, timeout_s=timeout_s
     )
 
 

@@ -8,10 +8,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from palpate.bus import Presence, Session
+from palpate.bus import Presence, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
-from palpate.codec import TARE as TARE_CODEC
-from palpate.codec import TARE_REQUEST, WRENCH_ZERO, WRENCH_ZERO_REQUEST
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, PalpateError
 from palpate.health import Health, HealthReporter
@@ -90,22 +88,14 @@ def run(
             )
             workers.append(worker)
             if isinstance(device, WrenchDevice):
-                session.queryable(
-                    "zero",
-                    sensor=sensor.name,
-                    request=WRENCH_ZERO_REQUEST,
-                    reply=WRENCH_ZERO,
-                    handler=partial(answer_zero, worker),
-                )
+                session.queryable(endpoints.ZERO, partial(answer_zero, worker), sensor=sensor.name)
                 continue  # what has no electrodes has no baseline
             if sensor.of is not None:
                 continue  # its finger answers
             session.queryable(
-                "tare",
+                endpoints.TARE,
+                partial(answer_tare, worker),
                 sensor=sensor.name,
-                request=TARE_REQUEST,
-                reply=TARE_CODEC,
-                handler=partial(answer_tare, worker),
                 # Taring takes half a second; looking up a known tare must not wait for it.
                 workers=2,
             )

@@ -14,11 +14,10 @@ from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 
 from palpate import clock
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.bus.query import error_reply
 from palpate.bus.topics import STATUS as STATUS_TOPIC
 from palpate.closing import Closing
-from palpate.codec import SERVICE_REQUEST, STATUS
 from palpate.errors import PalpateError
 from palpate.messages import (
     ChannelFault,
@@ -180,13 +179,11 @@ class HealthReporter(Closing):
         self._publisher = session.publisher(
             STATUS_TOPIC, service=health.service, instance=health.instance
         )
-        self._queryable = session.service_queryable(
-            "status",
+        self._queryable = session.queryable(
+            endpoints.STATUS,
+            lambda _: self._status(),
             service=health.service,
             instance=health.instance,
-            request=SERVICE_REQUEST,
-            reply=STATUS,
-            handler=lambda _: self._status(),
         )
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
         self._thread.start()

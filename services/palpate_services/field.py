@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.bus.topics import ELECTRODES, FIELD
-from palpate.codec import FIELD_ESTIMATE, FIELD_REQUEST
 from palpate.config import LinkConfig
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, FieldEstimate, FieldRequest
@@ -50,14 +49,7 @@ def run(
         def handle(request: FieldRequest) -> FieldEstimate:
             return answered(asked.answer(request.sensor, request.frame), health)
 
-        session.service_queryable(
-            "estimate",
-            service=LINE.service,
-            instance=instance,
-            request=FIELD_REQUEST,
-            reply=FIELD_ESTIMATE,
-            handler=handle,
-        )
+        session.queryable(endpoints.ESTIMATE_FIELD, handle, service=LINE.service, instance=instance)
         return TaredFrames(session, config, runtime, estimate_field, health).answer
 
     serve(LINE, config, link, station, stop, instance=instance, make=make, rate_hz=config.rate_hz)

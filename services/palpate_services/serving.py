@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from palpate.bus import Delivery, Session, Subscriber
-from palpate.codec import MODEL_METADATA, SERVICE_REQUEST
+from palpate.bus import Delivery, Session, Subscriber, endpoints
 from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
 from palpate.files.bundle import read_bundle
@@ -60,13 +59,8 @@ def serve(
     health = Health(line.service, instance)
     with Session.open(link, station=station) as session:
         presence = session.presence(line.service, instance=instance)
-        session.service_queryable(
-            "model",
-            service=line.service,
-            instance=instance,
-            request=SERVICE_REQUEST,
-            reply=MODEL_METADATA,
-            handler=lambda _: runtime.metadata(),
+        session.queryable(
+            endpoints.MODEL, lambda _: runtime.metadata(), service=line.service, instance=instance
         )
         answer = make(session, runtime, health)
         answerer = Answerer(line, session, config, health, answer, rate_hz=rate_hz)

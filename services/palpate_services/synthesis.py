@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.bus.topics import FIELD, FIELD_TRUTH, SYNTHESIS
-from palpate.codec import FIELD_FRAME, SYNTHESIS_ESTIMATE
 from palpate.config import LinkConfig
 from palpate.health import Health
 from palpate.messages import FieldEstimate, FieldFrame, SynthesisEstimate
@@ -51,13 +50,11 @@ def run(
     """
 
     def make(session: Session, runtime: Runtime, health: Health) -> Answer[Any, SynthesisEstimate]:
-        session.service_queryable(
-            "synthesise",
+        session.queryable(
+            endpoints.SYNTHESISE,
+            lambda field: answered(synthesise(field, runtime), health),
             service=SERVICE,
             instance=instance,
-            request=FIELD_FRAME,
-            reply=SYNTHESIS_ESTIMATE,
-            handler=lambda field: answered(synthesise(field, runtime), health),
         )
         return lambda _, field: synthesise(field, runtime)
 

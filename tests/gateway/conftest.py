@@ -16,9 +16,8 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Delivery, Session, Tap, run_router
+from palpate.bus import Delivery, Session, Tap, endpoints, run_router
 from palpate.bus.topics import TOPICS, sensor_key
-from palpate.codec import SERVICE_REQUEST, STATUS, TARE, TARE_REQUEST
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
 from palpate.files.record import RecordWriter
@@ -205,13 +204,7 @@ class Bus:
 
     def status(self) -> Status | None:
         try:
-            return self.session.query(
-                "status",
-                service="gateway",
-                request=ServiceRequest(),
-                request_codec=SERVICE_REQUEST,
-                reply_codec=STATUS,
-            )
+            return self.session.query(endpoints.STATUS, ServiceRequest(), service="gateway")
         except PalpateError:
             return None
 
@@ -228,12 +221,7 @@ class Bus:
 
     def ask_tare(self, sensor: str, tare_id: int = 0, frames: int = 0) -> Tare:
         return self.session.query(
-            "tare",
-            sensor=sensor,
-            request=TareRequest(tare_id, frames),
-            request_codec=TARE_REQUEST,
-            reply_codec=TARE,
-            timeout_s=PATIENCE_S,
+            endpoints.TARE, TareRequest(tare_id, frames), sensor=sensor, timeout_s=PATIENCE_S
         )
 
     @contextmanager

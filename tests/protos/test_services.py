@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from palpate.bus import Delivery, Session, run_router
+from palpate.bus import Delivery, Session, endpoints, run_router
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import FEATURES, STATUS, sensor_key
 from palpate.client import Client
-from palpate.codec import TARE, TARE_REQUEST
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import (
     ConfigError,
@@ -50,16 +49,10 @@ def test_a_query_always_answers(pair: Any, examples: dict[str, Any], wait_until:
             raise ZeroDivisionError("a defect")
         return tare
 
-    a.queryable("tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=handler)
+    a.queryable(endpoints.TARE, handler, sensor="finger")
 
     def ask(tare_id: int, **more: Any) -> Tare:
-        reply: Tare = b.query(
-            "tare",
-            request=TareRequest(tare_id),
-            request_codec=TARE_REQUEST,
-            reply_codec=TARE,
-            **{"sensor": "finger", **more},
-        )
+        reply: Tare = b.query(endpoints.TARE, TareRequest(tare_id), **{"sensor": "finger", **more})
         return reply
 
     wait_until(lambda: b.alive() == [])
@@ -101,19 +94,12 @@ def test_a_slow_or_overloaded_service_is_told_as_such(pair: Any, examples: dict[
         tare: Tare = examples["Tare"]
         return tare
 
-    a.queryable("tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=slow, capacity=1)
+    a.queryable(endpoints.TARE, slow, sensor="finger", capacity=1)
     codes: list[object] = []
 
     def ask() -> None:
         try:
-            b.query(
-                "tare",
-                sensor="finger",
-                request=TareRequest(),
-                request_codec=TARE_REQUEST,
-                reply_codec=TARE,
-                timeout_s=1.0,
-            )
+            b.query(endpoints.TARE, TareRequest(), sensor="finger", timeout_s=1.0)
         except (RemoteError, StreamTimeout) as error:
             codes.append(error.code)
 
@@ -140,20 +126,11 @@ def test_a_quick_question_overtakes_a_slow_one(pair: Any, examples: dict[str, An
         tare: Tare = examples["Tare"]
         return tare
 
-    a.queryable(
-        "tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=handler, workers=2
-    )
+    a.queryable(endpoints.TARE, handler, sensor="finger", workers=2)
     time.sleep(0.3)
 
     def ask(tare_id: int) -> Tare:
-        reply: Tare = b.query(
-            "tare",
-            sensor="finger",
-            request=TareRequest(tare_id),
-            request_codec=TARE_REQUEST,
-            reply_codec=TARE,
-            timeout_s=5,
-        )
+        reply: Tare = b.query(endpoints.TARE, TareRequest(tare_id), sensor="finger", timeout_s=5)
         return reply
 
     slow = threading.Thread(target=ask, args=(0,))
@@ -230,7 +207,7 @@ def test_a_tare_book_asks_when_it_does_not_know(pair: Any, examples: dict[str, A
         asked.append(request.tare_id)
         return tare
 
-    a.queryable("tare", sensor="finger", request=TARE_REQUEST, reply=TARE, handler=handler)
+    a.queryable(endpoints.TARE, handler, sensor="finger")
     book = TareBook(b, query_timeout_s=2)
     time.sleep(0.3)
     assert book.baseline("finger", tare.tare_id).tare_id == tare.tare_id

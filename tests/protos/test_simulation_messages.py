@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import MAX_REPLY_BYTES, Answer, Session
-from palpate.bus.topics import asking_key
+from palpate.bus import MAX_REPLY_BYTES, QueryAnswer, Session, endpoints
+from palpate.bus.topics import caller_key
 from palpate.client import Client
 from palpate.client.simulations import join, straight_path
-from palpate.codec import SIMULATION_REPLY, SIMULATION_REQUEST
+from palpate.codec import SIMULATION_REPLY
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, LinkError, RemoteError, SimulationError, WireError
 from palpate.messages import (
@@ -134,35 +134,27 @@ def test_straight_path() -> None:
         straight_path((0, 0, 0), (0, 0, 1), 0)
 
 
+Answers = list[QueryAnswer[SimulationReply]]
 REQUEST = SimulationRequest("r", "sphere", straight_path((0, 0, -0.01), (0, 0, -0.008), 2))
 
 
 @pytest.fixture
-def answers() -> list[Answer[SimulationReply]]:
+def answers() -> Answers:
     """Answers that a server has in hand."""
     return []
 
 
 @pytest.fixture
-def robot(
-    link: LinkConfig, answers: list[Answer[SimulationReply]], wait_until: WaitUntil
-) -> Iterator[Client]:
+def robot(link: LinkConfig, answers: Answers, wait_until: WaitUntil) -> Iterator[Client]:
     """A client of a server that takes questions and leaves the answering to the test."""
 
-    def handler(request: SimulationRequest, answer: Answer[SimulationReply]) -> None:
+    def handler(request: SimulationRequest, answer: QueryAnswer[SimulationReply]) -> None:
         if request.indenter == "unknown":
             raise SimulationError("no such indenter", remedy="choose another")
         answers.append(answer)
 
     with Session.open(link) as server, Client(link.connect[0]) as client:
-        server.stream_queryable(
-            "simulate",
-            sensor="twin",
-            request=SIMULATION_REQUEST,
-            reply=SIMULATION_REPLY,
-            handler=handler,
-            capacity=2,
-        )
+        server.stream_queryable(endpoints.SIMULATE, handler, sensor="twin", capacity=2)
         probe = dataclasses.replace(REQUEST, indenter="unknown")
 
         def serves() -> bool:
@@ -194,7 +186,7 @@ def in_thread(ask: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
 
 
 def test_steps_arrive_before_the_answer_has_ended(
-    robot: Client, answers: list[Answer[SimulationReply]], wait_until: WaitUntil
+    robot: Client, answers: Answers, wait_until: WaitUntil
 ) -> None:
     seen: list[int] = []
     thread, out = in_thread(
@@ -213,9 +205,7 @@ def test_steps_arrive_before_the_answer_has_ended(
     assert len(out[0].steps) == 2
 
 
-def test_an_error_after_some_steps(
-    robot: Client, answers: list[Answer[SimulationReply]], wait_until: WaitUntil
-) -> None:
+def test_an_error_after_some_steps(robot: Client, answers: Answers, wait_until: WaitUntil) -> None:
     seen: list[int] = []
     thread, out = in_thread(
         lambda: robot.simulate(REQUEST, on_step=lambda index, _: seen.append(index))
@@ -230,7 +220,7 @@ def test_an_error_after_some_steps(
 
 
 def test_a_reply_larger_than_a_message_is_not_sent(
-    robot: Client, answers: list[Answer[SimulationReply]], wait_until: WaitUntil
+    robot: Client, answers: Answers, wait_until: WaitUntil
 ) -> None:
     nodes = MAX_REPLY_BYTES // 12
     fields = np.zeros((nodes, 3), np.float32)
@@ -253,20 +243,23 @@ def test_a_reply_larger_than_a_message_is_not_sent(
 
 
 def test_who_waits_no_longer_is_noticed(
-    link: LinkConfig, robot: Client, answers: list[Answer[SimulationReply]], wait_until: WaitUntil
+    link: LinkConfig,
+    robot: Client,
+    answers: Answers,
+    wait_until: WaitUntil,
 ) -> None:
     gone: list[str] = []
     with Session.open(link) as watcher:
-        watcher.watch_askers(gone.append)
+        watcher.watch_callers(gone.append)
         time.sleep(0.2)
         thread, _ = in_thread(lambda: robot.simulate(REQUEST))
         wait_until(lambda: answers)
-        assert asking_key("lab", "r") not in gone
+        assert caller_key("lab", "r") not in gone
         answers[0].fail(SimulationError("a", remedy="b"))
         thread.join(5)
-        wait_until(lambda: gone == [asking_key("lab", "r")])
-        robot.session.asking("again").close()
-        with robot.session.asking("again"):  # the same question, asked a second time
+        wait_until(lambda: gone == [caller_key("lab", "r")])
+        robot.session.caller_token("again").close()
+        with robot.session.caller_token("again"):  # the same question, asked a second time
             time.sleep(0.3)
-            assert asking_key("lab", "again") not in gone
-        wait_until(lambda: asking_key("lab", "again") in gone)
+            assert caller_key("lab", "again") not in gone
+        wait_until(lambda: caller_key("lab", "again") in gone)

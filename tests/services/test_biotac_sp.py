@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import Delivery, Sample, Session
+from palpate.bus import Delivery, Sample, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, TARE, TOPICS, sensor_key
 from palpate.client import Client
-from palpate.codec import TARE as TARE_CODEC
-from palpate.codec import TARE_REQUEST
 from palpate.config import LinkConfig
 from palpate.errors import BundleError, ErrorCode, RemoteError
 from palpate.files.bundle import read_bundle
@@ -52,9 +50,7 @@ def running(node: Callable[..., None], config: Any, link: LinkConfig) -> Iterato
 
 
 def announce(session: Session, sensor: str, tare: Tare) -> None:
-    session.queryable(
-        "tare", sensor=sensor, request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
-    )
+    session.queryable(endpoints.TARE, lambda _: tare, sensor=sensor)
     session.publisher(TARE, sensor=sensor, lossless=True).put(tare)
 
 

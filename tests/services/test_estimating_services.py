@@ -12,10 +12,8 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE, Topic
-from palpate.codec import MODEL_METADATA, SERVICE_REQUEST, STATUS, TARE_REQUEST
-from palpate.codec import TARE as TARE_CODEC
 from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
 from palpate.files.bundle import read_bundle
@@ -127,21 +125,12 @@ def serve(case: Case, folder: Path, link: LinkConfig, until: Until) -> Serve:
 
 def announce(session: Session, tare: Tare, sensor: str = "finger") -> None:
     """Publish a tare as a gateway does, and answer for it: a frame may overtake the stream."""
-    session.queryable(
-        "tare", sensor=sensor, request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
-    )
+    session.queryable(endpoints.TARE, lambda _: tare, sensor=sensor)
     session.publisher(TARE, sensor=sensor).put(tare)
 
 
 def status_of(session: Session, case: Case) -> Status:
-    return session.query(
-        "status",
-        service=case.name,
-        request=ServiceRequest(),
-        request_codec=SERVICE_REQUEST,
-        reply_codec=STATUS,
-        timeout_s=5.0,
-    )
+    return session.query(endpoints.STATUS, ServiceRequest(), service=case.name, timeout_s=5.0)
 
 
 class TestEstimatingService:
@@ -169,13 +158,7 @@ class TestEstimatingService:
             status = status_of(session, case)
             assert status.counters[case.received] == 10
             assert status.sensors == ("finger",)
-            metadata = session.query(
-                "model",
-                service=case.name,
-                request=ServiceRequest(),
-                request_codec=SERVICE_REQUEST,
-                reply_codec=MODEL_METADATA,
-            )
+            metadata = session.query(endpoints.MODEL, ServiceRequest(), service=case.name)
             assert metadata.task == case.name
             assert metadata.bundle_sha256 == got.message.bundle_sha256 == read_bundle(folder).sha256
 

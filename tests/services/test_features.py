@@ -12,14 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, TARE
 from palpate.codec import (
     ELECTRODE_FRAME,
-    MODEL_METADATA,
-    SERVICE_REQUEST,
-    STATUS,
-    TARE_REQUEST,
 )
 from palpate.codec import TARE as TARE_CODEC
 from palpate.config import LinkConfig
@@ -69,21 +65,12 @@ def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> S
 
 def announce(session: Session, sensor: str, tare: Tare) -> None:
     """Publish a tare as a gateway does, and answer for it: a frame may overtake the stream."""
-    session.queryable(
-        "tare", sensor=sensor, request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
-    )
+    session.queryable(endpoints.TARE, lambda _: tare, sensor=sensor)
     session.publisher(TARE, sensor=sensor).put(tare)
 
 
 def ask_status(session: Session) -> Status:
-    return session.query(
-        "status",
-        service="features",
-        request=ServiceRequest(),
-        request_codec=SERVICE_REQUEST,
-        reply_codec=STATUS,
-        timeout_s=5.0,
-    )
+    return session.query(endpoints.STATUS, ServiceRequest(), service="features", timeout_s=5.0)
 
 
 def counters(session: Session) -> dict[str, int]:
@@ -107,13 +94,7 @@ def test_answers_frames_and_says_what_it_is(
         assert status.state is ServiceState.READY
         assert status.sensors == ("finger",)
         until(lambda: ask_status(session).gauges.get("latency_p50_s", 0.0) > 0)
-        metadata = session.query(
-            "model",
-            service="features",
-            request=ServiceRequest(),
-            request_codec=SERVICE_REQUEST,
-            reply_codec=MODEL_METADATA,
-        )
+        metadata = session.query(endpoints.MODEL, ServiceRequest(), service="features")
         assert metadata.bundle_sha256 == got.message.bundle_sha256
 
 
@@ -219,9 +200,7 @@ def test_lost_tare_of_one_sensor_does_not_hold_up_another(
         return make_tare(77)
 
     with serve(max_age_s=None, tare_timeout_s=0.1) as session:
-        session.queryable(
-            "tare", sensor="lost", request=TARE_REQUEST, reply=TARE_CODEC, handler=hangs
-        )
+        session.queryable(endpoints.TARE, hangs, sensor="lost")
         estimates = session.subscriber(FEATURES, sensor="finger", delivery=Delivery.QUEUE)
         announce(session, "finger", make_tare())
         lost = session.publisher(ELECTRODES, sensor="lost")

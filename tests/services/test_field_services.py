@@ -12,11 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FIELD, FIELD_TRUTH, SYNTHESIS, TARE
 from palpate.client import Client
-from palpate.codec import TARE as TARE_CODEC
-from palpate.codec import TARE_REQUEST
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, LinkError, RemoteError
 from palpate.files.bundle import read_bundle
@@ -60,9 +58,7 @@ def station(link: LinkConfig, tmp_path: Path, until: Until) -> Iterator[Client]:
 
 
 def announce(session: Session, tare: Tare) -> None:
-    session.queryable(
-        "tare", sensor="finger", request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
-    )
+    session.queryable(endpoints.TARE, lambda _: tare, sensor="finger")
     session.publisher(TARE, sensor="finger", lossless=True).put(tare)
 
 

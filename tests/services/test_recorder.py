@@ -16,10 +16,8 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, POSE, TARE, WRENCH, sensor_key
-from palpate.codec import SERVICE_REQUEST, STATUS, TARE_REQUEST
-from palpate.codec import TARE as TARE_CODEC
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode
 from palpate.files.record import RecordWriter, read_record
@@ -82,20 +80,11 @@ def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) ->
 
 
 def status_of(session: Session, service: str) -> Status:
-    return session.query(
-        "status",
-        service=service,
-        request=ServiceRequest(),
-        request_codec=SERVICE_REQUEST,
-        reply_codec=STATUS,
-        timeout_s=5.0,
-    )
+    return session.query(endpoints.STATUS, ServiceRequest(), service=service, timeout_s=5.0)
 
 
 def announce(session: Session, tare: Tare) -> None:
-    session.queryable(
-        "tare", sensor="finger", request=TARE_REQUEST, reply=TARE_CODEC, handler=lambda _: tare
-    )
+    session.queryable(endpoints.TARE, lambda _: tare, sensor="finger")
     session.publisher(TARE, sensor="finger", lossless=True).put(tare)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from palpate.bus import Answer, Publisher
+from palpate.bus import Publisher, QueryAnswer
 from palpate.errors import ErrorCode, LinkError, RemoteError
 from palpate.messages import (
     SimulationPhase,
@@ -32,7 +32,7 @@ class Asked:
     def __init__(
         self,
         request: SimulationRequest,
-        answer: Answer[SimulationReply],
+        answer: QueryAnswer[SimulationReply],
         progress: Publisher[SimulationProgress],
     ) -> None:
         self.request = request

@@ -9,15 +9,9 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 
-from palpate.bus import Answer, Presence, Session
-from palpate.bus.topics import SIMULATION_PROGRESS, asking_key
+from palpate.bus import Presence, QueryAnswer, Session, endpoints
+from palpate.bus.topics import SIMULATION_PROGRESS, caller_key
 from palpate.closing import Closing
-from palpate.codec import (
-    SIMULATION_CANCEL_REPLY,
-    SIMULATION_CANCEL_REQUEST,
-    SIMULATION_REPLY,
-    SIMULATION_REQUEST,
-)
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, PalpateError, SimulationError, WireError
 from palpate.health import Health, HealthReporter
@@ -74,7 +68,7 @@ class Simulations(Closing):
             on_fingertip=self._know,
         )
 
-    def ask(self, request: SimulationRequest, answer: Answer[SimulationReply]) -> None:
+    def ask(self, request: SimulationRequest, answer: QueryAnswer[SimulationReply]) -> None:
         """Take a request; it is answered from the pool's threads.
 
         Raises:
@@ -113,10 +107,10 @@ class Simulations(Closing):
         """Stop the simulation that nobody waits for any more.
 
         Args:
-            key: The ``asking_key`` that vanished.
+            key: The ``caller_key`` that vanished.
         """
         with self._lock:
-            ids = [name for name in self._asked if asking_key(self._station, name) == key]
+            ids = [name for name in self._asked if caller_key(self._station, name) == key]
         for name in ids:
             if self.pool.cancel(name):
                 self._health.count("callers_gone")
@@ -202,20 +196,10 @@ def run(
             Simulations(session, config, default, health) as simulations,
             HealthReporter(session, health, refresh=simulations.take_over),
         ):
-            session.watch_askers(simulations.caller_gone)
-            session.queryable(
-                "simulate_cancel",
-                sensor=config.sensor,
-                request=SIMULATION_CANCEL_REQUEST,
-                reply=SIMULATION_CANCEL_REPLY,
-                handler=simulations.cancel,
-            )
+            session.watch_callers(simulations.caller_gone)
+            session.queryable(endpoints.CANCEL_SIMULATION, simulations.cancel, sensor=config.sensor)
             served = session.stream_queryable(
-                "simulate",
-                sensor=config.sensor,
-                request=SIMULATION_REQUEST,
-                reply=SIMULATION_REPLY,
-                handler=simulations.ask,
+                endpoints.SIMULATE, simulations.ask, sensor=config.sensor
             )
             health.set_state(ServiceState.STARTING, "the first fingertip is being pressurised")
             try:

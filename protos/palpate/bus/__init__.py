@@ -6,20 +6,20 @@ sensor streams drop rather than block; a query is always answered; plain TCP, ne
 
 from palpate.bus.link import Session
 from palpate.bus.opening import run_router
-from palpate.bus.presence import Alive, Asking, Presence
+from palpate.bus.presence import Alive, CallerToken, Presence
 from palpate.bus.publish import Publisher
+from palpate.bus.query import MAX_REPLY_BYTES, QueryAnswer
 from palpate.bus.queues import Delivery
-from palpate.bus.streams import MAX_REPLY_BYTES, Answer
 from palpate.bus.subscribe import Received, Sample, Subscriber, Tap
 
 __all__ = [
     "MAX_REPLY_BYTES",
     "Alive",
-    "Answer",
-    "Asking",
+    "CallerToken",
     "Delivery",
     "Presence",
     "Publisher",
+    "QueryAnswer",
     "Received",
     "Sample",
     "Session",

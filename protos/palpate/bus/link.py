@@ -8,16 +8,22 @@ from typing import Any, Protocol, Self, TypeVar
 
 import zenoh
 
+from palpate.bus.endpoints import Endpoint
 from palpate.bus.opening import no_router, open_zenoh
-from palpate.bus.presence import Alive, Asking, Departures, Presence, alive
+from palpate.bus.presence import Alive, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.publish import Publisher
-from palpate.bus.query import Queryable, ask_all, ask_one
+from palpate.bus.query import (
+    Queryable,
+    QueryAnswer,
+    ask,
+    first_reply,
+    raise_errors,
+    single_reply,
+)
 from palpate.bus.queues import Delivery
-from palpate.bus.streams import Answer, StreamQueryable, ask_stream
 from palpate.bus.subscribe import Subscriber, Tap
-from palpate.bus.topics import Topic, asking_key, sensor_key, service_key
+from palpate.bus.topics import Topic, caller_key, sensor_key, service_key
 from palpate.closing import Closing
-from palpate.codec import Codec
 from palpate.config import LinkConfig
 from palpate.errors import PalpateError
 
@@ -84,7 +90,7 @@ class Session(Closing):
             instance: Name of its instance.
             lossless: Wait for slow subscribers instead of dropping. Offline replay only.
         """
-        key = self._key(topic, sensor, service, instance, None)
+        key = self._key(topic, sensor, service, instance)
         return self._keep(Publisher(self._raw, topic, key, lossless=lossless))
 
     def subscriber(
@@ -131,109 +137,97 @@ class Session(Closing):
 
     def queryable(
         self,
-        endpoint: str,
-        *,
-        sensor: str,
-        request: Codec[Q],
-        reply: Codec[R],
+        endpoint: Endpoint[Q, R],
         handler: Callable[[Q], R],
+        *,
+        sensor: str | None = None,
+        service: str = "",
+        instance: str = "",
         capacity: int = 16,
         workers: int = 1,
     ) -> Queryable:
-        """Answer questions about a sensor; the handler may raise any ``PalpateError``."""
-        key = sensor_key(self.station, sensor, endpoint)
+        """Answer each question with one reply.
+
+        Args:
+            endpoint: From ``palpate.bus.endpoints``.
+            handler: Returns the reply; may raise any ``PalpateError``.
+            sensor: Name of the sensor.
+            service: Name of the service, for a service's endpoint.
+            instance: Name of its instance.
+            capacity: Questions that may wait; more are refused.
+            workers: Questions that are handled at the same time.
+        """
+        key = self._key(endpoint, sensor, service, instance)
         return self._keep(
-            Queryable(self._raw, key, request, reply, handler, capacity=capacity, workers=workers)
+            Queryable(
+                self._raw, key, endpoint, single_reply(handler), capacity=capacity, workers=workers
+            )
         )
 
-    def service_queryable(
+    def stream_queryable(
         self,
-        endpoint: str,
+        endpoint: Endpoint[Q, R],
+        handler: Callable[[Q, QueryAnswer[R]], None],
         *,
-        service: str,
-        instance: str,
-        request: Codec[Q],
-        reply: Codec[R],
-        handler: Callable[[Q], R],
+        sensor: str,
         capacity: int = 16,
     ) -> Queryable:
-        """Answer questions to a service's instance."""
-        key = service_key(self.station, service, instance, endpoint)
-        return self._keep(Queryable(self._raw, key, request, reply, handler, capacity=capacity))
+        """Answer each question about a sensor with several replies, from any thread."""
+        key = self._key(endpoint, sensor, "", "")
+        return self._keep(Queryable(self._raw, key, endpoint, handler, capacity=capacity))
 
     def query(
         self,
-        endpoint: str,
+        endpoint: Endpoint[Q, R],
+        request: Q,
         *,
         sensor: str | None = None,
         service: str = "*",
         instance: str = "*",
-        request: Q,
-        request_codec: Codec[Q],
-        reply_codec: Codec[R],
         timeout_s: float = 1.0,
     ) -> R:
-        """Ask a sensor's endpoint (``sensor`` given) or a service's.
+        """Ask an endpoint of a sensor, or of a service.
 
         Raises:
             LinkError: Nobody serves it.
             StreamTimeout: No answer in time.
             RemoteError: The service's typed error.
+            WireError: The answer breaks the contract.
         """
-        key = self._endpoint(endpoint, sensor, service, instance)
-        return ask_one(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
+        key = self._key(endpoint, sensor, service, instance)
+        replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=True)
+        return first_reply(list(replies), key)
 
     def query_all(
         self,
-        endpoint: str,
+        endpoint: Endpoint[Q, R],
+        request: Q,
         *,
         sensor: str | None = None,
         service: str = "*",
         instance: str = "*",
-        request: Q,
-        request_codec: Codec[Q],
-        reply_codec: Codec[R],
         timeout_s: float = 1.0,
     ) -> list[R | PalpateError]:
         """Every answer; errors are returned, not raised."""
-        key = self._endpoint(endpoint, sensor, service, instance)
-        return ask_all(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
+        key = self._key(endpoint, sensor, service, instance)
+        replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=True)
+        return list(replies)
 
-    def stream_queryable(
-        self,
-        endpoint: str,
-        *,
-        sensor: str,
-        request: Codec[Q],
-        reply: Codec[R],
-        handler: Callable[[Q, Answer[R]], None],
-        capacity: int = 16,
-    ) -> StreamQueryable:
-        """Answer questions about a sensor with several replies each, from any thread."""
-        key = sensor_key(self.station, sensor, endpoint)
-        return self._keep(StreamQueryable(self._raw, key, request, reply, handler, capacity))
-
-    def ask_stream(
-        self,
-        endpoint: str,
-        *,
-        sensor: str,
-        request: Q,
-        request_codec: Codec[Q],
-        reply_codec: Codec[R],
-        timeout_s: float,
+    def query_stream(
+        self, endpoint: Endpoint[Q, R], request: Q, *, sensor: str, timeout_s: float
     ) -> Iterator[R]:
-        """The replies of a sensor's endpoint as they come; the errors of ``query``."""
-        key = sensor_key(self.station, sensor, endpoint)
-        return ask_stream(self._raw, key, request_codec, reply_codec, request, timeout_s=timeout_s)
+        """The replies of a sensor's endpoint as they come; raises the errors of ``query``."""
+        key = self._key(endpoint, sensor, "", "")
+        replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=False)
+        return raise_errors(replies, key)
 
-    def asking(self, request_id: str) -> Asking:
+    def caller_token(self, request_id: str) -> CallerToken:
         """Show that this process waits for an answer, until it is closed or this process dies."""
-        return Asking(self._raw, asking_key(self.station, request_id))
+        return CallerToken(self._raw, caller_key(self.station, request_id))
 
-    def watch_askers(self, on_gone: Callable[[str], None]) -> None:
-        """Call ``on_gone`` with the ``asking_key`` of every caller that waits no longer."""
-        self._keep(Departures(self._raw, asking_key(self.station, "*"), on_gone))
+    def watch_callers(self, on_gone: Callable[[str], None]) -> None:
+        """Call ``on_gone`` with the ``caller_key`` of every caller that waits no longer."""
+        self._keep(CallerWatch(self._raw, caller_key(self.station, "*"), on_gone))
 
     def presence(self, service: str, *, instance: str) -> Presence:
         """Declare this process alive; call ``ready`` on the result when it serves."""
@@ -263,20 +257,15 @@ class Session(Closing):
 
     def _key(
         self,
-        topic: Topic[Any],
+        what: Topic[Any] | Endpoint[Any, Any],
         sensor: str | None,
         service: str,
         instance: str,
-        station: str | None,
+        station: str | None = None,
     ) -> str:
         where = self.station if station is None else station
-        if topic.per_service:
-            return service_key(where, service, instance, topic.name)
+        if what.per_service:
+            return service_key(where, service, instance, what.name)
         if sensor is None:
-            raise TypeError(f"topic {topic.name!r} needs a sensor")
-        return sensor_key(where, sensor, topic.name)
-
-    def _endpoint(self, endpoint: str, sensor: str | None, service: str, instance: str) -> str:
-        if sensor is not None:
-            return sensor_key(self.station, sensor, endpoint)
-        return service_key(self.station, service, instance, endpoint)
+            raise TypeError(f"{what.name!r} needs a sensor")
+        return sensor_key(where, sensor, what.name)

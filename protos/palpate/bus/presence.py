@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from palpate.bus.topics import live_key
 from palpate.closing import Closing
 
 _LOOK_S = 1.0
+_SETTLE_S = 0.1
+"""How long a vanished token may take to be declared again [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +71,8 @@ def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> li
     return [Alive(*name, ready) for name, ready in sorted(found.items())]
 
 
-class Asking(Closing):
-    """A caller's token: while it is there, somebody waits for the answer."""
+class CallerToken(Closing):
+    """A caller's token: while it exists, the caller waits for an answer."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self._token = session.liveliness().declare_token(key)
@@ -82,11 +85,11 @@ class Asking(Closing):
             return
 
 
-class Departures(Closing):
-    """Calls ``on_gone``, in a thread of its own, with the key of every token that is gone for good.
+class CallerWatch(Closing):
+    """Calls ``on_gone``, in a thread of its own, with the key of every token that has vanished.
 
-    A token of the same key that is there again, from a caller that asked a second time, is none
-    that has gone.
+    A token that vanishes and is declared again at once, because its caller asked a second time,
+    does not count as vanished.
 
     Args:
         session: The bus.
@@ -98,7 +101,7 @@ class Departures(Closing):
         self._session = session
         self._on_gone = on_gone
         self._vanished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._worker = threading.Thread(target=self._run, name=f"departures {key}", daemon=True)
+        self._worker = threading.Thread(target=self._run, name=f"callers {key}", daemon=True)
         self._worker.start()
         self._subscriber = session.liveliness().declare_subscriber(
             key, self._on_sample, history=True
@@ -110,6 +113,9 @@ class Departures(Closing):
 
     def _run(self) -> None:
         while (key := self._vanished.get()) is not None:
+            # On a loaded host the new token of a caller that asks again comes a little later than
+            # the end of the old one.
+            time.sleep(_SETTLE_S)
             try:
                 if not any(self._session.liveliness().get(key, timeout=_LOOK_S)):
                     self._on_gone(key)

@@ -1,16 +1,23 @@
-"""Questions and answers: a handler always answers, if need be with a typed error."""
+"""Questions and answers: every query is answered, if need be with a typed error.
+
+A query has one reply or, for a simulation, many that are sent as they become known. Both use the
+same queryable and the same way of asking.
+"""
 
 from __future__ import annotations
 
 import logging
 import queue
 import threading
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
 
 import zenoh
 
+from palpate.bus.endpoints import Endpoint
+from palpate.bus.settings import MAX_MESSAGE_BYTES
 from palpate.bus.topics import ENCODING_PREFIX, check_schema
+from palpate.closing import Closing
 from palpate.codec import ERROR, Codec
 from palpate.errors import (
     ErrorCode,
@@ -26,11 +33,17 @@ Q = TypeVar("Q")
 R = TypeVar("R")
 
 _log = logging.getLogger(__name__)
+
 _STOP = None
+_FRAMING_BYTES = 4096
+"""Upper bound of what key, encoding and Zenoh's headers add to a payload; about 200 in practice."""
+
+MAX_REPLY_BYTES = MAX_MESSAGE_BYTES - _FRAMING_BYTES
+"""Largest payload of one reply [bytes]; receivers drop larger messages without an error."""
 
 
 def error_reply(error: BaseException) -> ErrorReply:
-    """The typed error that tells a caller what an exception meant."""
+    """The message that describes an exception to a caller."""
     if isinstance(error, RemoteError):
         return ErrorReply(error.code, error.problem, error.remedy, error.retry_after_s)
     if isinstance(error, WireError):
@@ -44,33 +57,99 @@ def error_reply(error: BaseException) -> ErrorReply:
     )
 
 
-class Queryable:
-    """Answers queries with ``handler`` in its own threads. Made by ``Session.queryable``.
+class QueryAnswer(Generic[R]):
+    """The answer to one query: any number of replies, then an end or an error.
 
-    One worker answers one query after another; more let a quick question overtake a slow one.
+    Safe to use from several threads. After the end nothing more is sent.
+    """
 
-    A handler that raises, a request that does not decode, a full queue: each is answered with a
-    typed error. Zenoh itself would give the caller silence.
+    def __init__(self, query: zenoh.Query, key: str, codec: Codec[R]) -> None:
+        self._query: zenoh.Query | None = query
+        # A query may use wildcards; the reply names the key of the queryable that answers.
+        self._key = key
+        self._codec = codec
+        self._lock = threading.Lock()
+
+    def send(self, reply: R) -> None:
+        """Send a reply; does nothing if the caller is gone or the answer has ended.
+
+        Raises:
+            WireError: The reply breaks the contract, or is larger than a message may be (reason
+                ``"size"``).
+        """
+        payload = self._codec.encode(reply)
+        if len(payload) > MAX_REPLY_BYTES:
+            raise WireError(
+                f"a {self._codec.schema} of {len(payload):,} bytes is larger than a message may be"
+                f" ({MAX_REPLY_BYTES:,} bytes)",
+                remedy="ask for less in one answer",
+                reason="size",
+            )
+        encoding = zenoh.Encoding(ENCODING_PREFIX + self._codec.schema)
+        with self._lock:
+            if self._query is None:
+                return
+            try:
+                self._query.reply(self._key, payload, encoding=encoding)
+            except zenoh.ZError:
+                _log.warning("the caller of %s is gone", self._key)
+
+    def fail(self, error: BaseException) -> None:
+        """End with a typed error."""
+        payload = ERROR.encode(error_reply(error))
+        encoding = zenoh.Encoding(ENCODING_PREFIX + ERROR.schema)
+        with self._lock:
+            if self._query is None:
+                return
+            try:
+                self._query.reply_err(payload, encoding=encoding)
+            except zenoh.ZError:
+                _log.warning("the caller of %s is gone", self._key)
+            self._drop()
+
+    def end(self) -> None:
+        """End without an error."""
+        with self._lock:
+            self._drop()
+
+    def _drop(self) -> None:
+        if self._query is not None:
+            self._query.drop()
+            self._query = None
+
+
+class Queryable(Closing):
+    """Gives each question and its ``QueryAnswer`` to ``handler``, in threads of its own.
+
+    The handler may return before the answer has ended, and may end it from another thread. An
+    exception of the handler, a request that does not decode and a full queue end the answer with a
+    typed error; Zenoh itself would leave the caller without a reply. Made by ``Session.queryable``
+    and ``Session.stream_queryable``.
+
+    Args:
+        session: The Zenoh session.
+        key: Key on which the questions come.
+        endpoint: What is asked.
+        handler: What answers.
+        capacity: Questions that may wait.
+        workers: Questions that are handled at the same time. With more than one, a quick question
+            overtakes a slow one.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         key: str,
-        request: Codec[Q],
-        reply: Codec[R],
-        handler: Callable[[Q], R],
+        endpoint: Endpoint[Q, R],
+        handler: Callable[[Q, QueryAnswer[R]], None],
         *,
-        capacity: int = 16,
+        capacity: int,
         workers: int = 1,
     ) -> None:
         self.key = key
-        self._request = request
-        self._reply = reply
-        self._handler = handler
+        self._endpoint: Endpoint[Any, Any] = endpoint
+        self._handler: Callable[[Any, QueryAnswer[Any]], None] = handler
         self._queries: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
-        self._reply_encoding = zenoh.Encoding(ENCODING_PREFIX + reply.schema)
-        self._error_encoding = zenoh.Encoding(ENCODING_PREFIX + ERROR.schema)
         self._workers = [
             threading.Thread(target=self._run, name=f"query {key} {i}", daemon=True)
             for i in range(workers)
@@ -83,50 +162,32 @@ class Queryable:
         try:
             self._queries.put_nowait(query)
         except queue.Full:
-            with query:
-                self._answer_error(
-                    query,
-                    ErrorReply(
-                        ErrorCode.RESOURCE_EXHAUSTED,
-                        f"{self.key} has {self._queries.maxsize} queries waiting",
-                        "ask again later",
-                        0.5,
-                    ),
+            QueryAnswer(query, self.key, self._endpoint.reply).fail(
+                RemoteError(
+                    f"{self.key} has {self._queries.maxsize} queries waiting",
+                    remedy="ask again later",
+                    code=ErrorCode.RESOURCE_EXHAUSTED,
+                    retry_after_s=0.5,
                 )
+            )
 
     def _run(self) -> None:
         while (query := self._queries.get()) is not _STOP:
-            with query:
-                self._answer(query)
-
-    def _answer(self, query: zenoh.Query) -> None:
-        try:
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            if query.encoding is not None and payload:
-                check_schema(str(query.encoding), self._request.schema)
-            reply = self._reply.encode(self._handler(self._request.decode(payload)))
-        except PalpateError as error:
-            self._answer_error(query, error_reply(error))
-            return
-        except Exception as error:
-            # The last line of defence: the caller must hear of it, and so must the log.
-            _log.exception("query on %s failed", self.key)
-            self._answer_error(query, error_reply(error))
-            return
-        try:
-            # A query may use wildcards; the answer names the key that answered.
-            query.reply(self.key, reply, encoding=self._reply_encoding)
-        except zenoh.ZError:
-            _log.warning("the caller of %s is gone", self.key)
-
-    def _answer_error(self, query: zenoh.Query, error: ErrorReply) -> None:
-        try:
-            query.reply_err(ERROR.encode(error), encoding=self._error_encoding)
-        except zenoh.ZError:
-            _log.warning("the caller of %s is gone", self.key)
+            answer = QueryAnswer(query, self.key, self._endpoint.reply)
+            try:
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                if query.encoding is not None and payload:
+                    check_schema(str(query.encoding), self._endpoint.request.schema)
+                self._handler(self._endpoint.request.decode(payload), answer)
+            except PalpateError as error:
+                answer.fail(error)
+            except Exception as error:
+                # The last line of defence: both the caller and the log must get this error.
+                _log.exception("query on %s failed", self.key)
+                answer.fail(error)
 
     def close(self) -> None:
-        """Undeclare; queries already accepted are answered."""
+        """Undeclare; questions that were already accepted are still handled."""
         self._queryable.undeclare()
         for _ in self._workers:
             self._queries.put(_STOP)
@@ -134,38 +195,67 @@ class Queryable:
             worker.join(timeout=5)
 
 
-def ask_all(
+def single_reply(handler: Callable[[Q], R]) -> Callable[[Q, QueryAnswer[R]], None]:
+    """A handler for ``Queryable`` of a function that returns the only reply."""
+
+    def handle(request: Q, answer: QueryAnswer[R]) -> None:
+        answer.send(handler(request))
+        answer.end()
+
+    return handle
+
+
+def ask(
     session: zenoh.Session,
     key: str,
-    request: Codec[Q],
-    reply: Codec[R],
-    value: Q,
+    endpoint: Endpoint[Q, R],
+    request: Q,
     *,
     timeout_s: float,
-) -> list[R | PalpateError]:
-    """Every answer to a query: values, and typed errors as exceptions (not raised)."""
-    answers: list[R | PalpateError] = []
-    for item in session.get(
+    everyone: bool,
+) -> Iterator[R | PalpateError]:
+    """Replies to a query as they come; typed errors are yielded as exceptions, not raised.
+
+    Closing the iterator cancels the query.
+
+    Args:
+        session: The Zenoh session.
+        key: Key of the endpoint, perhaps with wildcards.
+        endpoint: What is asked.
+        request: The question.
+        timeout_s: How long all of it may take [s].
+        everyone: Ask every queryable that matches; False = the best matching one does the work.
+    """
+    replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+    stopped = zenoh.CancellationToken()
+    target = zenoh.QueryTarget.ALL if everyone else zenoh.QueryTarget.BEST_MATCHING
+    session.get(
         key,
-        payload=request.encode(value),
-        encoding=zenoh.Encoding(ENCODING_PREFIX + request.schema),
+        zenoh.handlers.Callback(replies.put, lambda: replies.put(None)),
+        payload=endpoint.request.encode(request),
+        encoding=zenoh.Encoding(ENCODING_PREFIX + endpoint.request.schema),
         timeout=timeout_s,
-        target=zenoh.QueryTarget.ALL,
+        target=target,
         consolidation=zenoh.ConsolidationMode.NONE,
-    ):
-        if item.ok is not None:
-            try:
-                check_schema(str(item.ok.encoding), reply.schema)
-                answers.append(reply.decode(item.ok.payload.to_bytes()))
-            except WireError as error:
-                answers.append(error)
-        elif item.err is not None:
-            answers.append(remote_error(item.err, key, timeout_s))
-    return answers
+        cancellation_token=stopped,
+    )
+    try:
+        while (item := replies.get()) is not None:
+            if item.err is not None:
+                yield _remote_error(item.err, key, timeout_s)
+            elif item.ok is not None:
+                try:
+                    check_schema(str(item.ok.encoding), endpoint.reply.schema)
+                    reply = endpoint.reply.decode(item.ok.payload.to_bytes())
+                except WireError as error:
+                    yield error
+                else:
+                    yield reply
+    finally:
+        stopped.cancel()
 
 
-def remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> PalpateError:
-    """The exception that an error reply stands for."""
+def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> PalpateError:
     payload = error.payload.to_bytes()
     if str(error.encoding) == ENCODING_PREFIX + ERROR.schema:
         try:
@@ -190,36 +280,41 @@ def remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> Palpate
     )
 
 
-def ask_one(
-    session: zenoh.Session,
-    key: str,
-    request: Codec[Q],
-    reply: Codec[R],
-    value: Q,
-    *,
-    timeout_s: float,
-) -> R:
-    """The answer to a query.
+def first_reply(replies: list[R | PalpateError], key: str) -> R:
+    """The first reply that is no error.
 
     Raises:
-        LinkError: Nobody serves this key.
-        StreamTimeout: It did not answer in time.
-        RemoteError: It answered with a typed error.
-        WireError: Its answer breaks the contract.
+        LinkError: There is no reply at all.
+        PalpateError: All replies are errors; the first of them.
     """
-    answers = ask_all(session, key, request, reply, value, timeout_s=timeout_s)
-    if not answers:
-        raise nobody_answers(key)
-    for answer in answers:
-        if not isinstance(answer, PalpateError):
-            return answer
-    error = answers[0]
-    assert isinstance(error, PalpateError)
-    raise error
+    for reply in replies:
+        if not isinstance(reply, PalpateError):
+            return reply
+    for reply in replies:
+        assert isinstance(reply, PalpateError)
+        raise reply
+    raise no_reply(key)
 
 
-def nobody_answers(key: str) -> LinkError:
-    """The error that says that a question had no reply at all."""
+def raise_errors(replies: Iterator[R | PalpateError], key: str) -> Iterator[R]:
+    """The same replies; an error is raised, and so is their absence.
+
+    Raises:
+        LinkError: There is no reply at all.
+        PalpateError: A reply is an error.
+    """
+    silent = True
+    for reply in replies:
+        silent = False
+        if isinstance(reply, PalpateError):
+            raise reply
+        yield reply
+    if silent:
+        raise no_reply(key)
+
+
+def no_reply(key: str) -> LinkError:
+    """The error for a question that had no reply at all."""
     return LinkError(
         f"nobody answers on {key}",
         remedy="start the service: palpate up; see what runs: palpate status",

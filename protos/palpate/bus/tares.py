@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import threading
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import TARE
-from palpate.codec import TARE as TARE_CODEC
-from palpate.codec import TARE_REQUEST
 from palpate.errors import StreamTimeout
 from palpate.messages import NO_TARE, Tare, TareRequest
 
@@ -48,11 +46,9 @@ class TareBook:
         tare = self._known.get((sensor, tare_id))
         if tare is None:
             tare = self._session.query(
-                "tare",
+                endpoints.TARE,
+                TareRequest(tare_id=tare_id),
                 sensor=sensor,
-                request=TareRequest(tare_id=tare_id),
-                request_codec=TARE_REQUEST,
-                reply_codec=TARE_CODEC,
                 timeout_s=self._timeout_s,
             )
             self.remember(sensor, tare)

@@ -203,7 +203,7 @@ def live_key(station: str, service: str, instance: str, what: str) -> str:
     )
 
 
-def asking_key(station: str, request_id: str) -> str:
+def caller_key(station: str, request_id: str) -> str:
     """Key of the token of a caller that waits for the answer to ``request_id``; ``"*"`` for any.
 
     The id may be any text, so its digest stands in the key.

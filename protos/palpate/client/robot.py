@@ -16,26 +16,11 @@ from __future__ import annotations
 import time
 from typing import Any, TypeVar
 
-from palpate.bus import Alive, Delivery, Received, Session, Subscriber
+from palpate.bus import Alive, Delivery, Received, Session, Subscriber, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import OnProgress, OnStep, ask_simulation
 from palpate.closing import Closing
-from palpate.codec import (
-    FIELD_ESTIMATE,
-    FIELD_FRAME,
-    FIELD_REQUEST,
-    MODEL_METADATA,
-    SERVICE_REQUEST,
-    SIMULATION_CANCEL_REPLY,
-    SIMULATION_CANCEL_REQUEST,
-    STATUS,
-    SYNTHESIS_ESTIMATE,
-    TARE,
-    TARE_REQUEST,
-    WRENCH_ZERO,
-    WRENCH_ZERO_REQUEST,
-)
 from palpate.config import DEFAULT_ROUTER, LinkConfig, TlsConfig
 from palpate.errors import PalpateError, StaleError
 from palpate.messages import (
@@ -130,11 +115,9 @@ class Client(Closing):
             StaleError: No frame is given and none is young enough.
         """
         return self.session.query(
-            "estimate",
+            endpoints.ESTIMATE_FIELD,
+            FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
             service="field",
-            request=FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
-            request_codec=FIELD_REQUEST,
-            reply_codec=FIELD_ESTIMATE,
             timeout_s=self._timeout_s if timeout_s is None else timeout_s,
         )
 
@@ -152,11 +135,9 @@ class Client(Closing):
             RemoteError: It has no answer for this field, e.g. because the mesh is another.
         """
         return self.session.query(
-            "synthesise",
+            endpoints.SYNTHESISE,
+            as_field_frame(field),
             service="synthesis",
-            request=as_field_frame(field),
-            request_codec=FIELD_FRAME,
-            reply_codec=SYNTHESIS_ESTIMATE,
             timeout_s=self._timeout_s if timeout_s is None else timeout_s,
         )
 
@@ -191,12 +172,7 @@ class Client(Closing):
             RemoteError: The gateway refuses, e.g. because the finger is touched.
         """
         return self.session.query(
-            "tare",
-            sensor=sensor,
-            request=TareRequest(frames=frames),
-            request_codec=TARE_REQUEST,
-            reply_codec=TARE,
-            timeout_s=timeout_s,
+            endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
         )
 
     def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
@@ -212,12 +188,7 @@ class Client(Closing):
             RemoteError: The gateway refuses, e.g. because the load is not still.
         """
         return self.session.query(
-            "zero",
-            sensor=sensor,
-            request=WrenchZeroRequest(readings=readings),
-            request_codec=WRENCH_ZERO_REQUEST,
-            reply_codec=WRENCH_ZERO,
-            timeout_s=timeout_s,
+            endpoints.ZERO, WrenchZeroRequest(readings=readings), sensor=sensor, timeout_s=timeout_s
         )
 
     def simulate(
@@ -262,23 +233,16 @@ class Client(Closing):
             Whether it was waiting or running.
         """
         return self.session.query(
-            "simulate_cancel",
+            endpoints.CANCEL_SIMULATION,
+            SimulationCancelRequest(request_id),
             sensor=sensor,
-            request=SimulationCancelRequest(request_id),
-            request_codec=SIMULATION_CANCEL_REQUEST,
-            reply_codec=SIMULATION_CANCEL_REPLY,
             timeout_s=timeout_s,
         ).found
 
     def model(self, *, service: str = "features") -> ModelMetadata:
         """What the served bundle says of itself."""
         return self.session.query(
-            "model",
-            service=service,
-            request=ServiceRequest(),
-            request_codec=SERVICE_REQUEST,
-            reply_codec=MODEL_METADATA,
-            timeout_s=self._timeout_s,
+            endpoints.MODEL, ServiceRequest(), service=service, timeout_s=self._timeout_s
         )
 
     def alive(self) -> list[Alive]:
@@ -288,11 +252,7 @@ class Client(Closing):
     def status(self) -> list[Status]:
         """What every process of the station says of itself; broken answers are left out."""
         answers = self.session.query_all(
-            "status",
-            request=ServiceRequest(),
-            request_codec=SERVICE_REQUEST,
-            reply_codec=STATUS,
-            timeout_s=self._timeout_s,
+            endpoints.STATUS, ServiceRequest(), timeout_s=self._timeout_s
         )
         return [answer for answer in answers if not isinstance(answer, PalpateError)]
 

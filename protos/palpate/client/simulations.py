@@ -6,8 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 
-from palpate.bus import Session
-from palpate.codec import SIMULATION_REPLY, SIMULATION_REQUEST
+from palpate.bus import Session, endpoints
 from palpate.errors import WireError
 from palpate.messages import (
     Pose,
@@ -87,14 +86,9 @@ def ask_simulation(
     """
     deadline_s = min(request.deadline_s or math.inf, timeout_s)
     asked = dataclasses.replace(request, deadline_s=deadline_s)
-    with session.asking(request.request_id):
-        parts = session.ask_stream(
-            "simulate",
-            sensor=sensor,
-            request=asked,
-            request_codec=SIMULATION_REQUEST,
-            reply_codec=SIMULATION_REPLY,
-            timeout_s=deadline_s + GRACE_S,
+    with session.caller_token(request.request_id):
+        parts = session.query_stream(
+            endpoints.SIMULATE, asked, sensor=sensor, timeout_s=deadline_s + GRACE_S
         )
         return join(parts, on_progress=on_progress, on_step=on_step)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.codec import WRENCH_ZERO, WRENCH_ZERO_REQUEST
+from palpate.bus import endpoints
 from palpate.errors import ErrorCode, LinkError, RemoteError
 from palpate.messages import (
     SensorState,
@@ -38,12 +38,7 @@ def gateway(driver: str, options: dict[str, Any]) -> dict[str, Any]:
 
 def ask_zero(bus: Any, *, readings: int = 20) -> WrenchZero:
     found: WrenchZero = bus.session.query(
-        "zero",
-        sensor="ft",
-        request=WrenchZeroRequest(readings),
-        request_codec=WRENCH_ZERO_REQUEST,
-        reply_codec=WRENCH_ZERO,
-        timeout_s=20.0,
+        endpoints.ZERO, WrenchZeroRequest(readings), sensor="ft", timeout_s=20.0
     )
     return found
 

@@ -1,0 +1,96 @@
+"""The endpoint table: the questions that can be asked on the bus, beside the streams of ``topics``.
+
+A node serves an endpoint with ``Session.queryable`` (one reply) or ``Session.stream_queryable``
+(several), and a caller asks it with ``Session.query``, ``query_all`` or ``query_stream``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from palpate import codec
+from palpate.codec import Codec
+from palpate.messages import (
+    FieldEstimate,
+    FieldFrame,
+    FieldRequest,
+    ModelMetadata,
+    ServiceRequest,
+    SimulationCancelReply,
+    SimulationCancelRequest,
+    SimulationReply,
+    SimulationRequest,
+    Status,
+    SynthesisEstimate,
+    Tare,
+    TareRequest,
+    WrenchZero,
+    WrenchZeroRequest,
+)
+
+Q = TypeVar("Q")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint(Generic[Q, R]):
+    """One question and its reply.
+
+    Attributes:
+        name: Last chunk of its key.
+        request: Codec of the question.
+        reply: Codec of a reply.
+        doc: One line for people.
+        per_service: Whether its key names a service instead of a sensor.
+    """
+
+    name: str
+    request: Codec[Q]
+    reply: Codec[R]
+    doc: str
+    per_service: bool = False
+
+
+TARE: Endpoint[TareRequest, Tare] = Endpoint(
+    "tare", codec.TARE_REQUEST, codec.TARE, "tare a BioTac, or look up a tare by its id"
+)
+ZERO: Endpoint[WrenchZeroRequest, WrenchZero] = Endpoint(
+    "zero", codec.WRENCH_ZERO_REQUEST, codec.WRENCH_ZERO, "zero a force/torque sensor"
+)
+SIMULATE: Endpoint[SimulationRequest, SimulationReply] = Endpoint(
+    "simulate",
+    codec.SIMULATION_REQUEST,
+    codec.SIMULATION_REPLY,
+    "indent the finite-element fingertip; several replies",
+)
+CANCEL_SIMULATION: Endpoint[SimulationCancelRequest, SimulationCancelReply] = Endpoint(
+    "simulate_cancel",
+    codec.SIMULATION_CANCEL_REQUEST,
+    codec.SIMULATION_CANCEL_REPLY,
+    "stop a simulation that waits or runs",
+)
+STATUS: Endpoint[ServiceRequest, Status] = Endpoint(
+    "status", codec.SERVICE_REQUEST, codec.STATUS, "state and counters of a process", True
+)
+MODEL: Endpoint[ServiceRequest, ModelMetadata] = Endpoint(
+    "model", codec.SERVICE_REQUEST, codec.MODEL_METADATA, "metadata of the served bundle", True
+)
+ESTIMATE_FIELD: Endpoint[FieldRequest, FieldEstimate] = Endpoint(
+    "estimate", codec.FIELD_REQUEST, codec.FIELD_ESTIMATE, "field of one electrode frame", True
+)
+SYNTHESISE: Endpoint[FieldFrame, SynthesisEstimate] = Endpoint(
+    "synthesise", codec.FIELD_FRAME, codec.SYNTHESIS_ESTIMATE, "tared counts of one field", True
+)
+
+ENDPOINTS: tuple[Endpoint[Any, Any], ...] = (
+    TARE,
+    ZERO,
+    SIMULATE,
+    CANCEL_SIMULATION,
+    STATUS,
+    MODEL,
+    ESTIMATE_FIELD,
+    SYNTHESISE,
+)
+"""All questions."""
