@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from palpate.command import typed_command
-from palpate_deploy.left_out import show_left_out
-from palpate_deploy.options import JsonOption
+from palpate_deploy.cli.options import JsonOption, show_left_out
 from palpate_fem.config import LIMITS
 
 if TYPE_CHECKING:

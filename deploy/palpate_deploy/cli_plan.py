@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from palpate.errors import ConfigError
-from palpate_deploy.left_out import show_left_out
-from palpate_deploy.options import JsonOption
+from palpate_deploy.cli.options import JsonOption, show_left_out
 
 if TYPE_CHECKING:
     from palpate_training.testbed.plan import Eliminated, Plan

@@ -11,15 +11,15 @@ from typer.testing import CliRunner
 
 pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
-from palpate_deploy import cli_files
-from palpate_deploy.options import PalpateGroup
+from palpate_deploy.cli import files as cli_files
+from palpate_deploy.cli.options import PalpateGroup
 from palpate_fem.store import hdf5 as store_hdf5
 from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
-from palpate_services import simulation_view_file
-from palpate_services.simulation_view_file import Simulations
+from palpate_services.viewer import simulation_file
+from palpate_services.viewer.simulation_file import Simulations
 
 NAMES = ["sphere_medium/00/angled", "sphere_medium/00/normal"]
 
@@ -36,8 +36,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_both_rooms_name_the_same_schema() -> None:
-    assert simulation_view_file.SCHEMA == store_hdf5.SCHEMA
-    assert simulation_view_file.SCHEMA_VERSION == store_hdf5.SCHEMA_VERSION
+    assert simulation_file.SCHEMA == store_hdf5.SCHEMA
+    assert simulation_file.SCHEMA_VERSION == store_hdf5.SCHEMA_VERSION
 
 
 @pytest.mark.parametrize("suffix", [".sim", ".h5"])

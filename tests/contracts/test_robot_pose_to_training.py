@@ -26,8 +26,8 @@ from palpate_gateway.drivers import DRIVERS
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.readings import PoseReading, Reading
 from palpate_gateway.virtual.finger import Virtual
-from palpate_services import recorder
 from palpate_services.config import RecorderConfig
+from palpate_services.recorder.service import run_recorder
 
 PATIENCE_S = 20.0
 PERIOD_S = 0.004
@@ -67,7 +67,7 @@ def station(link: LinkConfig, out: Path) -> Iterator[None]:
     keep = RecorderConfig(out=out, rrd=False)
     stop = threading.Event()
     nodes = [
-        threading.Thread(target=recorder.run, args=(keep, link, "lab", stop)),
+        threading.Thread(target=run_recorder, args=(keep, link, "lab", stop)),
         threading.Thread(target=node.run, args=(gateway, link, "lab", stop)),
     ]
     for one in nodes:

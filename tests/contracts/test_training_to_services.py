@@ -12,10 +12,10 @@ from palpate.errors import BundleError
 from palpate.files.bundle import read_bundle
 from palpate.files.record import read_record
 from palpate.messages import ElectrodeFrame, FeatureEstimate, Tare
-from palpate_deploy.virtual_record import write_virtual_record
-from palpate_services.estimator import estimate
-from palpate_services.repository import resolve
-from palpate_services.runtime import load
+from palpate_deploy.demo.bundles import write_virtual_record
+from palpate_services.inference.estimates import estimate
+from palpate_services.inference.model import load
+from palpate_services.inference.repository import resolve
 
 
 def _frames(record: Path) -> tuple[list[ElectrodeFrame], dict[int, Tare], list[float]]:

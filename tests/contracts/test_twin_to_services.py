@@ -22,9 +22,9 @@ from palpate.messages import (
 from palpate_gateway.drivers import make_device
 from palpate_gateway.pipeline import Pipeline
 from palpate_gateway.timing.clock_map import FileClock
-from palpate_services.estimator import estimate, estimate_field, synthesise
-from palpate_services.repository import resolve
-from palpate_services.runtime import Runtime, load
+from palpate_services.inference.estimates import estimate, estimate_field, synthesise
+from palpate_services.inference.model import Runtime, load
+from palpate_services.inference.repository import resolve
 
 
 def shipped(task: str) -> Runtime:

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from palpate.config import LinkConfig
-from palpate_deploy.ports import free_endpoint
-from palpate_deploy.virtual_record import write_virtual_record
-from palpate_services.repository import available
+from palpate_deploy.demo.bundles import write_virtual_record
+from palpate_deploy.station.host import free_endpoint
+from palpate_services.inference.repository import available
 
 ROOT = Path(__file__).resolve().parents[2]
 BUNDLE = "features-virtual"

@@ -22,19 +22,26 @@ from palpate.messages import (
     WrenchFrame,
 )
 from palpate.sampling import slots_of
-from palpate_deploy.bench.alignment_account import (
+from palpate_deploy.bench.alignment import (
     LOW_COUNTS,
     LOW_N,
     SPAN_COUNTS,
     SPAN_M,
     SPAN_N,
     apart,
+    page_of,
     spread,
     stamp_errors,
 )
-from palpate_deploy.bench.alignment_page import page_of
-from palpate_deploy.bench.lateness import LATE_S, Lateness, OnTime
-from palpate_deploy.bench.ramp import MARGIN_S, RAMP_S, share_at, time_of
+from palpate_deploy.bench.alignment_parts import (
+    LATE_S,
+    MARGIN_S,
+    RAMP_S,
+    Lateness,
+    OnTime,
+    share_at,
+    time_of,
+)
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

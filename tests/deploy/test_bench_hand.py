@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.messages import ServiceState, Status
-from palpate_deploy.bench.hand_result import HandResult, Used, account
+from palpate_deploy.bench.hand import HandResult, Used, account
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

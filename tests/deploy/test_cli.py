@@ -26,10 +26,11 @@ from palpate.errors import (
     PalpateError,
     RecordingError,
 )
-from palpate_deploy import doctor, training
-from palpate_deploy.cli import app
-from palpate_deploy.failure import exit_code
-from palpate_deploy.ports import check_free, free_endpoint
+from palpate_deploy import training
+from palpate_deploy.cli.app import app
+from palpate_deploy.diagnose import doctor
+from palpate_deploy.station.host import check_free, free_endpoint
+from palpate_deploy.station.logs import exit_code
 from palpate_fem.cli.group import EXTRA_MODULES
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -70,7 +71,7 @@ def test_help_has_a_runnable_example(path: tuple[str, ...]) -> None:
 def test_help_imports_nothing_heavy() -> None:
     heavy = ("numpy", "zenoh", "pydantic", "onnxruntime", "rerun", "torch", "matplotlib", "mcap")
     program = (
-        "import sys; from palpate_deploy.cli import app\n"
+        "import sys; from palpate_deploy.cli.app import app\n"
         "from typer.testing import CliRunner\n"
         "assert CliRunner().invoke(app, ['--help']).exit_code == 0\n"
         f"print([name for name in {heavy!r} if name in sys.modules])"

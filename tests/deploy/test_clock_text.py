@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from palpate.messages import ServiceState, Status
-from palpate_deploy.clock_text import clock_lines, duration_words, wall_words
+from palpate_deploy.station.status import clock_lines, duration_words, wall_words
 from palpate_gateway.timing.clock_map import ClockQuality
 from palpate_gateway.timing.discipline import Discipline
 

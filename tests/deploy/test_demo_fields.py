@@ -11,7 +11,7 @@ import pytest
 
 from palpate.errors import LinkError, StreamTimeout
 from palpate.messages import Origin, Stamp
-from palpate_deploy.demo_fields import FieldComparison, FieldStreams
+from palpate_deploy.demo.comparison import FieldComparison, FieldStreams
 
 MS = 1_000_000
 

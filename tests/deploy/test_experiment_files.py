@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from palpate_deploy.cli import app
+from palpate_deploy.cli.app import app
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory

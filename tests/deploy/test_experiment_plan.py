@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from palpate_deploy.cli import app
+from palpate_deploy.cli.app import app
 from palpate_fem.indenter.approach import first_contact
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.service.start import skin_of

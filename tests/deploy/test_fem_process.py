@@ -14,8 +14,8 @@ import pytest
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError
-from palpate_deploy.processes import START_ORDER, service_named
-from palpate_deploy.profile import load_profile, profile_names
+from palpate_deploy.station.processes import START_ORDER, service_named
+from palpate_deploy.station.profile import load_profile, profile_names
 
 FAKES = Path(__file__).resolve().parents[1] / "fem"
 PATIENCE_S = 20.0

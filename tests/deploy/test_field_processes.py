@@ -16,9 +16,9 @@ import pytest
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError
-from palpate_deploy.doctor import run_doctor
-from palpate_deploy.processes import START_ORDER, service_named
-from palpate_deploy.profile import SERVICES, load_profile
+from palpate_deploy.diagnose.doctor import run_doctor
+from palpate_deploy.station.processes import START_ORDER, service_named
+from palpate_deploy.station.profile import SERVICES, load_profile
 
 PATIENCE_S = 20.0
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from palpate.files.record import read_record
-from palpate_deploy.virtual_record import write_virtual_record
+from palpate_deploy.demo.bundles import write_virtual_record
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

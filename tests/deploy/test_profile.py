@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from palpate.errors import ConfigError
-from palpate_deploy.profile import (
+from palpate_deploy.station.profile import (
     changed,
     load_profile,
     parse_profile,

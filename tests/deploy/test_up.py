@@ -17,7 +17,7 @@ from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
-from palpate_deploy.processes import command_line
+from palpate_deploy.station.processes import command_line
 
 _log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from palpate.messages import (
     ServiceState,
     Status,
 )
-from palpate_deploy.status import show_status
+from palpate_deploy.station.status import show_status
 from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
 
 PAC, PDC = 22, 19

@@ -85,10 +85,10 @@ def test_makefile_describes_every_target() -> None:
 @pytest.fixture(scope="module")
 def command() -> Any:
     """The tree of `palpate` commands."""
-    if importlib.util.find_spec("palpate_deploy.cli") is None:
-        pytest.skip("palpate_deploy.cli does not exist")
+    if importlib.util.find_spec("palpate_deploy.cli.app") is None:
+        pytest.skip("palpate_deploy.cli.app does not exist")
     typer = importlib.import_module("typer")
-    cli = importlib.import_module("palpate_deploy.cli")
+    cli = importlib.import_module("palpate_deploy.cli.app")
     return typer.main.get_command(cli.app)
 
 

@@ -39,10 +39,10 @@ def test_protos_load_nothing_heavy() -> None:
     ("module", "may_load"),
     [
         ("palpate.client", ()),
-        ("palpate_deploy.cli", ()),
+        ("palpate_deploy.cli.app", ()),
         ("palpate_gateway.node", ()),
-        ("palpate_services.features", ("onnxruntime",)),
-        ("palpate_services.recorder", ("rerun", "pyarrow")),
+        ("palpate_services.inference.services", ("onnxruntime",)),
+        ("palpate_services.recorder.service", ("rerun", "pyarrow")),
     ],
 )
 def test_module_loads_only_what_it_needs(module: str, may_load: tuple[str, ...]) -> None:

@@ -22,11 +22,11 @@ from palpate.files.bundle import read_bundle
 from palpate.files.record import read_record
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, SensorType, ServiceState, Tare
-from palpate_services import features, field
 from palpate_services.config import FeaturesConfig, FieldConfig, RecorderConfig
-from palpate_services.estimator import Refusal, estimate, estimate_field
-from palpate_services.keeper import RecordKeeper
-from palpate_services.runtime import load
+from palpate_services.inference.estimates import Refusal, estimate, estimate_field
+from palpate_services.inference.model import load
+from palpate_services.inference.services import run_features, run_field
+from palpate_services.recorder.writer import RecordKeeper
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -84,7 +84,7 @@ def test_features_service_names_the_sensor_and_serves_the_others(
     until: Until,
 ) -> None:
     config = FeaturesConfig(bundle=str(make_bundle()), max_age_s=10.0)
-    with running(features.run, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
+    with running(run_features, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         session = robot.session
         estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
@@ -115,7 +115,7 @@ def test_field_service_answers_by_an_error(
     link: LinkConfig, make_frame: Frames, make_tare: Tares, until: Until, tmp_path: Path
 ) -> None:
     config = FieldConfig(bundle=str(bundles.write(tmp_path / "f", "field")))
-    with running(field.run, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
+    with running(run_field, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         announce(robot.session, "thumb", make_tare(sensor_type=SP))
         with pytest.raises(RemoteError, match="made for another type of sensor") as caught:
@@ -141,7 +141,7 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
-    from palpate_services.view import review
+    from palpate_services.viewer.rerun import review
 
     def frames(kind: SensorType, first: int) -> list[Any]:
         sequences = range(first, first + 40)
@@ -174,7 +174,7 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
 
 
 def test_a_lost_pac_sample_is_a_gap_in_the_picture(make_frame: Frames) -> None:
-    from palpate_services.scene import SensorScene
+    from palpate_services.viewer.timeline import SensorScene
 
     layout = SP.layout
     frame = make_frame(sensor_type=SP)

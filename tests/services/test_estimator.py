@@ -11,8 +11,8 @@ import pytest
 from palpate.codec import FEATURE_ESTIMATE
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.messages import ElectrodeFrame, FeatureEstimate, SensorType, Tare
-from palpate_services.estimator import Refusal, estimate, tared_counts
-from palpate_services.runtime import Runtime, load
+from palpate_services.inference.estimates import Refusal, estimate, tared_counts
+from palpate_services.inference.model import Runtime, load
 
 Frames = Callable[..., ElectrodeFrame]
 

@@ -30,10 +30,10 @@ from palpate.messages import (
     Tare,
     TareRequest,
 )
-from palpate_services import features
 from palpate_services.config import FeaturesConfig
-from palpate_services.estimator import estimate
-from palpate_services.runtime import Runtime
+from palpate_services.inference.estimates import estimate
+from palpate_services.inference.model import Runtime
+from palpate_services.inference.services import run_features
 
 Frames = Callable[..., ElectrodeFrame]
 Tares = Callable[..., Tare]
@@ -49,7 +49,7 @@ def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> S
     def running(**config: Any) -> Iterator[Session]:
         stop = threading.Event()
         settings = FeaturesConfig(bundle=str(make_bundle()), **config)
-        node = threading.Thread(target=features.run, args=(settings, link, "lab", stop))
+        node = threading.Thread(target=run_features, args=(settings, link, "lab", stop))
         node.start()
         try:
             with Session.open(link) as session:
@@ -217,7 +217,7 @@ def test_lossless_replay_answers_every_frame_with_the_bytes_of_the_estimator(
     serve: Serve, bundle: Any, make_frame: Frames, make_tare: Tares
 ) -> None:
     from palpate.codec import FEATURE_ESTIMATE
-    from palpate_services.runtime import load
+    from palpate_services.inference.model import load
 
     replayed = [make_frame(n, origin=Origin.REPLAYED, monotonic_ns=n) for n in range(1, 501)]
     with serve(delivery="every", accept_replayed=True) as session:
@@ -245,4 +245,4 @@ def test_ready_token_goes_when_it_stops(serve: Serve, link: LinkConfig, until: U
 
 def test_unknown_bundle_lists_what_there_is() -> None:
     with pytest.raises(ConfigError, match="bundle 'no-such'"):
-        features.run(FeaturesConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event())
+        run_features(FeaturesConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event())

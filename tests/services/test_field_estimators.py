@@ -21,8 +21,8 @@ from palpate.messages import (
     SynthesisEstimate,
     Tare,
 )
-from palpate_services.estimator import Refusal, estimate_field, synthesise, tared_counts
-from palpate_services.runtime import Runtime, load
+from palpate_services.inference.estimates import Refusal, estimate_field, synthesise, tared_counts
+from palpate_services.inference.model import Runtime, load
 
 bundles: Any = importlib.import_module("field_bundles")
 

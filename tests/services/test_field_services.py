@@ -19,11 +19,11 @@ from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, LinkError, RemoteError
 from palpate.files.bundle import read_bundle
 from palpate.messages import ElectrodeFrame, Origin, Tare
-from palpate_services import field, synthesis
-from palpate_services.answering import Pace
 from palpate_services.config import FieldConfig, SynthesisConfig
-from palpate_services.estimator import estimate_field
-from palpate_services.runtime import load
+from palpate_services.inference.estimates import estimate_field
+from palpate_services.inference.loop import Pace
+from palpate_services.inference.model import load
+from palpate_services.inference.services import run_field, run_synthesis
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -41,8 +41,8 @@ def station(link: LinkConfig, tmp_path: Path, until: Until) -> Iterator[Client]:
         bundle=str(bundles.write(tmp_path / "s", "synthesis")), source="estimate", **replay
     )
     nodes = [
-        threading.Thread(target=field.run, args=(fields, link, "lab", stop)),
-        threading.Thread(target=synthesis.run, args=(counts, link, "lab", stop)),
+        threading.Thread(target=run_field, args=(fields, link, "lab", stop)),
+        threading.Thread(target=run_synthesis, args=(counts, link, "lab", stop)),
     ]
     for node in nodes:
         node.start()
@@ -134,7 +134,8 @@ def test_a_robot_asks_for_one_field_and_for_its_electrodes(
 ) -> None:
     tare = make_tare()
     announce(station.session, tare)
-    frame = make_frame(7, age_s=3600.0)  # whoever holds a frame knows how old it is
+    # Far over max_age_s, and yet after the start of a host that was just switched on.
+    frame = make_frame(7, age_s=30.0)
     answer = station.estimate_field("finger", frame)
     wanted = estimate_field(frame, tare, load(read_bundle(tmp_path / "f"), "field"))
     assert not isinstance(wanted, str)

@@ -18,11 +18,10 @@ from palpate.config import LinkConfig
 from palpate.errors import ConfigError
 from palpate.files.record import read_record
 from palpate.messages import ElectrodeFrame, Stamp, SynthesisEstimate, Tare
-from palpate_services import recorder
 from palpate_services.config import RecorderConfig
-from palpate_services.field_scene import FieldThinner
-from palpate_services.meshes import MeshLibrary
-from palpate_services.scene import SensorScene
+from palpate_services.inference.repository import MeshLibrary
+from palpate_services.recorder.service import run_recorder
+from palpate_services.viewer.timeline import FieldThinner, SensorScene
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -100,7 +99,7 @@ def test_library_knows_packaged_meshes_and_those_it_is_told_of(tmp_path: Path) -
 def test_recorder_refuses_a_bundle_that_is_not_there(tmp_path: Path) -> None:
     config = RecorderConfig(out=tmp_path, bundles=("no-such",))
     with pytest.raises(ConfigError, match="bundle 'no-such'"):
-        recorder.run(config, LinkConfig(), "lab", threading.Event())
+        run_recorder(config, LinkConfig(), "lab", threading.Event())
 
 
 def columns_of(view: Path) -> dict[str, dict[str, list[Any]]]:
@@ -129,12 +128,12 @@ def test_recorded_and_drawn(
     until: Until,
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.view import review
+    from palpate_services.viewer.rerun import review
 
     mine = str(bundles.write(tmp_path / "mine", "field"))
     stop = threading.Event()
     config = RecorderConfig(out=tmp_path / "runs", bundles=(mine,), min_free_bytes=0)
-    node = threading.Thread(target=recorder.run, args=(config, link, "lab", stop))
+    node = threading.Thread(target=run_recorder, args=(config, link, "lab", stop))
     node.start()
     stamp = make_frame().stamp
     try:
@@ -194,7 +193,7 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
     make_frame: Frames, tmp_path: Path
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.view import View
+    from palpate_services.viewer.rerun import View
 
     meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
     field = bundles.truth(stamp_at(make_frame().stamp, 0.0))

@@ -19,10 +19,9 @@ from palpate.errors import ErrorCode
 from palpate.files.record import RecordWriter, check_readable, read_record
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, ServiceState
-from palpate_services import keeper as keeper_module
 from palpate_services.config import RecorderConfig
-from palpate_services.keeper import RecordKeeper
-from palpate_services.recovery import leftovers, recover_all
+from palpate_services.recorder import writer as keeper_module
+from palpate_services.recorder.writer import RecordKeeper, leftovers, recover_all
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -214,7 +213,7 @@ def test_view_that_fails_leaves_the_record_alone(
 
 def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.view import View
+    from palpate_services.viewer.rerun import View
 
     path = tmp_path / "view.rrd"
     with View(path, title="view", max_bytes=1) as view:

@@ -29,9 +29,10 @@ from palpate.messages import (
     Status,
     Tare,
 )
-from palpate_services import features, recorder
 from palpate_services.config import FeaturesConfig, RecorderConfig
-from palpate_services.recovery import leftovers, recover_all
+from palpate_services.inference.services import run_features
+from palpate_services.recorder.service import run_recorder
+from palpate_services.recorder.writer import leftovers, recover_all
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -55,8 +56,8 @@ def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) ->
         keep = RecorderConfig(delivery="every" if lossless else "queue", **config)
         on = link.model_copy(update={"direct": not lossless})  # as the replay profile does it
         nodes = [
-            threading.Thread(target=features.run, args=(serve, on, "lab", stops["features"])),
-            threading.Thread(target=recorder.run, args=(keep, on, "lab", stops["recorder"])),
+            threading.Thread(target=run_features, args=(serve, on, "lab", stops["features"])),
+            threading.Thread(target=run_recorder, args=(keep, on, "lab", stops["recorder"])),
         ]
         for node in nodes:
             node.start()
@@ -129,8 +130,8 @@ def test_record_view_and_picture_of_a_session(
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
-    from palpate_services.plot import plot_record
-    from palpate_services.view import review
+    from palpate_services.viewer.plot import plot_record
+    from palpate_services.viewer.rerun import review
 
     with station(lossless=True, out=tmp_path) as session:
         answers = session.subscriber(FEATURES, delivery=Delivery.EVERY)
@@ -242,18 +243,18 @@ def test_disk_that_fills_up_while_recording(
 
 def test_unknown_topic_is_named() -> None:
     with pytest.raises(ConfigError, match="unknown topic 'elektrodes'"):
-        recorder.run(RecorderConfig(topics=("elektrodes",)), LinkConfig(), "lab", threading.Event())
+        run_recorder(RecorderConfig(topics=("elektrodes",)), LinkConfig(), "lab", threading.Event())
 
 
 KILLED = """
 import sys, threading
 from pathlib import Path
 from palpate.config import LinkConfig
-from palpate_services import recorder
+from palpate_services.recorder.service import run_recorder
 from palpate_services.config import RecorderConfig
 
 config = RecorderConfig(out=Path(sys.argv[1]), rrd=False, min_free_bytes=0)
-recorder.run(config, LinkConfig(connect=(sys.argv[2],)), "lab", threading.Event())
+run_recorder(config, LinkConfig(connect=(sys.argv[2],)), "lab", threading.Event())
 """
 
 

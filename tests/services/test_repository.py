@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from palpate.errors import ConfigError
-from palpate_services.repository import available, resolve
+from palpate_services.inference.repository import available, resolve
 
 
 @pytest.fixture

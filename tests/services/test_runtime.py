@@ -13,8 +13,7 @@ import pytest
 
 from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import Bundle, read_bundle
-from palpate_services.external_data import has_external_data
-from palpate_services.runtime import load
+from palpate_services.inference.model import has_external_data, load
 
 onnx = pytest.importorskip("onnx")
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_services.simulation_view import LONGEST_ARROW_M, review_simulations
-from palpate_services.simulation_view_file import Simulations, choose, is_simulations
-from palpate_services.simulation_view_surface import border_of, normals_of, shades
+from palpate_services.viewer.layout import border_of, normals_of, shades
+from palpate_services.viewer.simulation import LONGEST_ARROW_M, review_simulations
+from palpate_services.viewer.simulation_file import Simulations, choose, is_simulations
 
 h5py = pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 

@@ -3,7 +3,7 @@
 Emulators in processes of their own and a robot's program show one signal whose time is known by the
 host's monotonic clock: a BioTac on a CAN bus, a KMS 40 (TCP), an ATI Net F/T (UDP), a Bota (serial
 line) and poses over the bus. They go the whole way: driver, pipeline, bus, client. What a client
-then holds is compared with the truth by ``alignment_account``.
+then holds is compared with the truth.
 """
 
 from __future__ import annotations
@@ -12,31 +12,225 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from palpate.alignment import Clock, electrode_instants, linear, times_of
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import ELECTRODES, POSE, WRENCH
 from palpate.config import LinkConfig
 from palpate.errors import LinkError, StreamTimeout
 from palpate.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
-from palpate_deploy.bench.alignment_account import Spread, apart, stamp_errors
-from palpate_deploy.bench.alignment_page import page_of
-from palpate_deploy.bench.e2e import wait_ready
-from palpate_deploy.bench.lateness import OnTime
+from palpate.sampling import sample_offsets
+from palpate_deploy.bench.alignment_parts import (
+    LOW_COUNTS,
+    LOW_N,
+    SPAN_COUNTS,
+    SPAN_M,
+    SPAN_N,
+    OnTime,
+    time_of,
+)
 from palpate_deploy.bench.results import append_history, machine
-from palpate_deploy.bench.station import free_port, gateway_station
-from palpate_deploy.children import Children
-from palpate_deploy.processes import command_line
-from palpate_deploy.profile import Profile
-from palpate_deploy.run_folder import write_profile
-from palpate_deploy.status import ask_status
+from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
+from palpate_deploy.station.host import write_profile
+from palpate_deploy.station.processes import Children, command_line
+from palpate_deploy.station.profile import Profile
+from palpate_deploy.station.status import ask_status
+
+Floats = npt.NDArray[np.float64]
+
+Wrenches = dict[str, list[WrenchFrame]]
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Of many errors [s]: their median, and of their sizes 95 and 99 % and the largest.
+
+    Attributes:
+        count: How many readings.
+        median_s: Signed: late is positive.
+        p95_s: Of the sizes.
+        p99_s: Of the sizes.
+        max_s: Of the sizes.
+    """
+
+    count: int
+    median_s: float
+    p95_s: float
+    p99_s: float
+    max_s: float
+
+
+def spread(errors_s: Floats) -> Spread:
+    """Numbers of errors [s]; NaN is left out."""
+    kept = errors_s[np.isfinite(errors_s)]
+    if not len(kept):
+        return Spread(0, np.nan, np.nan, np.nan, np.nan)
+    sizes = np.abs(kept)
+    p95, p99 = np.percentile(sizes, (95, 99))
+    return Spread(len(kept), float(np.median(kept)), float(p95), float(p99), float(sizes.max()))
+
+
+def _off(share: Floats, stamp_ns: npt.NDArray[np.int64], counts: OnTime) -> Floats:
+    """Stamp less the time at which the value was there [s]; NaN at times that do not count."""
+    stamp_s = _seconds(stamp_ns)
+    return np.where(counts(stamp_s), stamp_s - time_of(share, stamp_s), np.nan)
+
+
+def _seconds(time_ns: npt.NDArray[np.int64]) -> Floats:
+    return np.asarray(1e-9 * time_ns.astype(np.float64))
+
+
+def _shares(frames: Sequence[ElectrodeFrame], *, pac: bool) -> Floats:
+    """What the electrodes, or the PAC samples, of frames show; NaN where a sample is invalid."""
+    layout = frames[0].sensor_type.layout
+    first, number = (layout.first_pac_bit, layout.pac_samples) if pac else (0, layout.electrodes)
+    counts = np.array([frame.pac if pac else frame.electrodes for frame in frames], np.float64)
+    bits = np.array([frame.validity for frame in frames], np.uint64)[:, None]
+    good = bits >> np.arange(first, first + number, dtype=np.uint64) & np.uint64(1)
+    return np.where(good == 1, (counts - LOW_COUNTS) / SPAN_COUNTS, np.nan)
+
+
+def _forces(frames: Sequence[WrenchFrame]) -> Floats:
+    return np.array([[frame.force[2]] for frame in frames], np.float64)
+
+
+def _travels(frames: Sequence[IndenterPoseFrame]) -> Floats:
+    return np.array([[frame.position[0]] for frame in frames], np.float64)
+
+
+def stamp_errors(
+    frames: Sequence[ElectrodeFrame],
+    wrenches: Wrenches,
+    poses: Sequence[IndenterPoseFrame],
+    counts: OnTime,
+) -> dict[str, Spread]:
+    """How far each stream's stamps are from when their values were there."""
+    at_ns = electrode_instants(frames, Clock.MONOTONIC)
+    shares = _shares(frames, pac=False)
+    stamps_ns = times_of(frames, Clock.MONOTONIC)
+    pac_ns = stamps_ns[:, None] + np.array([sample_offsets(frame).pac for frame in frames])
+    pac = _shares(frames, pac=True)
+    errors = {
+        "electrodes": _off(shares, at_ns, counts),
+        "PAC": _off(pac, pac_ns, counts),
+        "electrodes, all at the stamp": _off(shares, at_ns, counts)
+        - _seconds(at_ns - stamps_ns[:, None]),
+    }
+    for name, stream in wrenches.items():
+        share = (_forces(stream)[:, 0] - LOW_N) / SPAN_N
+        errors[name] = _off(share, times_of(stream, Clock.MONOTONIC), counts)
+    shares = _travels(poses)[:, 0] / SPAN_M
+    errors["pose"] = _off(shares, times_of(poses, Clock.MONOTONIC), counts)
+    return {name: spread(found) for name, found in errors.items()}
+
+
+def apart(
+    frames: Sequence[ElectrodeFrame],
+    wrenches: Wrenches,
+    poses: Sequence[IndenterPoseFrame],
+    counts: OnTime,
+) -> dict[str, Spread]:
+    """How far apart in time electrodes and other streams are that were aligned by their stamps.
+
+    Every stream is brought to the instant of each electrode of each frame; what it shows there was
+    there sooner or later than what the electrode shows.
+    """
+    at_ns = electrode_instants(frames, Clock.MONOTONIC)
+    about_s = _seconds(at_ns)
+    shares = _shares(frames, pac=False)
+    electrodes_s = np.where(counts(about_s), time_of(shares, about_s), np.nan)
+    out = {}
+    for name, stream in wrenches.items():
+        force, _ = linear(at_ns, times_of(stream, Clock.MONOTONIC), _forces(stream))
+        share = (force[..., 0] - LOW_N) / SPAN_N
+        out[name] = spread(electrodes_s - time_of(share, about_s))
+    travel, _ = linear(at_ns, times_of(poses, Clock.MONOTONIC), _travels(poses))
+    out["pose"] = spread(electrodes_s - time_of(travel[..., 0] / SPAN_M, about_s))
+    return out
+
+
+_HEAD = """\
+# Alignment on one host: what was measured
+
+Made by `palpate bench alignment --seconds {seconds:g} --page docs/results/alignment.md`
+on {machine}.
+
+Emulated devices, each in a process of its own, and a robot's program show one signal whose time is
+known by the host's monotonic clock: a ramp up and down, 0.25 s each. They go the whole way through
+driver, pipeline and bus to a client. Nothing here is hardware: what a real device delays before it
+sends (filters, conversion, adapters) comes on top, and is the same for every reading of it
+([time.md](../time.md#what-no-stamp-can-know)). The clocks of finger, RDT and Bota run 200 ppm fast,
+the robot's is another than the host's and 40 ppm fast.
+
+The host is shared, and puts emulators aside as it never does with sensors: what they sent more
+than 5 ms late, and what lies around it, is left out. {kept:.0%} of the time counts.
+
+## Stamps
+
+A reading's stamp less the instant at which its value was there; late is positive. Median with its
+sign, the others of the sizes.
+
+{stamps}
+
+Of the finger every channel counts at its own instant (`palpate.sampling`); a count is worth
+0.07 ms here, which is part of the numbers. The row "all at the stamp" is the same readings for
+whoever forgets that a frame takes 10 ms.
+
+## Electrodes, wrench and pose
+
+Every stream brought to the instant of each electrode (`palpate.alignment`); how far apart in
+time what the two show was there. The goal is 1 ms.
+
+{apart}
+
+## What the gateway told
+
+{gauges}
+"""
+
+
+def page_of(
+    seconds: float,
+    kept: float,
+    stamps: dict[str, Spread],
+    apart: dict[str, Spread],
+    gauges: dict[str, float],
+    machine: dict[str, Any],
+) -> str:
+    """The page as Markdown."""
+    told = ["| gauge | |", "| --- | ---: |"]
+    told += [f"| `{name}` | {value:.6g} |" for name, value in gauges.items()]
+    return _HEAD.format(
+        seconds=seconds,
+        kept=kept,
+        machine=f"{machine['cpus']} CPUs ({machine['cpu']}), load {machine['load_1min']}",
+        stamps=_table(stamps),
+        apart=_table(apart),
+        gauges="\n".join(told),
+    )
+
+
+def _table(rows: dict[str, Spread]) -> str:
+    out = [
+        "| | readings | median | 95 % | 99 % | largest |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for name, one in rows.items():
+        numbers = (one.median_s, one.p95_s, one.p99_s, one.max_s)
+        cells = " | ".join(f"{1e3 * value:.3f} ms" for value in numbers)
+        out.append(f"| {name} | {one.count:,} | {cells} |")
+    return "\n".join(out)
+
 
 GOAL_S = 1e-3
 CHANNEL = "239.74.163.7"

@@ -15,23 +15,110 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
-from palpate_deploy.bench.alignment_account import (
-    LOW_COUNTS,
-    LOW_N,
-    SPAN_COUNTS,
-    SPAN_M,
-    SPAN_N,
-)
 from palpate_deploy.bench.harness import stop_on_sigterm
-from palpate_deploy.bench.lateness import Lateness
-from palpate_deploy.bench.ramp import share_at
 from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
 from palpate_gateway.emulators.biotac_slots import Counts, CountTrack, Indices, Times
 from palpate_gateway.emulators.bota import Bota
 from palpate_gateway.emulators.emulator import Emulator, HostTimed
 from palpate_gateway.emulators.kms40 import Kms40Emulator
 from palpate_gateway.emulators.rdt import RdtEmulator
+
+Floats = npt.NDArray[np.float64]
+
+LOW_COUNTS, SPAN_COUNTS = 300, 3500
+"""Counts of an electrode that is not pressed, and how many more when it is."""
+LOW_N, SPAN_N = 1.0, 20.0
+"""Force likewise [N]."""
+SPAN_M = 0.02
+"""Travel of the indenter [m]."""
+
+RAMP_S = 0.25
+"""How long it rises, and falls [s]."""
+
+MARGIN_S = 0.025
+"""Readings nearer to a turning point are left out: there a value has two times [s]."""
+
+
+def share_at(time_s: Floats) -> Floats:
+    """How far it is pressed, 0..1, at monotonic times [s]."""
+    place = np.mod(time_s / RAMP_S, 2.0)
+    return np.asarray(1.0 - np.abs(place - 1.0))
+
+
+def time_of(share: Floats, about_s: Floats) -> Floats:
+    """When it was pressed so far [s]; NaN near turning points.
+
+    Args:
+        share: 0..1.
+        about_s: When that was, to a tenth of a ramp [s]; of the same shape.
+    """
+    ramp = np.floor(about_s / RAMP_S)
+    rising = np.mod(ramp, 2.0) == 0.0
+    time_s = RAMP_S * (ramp + np.where(rising, share, 1.0 - share))
+    past_s = about_s - RAMP_S * ramp
+    clear = (past_s > MARGIN_S) & (past_s < RAMP_S - MARGIN_S)
+    return np.where(clear, time_s, np.nan)
+
+
+LATE_S = 5e-3
+"""A sample that is sent later than this was due is of a starved emulator [s]."""
+
+_BEFORE_S, _AFTER_S = 0.05, 0.3
+"""What lies around such a sample is left out: slots that come in a burst, times that follow [s]."""
+
+
+class Lateness:
+    """Notes late samples of one process."""
+
+    def __init__(self) -> None:
+        self._spans: list[tuple[float, float]] = []
+
+    def note(self, due_s: float) -> None:
+        """A sample is sent now that was due then [s, monotonic]."""
+        now_s = time.monotonic()
+        if now_s - due_s <= LATE_S:
+            return
+        if self._spans and due_s <= self._spans[-1][1]:
+            self._spans[-1] = (min(self._spans[-1][0], due_s), now_s)
+        else:
+            self._spans.append((due_s, now_s))
+
+    def write(self, path: Path) -> None:
+        """Keep what was noted, whole or not at all."""
+        made = path.with_suffix(".part")
+        with made.open("wb") as file:
+            np.save(file, np.array(self._spans, np.float64).reshape(-1, 2))
+        made.rename(path)
+
+
+class OnTime:
+    """Which instants count.
+
+    Args:
+        spans_s: Beginnings and ends of what does not [s, monotonic], shape ``(N, 2)``.
+    """
+
+    def __init__(self, spans_s: Floats) -> None:
+        wide = spans_s + np.array([-_BEFORE_S, _AFTER_S])
+        wide = wide[np.argsort(wide[:, 0])]
+        self._starts = wide[:, 0]
+        self._ends = np.maximum.accumulate(wide[:, 1]) if len(wide) else wide[:, 1]
+
+    @classmethod
+    def of(cls, paths: list[Path]) -> OnTime:
+        """Of all devices together."""
+        return cls(np.concatenate([np.zeros((0, 2)), *(np.load(path) for path in paths)]))
+
+    def __call__(self, time_s: Floats) -> npt.NDArray[np.bool_]:
+        """Whether each instant counts; of the shape of the times [s, monotonic]."""
+        last = np.searchsorted(self._starts, time_s, side="right") - 1
+        if not len(self._ends):
+            return np.ones(np.shape(time_s), np.bool_)
+        inside = (last >= 0) & (time_s <= self._ends[np.maximum(last, 0)])
+        return np.asarray(~inside)
+
 
 ROBOT_HZ = 250.0
 _SLOT_RATE_HZ = 4400.0

@@ -31,7 +31,7 @@ from palpate_deploy.bench.harness import (
     stop_on_sigterm,
     write_rows,
 )
-from palpate_deploy.parent import end_with_parent
+from palpate_deploy.station.parent import end_with_parent
 
 FRAMES = "floor/finger/electrodes"
 ESTIMATES = "floor/finger/features"

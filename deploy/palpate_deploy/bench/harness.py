@@ -12,7 +12,7 @@ from types import FrameType
 import numpy as np
 import numpy.typing as npt
 
-from palpate_deploy.parent import end_with_parent
+from palpate_deploy.station.parent import end_with_parent
 
 SERIAL = "BENCH-0001"
 REST_COUNTS = 3000

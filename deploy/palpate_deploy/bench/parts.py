@@ -19,8 +19,8 @@ DRIVER = "palpate_deploy.bench.device:Bench"
 
 def gateway(profile: str) -> None:
     """Run the gateway with the benchmark's driver."""
-    from palpate_deploy.processes import run_service
-    from palpate_deploy.profile import load_profile
+    from palpate_deploy.station.processes import run_service
+    from palpate_deploy.station.profile import load_profile
     from palpate_gateway.drivers import DRIVERS
 
     DRIVERS["bench"] = DRIVER

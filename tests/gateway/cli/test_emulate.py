@@ -21,7 +21,7 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.config import parse_config
-from palpate_deploy.cli import app
+from palpate_deploy.cli.app import app
 from palpate_gateway.config import GatewayConfig
 from palpate_gateway.drivers import make_device
 from palpate_gateway.emulators.kms40 import Kms40Emulator

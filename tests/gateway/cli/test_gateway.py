@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.errors import MissingExtraError
-from palpate_deploy.cli import app
+from palpate_deploy.cli.app import app
 from palpate_gateway.cli import inventory
 from palpate_gateway.drivers import driver_names
 from palpate_gateway.emulators.kms40 import Kms40Emulator

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from palpate.errors import DeviceLost, DeviceTimeout
 from palpate.messages import Pose
-from palpate_deploy.cli import app
+from palpate_deploy.cli.app import app
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import make_device
 from palpate_gateway.emulators.robot import (

@@ -22,7 +22,7 @@ from palpate.bus import Session
 from palpate.bus.topics import ROBOT_POSE
 from palpate.client import Client
 from palpate.config import LinkConfig
-from palpate_deploy.cli import app
+from palpate_deploy.cli.app import app
 from palpate_gateway.cli.probe import device_of
 from palpate_gateway.cli.reading_text import text_of, values_of
 from palpate_gateway.readings import PoseReading

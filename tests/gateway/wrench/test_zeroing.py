@@ -19,7 +19,7 @@ from palpate.messages import (
     WrenchZero,
     WrenchZeroRequest,
 )
-from palpate_deploy.tare import take_tare
+from palpate_deploy.station.tare import take_tare
 from palpate_gateway.emulators.bota import Bota
 from palpate_gateway.emulators.kms40 import Kms40Emulator
 from palpate_gateway.emulators.robotous import RobotousSerial

@@ -1,0 +1,221 @@
+"""The ``palpate`` command. Signatures and help only; each command's work is in its own module.
+
+Nothing heavy is imported before a command runs: ``palpate --help`` must not wait for NumPy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from palpate_deploy import training
+from palpate_deploy.cli.bench import bench_app
+from palpate_deploy.cli.files import bundle_app, model_app, register
+from palpate_deploy.cli.options import (
+    DEFAULT_CONNECT,
+    DEFAULT_PROFILE,
+    DEFAULT_STATION,
+    ConnectOption,
+    JsonOption,
+    PalpateGroup,
+    ProfileOption,
+    SensorOption,
+    StationOption,
+    client_link,
+    example,
+    group,
+)
+from palpate_deploy.station.logs import LogFormat, LogLevel, configure
+from palpate_fem.cli.app import fem_app
+from palpate_gateway.cli.app import gateway_app
+from palpate_gateway.cli.emulate_app import emulate_app
+
+app = typer.Typer(
+    cls=PalpateGroup,
+    help="Tactile inference for the SynTouch BioTac: electrodes to features, live and recorded.",
+    epilog=example("palpate demo", "palpate up --profile virtual"),
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"palpate {version('palpate')}")
+        except PackageNotFoundError:
+            print("palpate (not installed)")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    log_level: Annotated[LogLevel, typer.Option(help="Least level logged to stderr.")] = "warning",
+    log_format: Annotated[LogFormat, typer.Option(help="Log lines for people or machines.")] = (
+        "text"
+    ),
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Options before the command."""
+    configure(log_level, log_format)
+
+
+@app.command(epilog=example("palpate up --profile virtual", "palpate up --print-config"))
+def up(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the resolved profile and end.")
+    ] = False,
+) -> None:
+    """Start a station's processes and keep them running until Ctrl-C."""
+    from palpate_deploy.station.profile import load_profile, plain_values
+    from palpate_deploy.toml_text import toml_text
+
+    loaded = load_profile(profile)
+    if print_config:
+        print(toml_text(plain_values(loaded)), end="")
+        return
+    from palpate_deploy.station.up import run_up
+
+    raise typer.Exit(run_up(loaded, Path(profile).stem))
+
+
+@app.command(epilog=example("palpate run features --profile virtual"))
+def run(
+    service: Annotated[str, typer.Argument(help="E.g. gateway, features, field.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+) -> None:
+    """Be one process of a station, unsupervised (what `palpate up` starts)."""
+    from palpate_deploy.station.processes import run_service, service_named
+    from palpate_deploy.station.profile import load_profile
+
+    run_service(service_named(service), load_profile(profile))
+
+
+@app.command(epilog=example("palpate status --json"))
+def status(
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Who is alive and ready, what each process counts, and its last error."""
+    from palpate_deploy.station.status import show_status
+
+    raise typer.Exit(show_status(client_link(connect), station, as_json=json_))
+
+
+@app.command(epilog=example("palpate doctor --profile virtual"))
+def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -> None:
+    """Check what a station needs on this host; each line ok, warn or fail, with its fix."""
+    from palpate_deploy.diagnose.doctor import run_doctor
+
+    raise typer.Exit(run_doctor(profile, as_json=json_))
+
+
+@app.command(epilog=example("palpate tare finger"))
+def tare(
+    sensor: Annotated[str, typer.Argument(help="Name of the sensor.")] = "finger",
+    frames: Annotated[
+        int, typer.Option(help="Frames, or readings, to average; 0 = the gateway's number.")
+    ] = 0,
+    timeout_s: Annotated[float, typer.Option(help="How long it may take [s].")] = 5.0,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+) -> None:
+    """Take the untouched finger, or the present load of a force/torque sensor, as zero now."""
+    from palpate_deploy.station.tare import take_tare
+
+    take_tare(client_link(connect), station, sensor, frames=frames, timeout_s=timeout_s)
+
+
+@app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))
+def demo(
+    seconds: Annotated[float, typer.Option(min=1, help="How long the finger is watched [s].")] = 20,
+    out: Annotated[Path, typer.Option(help="Folder of record, view and picture.")] = Path(
+        "runs/demo"
+    ),
+) -> None:
+    """Virtual finger -> features -> recorder: truth against estimate, live, then pictures."""
+    from palpate_deploy.demo.demo import run_demo
+
+    raise typer.Exit(run_demo(seconds, out))
+
+
+topic_app = group("What is on the bus: streams, rates, messages.")
+
+TopicArgument = Annotated[str, typer.Argument(metavar="TOPIC", help="E.g. electrodes, features.")]
+
+
+@topic_app.command("list", epilog=example("palpate topic list"))
+def list_(
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long to listen [s].")] = 1.5,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Every stream of the contract, and which of them are heard now."""
+    from palpate_deploy.diagnose.topics import list_topics
+
+    list_topics(client_link(connect), station, seconds, as_json=json_)
+
+
+@topic_app.command(
+    epilog=example("palpate topic hz electrodes", "palpate topic hz features --sensor finger")
+)
+def hz(
+    topic: TopicArgument = "electrodes",
+    sensor: SensorOption = "*",
+    seconds: Annotated[
+        float, typer.Option(min=0, help="End after this time [s]; 0 = at Ctrl-C.")
+    ] = 0,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Rate, jitter, bandwidth and loss of a stream, once a second."""
+    from palpate_deploy.diagnose.topics import measure
+
+    raise typer.Exit(measure(client_link(connect), station, topic, sensor, seconds, as_json=json_))
+
+
+@topic_app.command(epilog=example("palpate topic echo features --count 3"))
+def echo(
+    topic: TopicArgument = "features",
+    sensor: SensorOption = "*",
+    count: Annotated[int, typer.Option(min=0, help="End after so many; 0 = at Ctrl-C.")] = 0,
+    timeout_s: Annotated[float, typer.Option(help="End when none comes for so long [s].")] = 10.0,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Messages of a stream, decoded."""
+    from palpate_deploy.diagnose.topics import echo_topic
+
+    echo_topic(
+        client_link(connect),
+        station,
+        topic,
+        sensor,
+        count=count,
+        timeout_s=timeout_s,
+        as_json=json_,
+    )
+
+
+app.add_typer(topic_app, name="topic")
+app.add_typer(model_app, name="model")
+app.add_typer(bundle_app, name="bundle")
+app.add_typer(bench_app, name="bench")
+register(app)
+app.add_typer(fem_app, name="fem")
+app.add_typer(gateway_app, name="gateway")
+app.add_typer(emulate_app, name="emulate")
+app.add_typer(training.train, name="train")
+app.add_typer(training.data, name="data")

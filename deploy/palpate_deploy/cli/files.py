@@ -1,0 +1,173 @@
+"""``palpate model`` and ``palpate bundle``: bundles that are there, and making one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from palpate_deploy.cli.options import (
+    DEFAULT_CONNECT,
+    DEFAULT_STATION,
+    ConnectOption,
+    JsonOption,
+    Pace,
+    SensorOption,
+    StationOption,
+    client_link,
+    example,
+    existing_file,
+    group,
+)
+
+RecordArgument = Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A palpate record.")]
+
+
+def record(
+    out: Annotated[Path, typer.Option(help="Folder of the record.")] = Path("runs"),
+    duration_s: Annotated[float, typer.Option(min=0, help="0 = until Ctrl-C.")] = 0,
+    topic: Annotated[
+        list[str] | None, typer.Option("--topic", help="Only this topic; may be repeated.")
+    ] = None,
+    sensor: SensorOption = "*",
+    rrd: Annotated[bool, typer.Option(help="Also write a Rerun view.")] = True,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+) -> None:
+    """Record a running station, beside its own recorder."""
+    from palpate_deploy.diagnose.records import record_station
+
+    record_station(
+        client_link(connect),
+        station,
+        {"out": str(out), "topics": tuple(topic or ()), "sensor": sensor, "rrd": rrd},
+        duration_s=duration_s,
+    )
+
+
+def replay(
+    file: Annotated[
+        Path, typer.Argument(help="A vendor's text log (plain or .gz) or a palpate .mcap.")
+    ],
+    pace: Annotated[
+        Pace, typer.Option(help="As fast as possible without loss, or as recorded.")
+    ] = Pace.FAST,
+    out: Annotated[Path, typer.Option(help="Folder of the new record.")] = Path("runs/replay"),
+    bundle: Annotated[
+        str, typer.Option(help="Bundle by name, name:version or folder.")
+    ] = "features-virtual",
+    rrd: Annotated[bool, typer.Option(help="Also write a Rerun view.")] = True,
+    json_: JsonOption = False,
+) -> None:
+    """Send a file through gateway, features and recorder, and check that nothing is lost."""
+    from palpate_deploy.diagnose.replay import run_replay
+
+    raise typer.Exit(
+        run_replay(existing_file(file), pace.value, out, bundle, rrd=rrd, as_json=json_)
+    )
+
+
+def review(
+    path: Annotated[
+        Path, typer.Argument(metavar="FILE.mcap|STORE.sim", help="A record, or simulations.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The .rrd to write; default: beside.")] = None,
+    png: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also draw a PNG: truth against estimate of a record; the overview of a store, or "
+            "the last step of the one trajectory that is named."
+        ),
+    ] = None,
+    trajectory: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trajectory", metavar="ID", help="Of a store: only this, e.g. 'cube/*'; repeatable."
+        ),
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=1, help="Of a store: at most so many trajectories, evenly picked.")
+    ] = 8,
+    bundle: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Of a record: a bundle with the mesh of its fields, beside the packaged ones; "
+            "repeatable."
+        ),
+    ] = None,
+) -> None:
+    """Make a Rerun view of a record, or of a store of simulations."""
+    from palpate_deploy.diagnose.records import review_path
+
+    named = tuple(trajectory or ())
+    review_path(path, out, png, trajectories=named, most=most, bundles=tuple(bundle or ()))
+
+
+def info(file: RecordArgument, json_: JsonOption = False) -> None:
+    """What a record holds: streams, counts, rates, time."""
+    from palpate_deploy.diagnose.records import show_info
+
+    show_info(existing_file(file), as_json=json_)
+
+
+def recover(
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap.part", help="A cut-off record.")],
+) -> None:
+    """Rescue the whole messages of a record whose writer was killed."""
+    from palpate_deploy.diagnose.records import recover_record
+
+    recover_record(existing_file(file))
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to ``app``."""
+    for command, lines in (
+        (record, ("palpate record --out runs --duration-s 60",)),
+        (replay, ("palpate replay data.btd.gz", "palpate replay runs/lab.mcap --pace recorded")),
+        (review, ("palpate review runs/lab.mcap", "palpate review sweep.sim --most 4")),
+        (info, ("palpate info runs/lab.mcap",)),
+        (recover, ("palpate recover runs/lab.mcap.part",)),
+    ):
+        app.command(epilog=example(*lines))(command)
+
+
+model_app = group("Bundles of networks: list and verify.")
+bundle_app = group("Make bundles.")
+
+
+@model_app.command("list", epilog=example("palpate model list"))
+def list_(json_: JsonOption = False) -> None:
+    """The bundles that come with this palpate."""
+    from palpate_deploy.demo.bundles import list_models
+
+    list_models(as_json=json_)
+
+
+@model_app.command(epilog=example("palpate model verify features-virtual"))
+def verify(
+    bundle: Annotated[str, typer.Argument(help="Name, name:version or folder.")],
+) -> None:
+    """Check digests, contract and golden vectors of a bundle."""
+    from palpate_deploy.demo.bundles import verify_model
+
+    verify_model(bundle)
+
+
+@bundle_app.command(epilog=example("palpate bundle virtual --out runs/bundle/1 --frames 20000"))
+def virtual(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; default: the one that ships.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1000, help="Frames of the virtual finger.")] = 160_000,
+    seed: Annotated[int, typer.Option(min=0, help="Of the finger, and of training.")] = 1,
+) -> None:
+    """Train the features bundle of the demo on the virtual finger (needs palpate[training])."""
+    from palpate_deploy.demo.bundles import make_virtual_bundle
+
+    make_virtual_bundle(out, frames=frames, seed=seed)
+
+
+@bundle_app.callback()
+def _group() -> None:
+    """Keep ``virtual`` a sub-command although it is the only one."""

@@ -1,0 +1,103 @@
+"""Options and output that several commands share."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from palpate.errors import PalpateError
+from palpate_deploy.station.logs import exit_code, print_error
+
+if TYPE_CHECKING:
+    from palpate.config import LinkConfig
+
+ProfileOption = Annotated[
+    str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="A profile by name or path.")
+]
+ConnectOption = Annotated[
+    str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
+]
+StationOption = Annotated[str, typer.Option("--station", help="Name of the station.")]
+SensorOption = Annotated[str, typer.Option("--sensor", help="One sensor; * = all.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"  # protos.config.DEFAULT_ROUTER; that import takes too long
+DEFAULT_STATION = "lab"
+DEFAULT_PROFILE = "virtual"
+ROUTER_WAIT_S = 2.0
+"""How long a command waits for the station's router before it says that there is none [s]."""
+
+
+class Pace(enum.StrEnum):
+    """How fast a file is replayed."""
+
+    RECORDED = "recorded"
+    FAST = "fast"
+
+
+class PalpateGroup(typer.core.TyperGroup):
+    """Commands whose ``PalpateError`` ends in two lines and an exit code."""
+
+    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
+        """Run the command that was given."""
+        try:
+            return super().invoke(ctx)
+        except PalpateError as error:
+            print_error(error)
+            raise typer.Exit(exit_code(error)) from error
+
+
+def group(help_text: str) -> typer.Typer:
+    """A group of commands: shows its help when called alone."""
+    return typer.Typer(
+        help=help_text, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None
+    )
+
+
+def example(*lines: str) -> str:
+    """The end of a command's help: runnable lines."""
+    return "Example: " + "  or  ".join(lines)
+
+
+def client_link(connect: str) -> LinkConfig:
+    """How a command joins a running station: it gives up soon and says so.
+
+    Raises:
+        ConfigError: ``connect`` is not an endpoint.
+    """
+    from palpate.config import LinkConfig, parse_config
+
+    return parse_config(
+        LinkConfig,
+        {"connect": (connect,), "wait_for_router_s": ROUTER_WAIT_S},
+        where="--connect",
+    )
+
+
+def existing_file(path: Path) -> Path:
+    """Check that a file is there.
+
+    Raises:
+        ConfigError: It is not.
+    """
+    from palpate.errors import ConfigError
+
+    if not path.is_file():
+        raise ConfigError(f"{path} does not exist", remedy="check the path")
+    return path
+
+
+SHOWN = 10
+"""How many people are told of."""
+
+
+def show_left_out(pairs: Sequence[tuple[str, str]]) -> None:
+    """Print names with their reasons."""
+    for name, why in pairs[:SHOWN]:
+        typer.echo(f"  {name}: {why}")
+    if len(pairs) > SHOWN:
+        typer.echo(f"  ... {len(pairs) - SHOWN} more; all of them: --json")

@@ -1,0 +1,1 @@
+"""``palpate demo``, and the bundles that come with palpate."""

@@ -1,0 +1,251 @@
+"""``palpate bundle virtual``: the bundle of the demo, trained on the virtual finger."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from palpate.bus.topics import ELECTRODES, TOPICS, sensor_key
+from palpate.errors import BundleError, PalpateError
+from palpate.extras import require
+from palpate.files.bundle import read_bundle
+from palpate.files.record import RecordWriter
+from palpate_deploy.training import EXTRA_MODULES
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.timing.clock_map import FileClock
+from palpate_services.inference.model import load
+from palpate_services.inference.repository import PACKAGED, available, resolve
+
+TELLING_METRICS = (
+    "force_magnitude_n_median",
+    "force_angle_rad_median",
+    "location_distance_m_median",
+)
+"""What a person wants to see of a bundle; the rest is in --json and in its manifest."""
+
+
+def list_models(*, as_json: bool) -> None:
+    """Print every bundle that comes with this palpate, a broken one with its error."""
+    rows: list[dict[str, Any]] = []
+    for name in available():
+        try:
+            bundle = read_bundle(resolve(name))
+        except PalpateError as error:
+            rows.append({"bundle": name, "error": str(error)})
+            continue
+        manifest = bundle.manifest
+        rows.append(
+            {
+                "bundle": name,
+                "task": manifest.task,
+                "sha256": bundle.sha256.hex(),
+                "trained_on": manifest.trained_on,
+                "metrics": dict(manifest.metrics),
+            }
+        )
+    if as_json:
+        print(json.dumps({"repository": str(PACKAGED), "bundles": rows}, indent=2))
+        return
+    table = Table(title=str(PACKAGED), title_justify="left")
+    for column in ("bundle", "task", "sha256", "trained on", "metrics"):
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        if "error" in row:
+            table.add_row(str(row["bundle"]), "[red]broken[/]", "", escape(str(row["error"])), "")
+            continue
+        table.add_row(
+            str(row["bundle"]),
+            str(row["task"]),
+            str(row["sha256"])[:12],
+            escape(str(row["trained_on"])),
+            "\n".join(
+                f"{key} {value:.4g}"
+                for key, value in row["metrics"].items()
+                if key in TELLING_METRICS
+            ),
+        )
+    Console().print(table)
+
+
+def verify_model(name: str) -> None:
+    """Check a bundle as the service does before it serves it, and say what it is.
+
+    Raises:
+        ConfigError: There is no such bundle.
+        BundleError: It breaks its contract.
+        MissingExtraError: ONNX Runtime is not installed.
+    """
+    bundle = read_bundle(resolve(name))
+    load(bundle, bundle.manifest.task)
+    manifest = bundle.manifest
+    rows = next(iter(bundle.golden.values())).shape[0]
+    print(f"ok  {manifest.name}:{manifest.version}  task {manifest.task}  {bundle.folder}")
+    print(f"    digest {bundle.sha256.hex()}")
+    print(f"    {rows} golden rows reproduced; trained on {manifest.trained_on}")
+
+
+SENSOR = "virtual-finger"
+_STATION = "virtual"
+
+
+def write_virtual_record(
+    path: Path,
+    *,
+    frames: int,
+    seed: int,
+    unit: int = 1,
+    rate_hz: float = 100.0,
+    on_frames: Callable[[int], None] | None = None,
+) -> int:
+    """Record the virtual finger as a gateway would publish it, tare and ground truth included.
+
+    Args:
+        path: ``NAME.mcap``.
+        frames: How many electrode frames.
+        seed: Of trajectories and noise.
+        unit: Number of the finger.
+        rate_hz: Frames per second of the finger's time; fewer give more presses for as many frames.
+        on_frames: Called with the frames written so far, for a progress bar.
+
+    Returns:
+        The electrode frames written.
+
+    Raises:
+        RecordingError: The disk refuses.
+    """
+    options = {
+        "model": "formula",  # endless different presses; a tape repeats its own
+        "seed": seed,
+        "unit": unit,
+        "frames": frames,
+        "realtime": False,
+        "rate_hz": rate_hz,
+    }
+    keys = {name: sensor_key(_STATION, SENSOR, name) for name in TOPICS}
+    written = 0
+    facts = {"station": _STATION, "source": f"virtual finger, seed {seed}, unit {unit}"}
+    with make_device("virtual", options) as device, RecordWriter(path, facts) as writer:
+        pipeline = Pipeline(device.info)
+        clock = FileClock(device.identity.serial, None)
+        pipeline.begin(device.identity, clock)
+
+        def write(items: list[Outgoing]) -> None:
+            nonlocal written
+            for item in items:
+                topic = TOPICS[item.topic]
+                stamp = topic.stamp_of(item.message)
+                payload = (
+                    item.message
+                    if isinstance(item.message, bytes)
+                    else topic.codec.encode(item.message)
+                )
+                writer.write(
+                    keys[item.topic],
+                    topic.codec.schema,
+                    payload,
+                    # A record is in order of its log times; here they are the readings' own.
+                    log_time_ns=0 if stamp is None else stamp.wall_ns,
+                    sequence=0 if stamp is None else stamp.sequence,
+                )
+                written += item.topic == ELECTRODES.name
+            if on_frames is not None:
+                on_frames(written)
+
+        while readings := device.read(timeout_s=1.0):
+            write(pipeline.push(readings, arrival_ns=0))
+        write(pipeline.finish())
+    return written
+
+
+NAME = "features-virtual"
+
+RATE_HZ = 20.0
+"""Rate at which the finger is recorded for training: neighbouring frames of a press say nearly the
+same, so the same number of frames is better spent on five times as many presses."""
+
+
+def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
+    """Record the virtual finger, ingest, train, and write the bundle whole or not at all.
+
+    Args:
+        out: Folder to write; None = the next free version of the one that ships.
+        frames: Frames of the virtual finger.
+        seed: Of the finger, and of training.
+
+    Raises:
+        MissingExtraError: The training extra is not installed.
+        BundleError: The folder exists, or the exported model is not the trained one.
+    """
+    for module in EXTRA_MODULES:
+        require(module, extra="training")
+    from palpate_training.ingest_record import ingest_record
+    from palpate_training.schema import write_dataset
+    from palpate_training.train_features import train_features
+
+    folder = PACKAGED / NAME / str(_next_version()) if out is None else out
+    version = int(folder.name) if folder.name.isdigit() else 1
+    if folder.exists():
+        raise BundleError(
+            f"{folder} exists and bundles are immutable", remedy="write the next version"
+        )
+    with tempfile.TemporaryDirectory(prefix="palpate-bundle-") as temporary, _progress() as bar:
+        record = Path(temporary) / "virtual.mcap"
+        step = bar.add_task("virtual finger", total=frames)
+        write_virtual_record(
+            record,
+            frames=frames,
+            seed=seed,
+            rate_hz=RATE_HZ,
+            on_frames=lambda n: bar.update(step, completed=n),
+        )
+        step = bar.add_task("ingest", total=None)
+        command = f"palpate bundle virtual --frames {frames} --seed {seed}"
+        dataset = Path(temporary) / "virtual.h5"
+        data = ingest_record(record, command=command, licence="Apache-2.0, made by palpate")
+        write_dataset(dataset, data)
+        bar.update(step, total=1, completed=1)
+        steps: dict[str, TaskID] = {}
+
+        def on_epoch(quantity: str, done: int, at_most: int) -> None:
+            if quantity not in steps:
+                steps[quantity] = bar.add_task(f"train {quantity}", total=at_most)
+            bar.update(steps[quantity], completed=done)
+
+        report = train_features(
+            dataset,
+            folder,
+            name=NAME,
+            version=version,
+            seed=seed,
+            on_epoch=on_epoch,
+        )
+        for task in steps.values():  # training may stop before the last epoch
+            bar.update(task, total=1, completed=1)
+    print(f"{NAME}:{version}  {report.digest.hex()[:12]}  {folder}")
+    print("rows: train {:,}, validation {:,}, test {:,}".format(*report.rows))
+    for name, value in sorted(report.metrics.items()):
+        print(f"  {name:40} {value:.4g}")
+
+
+def _next_version() -> int:
+    """The version after the newest that is there."""
+    there = [int(path.name) for path in (PACKAGED / NAME).glob("*") if path.name.isdigit()]
+    return max(there, default=0) + 1
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description:24}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )

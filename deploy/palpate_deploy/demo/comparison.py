@@ -1,0 +1,293 @@
+"""Fields and synthesised electrodes of the demo, beside what is known of them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate import clock
+from palpate.bus import Delivery, Session, Subscriber
+from palpate.bus.tares import TareBook
+from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, FIELD_TRUTH, POSE, SYNTHESIS, WRENCH
+from palpate.errors import PalpateError, StreamTimeout
+from palpate.messages import (
+    NO_TARE,
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    FieldFrame,
+    IndenterPoseFrame,
+    SynthesisEstimate,
+    Tare,
+    WrenchFrame,
+)
+
+_KEPT = 500
+"""Truths that wait for their estimate; five seconds at 100 Hz."""
+
+Vector = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """What is compared."""
+
+    features: Subscriber[FeatureEstimate]
+    wrench: Subscriber[WrenchFrame]
+    pose: Subscriber[IndenterPoseFrame]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One frame: forces [N], locations [m], each of shape ``(3,)``; None where there is none."""
+
+    force: Vector
+    true_force: Vector
+    location: Vector | None
+    true_location: Vector | None
+    in_contact: bool
+    age_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Medians:
+    """Median errors: of the vectors' lengths and per axis, [N] and [m]; median age [s]."""
+
+    force_n: float
+    location_m: float
+    force_axes_n: Vector
+    location_axes_m: Vector
+    age_s: float
+
+
+class Comparison:
+    """Matches estimates with the truth of the same instant and keeps the errors in contact."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.newest: Moment | None = None
+        self._wrench: OrderedDict[int, WrenchFrame] = OrderedDict()
+        self._pose: OrderedDict[int, IndenterPoseFrame] = OrderedDict()
+        self._force_errors: list[Vector] = []
+        self._location_errors: list[Vector] = []
+        self._ages_s: list[float] = []
+
+    def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> Streams:
+        """Subscribe to estimate and truth of a sensor."""
+        return Streams(
+            session.subscriber(FEATURES, sensor=sensor, delivery=delivery),
+            session.subscriber(WRENCH, sensor=sensor, delivery=delivery),
+            session.subscriber(POSE, sensor=sensor, delivery=delivery),
+        )
+
+    def take(self, streams: Streams, *, timeout_s: float) -> None:
+        """Take in the next estimate and all truth that has come.
+
+        Raises:
+            StreamTimeout: No estimate came in time.
+        """
+        received = streams.features.next(timeout_s)
+        self.add_truth(streams)
+        self.add(received.message, received.received_monotonic_ns)
+
+    def add_truth(self, streams: Streams) -> None:
+        """Take in the truth that has come."""
+        for wrench in _all(streams.wrench):
+            _remember(self._wrench, wrench.stamp.monotonic_ns, wrench)
+        for pose in _all(streams.pose):
+            _remember(self._pose, pose.stamp.monotonic_ns, pose)
+
+    def add(self, estimate: FeatureEstimate, received_ns: int) -> None:
+        """Take in one estimate, received at ``received_ns`` of this host's monotonic clock."""
+        self.count += 1
+        age_s = clock.age_s(estimate.source, monotonic_ns=received_ns)
+        self._ages_s.append(age_s)
+        wrench = self._wrench.get(estimate.source.monotonic_ns)
+        if wrench is None:
+            return
+        pose = self._pose.get(estimate.source.monotonic_ns)
+        # Who cannot know whether it touches counts as one who does not say.
+        touched = pose is None or pose.in_contact is not False
+        moment = Moment(
+            force=estimate.force,
+            true_force=wrench.force,
+            location=estimate.contact_location,
+            true_location=pose.position if pose is not None and touched else None,
+            in_contact=touched,
+            age_s=age_s,
+        )
+        self.newest = moment
+        if not touched:
+            return
+        self._force_errors.append(moment.force - moment.true_force)
+        if moment.location is not None and moment.true_location is not None:
+            self._location_errors.append(moment.location - moment.true_location)
+
+    def medians(self) -> Medians:
+        """Medians over all frames in contact so far; NaN where there were none."""
+        force, location = _rows(self._force_errors), _rows(self._location_errors)
+        return Medians(
+            force_n=float(np.median(np.linalg.norm(force, axis=1))),
+            location_m=float(np.median(np.linalg.norm(location, axis=1))),
+            force_axes_n=np.median(np.abs(force), axis=0),
+            location_axes_m=np.median(np.abs(location), axis=0),
+            age_s=float(np.median(self._ages_s)) if self._ages_s else float("nan"),
+        )
+
+
+def _rows(errors: list[Vector]) -> Vector:
+    return np.array(errors) if errors else np.full((1, 3), np.nan)
+
+
+def _all(stream: Subscriber[Any]) -> list[Any]:
+    found = []
+    while True:
+        try:
+            found.append(stream.next(timeout_s=0).message)
+        except StreamTimeout:
+            return found
+
+
+def _remember(known: OrderedDict[int, Any], key: int, value: Any) -> None:
+    known[key] = value
+    while len(known) > _KEPT:
+        known.popitem(last=False)
+
+
+Values = npt.NDArray[Any]
+
+_WAITING = 200
+"""Estimates and frames that wait for what they are compared with."""
+
+MOVED_M = 0.05e-3
+"""A skin whose nodes move less on average counts as untouched [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldStreams:
+    """What is compared; ``tare`` finds the one that a frame names, which may be older than we."""
+
+    field: Subscriber[FieldEstimate]
+    truth: Subscriber[FieldFrame]
+    synthesis: Subscriber[SynthesisEstimate]
+    electrodes: Subscriber[ElectrodeFrame]
+    tare: Callable[[int], Tare]
+
+
+@dataclass(frozen=True, slots=True)
+class FieldMedians:
+    """What was found so far, NaN where nothing was.
+
+    Attributes:
+        fields: Estimates that were compared.
+        moved_m: Median over touched moments of the mean displacement of a node [m].
+        field_m: Median of the mean error of a node, touched [m].
+        syntheses: Syntheses that were compared.
+        counts: Median r.m.s. error of the 19 electrodes, touched [counts].
+    """
+
+    fields: int
+    moved_m: float
+    field_m: float
+    syntheses: int
+    counts: float
+
+
+class FieldComparison:
+    """Matches fields with the truth, and synthesised electrodes with those that were read."""
+
+    def __init__(self) -> None:
+        self._truth: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
+        self._waiting: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
+        self._counts: OrderedDict[int, tuple[int, Values]] = OrderedDict()
+        self._moved: list[float] = []
+        self._errors: list[float] = []
+        self._electrodes: list[float] = []
+
+    def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> FieldStreams:
+        """Subscribe to estimates and truth of a sensor."""
+        book = TareBook(session)
+        return FieldStreams(
+            session.subscriber(FIELD, sensor=sensor, delivery=delivery),
+            session.subscriber(FIELD_TRUTH, sensor=sensor, delivery=delivery),
+            session.subscriber(SYNTHESIS, sensor=sensor, delivery=delivery),
+            session.subscriber(ELECTRODES, sensor=sensor, delivery=delivery),
+            lambda tare_id: book.baseline(sensor, tare_id),
+        )
+
+    def take(self, streams: FieldStreams) -> None:
+        """Take in all that has come; never waits."""
+        for frame in _all(streams.electrodes):
+            counts = np.asarray(frame.electrodes, np.float64)
+            self._counts[frame.stamp.monotonic_ns] = (frame.tare_id, counts)
+            while len(self._counts) > _WAITING:
+                self._counts.popitem(last=False)
+        for truth in _all(streams.truth):
+            self._truth.append((truth.stamp.monotonic_ns, truth.displacement))
+        for estimate in _all(streams.field):
+            self._waiting.append((estimate.source.monotonic_ns, estimate.displacement))
+        self._match()
+        for synthesis in _all(streams.synthesis):
+            self._compare(synthesis, streams.tare)
+
+    def medians(self) -> FieldMedians:
+        """Of all that was compared so far."""
+        return FieldMedians(
+            fields=len(self._errors),
+            moved_m=_median(self._moved),
+            field_m=_median(self._errors),
+            syntheses=len(self._electrodes),
+            counts=_median(self._electrodes),
+        )
+
+    def _match(self) -> None:
+        """Compare estimates that lie between two known fields, which are 50 ms apart."""
+        while self._waiting and self._truth and self._waiting[0][0] <= self._truth[-1][0]:
+            at, estimate = self._waiting.popleft()
+            truth = self._truth_at(at)
+            if truth is None or truth.shape != estimate.shape:
+                continue
+            moved = float(np.linalg.norm(truth, axis=1).mean())
+            if moved > MOVED_M:
+                self._moved.append(moved)
+                self._errors.append(float(np.linalg.norm(estimate - truth, axis=1).mean()))
+
+    def _truth_at(self, at: int) -> Values | None:
+        before: tuple[int, Values] | None = None
+        for when, field in self._truth:
+            if when == at:
+                return field
+            if when > at:
+                if before is None:
+                    return None
+                share = (at - before[0]) / (when - before[0])
+                return np.asarray(before[1] + np.float32(share) * (field - before[1]))
+            before = (when, field)
+        return None
+
+    def _compare(self, synthesis: SynthesisEstimate, find: Callable[[int], Tare]) -> None:
+        tare_id, counts = self._counts.get(synthesis.source.monotonic_ns, (NO_TARE, None))
+        if counts is None or tare_id == NO_TARE:
+            return
+        try:
+            rest = find(tare_id)
+        except PalpateError:  # the gateway is gone; what was compared stays
+            return
+        tared = counts - np.asarray(rest.electrodes, np.float64)
+        if np.abs(tared).max() < _TOUCHED_COUNTS:
+            return
+        difference = np.asarray(synthesis.tared_counts, np.float64) - tared
+        self._electrodes.append(float(np.sqrt(np.mean(difference**2))))
+
+
+_TOUCHED_COUNTS = 40.0
+"""Of the electrode that moved most: above noise and drift [counts]."""
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else float("nan")

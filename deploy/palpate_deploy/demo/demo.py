@@ -1,0 +1,214 @@
+"""``palpate demo``: a virtual finger is touched, and one sees how well palpate feels it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+
+from palpate.bus import Delivery
+from palpate.client import Client
+from palpate.errors import LinkError, PalpateError, StreamTimeout
+from palpate_deploy.demo.comparison import Comparison, FieldComparison, FieldMedians, Moment
+from palpate_deploy.diagnose.records import viewer_command
+from palpate_deploy.station.host import free_endpoint
+from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.profile import Profile, changed, load_profile
+from palpate_deploy.station.supervisor import Supervisor
+from palpate_deploy.station.up import stop_on_signals
+
+_SENSOR = "finger"
+_REFRESH_S = 0.1
+_LINE_S = 1.0
+_JOIN_S = 15.0
+_FIRST_S = 20.0
+"""A cold host may take this long to import, load, tare and give the first estimate [s]."""
+
+
+def run_demo(seconds: float, out: Path) -> int:
+    """Run the demo.
+
+    Args:
+        seconds: How long the finger is watched [s], from the first estimate.
+        out: Folder of record, view and picture.
+
+    Returns:
+        0, or 1 if no estimate came.
+
+    Raises:
+        PalpateError: The demo cannot start.
+    """
+    from palpate_services.inference.repository import resolve
+
+    console = Console()
+    endpoint = free_endpoint()  # it must not collide with a station of this host
+    profile = changed(
+        load_profile("demo"),
+        router={"listen": (endpoint,)},
+        link={"connect": (endpoint,)},
+        recorder={"out": str(out)},
+    )
+    for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
+        resolve(bundle)  # one that is not there is said before anything starts
+    before = set(out.glob("*.mcap"))
+    stop = stop_on_signals()
+    console.print(
+        "virtual finger -> features, fields, synthesis -> recorder, for "
+        f"{seconds:g} s after the first estimate",
+        highlight=False,
+    )
+    comparison, fields = Comparison(), FieldComparison()
+    with Supervisor(profile, "demo") as supervisor:
+        try:
+            _watch(console, profile, comparison, fields, seconds, stop)
+        except LinkError as error:
+            raise LinkError(
+                f"{error.problem}; the router says: {supervisor.log_tail('router') or 'nothing'}",
+                remedy=f"see {supervisor.logs}",
+            ) from error
+        if not comparison.count:
+            for service in profile.processes:
+                if tail := supervisor.log_tail(service):
+                    console.print(f"--- {service}\n{tail}", markup=False, highlight=False)
+    records = sorted(set(out.glob("*.mcap")) - before)
+    return _report(console, comparison, fields.medians(), records)
+
+
+def _watch(
+    console: Console,
+    profile: Profile,
+    comparison: Comparison,
+    fields: FieldComparison,
+    seconds: float,
+    stop: threading.Event,
+) -> None:
+    """Compare estimates with truth until ``seconds`` after the first estimate."""
+    with (
+        Client(profile.link.connect[0], station=profile.station, timeout_s=_JOIN_S) as robot,
+        Live(console=console, auto_refresh=False, transient=False) as live,
+    ):
+        streams = comparison.subscribe(robot.session, _SENSOR, Delivery.QUEUE)
+        field_streams = fields.subscribe(robot.session, _SENSOR, Delivery.QUEUE)
+        end = time.monotonic() + _FIRST_S
+        redraw = 0.0
+        started = False
+        while (now := time.monotonic()) < end and not stop.is_set():
+            try:
+                comparison.take(streams, timeout_s=0.05)
+            except StreamTimeout:
+                continue
+            finally:
+                fields.take(field_streams)
+            if comparison.count and not started:
+                started, end = True, now + seconds
+            if comparison.newest is None or now < redraw:
+                continue
+            if console.is_terminal:
+                live.update(_table(comparison, fields.medians(), end - now), refresh=True)
+                redraw = now + _REFRESH_S
+            else:
+                console.print(_line(comparison.newest), highlight=False, soft_wrap=True)
+                redraw = now + _LINE_S
+
+
+def _table(comparison: Comparison, fields: FieldMedians, left_s: float) -> Table:
+    moment = comparison.newest
+    assert moment is not None
+    table = Table(title="touch of the virtual finger", title_justify="left")
+    table.add_column("")
+    for column in ("truth", "estimate", "error", "median error"):
+        table.add_column(column, justify="right", min_width=9)
+    medians = comparison.medians()
+    for axis, name in enumerate("xyz"):
+        table.add_row(
+            escape(f"force {name} [N]"),
+            f"{moment.true_force[axis]:+.2f}",
+            f"{moment.force[axis]:+.2f}",
+            f"{moment.force[axis] - moment.true_force[axis]:+.2f}",
+            f"{medians.force_axes_n[axis]:.3f}",
+            end_section=axis == 2,
+        )
+    for axis, name in enumerate("xyz"):
+        estimate, truth = moment.location, moment.true_location
+        table.add_row(
+            escape(f"location {name} [mm]"),
+            "-" if truth is None else f"{truth[axis] * 1e3:+.2f}",
+            "-" if estimate is None else f"{estimate[axis] * 1e3:+.2f}",
+            "-"
+            if truth is None or estimate is None
+            else f"{(estimate[axis] - truth[axis]) * 1e3:+.2f}",
+            f"{medians.location_axes_m[axis] * 1e3:.2f}",
+        )
+    table.add_section()
+    table.add_row(
+        "skin, mean of all nodes [mm]",
+        f"{fields.moved_m * 1e3:.3f}",
+        "",
+        "",
+        f"{fields.field_m * 1e3:.3f}",
+    )
+    table.add_row("electrodes from the field [counts]", "", "", "", f"{fields.counts:.0f}")
+    touched = "[green]touched[/]" if moment.in_contact else "[dim]untouched[/]"
+    table.caption = (
+        f"{touched}   {comparison.count:,} estimates   age {moment.age_s * 1e3:.1f} ms"
+        f"   {max(0.0, left_s):.0f} s left"
+    )
+    return table
+
+
+def _line(moment: Moment) -> str:
+    truth, force = moment.true_force, moment.force
+    line = (
+        f"force [N] truth {truth[0]:+.2f} {truth[1]:+.2f} {truth[2]:+.2f}"
+        f"  estimate {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f}"
+    )
+    if moment.location is not None and moment.true_location is not None:
+        away_mm = float(((moment.location - moment.true_location) ** 2).sum() ** 0.5) * 1e3
+        line += f"  location off by {away_mm:.2f} mm"
+    return line + ("" if moment.in_contact else "  (untouched)")
+
+
+def _report(
+    console: Console, comparison: Comparison, fields: FieldMedians, records: list[Path]
+) -> int:
+    """Draw the picture, print where everything is and how good it was."""
+    if not comparison.count or not records:
+        console.print("no estimate came; see the logs above and try: palpate doctor")
+        return FAILED
+    record = records[-1]
+    medians = comparison.medians()
+    console.print(
+        f"{comparison.count:,} estimates; median error: force {medians.force_n:.3f} N, "
+        f"location {medians.location_m * 1e3:.2f} mm (in contact); "
+        f"median age at the client {medians.age_s * 1e3:.1f} ms",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(
+        f"{fields.fields:,} fields; median error of a node {fields.field_m * 1e3:.3f} mm where "
+        f"nodes move {fields.moved_m * 1e3:.3f} mm; {fields.syntheses:,} syntheses of the "
+        f"electrodes, median error {fields.counts:.0f} counts r.m.s.",
+        highlight=False,
+        soft_wrap=True,
+    )
+    print(f"record   {record}")
+    picture = record.with_suffix(".png")
+    try:
+        from palpate_services.viewer.plot import plot_record
+
+        plot_record(record, picture)
+        print(f"picture  {picture}")
+    except PalpateError as error:  # the record is there; a picture can be made later
+        print(f"picture  none: {error}")
+    view = record.with_suffix(".rrd")
+    if view.is_file():
+        print(f"view     {view}")
+        print(f"look at it: {viewer_command(view)}")
+    else:
+        print(f"view     none; make one: palpate review {record}")
+    return 0

@@ -1,0 +1,1 @@
+"""Looking at a station and its files: status, doctor, topics, records, replay."""

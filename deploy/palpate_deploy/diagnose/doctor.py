@@ -1,0 +1,286 @@
+"""``palpate doctor``: what a station needs on this host, one line each, with its fix."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+
+from palpate.config import endpoint_host_port, is_loopback
+from palpate.errors import LinkError, PalpateError
+from palpate_deploy.station.host import check_free, state_folder
+from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.profile import Profile, load_profile
+
+Grade = Literal["ok", "warn", "fail"]
+
+_COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
+_PYTHON_MIN = (3, 11)
+_PACKAGES = (
+    # module, distribution, extra; None = palpate cannot do without
+    ("numpy", "numpy", None),
+    ("zenoh", "eclipse-zenoh", None),
+    ("google.protobuf", "protobuf", None),
+    ("mcap", "mcap", None),
+    ("supervisor", "supervisor", None),
+    ("onnxruntime", "onnxruntime", "services"),
+    ("rerun", "rerun-sdk", "services"),
+    ("matplotlib", "matplotlib", "services"),
+    ("torch", "torch", "training"),
+    # Stores of simulations and data sets: `fem` is the lighter of the two extras that bring it.
+    ("h5py", "h5py", "fem"),
+    ("warp", "warp-lang", "fem"),
+    ("scipy", "scipy", "fem"),
+    ("pymetis", "pymetis", "fem"),
+    ("threadpoolctl", "threadpoolctl", "fem"),
+)
+_YEAR_MIN = 2024
+_ROUTER_WAIT_S = 1.0
+_SLEEP_S = 0.01
+_LATE_WARN_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        what: What was looked at.
+        grade: ``ok``, ``warn`` (a station runs, something is missing) or ``fail``.
+        found: What was found.
+        fix: What to do about it.
+    """
+
+    what: str
+    grade: Grade
+    found: str
+    fix: str = ""
+
+
+def run_doctor(profile_name: str, *, as_json: bool) -> int:
+    """Look at everything and print it.
+
+    Returns:
+        0, or 1 if a line says fail.
+    """
+    console = Console()
+    findings: list[Finding] = []
+    for finding in _all(profile_name):
+        findings.append(finding)
+        if not as_json:
+            colour = _COLOURS[finding.grade]
+            console.print(
+                f"[{colour}]{finding.grade:4}[/] {finding.what:12} ", end="", highlight=False
+            )
+            console.print(finding.found, markup=False, highlight=False, soft_wrap=True)
+            if finding.fix:
+                console.print(f"     fix: {finding.fix}", markup=False, soft_wrap=True)
+    if as_json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    return FAILED if any(finding.grade == "fail" for finding in findings) else 0
+
+
+def _all(profile_name: str) -> Iterator[Finding]:
+    yield _python()
+    yield from _packages()
+    try:
+        profile = load_profile(profile_name)
+    except PalpateError as error:
+        yield Finding("profile", "fail", error.problem, error.remedy)
+        return
+    yield Finding("profile", "ok", f"{profile_name}: {', '.join(profile.processes)}")
+    looks: tuple[Callable[[Profile], Finding], ...] = (
+        _sensors,
+        _router,
+        _bundle,
+        _disk,
+        _state,
+    )
+    for look in looks:
+        yield look(profile)
+    yield _clock()
+    yield _wall(profile)
+    yield _cpu()
+
+
+def _python() -> Finding:
+    found = f"{sys.version.split()[0]} at {sys.executable}"
+    if sys.version_info < _PYTHON_MIN:
+        return Finding("python", "fail", found, "install Python 3.11 or later")
+    return Finding("python", "ok", found)
+
+
+def _packages() -> Iterator[Finding]:
+    for module, distribution, extra in _PACKAGES:
+        try:
+            if extra is None:
+                importlib.import_module(module)
+            elif importlib.util.find_spec(module) is None:  # torch takes seconds to import
+                raise ModuleNotFoundError(module)
+            found = f"{distribution} {version(distribution)}"
+        except (ImportError, PackageNotFoundError) as error:
+            fix = "reinstall palpate" if extra is None else f'pip install "palpate[{extra}]"'
+            grade: Grade = "fail" if extra is None else "warn"
+            why = "" if isinstance(error, ModuleNotFoundError) else f": {error}"
+            yield Finding("package", grade, f"{distribution} is not installed{why}", fix)
+            continue
+        yield Finding("package", "ok", found)
+
+
+def _sensors(profile: Profile) -> Finding:
+    if "gateway" not in profile.processes:
+        return Finding("sensors", "ok", "no gateway in this profile")
+    from palpate_gateway.drivers import make_device
+
+    names = []
+    for sensor in profile.gateway.sensors:
+        try:
+            make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
+        except PalpateError as error:
+            return Finding("sensors", "fail", error.problem, error.remedy)
+        path = sensor.options.get("path")
+        if path is not None and not Path(str(path)).is_file():
+            return Finding(
+                "sensors", "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
+            )
+        names.append(f"{sensor.name} ({sensor.driver})")
+    return Finding("sensors", "ok", ", ".join(names))
+
+
+def _router(profile: Profile) -> Finding:
+    from palpate.bus import Session
+
+    where = ", ".join(profile.link.connect)
+    link = profile.link.model_copy(update={"wait_for_router_s": _ROUTER_WAIT_S})
+    try:
+        with Session.open(link, station=profile.station) as session:
+            alive = sorted({one.service for one in session.alive()})
+        return Finding("router", "ok", f"answers at {where}; alive: {', '.join(alive) or 'nobody'}")
+    except LinkError as error:
+        if "router" not in profile.processes:
+            return Finding("router", "fail", error.problem, f"start the router at {where}")
+    try:
+        check_free(profile.router.listen)
+    except LinkError as error:
+        return Finding("router", "fail", f"{error.problem}, by something else", error.remedy)
+    exposed = [e for e in profile.router.listen if not is_loopback(endpoint_host_port(e)[0])]
+    if exposed and profile.link.tls is not None:
+        for path in (profile.link.tls.root_ca_certificate, profile.link.tls.certificate):
+            if not path.is_file():
+                return Finding("router", "fail", f"{path} does not exist", "set [link.tls]")
+    return Finding("router", "ok", f"not running; port free at {', '.join(profile.router.listen)}")
+
+
+def _bundle(profile: Profile) -> Finding:
+    tables = {
+        "features": profile.features,
+        "field": profile.field,
+        "synthesis": profile.synthesis,
+    }
+    served = {task: table.bundle for task, table in tables.items() if task in profile.processes}
+    if not served:
+        return Finding("bundle", "ok", "no service of this profile needs one")
+    from palpate.files.bundle import read_bundle
+    from palpate_services.inference.model import load
+    from palpate_services.inference.repository import resolve
+
+    names = []
+    for task, name in served.items():
+        try:
+            bundle = read_bundle(resolve(name))
+            load(bundle, task)
+        except PalpateError as error:
+            return Finding("bundle", "fail", error.problem, error.remedy)
+        names.append(f"{bundle.manifest.name}:{bundle.manifest.version}")
+    what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
+    return Finding("bundle", "ok", f"{', '.join(names)} {what}")
+
+
+def _disk(profile: Profile) -> Finding:
+    if "recorder" not in profile.processes:
+        return Finding("disk", "ok", "no recorder in this profile")
+    folder = profile.recorder.out.absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not os.access(existing, os.W_OK):
+        return Finding(
+            "disk", "fail", f"{existing} is not writable", "set [recorder] out to another folder"
+        )
+    free = shutil.disk_usage(existing).free
+    found = f"{free / 1e9:.1f} GB free at {existing}"
+    if free < profile.recorder.min_free_bytes:
+        return Finding("disk", "fail", found, "free space: the recorder pauses below its limit")
+    if free < 10 * profile.recorder.min_free_bytes:
+        return Finding("disk", "warn", found, "free space soon")
+    return Finding("disk", "ok", found)
+
+
+def _state(profile: Profile) -> Finding:
+    folder = state_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        return Finding(
+            "state",
+            "fail",
+            f"{folder}: {error.strerror}",
+            "set XDG_STATE_HOME to a writable folder",
+        )
+    return Finding("state", "ok", f"run folders and logs in {folder}")
+
+
+def _clock() -> Finding:
+    year = time.gmtime().tm_year
+    if year < _YEAR_MIN:
+        return Finding(
+            "clock", "fail", f"the wall clock says {year}", "set it, and keep it set: chrony"
+        )
+    lateness = []
+    for _ in range(50):
+        began = time.monotonic()
+        time.sleep(_SLEEP_S)
+        lateness.append(time.monotonic() - began - _SLEEP_S)
+    worst = max(lateness)
+    found = f"a 10 ms sleep is late by {worst * 1e3:.1f} ms at worst of 50"
+    if worst > _LATE_WARN_S:
+        return Finding("clock", "warn", found, "the host is busy: frames will be late or dropped")
+    return Finding("clock", "ok", found)
+
+
+def _wall(profile: Profile) -> Finding:
+    from palpate_deploy.station.status import wall_words
+    from palpate_gateway.timing.discipline import wall_discipline
+
+    kept = wall_discipline()
+    found = wall_words(kept)
+    ends = (*profile.router.listen, *profile.link.connect)
+    alone = all(is_loopback(endpoint_host_port(end)[0]) for end in ends)
+    if kept is None or kept.synchronised or alone:
+        return Finding("wall clock", "ok", found)
+    return Finding(
+        "wall clock",
+        "warn",
+        found,
+        "this profile is of several hosts: run chrony or ptp4l on each (docs/time.md)",
+    )
+
+
+def _cpu() -> Finding:
+    cpus = os.cpu_count() or 1
+    load = os.getloadavg()[0]
+    found = f"{cpus} CPUs, load {load:.1f}"
+    if cpus < 2:
+        return Finding("cpu", "warn", found, "a station wants two: estimates will be late at times")
+    if load > cpus:
+        return Finding("cpu", "warn", found, "stop what else runs here")
+    return Finding("cpu", "ok", found)

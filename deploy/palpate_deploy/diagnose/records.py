@@ -1,0 +1,236 @@
+"""``palpate record``, ``info``, ``review`` and ``recover``: records and simulations on disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from palpate.bus import Session
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import ConfigError
+from palpate.files.record import RecordSummary, check_readable, recover, summarise
+from palpate_deploy.station.status import duration_text
+
+
+def viewer_command(view: Path) -> str:
+    """``rerun FILE``, with the folder of ``rerun`` where it is not on the path."""
+    rerun = Path(sys.executable).with_name("rerun")
+    if shutil.which("rerun") is None and rerun.exists():
+        near = os.path.relpath(rerun)
+        return f"{rerun if near.startswith('..') else near} {view}"
+    return f"rerun {view}"
+
+
+def record_station(
+    link: LinkConfig, station: str, settings: Mapping[str, Any], *, duration_s: float
+) -> None:
+    """Record until ``duration_s`` have passed (0 = Ctrl-C), then print what was recorded.
+
+    Raises:
+        LinkError: There is no router.
+        ConfigError: An unknown topic.
+        RecordingError: The folder cannot be made.
+    """
+    from palpate_services.config import RecorderConfig
+    from palpate_services.recorder.service import run_recorder
+
+    config = parse_config(RecorderConfig, settings, where="command line")
+    Session.open(link, station=station).close()  # say at once that there is no router
+    before = set(config.out.glob("*.mcap"))
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    if duration_s:
+        timer = threading.Timer(duration_s, stop.set)
+        timer.daemon = True
+        timer.start()
+    until = f"for {duration_s:g} s" if duration_s else "until Ctrl-C"
+    print(f"recording station {station} to {config.out}/ {until}", flush=True)
+    run_recorder(config, link, station, stop, instance=f"record-{os.getpid()}")
+    for path in sorted(set(config.out.glob("*.mcap")) - before):
+        print_contents(path)
+
+
+def show_info(path: Path, *, as_json: bool) -> None:
+    """Print the contents of a record.
+
+    Raises:
+        RecordingError: It is damaged or not palpate's.
+    """
+    if not as_json:
+        print_contents(path)
+        return
+    summary = summarise(path)
+    print(
+        json.dumps(
+            {
+                "file": str(path),
+                "bytes": path.stat().st_size,
+                "complete": summary.complete,
+                "start_wall_ns": summary.start_wall_ns,
+                "end_wall_ns": summary.end_wall_ns,
+                "counts": dict(summary.counts),
+                "metadata": dict(summary.metadata),
+            },
+            indent=2,
+        )
+    )
+
+
+def print_contents(path: Path) -> RecordSummary:
+    """Print one row for each stream of a record.
+
+    Raises:
+        RecordingError: It is damaged or not palpate's.
+    """
+    summary = summarise(path)
+    if summary.complete:
+        check_readable(path)
+    seconds = max(0, summary.end_wall_ns - summary.start_wall_ns) * 1e-9
+    began = datetime.fromtimestamp(summary.start_wall_ns * 1e-9, UTC)
+    table = Table(title=str(path), title_justify="left")
+    table.add_column("stream", overflow="fold")
+    table.add_column("messages", justify="right")
+    table.add_column("Hz", justify="right")
+    for key, count in sorted(summary.counts.items()):
+        rate = f"{(count - 1) / seconds:.2f}" if seconds and count > 1 else "-"
+        table.add_row(key, f"{count:,}", rate)
+    table.caption = (
+        f"{path.stat().st_size / 1e6:.2f} MB, from {began:%Y-%m-%d %H:%M:%S} UTC, "
+        f"{duration_text(seconds)}" + ("" if summary.complete else ", cut off: palpate recover")
+    )
+    Console().print(table)
+    return summary
+
+
+def review_path(
+    path: Path,
+    view: Path | None,
+    picture: Path | None,
+    *,
+    trajectories: Sequence[str] = (),
+    most: int = 8,
+    bundles: Sequence[str] = (),
+) -> None:
+    """Write the Rerun view of a record or of a store of simulations, and on request the picture.
+
+    Args:
+        path: What to look at.
+        view: The ``.rrd`` to write; None = beside it.
+        picture: The PNG to write; None = none.
+        trajectories: Of a store: which, by id or pattern; none = a choice from all.
+        most: Of a store: how many trajectories at most.
+        bundles: Of a record: bundles that hold the meshes of its fields, beside the packaged ones.
+
+    Raises:
+        ConfigError: There is no such path or bundle.
+        RecordingError: The record is damaged or not palpate's.
+        DatasetError: The store is damaged, or has none of these trajectories.
+        MissingExtraError: Rerun, h5py or matplotlib is not installed.
+    """
+    if not path.exists():
+        raise ConfigError(f"{path} does not exist", remedy="check the path")
+    from palpate_services.viewer.simulation_file import is_simulations
+
+    if is_simulations(path):
+        _review_store(path, view, picture, trajectories, most)
+    elif trajectories:
+        raise ConfigError(
+            f"{path} is a record, which has no trajectories", remedy="leave out --trajectory"
+        )
+    else:
+        review_record(path, view, picture, bundles=bundles)
+
+
+def review_record(
+    path: Path, view: Path | None, picture: Path | None, *, bundles: Sequence[str] = ()
+) -> None:
+    """Write the Rerun view of a record, and on request the picture.
+
+    Raises:
+        ConfigError: There is no such bundle.
+        RecordingError: The record is damaged or not palpate's.
+        MissingExtraError: Rerun or matplotlib is not installed.
+    """
+    from palpate_services.viewer.rerun import review
+
+    written = review(path, view, bundles=bundles)
+    print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
+    if picture is not None:
+        from palpate_services.viewer.plot import plot_record
+
+        for name, value in plot_record(path, picture).items():
+            print(f"  {name:24} {value:.4g}")
+        print(picture)
+    print(f"look at it: {viewer_command(written)}")
+
+
+def _review_store(
+    path: Path, view: Path | None, picture: Path | None, trajectories: Sequence[str], most: int
+) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from palpate_services.viewer.simulation import review_simulations
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    console = Console(stderr=True)
+    silent = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=silent) as bar:
+        task = bar.add_task("drawing", total=None)
+        written = review_simulations(
+            path,
+            view,
+            trajectories=trajectories,
+            most=most,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
+    if picture is not None:
+        _draw_store(path, picture, trajectories)
+        print(picture)
+    print(f"look at it: {viewer_command(written)}")
+
+
+def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
+    """The overview of a store, or the last step of the one trajectory that is asked for."""
+    from palpate_fem.plot.step import plot_overview, plot_step
+    from palpate_fem.store.read import SimulationStore
+    from palpate_services.viewer.simulation_file import choose
+
+    store = SimulationStore.open(path)
+    names = store.ids()
+    if trajectories:
+        names = choose(names, trajectories, len(names))
+    if trajectories and len(names) == 1:
+        (name,) = names
+        press, outline = store.trajectory(name), store.outline(name)
+        plot_step(store.fingertip(), press, picture, indenter=outline, title=name)
+        return
+    outcomes = plot_overview([store.summary(name) for name in names], picture, title=path.name)
+    for outcome, count in sorted(outcomes.items()):
+        print(f"  {outcome.value:24} {count}")
+
+
+def recover_record(part: Path) -> None:
+    """Write ``NAME.recovered.mcap`` from ``NAME.mcap.part``.
+
+    Raises:
+        RecordingError: Nothing in it can be read.
+    """
+    print_contents(recover(part))

@@ -1,0 +1,325 @@
+"""``palpate replay``: a file through gateway, features and recorder, and the account of it.
+
+The run stands alone: its own router on a free port, its own station name, nothing shared with a
+station that may run beside it. Paced ``fast`` it is lossless, and what was published, estimated and
+recorded must be equal in number; the count that matters is read back from the record.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from palpate.bus import Session
+from palpate.bus.topics import ELECTRODES, FEATURES
+from palpate.errors import LinkError, PalpateError, RecordingError
+from palpate.files.record import summarise
+from palpate.messages import ServiceState, Status
+from palpate_deploy.diagnose.records import viewer_command
+from palpate_deploy.station.host import free_endpoint
+from palpate_deploy.station.logs import DEVICE, FAILED, print_error
+from palpate_deploy.station.processes import Children
+from palpate_deploy.station.profile import Profile, changed, load_profile
+from palpate_deploy.station.status import ask_status
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came of a replay.
+
+    Attributes:
+        file: What was replayed.
+        seconds: How long it took [s].
+        gateway: Last counters of the gateway.
+        features: Last counters of the features service.
+        recorded: Recorded messages by topic, read back from the records.
+        records: The files written.
+        error: Why the file ended early, if it did.
+        exit_status: Of the gateway.
+    """
+
+    file: Path
+    seconds: float = 0.0
+    gateway: dict[str, int] = field(default_factory=dict)
+    features: dict[str, int] = field(default_factory=dict)
+    recorded: dict[str, int] = field(default_factory=dict)
+    records: list[Path] = field(default_factory=list)
+    error: PalpateError | None = None
+    exit_status: int = 0
+
+    @property
+    def published(self) -> int:
+        """Frames the gateway published, over all sensors."""
+        return total(self.gateway, "frames_published")
+
+    @property
+    def estimated(self) -> int:
+        """Estimates the features service published."""
+        return self.features.get("estimates_published", 0)
+
+    @property
+    def problems(self) -> list[str]:
+        """What is not equal and ought to be.
+
+        A frame that got no estimate for a good reason is accounted for by the reason's counter.
+        """
+        found = []
+        answered = self.estimated + sum(self.unanswered.values())
+        frames = self.recorded.get(ELECTRODES.name, 0)
+        estimates = self.recorded.get(FEATURES.name, 0)
+        if not self.published:
+            found.append("no frame was published")
+        if frames != self.published:
+            found.append(f"{self.published} frames published, {frames} recorded")
+        if answered != self.published:
+            found.append(f"{self.published} frames published, {answered} answered")
+        if estimates != self.estimated:
+            found.append(f"{self.estimated} estimates published, {estimates} recorded")
+        if self.published and not self.estimated:
+            found.append(f"no frame got an estimate: {self.unanswered}")
+        return found
+
+    @property
+    def unanswered(self) -> dict[str, int]:
+        """Frames that got no estimate, by the service's reason."""
+        known = {"frames_received", "estimates_published", "restarts", "delivered", "received"}
+        return {k: n for k, n in self.features.items() if n and k not in known}
+
+
+def total(counters: dict[str, int], name: str) -> int:
+    """A counter summed over sensors: one sensor's has the bare name, several have a prefix."""
+    return sum(n for key, n in counters.items() if key == name or key.endswith(f".{name}"))
+
+
+def count_topics(records: list[Path]) -> dict[str, int]:
+    """Messages of records by topic, read back."""
+    counts: Counter[str] = Counter()
+    for path in records:
+        for key, count in summarise(path).counts.items():
+            counts[key.rpartition("/")[2]] += count
+    return dict(counts)
+
+
+def as_plain(outcome: Outcome) -> dict[str, Any]:
+    """The account as plain values."""
+    error = outcome.error
+    return {
+        "file": str(outcome.file),
+        "seconds": round(outcome.seconds, 3),
+        "samples": total(outcome.gateway, "samples"),
+        "frames": outcome.published,
+        "missing_frames": total(outcome.gateway, "missing_frames"),
+        "time_jumps": total(outcome.gateway, "time_jumps"),
+        "estimates": outcome.estimated,
+        "recorded": outcome.recorded,
+        "records": [str(path) for path in outcome.records],
+        "lossless": not outcome.problems,
+        "gateway": outcome.gateway,
+        "features": outcome.features,
+        "error": None if error is None else {"problem": error.problem, "remedy": error.remedy},
+    }
+
+
+def print_account(outcome: Outcome) -> None:
+    """Print the account as a table, and the files."""
+    table = Table(title=str(outcome.file), title_justify="left", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    plain = as_plain(outcome)
+    for name in ("samples", "frames", "missing_frames", "time_jumps", "estimates"):
+        table.add_row(name.replace("_", " "), f"{plain[name]:,}")
+    for reason, count in sorted(outcome.unanswered.items()):
+        table.add_row(f"  without estimate: {reason}", f"{count:,}")
+    for topic, count in sorted(outcome.recorded.items()):
+        table.add_row(f"recorded {topic}", f"{count:,}")
+    table.add_row("seconds", f"{outcome.seconds:.1f}")
+    Console().print(table)
+    for path in outcome.records:
+        print(path)
+        if (view := path.with_suffix(".rrd")).is_file():
+            print(f"{view}   look at it: {viewer_command(view)}")
+
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_POLL_S = 0.1
+_JOIN_S = 15.0
+_SETTLED_S = 20.0
+_LINGER_S = 1.0
+
+
+def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_json: bool) -> int:
+    """Replay a file and print the account.
+
+    Args:
+        file: A vendor's text log or a palpate record.
+        pace: ``fast`` (lossless) or ``recorded``.
+        out: Folder of the new record.
+        bundle: Bundle to serve.
+        rrd: Also write a Rerun view.
+        as_json: Print JSON instead of a table.
+
+    Returns:
+        0; 1 if something was lost on the way; 3 if the file is damaged.
+
+    Raises:
+        PalpateError: The replay could not be run at all.
+    """
+    from palpate_services.inference.repository import resolve
+
+    resolve(bundle)  # a bundle that is not there is said before anything starts
+    profile = replay_profile(file, pace, out, bundle, rrd=rrd)
+    outcome = replay(profile, file, show=not as_json)
+    if as_json:
+        print(json.dumps(as_plain(outcome), indent=2))
+    else:
+        print_account(outcome)
+    if outcome.error is not None:
+        print_error(outcome.error)
+        return DEVICE if outcome.exit_status == DEVICE else FAILED
+    # At the recorded pace a slow host may drop, as it would live; that is counted, not an error.
+    if outcome.problems and (pace == "fast" or not outcome.estimated):
+        for problem in outcome.problems:
+            print_error(
+                LinkError(problem, remedy="see the counters above; report it, nothing may be lost")
+            )
+        return FAILED
+    return 0
+
+
+def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) -> Profile:
+    """The profile of a replay.
+
+    Raises:
+        ConfigError: A value is wrong.
+    """
+    endpoint = free_endpoint()
+    fast = pace == "fast"
+    delivery = "every" if fast else "newest"
+    profile = load_profile("replay")
+    return changed(
+        profile,
+        router={"listen": (endpoint,)},
+        link={"connect": (endpoint,)},
+        gateway={"pace": pace, "sensors": sensors_of(file), "linger_s": _LINGER_S},
+        features={"bundle": bundle, "delivery": delivery, "accept_replayed": True},
+        recorder={"out": str(out), "delivery": "every" if fast else "queue", "rrd": rrd},
+    )
+
+
+def sensors_of(file: Path) -> list[dict[str, Any]]:
+    """What the gateway reads from a file: a record by its magic bytes, else a text log."""
+    with open(file, "rb") as stream:
+        head = stream.read(len(_MCAP_MAGIC))
+    path = str(file.absolute())
+    if head.startswith(_MCAP_MAGIC):
+        from palpate_gateway.recordings.record import recorded_sensors
+
+        try:
+            names = recorded_sensors(file)
+        except RecordingError:
+            names = []  # a damaged record delivers what is before the damage, and then says so
+        if not names:
+            return [{"name": "finger", "driver": "record", "options": {"path": path}}]
+        # Naming the sensor spares the driver a look through the whole record.
+        return [
+            {"name": name, "driver": "record", "options": {"path": path, "sensor": name}}
+            for name in names
+        ]
+    return [{"name": "finger", "driver": "text_log", "options": {"path": path}}]
+
+
+def replay(profile: Profile, file: Path, *, show: bool = False) -> Outcome:
+    """Run a replay to its end.
+
+    Args:
+        profile: As made by ``replay_profile``.
+        file: What is replayed, for the account.
+        show: Show progress on the terminal.
+
+    Raises:
+        LinkError: The bus cannot be joined.
+        ProcessEnded: A process could not start.
+    """
+    outcome = Outcome(file)
+    out = profile.recorder.out
+    before = set(out.glob("*.mcap"))
+    began = time.monotonic()
+    with Children("replay") as children:
+        children.start_profile(profile)
+        link = profile.link.model_copy(update={"wait_for_router_s": _JOIN_S})
+        with Session.open(link, station=profile.station) as session, _progress(show) as bar:
+            task = bar.add_task(file.name, total=None, frames=0)
+            last = _follow(children, session, outcome, bar, task)
+        outcome.exit_status = last
+    outcome.seconds = time.monotonic() - began
+    outcome.records = sorted(set(out.glob("*.mcap")) - before)
+    outcome.recorded = count_topics(outcome.records)
+    if last != 0 and outcome.error is None:
+        outcome.error = children.ended("gateway", last)
+    return outcome
+
+
+def _follow(
+    children: Children, session: Session, outcome: Outcome, bar: Progress, task: Any
+) -> int:
+    """Take over counters until the gateway has ended and its consumers have done their work.
+
+    Returns:
+        The gateway's exit status.
+    """
+    settled_by = float("inf")
+    while True:
+        children.check(["router", "features", "recorder"])
+        statuses = {status.service: status for status in ask_status(session)}
+        _take(outcome, statuses)
+        frames = outcome.published
+        bar.update(task, completed=frames, frames=frames)
+        status = children.status("gateway")
+        gateway = statuses.get("gateway")
+        ended = gateway is not None and gateway.state in (
+            ServiceState.FINISHED,
+            ServiceState.DEGRADED,
+        )
+        if status is not None or ended:
+            settled_by = min(settled_by, time.monotonic() + _SETTLED_S)
+            if status is not None and (
+                _settled(outcome, statuses) or time.monotonic() > settled_by
+            ):
+                bar.update(task, total=max(frames, 1), completed=max(frames, 1), frames=frames)
+                return status
+        time.sleep(_POLL_S)
+
+
+def _settled(outcome: Outcome, statuses: dict[str, Status]) -> bool:
+    """Whether every published frame was answered and recorded."""
+    recorder = statuses.get("recorder")
+    recorded = 0 if recorder is None else recorder.counters.get("recorded_electrodes", 0)
+    return (
+        outcome.estimated + sum(outcome.unanswered.values()) >= outcome.published
+        and recorded >= outcome.published
+    )
+
+
+def _take(outcome: Outcome, statuses: dict[str, Status]) -> None:
+    if "gateway" in statuses:
+        outcome.gateway = dict(statuses["gateway"].counters)
+    if "features" in statuses:
+        outcome.features = dict(statuses["features"].counters)
+
+
+def _progress(show: bool) -> Progress:
+    return Progress(
+        TextColumn("replay {task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[frames]:,} frames"),
+        TimeElapsedColumn(),
+        disable=not show,
+    )

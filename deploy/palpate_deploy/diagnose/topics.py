@@ -1,0 +1,344 @@
+"""``palpate topic hz``: rate, jitter, bandwidth and loss of a stream."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import enum
+import json
+import statistics
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from palpate import clock
+from palpate.bus import Delivery, Received, Sample, Session
+from palpate.bus.topics import TOPICS, Topic
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, StreamTimeout, WireError
+from palpate.messages import Stamp
+from palpate_deploy.station.logs import FAILED
+
+
+def topic_named(name: str) -> Topic[Any]:
+    """A topic of the contract.
+
+    Raises:
+        ConfigError: There is none of this name; the error names the nearest.
+    """
+    topic = TOPICS.get(name)
+    if topic is None:
+        near = difflib.get_close_matches(name, TOPICS, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ConfigError(
+            f"topic {name!r} does not exist", remedy=f"{hint}known: {', '.join(TOPICS)}"
+        )
+    return topic
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What came of one topic."""
+
+    messages: int = 0
+    sources: set[str] = field(default_factory=set)
+
+
+def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool) -> None:
+    """Listen to everything for a while and print the topic table.
+
+    Raises:
+        LinkError: There is no router.
+    """
+    heard: defaultdict[str, _Heard] = defaultdict(_Heard)
+    with Session.open(link, station=station) as session:
+        with session.tap(list(TOPICS.values())) as tap:
+            began = time.monotonic()
+            while (left := began + seconds - time.monotonic()) > 0:
+                try:
+                    sample = tap.next(left)
+                except StreamTimeout:
+                    break
+                heard[sample.topic].messages += 1
+                heard[sample.topic].sources.add(sample.sensor)
+    if as_json:
+        rows = [
+            {
+                "topic": topic.name,
+                "message": topic.codec.schema,
+                "usual_rate_hz": topic.rate_hz,
+                "sources": sorted(heard[topic.name].sources),
+                "messages": heard[topic.name].messages,
+                "rate_hz": round(_rate_hz(heard[topic.name], seconds), 2),
+            }
+            for topic in TOPICS.values()
+        ]
+        print(json.dumps({"station": station, "topics": rows}, indent=2))
+        return
+    table = Table(title=f"station {station}, {seconds:g} s of listening", title_justify="left")
+    for column in ("topic", "message", "from", "Hz now", "Hz usual", "what"):
+        table.add_column(column, justify="right" if column.startswith("Hz") else "left")
+    for topic in TOPICS.values():
+        now = heard[topic.name]
+        table.add_row(
+            topic.name,
+            topic.codec.schema.rpartition(".")[2],
+            " ".join(sorted(now.sources)) or "[dim]-[/]",
+            f"{_rate_hz(now, seconds):.1f}" if now.messages else "[dim]-[/]",
+            f"{topic.rate_hz:g}" if topic.rate_hz else "events",
+            topic.doc,
+        )
+    Console().print(table)
+
+
+def _rate_hz(heard: _Heard, seconds: float) -> float:
+    """Messages per second of one source."""
+    return heard.messages / seconds / max(1, len(heard.sources))
+
+
+def echo_topic(
+    link: LinkConfig,
+    station: str,
+    name: str,
+    sensor: str,
+    *,
+    count: int,
+    timeout_s: float,
+    as_json: bool,
+) -> None:
+    """Print messages of a topic.
+
+    Args:
+        link: The station's router.
+        station: Name of the station.
+        name: The topic.
+        sensor: One sensor, or ``*``.
+        count: End after so many; 0 = at Ctrl-C.
+        timeout_s: End when none comes for so long [s].
+        as_json: One JSON object a line.
+
+    Raises:
+        ConfigError: There is no such topic.
+        LinkError: There is no router.
+        StreamTimeout: Nothing came.
+    """
+    topic = topic_named(name)
+    with Session.open(link, station=station) as session:
+        service = sensor if topic.per_service else "*"
+        stream = session.subscriber(topic, sensor=sensor, service=service, delivery=Delivery.QUEUE)
+        done = 0
+        try:
+            while not count or done < count:
+                try:
+                    received = stream.next(timeout_s)
+                except StreamTimeout as error:
+                    rejected = sum(
+                        n for k, n in stream.counters.items() if k.startswith("rejected_")
+                    )
+                    if rejected:
+                        raise StreamTimeout(
+                            f"{rejected} payloads of {name} came and none is valid",
+                            remedy="the publisher speaks another contract: compare its version",
+                        ) from error
+                    raise
+                print(_json(received) if as_json else _text(topic, received), flush=True)
+                done += 1
+        except KeyboardInterrupt:
+            pass
+
+
+def plain(value: Any) -> Any:
+    """A message as JSON's own kinds: digests as hex, enums by name, arrays as lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, enum.Enum):
+        return value.name.lower()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value
+
+
+def _json(received: Received[Any]) -> str:
+    return json.dumps(
+        {
+            "station": received.station,
+            "sensor": received.sensor,
+            "received_monotonic_ns": received.received_monotonic_ns,
+            "message": plain(received.message),
+        }
+    )
+
+
+def _text(topic: Topic[Any], received: Received[Any]) -> str:
+    lines = [f"--- {received.sensor}/{topic.name}"]
+    for part in dataclasses.fields(received.message):
+        value = getattr(received.message, part.name)
+        if value is not None:
+            lines.append(f"{part.name:20} {_readable(value)}")
+    return "\n".join(lines)
+
+
+def _readable(value: Any) -> str:
+    if isinstance(value, Stamp):
+        age_ms = clock.age_s(value) * 1e3
+        missed = f", {value.missed_before} missed before" if value.missed_before else ""
+        return f"#{value.sequence} {value.origin.name.lower()}, {age_ms:.1f} ms old{missed}"
+    if isinstance(value, np.ndarray):
+        precision = 0 if value.dtype.kind in "ui" else 4
+        return np.array2string(
+            value, precision=precision, suppress_small=False, max_line_width=100, threshold=60
+        )
+    if isinstance(value, bytes):
+        return value.hex()[:12]
+    if isinstance(value, Mapping):
+        return "  ".join(f"{key} {item:g}" for key, item in sorted(value.items())) or "-"
+    if isinstance(value, enum.Enum):
+        return value.name.lower()
+    return json.dumps(plain(value), ensure_ascii=False) if value else str(value)
+
+
+_REPORT_S = 1.0
+
+
+@dataclass(slots=True)
+class Rate:
+    """What was seen of one source.
+
+    Attributes:
+        messages: How many came.
+        bytes: Their payloads [bytes].
+        lost: Holes in the sequence of stamps, for streams whose sequences have none.
+        rejected: Payloads that do not decode.
+        missed: Frames the device itself lost, by the stamps.
+        gaps_s: Time between two arrivals [s].
+    """
+
+    messages: int = 0
+    bytes: int = 0
+    lost: int = 0
+    rejected: int = 0
+    missed: int = 0
+    gaps_s: list[float] = field(default_factory=list)
+    _arrival_ns: int = 0
+    _sequence: int | None = None
+
+    def add(self, topic: Topic[object], sample: Sample) -> None:
+        """Count one sample."""
+        self.messages += 1
+        self.bytes += len(sample.payload)
+        if self._arrival_ns:
+            self.gaps_s.append((sample.received_monotonic_ns - self._arrival_ns) * 1e-9)
+        self._arrival_ns = sample.received_monotonic_ns
+        try:
+            stamp = topic.stamp_of(topic.codec.decode(sample.payload))
+        except WireError:
+            self.rejected += 1
+            return
+        if stamp is None:
+            return
+        step = stamp.sequence - (stamp.sequence - 1 if self._sequence is None else self._sequence)
+        if topic.contiguous and step > 1:
+            self.lost += step - 1
+        self.missed += stamp.missed_before
+        self._sequence = stamp.sequence
+
+    def summary(self) -> dict[str, float | int | None]:
+        """Numbers for people and machines; None where two messages would be needed."""
+        total_s = sum(self.gaps_s)
+        some = bool(self.gaps_s) and total_s > 0
+        return {
+            "messages": self.messages,
+            "rate_hz": len(self.gaps_s) / total_s if some else None,
+            "min_s": min(self.gaps_s) if some else None,
+            "max_s": max(self.gaps_s) if some else None,
+            "std_s": statistics.pstdev(self.gaps_s) if some else None,
+            "bytes_per_s": self.bytes / total_s if some else None,
+            "lost": self.lost,
+            "missed_by_device": self.missed,
+            "rejected": self.rejected,
+        }
+
+
+def measure(
+    link: LinkConfig,
+    station: str,
+    name: str,
+    sensor: str,
+    seconds: float,
+    *,
+    as_json: bool,
+) -> int:
+    """Print the rate of a topic until ``seconds`` have passed (0 = Ctrl-C).
+
+    Returns:
+        0, or 1 if nothing was heard.
+
+    Raises:
+        ConfigError: There is no such topic.
+        LinkError: There is no router.
+    """
+    topic = topic_named(name)
+    rates: defaultdict[str, Rate] = defaultdict(Rate)
+    with (
+        Session.open(link, station=station) as session,
+        session.tap([topic], sensor=sensor, delivery=Delivery.QUEUE) as tap,
+    ):
+        end = time.monotonic() + seconds if seconds else float("inf")
+        report = time.monotonic() + _REPORT_S
+        try:
+            while (now := time.monotonic()) < end:
+                if now >= report and not as_json:
+                    print_rates(topic, rates)
+                    report = now + _REPORT_S
+                try:
+                    sample = tap.next(max(0.0, min(end, report) - now))
+                except StreamTimeout:
+                    report = min(report, time.monotonic())
+                    continue
+                rates[sample.sensor].add(TOPICS[sample.topic], sample)
+        except KeyboardInterrupt:
+            pass
+    if as_json:
+        found = {source: rate.summary() for source, rate in sorted(rates.items())}
+        print(json.dumps({"topic": name, "sources": found}, indent=2))
+    else:
+        print_rates(topic, rates)
+    return 0 if rates else FAILED
+
+
+def print_rates(topic: Topic[object], rates: dict[str, Rate]) -> None:
+    """Print one line for each source."""
+    if not rates:
+        print(f"no {topic.name} heard; see what runs: palpate status", file=sys.stderr, flush=True)
+    for source, rate in sorted(rates.items()):
+        numbers = rate.summary()
+        if numbers["rate_hz"] is None:
+            print(f"{source}: {rate.messages} message", flush=True)
+            continue
+        print(
+            f"{source}: {numbers['rate_hz']:.2f} Hz  "
+            f"min {_ms(numbers['min_s'])}  max {_ms(numbers['max_s'])}  "
+            f"std {_ms(numbers['std_s'])}  {(numbers['bytes_per_s'] or 0) / 1e3:.1f} kB/s  "
+            f"lost {rate.lost}  missed by device {rate.missed}  rejected {rate.rejected}  "
+            f"n {rate.messages}",
+            flush=True,
+        )
+
+
+def _ms(seconds: float | int | None) -> str:
+    return f"{(seconds or 0) * 1e3:.2f} ms"

@@ -1,0 +1,114 @@
+"""Where a run keeps its resolved profile and its logs: one folder a run, in the user's state."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import socket
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from palpate.config import endpoint_host_port
+from palpate.errors import ConfigError, LinkError
+from palpate_deploy.station.profile import Profile, plain_values
+from palpate_deploy.toml_text import toml_text
+
+
+def check_free(endpoints: Iterable[str]) -> None:
+    """Check that a router can listen there.
+
+    Raises:
+        LinkError: A port is in use, or the address is not this host's.
+    """
+    for endpoint in endpoints:
+        host, port = endpoint_host_port(endpoint)
+        if port == 0:
+            continue
+        try:
+            _bind(host, port)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                other = port + 1 if port < 65535 else 7447
+                raise LinkError(
+                    f"{host}:{port} is in use",
+                    remedy="another `palpate up`? Look with `palpate status --connect "
+                    f"{endpoint}`, or choose another port: [router] listen in the profile, or "
+                    f"PALPATE_ROUTER__LISTEN='[\"tcp/{host}:{other}\"]'",
+                ) from error
+            raise LinkError(
+                f"the router cannot listen at {endpoint}: {error.strerror or error}",
+                remedy="set [router] listen to an address of this host",
+            ) from error
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nothing listens at now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _bind(host: str, port: int) -> None:
+    family, kind, protocol, _, address = socket.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )[0]
+    with socket.socket(family, kind, protocol) as probe:
+        # As the router does: a port whose last connection just closed is free.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(address)
+        probe.listen(1)
+
+
+KEPT_RUNS = 20
+"""Older folders are removed; recordings are never kept there."""
+
+
+def state_folder() -> Path:
+    """Folder for what palpate remembers of its runs (XDG base directories)."""
+    base = os.environ.get("XDG_STATE_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "state") / "palpate"
+
+
+def new_run_folder(name: str) -> Path:
+    """Make an empty folder for a run and forget the oldest runs.
+
+    Raises:
+        ConfigError: The folder cannot be made.
+    """
+    runs = state_folder() / "runs"
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    folder = runs / f"{stamp}-{name}-{os.getpid()}"
+    try:
+        (folder / "logs").mkdir(parents=True, mode=0o700)
+    except OSError as error:
+        raise ConfigError(
+            f"run folder {folder} cannot be made: {error.strerror or error}",
+            remedy="set XDG_STATE_HOME to a folder you may write in",
+        ) from error
+    for old in sorted(path for path in runs.iterdir() if path.is_dir())[:-KEPT_RUNS]:
+        if not _in_use(old):
+            shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def _in_use(folder: Path) -> bool:
+    """Whether the process that the folder is named after still runs."""
+    pid = folder.name.rpartition("-")[2]
+    if not pid.isdigit():
+        return True  # not one of ours
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def write_profile(profile: Profile, folder: Path) -> Path:
+    """Write the resolved profile that all processes of a run read."""
+    path = folder / "profile.toml"
+    path.write_text(toml_text(plain_values(profile)), encoding="utf-8")
+    return path

@@ -1,0 +1,248 @@
+"""A finite run: processes started once, watched, and stopped; nothing is restarted."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Self
+
+from palpate.errors import ConfigError, PalpateError
+from palpate_deploy.station import logs
+from palpate_deploy.station.host import new_run_folder, write_profile
+from palpate_deploy.station.parent import end_with_parent, environment_for_children
+from palpate_deploy.station.profile import Profile, Service
+
+_log = logging.getLogger(__name__)
+
+START_ORDER: tuple[Service, ...] = (
+    "router",
+    "recorder",
+    "synthesis",
+    "field",
+    "features",
+    "fem",
+    "gateway",
+)
+"""Listeners first; stopped in reverse, so that what the gateway last sent is still recorded."""
+
+
+def command_line(service: Service, profile: Path) -> list[str]:
+    """Command that runs one process of a profile, with this very Python.
+
+    Args:
+        service: Which.
+        profile: The resolved profile's file.
+    """
+    return [sys.executable, "-m", "palpate_deploy", "run", service, "--profile", str(profile)]
+
+
+def run_service(service: Service, profile: Profile) -> None:
+    """Be one process of a profile until ``SIGTERM`` or ``SIGINT``, or until its source ends.
+
+    Raises:
+        PalpateError: It cannot start or go on; the process ends and the supervisor restarts it.
+    """
+    logs.configure(profile.log.level, profile.log.format)
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    end_with_parent()
+    _log.info("%s starts, station %s", service, profile.station)
+    _RUN[service](profile, stop)
+    _log.info("%s ends", service)
+
+
+def _run_router(profile: Profile, stop: threading.Event) -> None:
+    from palpate.bus import run_router
+
+    run_router(profile.router.listen, stop, link=profile.link)
+
+
+def _run_gateway(profile: Profile, stop: threading.Event) -> None:
+    from palpate_gateway import node
+    from palpate_gateway.one_core import stay_on_one_core
+
+    if profile.gateway.pace != "fast":
+        stay_on_one_core(profile.gateway.core)
+    node.run(profile.gateway, profile.link, profile.station, stop)
+
+
+def _run_features(profile: Profile, stop: threading.Event) -> None:
+    from palpate_services.inference.services import run_features
+
+    run_features(profile.features, profile.link, profile.station, stop)
+
+
+def _run_field(profile: Profile, stop: threading.Event) -> None:
+    from palpate_services.inference.services import run_field
+
+    run_field(profile.field, profile.link, profile.station, stop)
+
+
+def _run_synthesis(profile: Profile, stop: threading.Event) -> None:
+    from palpate_services.inference.services import run_synthesis
+
+    run_synthesis(profile.synthesis, profile.link, profile.station, stop)
+
+
+def _run_recorder(profile: Profile, stop: threading.Event) -> None:
+    from palpate_services.recorder.service import run_recorder
+
+    run_recorder(profile.recorder, profile.link, profile.station, stop)
+
+
+def _run_fem(profile: Profile, stop: threading.Event) -> None:
+    from palpate_fem.service import node
+
+    node.run(profile.fem, profile.link, profile.station, stop)
+
+
+_RUN: dict[Service, Callable[[Profile, threading.Event], None]] = {
+    "router": _run_router,
+    "gateway": _run_gateway,
+    "features": _run_features,
+    "field": _run_field,
+    "synthesis": _run_synthesis,
+    "recorder": _run_recorder,
+    "fem": _run_fem,
+}
+
+
+def service_named(name: str) -> Service:
+    """A service by name.
+
+    Raises:
+        ConfigError: There is no such service.
+    """
+    for service in _RUN:
+        if service == name:
+            return service
+    raise ConfigError(f"service {name!r} does not exist", remedy=f"one of: {', '.join(_RUN)}")
+
+
+STOP_WAIT_S = 60.0
+"""A recorder may have much to write after its source has ended [s]."""
+
+
+class ProcessEnded(PalpateError, RuntimeError):
+    """A process of a finite run ended before its time.
+
+    Args:
+        problem: What was wrong.
+        remedy: What to do.
+        status: Its exit status.
+    """
+
+    def __init__(self, problem: str, *, remedy: str, status: int) -> None:
+        super().__init__(problem, remedy=remedy)
+        self.status = status
+
+
+class Children:
+    """Processes of one finite run, each with its log; they end with this process.
+
+    Args:
+        name: Stands in the name of the run's folder.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.folder = new_run_folder(name)
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, command: Sequence[str]) -> None:
+        """Start a process."""
+        with open(self.log(name), "ab") as output:
+            self._running[name] = subprocess.Popen(
+                list(command),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment_for_children(),
+                start_new_session=True,
+            )
+
+    def start_profile(self, profile: Profile) -> None:
+        """Start every process of a profile, listeners first."""
+        path = write_profile(profile, self.folder)
+        for service in START_ORDER:
+            if service in profile.processes:
+                self.start(service, command_line(service, path))
+
+    def status(self, name: str) -> int | None:
+        """Exit status of a process; None while it runs."""
+        return self._running[name].poll()
+
+    def pid(self, name: str) -> int:
+        """Process id of a process."""
+        return self._running[name].pid
+
+    def check(self, names: Iterable[str]) -> None:
+        """Check that processes run.
+
+        Raises:
+            ProcessEnded: One has ended; the error holds what it said last.
+        """
+        for name in names:
+            status = self.status(name)
+            if status is not None:
+                raise self.ended(name, status)
+
+    def ended(self, name: str, status: int) -> ProcessEnded:
+        """The error of a process that ended: its own words, where it had any."""
+        problem, remedy = f"ended with status {status}", f"see {self.log(name)}"
+        lines = self.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
+        for line, following in zip(lines, [*lines[1:], ""], strict=True):
+            if line.startswith("error: "):
+                problem = line.removeprefix("error: ")
+                if following.startswith("  fix: "):
+                    remedy = following.removeprefix("  fix: ")
+        return ProcessEnded(f"{name}: {problem}", remedy=remedy, status=status)
+
+    def log(self, name: str) -> Path:
+        """Log of a process."""
+        return self.folder / "logs" / f"{name}.log"
+
+    def stop(self) -> None:
+        """Stop every process in reverse order of starting, each after the one before has ended."""
+        for name in reversed(self._running):
+            self.stop_one(name)
+
+    def stop_one(self, name: str) -> int:
+        """Stop a process; its exit status."""
+        process = self._running[name]
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(timeout=STOP_WAIT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        return process.wait()
+
+    def wait(self, name: str, timeout_s: float) -> int | None:
+        """Wait for a process to end by itself; None if it does not in time."""
+        deadline = time.monotonic() + timeout_s
+        while (status := self.status(name)) is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        return status
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()

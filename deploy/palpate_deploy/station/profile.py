@@ -1,0 +1,297 @@
+"""A profile: everything a station runs, in one TOML file (docs/conventions.md, configuration).
+
+Every room reads only its own table. An unknown key is an error that names the nearest known one.
+Environment variables win over the file: ``PALPATE_FEATURES__BUNDLE=my-bundle``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import (
+    BaseSettings,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
+
+from palpate.config import (
+    DEFAULT_ROUTER,
+    LinkConfig,
+    StrictConfig,
+    config_error,
+    endpoint_host_port,
+    is_loopback,
+)
+from palpate.errors import ConfigError
+from palpate.names import Name
+from palpate_deploy.station.logs import LogFormat, LogLevel
+from palpate_fem.service.config import FemConfig
+from palpate_gateway.config import GatewayConfig
+from palpate_services.config import FeaturesConfig, FieldConfig, RecorderConfig, SynthesisConfig
+
+PROFILES = Path(__file__).parent.parent / "profiles"
+"""Profiles that come with palpate."""
+
+ENV_PREFIX = "PALPATE_"
+ENV_NESTED = "__"
+
+Service = Literal["router", "gateway", "features", "field", "synthesis", "recorder", "fem"]
+SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
+"""What a station runs by default; the others are named where they are wanted."""
+
+
+class RouterConfig(StrictConfig):
+    """Where the router listens.
+
+    Attributes:
+        listen: Endpoints; any that is not loopback needs ``[link.tls]``.
+    """
+
+    listen: tuple[str, ...] = (DEFAULT_ROUTER,)
+
+    @field_validator("listen")
+    @classmethod
+    def _endpoints(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for endpoint in value:
+            endpoint_host_port(endpoint)
+        return value
+
+
+class LogConfig(StrictConfig):
+    """What the processes write into their logs.
+
+    Attributes:
+        level: The least that is written.
+        format: ``text`` for people, ``json`` for machines.
+    """
+
+    level: LogLevel = "info"
+    format: LogFormat = "text"
+
+
+class Profile(StrictConfig):
+    """One station.
+
+    Attributes:
+        station: Name of the station, the third chunk of every key.
+        processes: The processes that ``palpate up`` starts here.
+        link: How every process joins the bus.
+        router: Where the router listens.
+        gateway: The sensors.
+        features: Electrodes to features.
+        field: Electrodes to displacement fields, where ``processes`` names ``field``.
+        synthesis: Displacement fields to electrodes, where ``processes`` names ``synthesis``.
+        recorder: What is recorded, and where.
+        fem: How simulations are served, where ``processes`` names ``fem``.
+        log: What the processes write into their logs.
+    """
+
+    station: Name = "lab"
+    processes: tuple[Service, ...] = Field(default=SERVICES, min_length=1)
+    link: LinkConfig = LinkConfig()
+    router: RouterConfig = RouterConfig()
+    gateway: GatewayConfig = Field(default_factory=GatewayConfig)
+    features: FeaturesConfig = FeaturesConfig()
+    field: FieldConfig = FieldConfig()
+    synthesis: SynthesisConfig = SynthesisConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    fem: FemConfig = FemConfig()
+    log: LogConfig = LogConfig()
+
+    @field_validator("processes")
+    @classmethod
+    def _each_once(cls, value: tuple[Service, ...]) -> tuple[Service, ...]:
+        if len(set(value)) != len(value):
+            raise ValueError("each process can be named once")
+        return value
+
+
+class _FileAndEnvironment(BaseSettings, Profile):
+    """A profile as it is read: the environment over the file."""
+
+    model_config = SettingsConfigDict(
+        env_prefix=ENV_PREFIX, env_nested_delimiter=ENV_NESTED, frozen=True, extra="forbid"
+    )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """The file's values come in by the constructor; the environment wins over them."""
+        return env_settings, init_settings
+
+
+def profile_names() -> list[str]:
+    """Names of the profiles that come with palpate."""
+    return sorted(path.stem for path in PROFILES.glob("*.toml"))
+
+
+def profile_path(profile: str | Path) -> Path:
+    """File of a profile given by name (``demo``) or by path (``./mine.toml``).
+
+    Raises:
+        ConfigError: There is no such profile; the error lists what exists.
+    """
+    text = str(profile)
+    if "/" in text or text.endswith(".toml"):
+        path = Path(text).expanduser()
+        if path.is_file():
+            return path
+        raise ConfigError(
+            f"profile {path} does not exist",
+            remedy=f"check the path, or use one by name: {', '.join(profile_names())}",
+        )
+    path = PROFILES / f"{text}.toml"
+    if path.is_file():
+        return path
+    near = difflib.get_close_matches(text, profile_names(), n=1, cutoff=0.5)
+    raise ConfigError(
+        f"profile {text!r} does not exist",
+        remedy=f"did you mean {near[0]!r}?"
+        if near
+        else f"known: {', '.join(profile_names())}; your own by path: ./{text}.toml",
+    )
+
+
+def load_profile(profile: str | Path) -> Profile:
+    """Read a profile by name or path.
+
+    Raises:
+        ConfigError: Names the file, the key and what was expected.
+    """
+    path = profile_path(profile)
+    return parse_profile(read_toml(path), where=str(path))
+
+
+def parse_profile(values: Mapping[str, Any], *, where: str) -> Profile:
+    """Build a profile from plain values and the environment.
+
+    Args:
+        values: As in the TOML file.
+        where: Where they come from, for the error.
+
+    Raises:
+        ConfigError: Names ``where``, the key and what was expected.
+    """
+    _check_environment()
+    try:
+        read = _FileAndEnvironment(**values)
+    except ValidationError as error:
+        blamed = _variable_of(error.errors()[0]["loc"])
+        raise config_error(Profile, error, where=blamed or where) from error
+    except SettingsError as error:
+        raise ConfigError(
+            f"environment: {error}",
+            remedy=f"tables and lists in {ENV_PREFIX}* variables are written as JSON",
+        ) from error
+    except ConfigError as error:  # a name that cannot stand in a key
+        raise ConfigError(f"{where}: {error.problem}", remedy=error.remedy) from error
+    _check_router(read, where)
+    if "router" in read.processes and "connect" not in read.link.model_fields_set:
+        # One port is enough to say: who starts the router connects to it.
+        link = read.link.model_copy(update={"connect": _connect_to(read.router.listen)})
+    else:
+        link = read.link
+    return Profile.model_validate({**read.model_dump(), "link": link.model_dump()})
+
+
+def changed(profile: Profile, **tables: Mapping[str, Any]) -> Profile:
+    """A copy with some keys of some tables replaced, checked like a file.
+
+    Args:
+        profile: The profile to start from.
+        tables: For each table the keys to replace, e.g. ``recorder={"out": "runs/1"}``.
+
+    Raises:
+        ConfigError: A replaced value is wrong.
+    """
+    values = plain_values(profile)
+    for table, keys in tables.items():
+        values[table] = {**values.get(table, {}), **keys}
+    try:
+        return Profile.model_validate(values)
+    except ValidationError as error:
+        raise config_error(Profile, error, where="command line") from error
+
+
+def plain_values(profile: Profile) -> dict[str, Any]:
+    """A profile as plain values: strings, numbers, lists, mappings."""
+    # Not through JSON text, which has no infinity; None means the default in every table.
+    return profile.model_dump(mode="json", exclude_none=True)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        ConfigError: It cannot be read or is not TOML; the error names the line.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{path} is not TOML: {error}", remedy="correct that place; strings need quotes"
+        ) from error
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror or error}", remedy="check its permissions"
+        ) from error
+
+
+def _check_environment() -> None:
+    """A misspelt variable must not be ignored: nothing else would tell."""
+    for variable in os.environ:
+        if not variable.upper().startswith(ENV_PREFIX):
+            continue
+        field = variable[len(ENV_PREFIX) :].lower().split(ENV_NESTED)[0]
+        if field not in Profile.model_fields:
+            near = difflib.get_close_matches(field, Profile.model_fields, n=1, cutoff=0.5)
+            hint = f"did you mean {ENV_PREFIX}{near[0].upper()}? " if near else ""
+            raise ConfigError(
+                f"environment variable {variable} is not a key of a profile",
+                remedy=f"{hint}keys: {', '.join(Profile.model_fields)}; nested by {ENV_NESTED}",
+            )
+
+
+def _variable_of(loc: tuple[int | str, ...]) -> str | None:
+    """The environment variable that gave the value at ``loc``, if one did."""
+    set_here = {variable.upper(): variable for variable in os.environ}
+    for depth in range(len(loc), 0, -1):
+        name = ENV_PREFIX + ENV_NESTED.join(str(part) for part in loc[:depth]).upper()
+        if name in set_here:
+            return f"environment variable {set_here[name]}"
+    return None
+
+
+def _connect_to(listen: tuple[str, ...]) -> tuple[str, ...]:
+    """Where to find a router of this host that listens at ``listen``."""
+    return tuple(
+        endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+        for endpoint in listen
+    )
+
+
+def _check_router(profile: Profile, where: str) -> None:
+    if "router" not in profile.processes:
+        return
+    for endpoint in profile.router.listen:
+        host, _ = endpoint_host_port(endpoint)
+        exposed = not is_loopback(host)
+        if exposed and (profile.link.tls is None or not endpoint.startswith("tls/")):
+            raise ConfigError(
+                f"{where}: router.listen {endpoint!r} is reachable from other hosts without "
+                "mutual TLS",
+                remedy="use tls/HOST:PORT with [link.tls] certificates, or listen on 127.0.0.1",
+            )

@@ -1,0 +1,265 @@
+"""``palpate status``: who is there, and what each process says of itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from palpate.bus import Alive, Session, endpoints
+from palpate.config import LinkConfig
+from palpate.errors import PalpateError
+from palpate.messages import (
+    SensorState,
+    SensorStatus,
+    ServiceRequest,
+    ServiceState,
+    Status,
+)
+from palpate_deploy.station.logs import FAILED
+from palpate_gateway.timing.clock_map import ClockQuality
+from palpate_gateway.timing.discipline import Discipline
+
+_QUALITY = "clock_quality"
+_SMALL_PPM = 0.5
+
+
+def clock_lines(status: Status) -> list[str]:
+    """A line for each sensor whose clock is followed, and one for the host's wall clock."""
+    gauges = status.gauges
+    lines = []
+    for name in sorted(gauges):
+        head, dot, tail = name.rpartition(".")
+        if tail != _QUALITY:
+            continue
+        sensor = head or " ".join(status.sensors) or status.service
+        lines.append(f"clock of {sensor}: {_sensor_clock(gauges, head + dot)}")
+    if "wall_synchronised" in gauges:
+        kept = Discipline(gauges["wall_synchronised"] > 0.5, gauges.get("wall_error_s", 0.0))
+        lines.append(f"wall clock: {wall_words(kept)}")
+    if steps := status.counters.get("wall_steps", 0):
+        times = "once" if steps == 1 else f"{steps} times"
+        lines.append(f"wall clock: it was set {times} since the start of {status.service}")
+    return lines
+
+
+def wall_words(kept: Discipline | None) -> str:
+    """How the wall clock is kept, for people."""
+    if kept is None:
+        return "whether anything keeps it right is not known here"
+    if not kept.synchronised:
+        return "nothing keeps it right (chrony, NTP, PTP): compare times of this host only"
+    return f"kept right, to {duration_words(kept.error_s)} by the kernel's account"
+
+
+def duration_words(seconds: float) -> str:
+    """A short duration for people: ``12 us``, ``3.4 ms``, ``1.2 s``."""
+    if seconds < 1e-3:
+        return f"{1e6 * seconds:.0f} us"
+    return f"{1e3 * seconds:.1f} ms" if seconds < 1.0 else f"{seconds:.1f} s"
+
+
+def _sensor_clock(gauges: Mapping[str, float], prefix: str) -> str:
+    try:
+        quality = ClockQuality(int(gauges[prefix + _QUALITY]))
+    except ValueError:  # of a newer palpate
+        return f"quality {gauges[prefix + _QUALITY]:g}"
+    if quality is ClockQuality.ARRIVAL:
+        return "it tells none; stamps are the time of arrival"
+    drift_ppm = gauges.get(prefix + "clock_drift_ppm", 0.0)
+    delay_s = gauges.get(prefix + "clock_delay_p50_s")
+    words = ["settling" if quality is ClockQuality.SETTLING else "followed"]
+    if abs(drift_ppm) >= _SMALL_PPM:
+        words.append(f"{abs(drift_ppm):.0f} ppm {'fast' if drift_ppm > 0 else 'slow'}")
+    if delay_s is not None:
+        words.append(f"frames arrive {duration_words(delay_s)} after their stamps")
+    if quality is ClockQuality.ODD:
+        words.append("no quartz is that wrong: check the configured rate")
+    return ", ".join(words)
+
+
+_ANSWER_S = 1.0
+
+_COLOURS = {
+    ServiceState.STARTING: "yellow",
+    ServiceState.READY: "green",
+    ServiceState.DEGRADED: "red",
+    ServiceState.FINISHED: "cyan",
+    ServiceState.STOPPING: "yellow",
+}
+
+_SENSOR_COLOURS = {
+    SensorState.LIVE: "green",
+    SensorState.WARMING: "yellow",
+    SensorState.STARTING: "yellow",
+    SensorState.ZERO_LOST: "red",
+    SensorState.LOST: "red",
+    SensorState.ENDED: "cyan",
+}
+
+# What a person wants to see of each process first; the rest is in --json.
+TELLING_COUNTERS = (
+    "frames_published",
+    "frames_received",
+    "fields_received",
+    "estimates_published",
+    "recorded_electrodes",
+    "recorded_features",
+    "recorded_field",
+    "simulations_complete",
+)
+_TROUBLE = (
+    "lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown", "failed",
+    "wrong", "silences", "stuck", "dead",
+)  # fmt: skip
+
+
+def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status]:
+    """What every process of the station says of itself; broken answers are left out."""
+    answers = session.query_all(endpoints.STATUS, ServiceRequest(), timeout_s=timeout_s)
+    return [answer for answer in answers if not isinstance(answer, PalpateError)]
+
+
+def show_status(link: LinkConfig, station: str, *, as_json: bool) -> int:
+    """Print presence and status of a station.
+
+    Returns:
+        0, or 1 if nobody is there or a process is degraded.
+
+    Raises:
+        LinkError: There is no router.
+    """
+    with Session.open(link, station=station) as session:
+        present = session.alive()
+        answers = {(s.service, s.instance): s for s in ask_status(session)}
+        router = session.has_router()
+    if as_json:
+        print(json.dumps(_as_json(station, router, present, answers), indent=2))
+    else:
+        console = Console()
+        console.print(_table(station, present, answers))
+        for status in answers.values():
+            for line in clock_lines(status):
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
+    degraded = any(s.state is ServiceState.DEGRADED for s in answers.values())
+    silent = any((p.service, p.instance) not in answers for p in present)
+    return FAILED if not present or degraded or silent else 0
+
+
+def telling(status: Status) -> str:
+    """The counters that a person wants to see: what flows, and anything that went wrong."""
+    return "  ".join(
+        f"{name} {count:,}"
+        for name, count in sorted(status.counters.items())
+        if name in TELLING_COUNTERS or (count and any(word in name for word in _TROUBLE))
+    )
+
+
+def state_text(state: ServiceState) -> str:
+    """A state with its colour, as rich markup."""
+    return f"[{_COLOURS[state]}]{state.name.lower()}[/]"
+
+
+def duration_text(seconds: float) -> str:
+    """A duration for people: ``12 s``, ``3:05``, ``2:03:05``."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _table(station: str, present: Iterable[Alive], answers: dict[tuple[str, str], Status]) -> Table:
+    table = Table(title=f"station {station}", title_justify="left")
+    for column in ("process", "ready", "state", "up", "sensors", "says", "counters"):
+        table.add_column(column, overflow="fold")
+    for process in present:
+        name = process.service
+        if process.instance != process.service:
+            name += f"/{process.instance}"
+        ready = "[green]yes[/]" if process.ready else "[yellow]no[/]"
+        status = answers.get((process.service, process.instance))
+        if status is None:
+            table.add_row(name, ready, "[red]no answer[/]", "", "", "", "")
+            continue
+        says = escape(status.message)
+        if status.last_error is not None and status.state is ServiceState.DEGRADED:
+            error = status.last_error
+            says = f"{escape(error.message)} [dim](fix: {escape(error.remedy)})[/]"
+        table.add_row(
+            name,
+            ready,
+            state_text(status.state),
+            duration_text(status.uptime_s),
+            _sensors(status),
+            says,
+            telling(status),
+        )
+    if not table.row_count:
+        table.caption = f"nobody is alive at station {station!r}: start it with `palpate up`"
+    return table
+
+
+def _sensors(status: Status) -> str:
+    """Each sensor with its state and what is to be said of it, as rich markup."""
+    if not status.sensor_states:
+        return " ".join(status.sensors)
+    return "\n".join(map(_sensor, status.sensor_states))
+
+
+def _sensor(sensor: SensorStatus) -> str:
+    state = sensor.state.name.lower().replace("_", " ")
+    colour = _SENSOR_COLOURS.get(sensor.state, "yellow")
+    said = f" [dim]({escape(sensor.message)})[/]" if sensor.message else ""
+    return f"{escape(sensor.name)} [{colour}]{state}[/]{said}"
+
+
+def _as_json(
+    station: str,
+    router: bool,
+    present: Iterable[Alive],
+    answers: dict[tuple[str, str], Status],
+) -> dict[str, Any]:
+    processes = []
+    for process in present:
+        entry: dict[str, Any] = {
+            "service": process.service,
+            "instance": process.instance,
+            "ready": process.ready,
+        }
+        status = answers.get((process.service, process.instance))
+        if status is not None:
+            error = status.last_error
+            entry |= {
+                "state": status.state.name.lower(),
+                "uptime_s": round(status.uptime_s, 3),
+                "version": status.version,
+                "sensors": list(status.sensors),
+                "sensor_states": [_sensor_json(sensor) for sensor in status.sensor_states],
+                "message": status.message,
+                "counters": dict(status.counters),
+                "gauges": dict(status.gauges),
+                "last_error": None
+                if error is None
+                else {
+                    "code": error.code.name.lower(),
+                    "message": error.message,
+                    "remedy": error.remedy,
+                },
+            }
+        processes.append(entry)
+    return {"station": station, "router": router, "processes": processes}
+
+
+def _sensor_json(sensor: SensorStatus) -> dict[str, Any]:
+    return {
+        "name": sensor.name,
+        "state": sensor.state.name.lower(),
+        "since_monotonic_ns": sensor.since_monotonic_ns,
+        "faults": {fault.kind.name.lower(): list(fault.channels) for fault in sensor.faults},
+        "message": sensor.message,
+    }

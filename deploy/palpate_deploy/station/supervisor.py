@@ -1,0 +1,279 @@
+"""Starting and keeping alive the processes of a station, with supervisord."""
+
+from __future__ import annotations
+
+import configparser
+import http.client
+import io
+import os
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import xmlrpc.client
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from palpate.errors import PalpateError
+from palpate_deploy.station.host import check_free, new_run_folder, write_profile
+from palpate_deploy.station.parent import environment_for_children
+from palpate_deploy.station.processes import START_ORDER, command_line
+from palpate_deploy.station.profile import Profile, Service
+
+STOP_WAIT_S = 10
+"""A process that has not ended this long after SIGTERM is killed [s]."""
+
+_START_WAIT_S = 10.0
+_RPC_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error)
+
+
+class SupervisorError(PalpateError, RuntimeError):
+    """The process manager itself does not work."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessState:
+    """One supervised process.
+
+    Attributes:
+        service: Which.
+        state: supervisord's word: ``RUNNING``, ``STARTING``, ``BACKOFF``, ``EXITED``, ...
+        pid: Its process id; 0 = not running.
+        uptime_s: Since its last start [s].
+        restarts: How often it was started again in this run, as far as it was seen.
+        exit_status: Of the last end.
+    """
+
+    service: Service
+    state: str
+    pid: int
+    uptime_s: float
+    restarts: int
+    exit_status: int
+
+
+class Supervisor:
+    """The processes of a profile, kept running until ``stop``.
+
+    Args:
+        profile: What to run.
+        name: Stands in the name of the run's folder.
+
+    Raises:
+        LinkError: The router's port is in use.
+        SupervisorError: supervisord does not start.
+    """
+
+    def __init__(self, profile: Profile, name: str) -> None:
+        if "router" in profile.processes:
+            check_free(profile.router.listen)
+        self.profile = profile
+        self.folder = new_run_folder(name)
+        self._pids: dict[str, int] = {}
+        self._restarts: dict[str, int] = {}
+        # A socket's path may have 107 bytes; a folder of one's own in /tmp is surely shorter.
+        self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        self._socket = self._socket_folder / "supervisor.sock"
+        config = self.folder / "supervisord.conf"
+        config.write_text(self._config_text(write_profile(profile, self.folder)), encoding="utf-8")
+        self._process = self._spawn(config)
+        self._rpc = xmlrpc.client.ServerProxy(
+            "http://127.0.0.1", transport=_transport(self._socket)
+        )
+        try:
+            self._wait_for_rpc()
+        except BaseException:
+            self.stop()
+            raise
+
+    @property
+    def logs(self) -> Path:
+        """Folder of the logs."""
+        return self.folder / "logs"
+
+    @property
+    def pid(self) -> int:
+        """Process id of supervisord."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """Whether supervisord itself runs."""
+        return self._process.poll() is None
+
+    def processes(self) -> list[ProcessState]:
+        """State of each process, in the profile's order.
+
+        Raises:
+            SupervisorError: supervisord is gone.
+        """
+        try:
+            answers: Any = self._rpc.supervisor.getAllProcessInfo()
+        except _RPC_ERRORS as error:
+            raise SupervisorError(
+                f"supervisord does not answer: {error}",
+                remedy=f"see {self.logs / 'supervisord.log'}; start again with `palpate up`",
+            ) from error
+        found = {info["name"]: self._state(info) for info in answers}
+        return [found[name] for name in self.profile.processes]
+
+    def _state(self, info: dict[str, Any]) -> ProcessState:
+        name, pid = info["name"], int(info["pid"])
+        if pid and pid != self._pids.get(name, pid):
+            self._restarts[name] = self._restarts.get(name, 0) + 1
+        if pid:
+            self._pids[name] = pid
+        uptime_s = float(info["now"] - info["start"]) if pid else 0.0
+        return ProcessState(
+            name,
+            str(info["statename"]),
+            pid,
+            uptime_s,
+            self._restarts.get(name, 0),
+            int(info["exitstatus"]),
+        )
+
+    def stop(self) -> None:
+        """Stop every process in reverse order of starting, then supervisord. Harmless twice."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(timeout=STOP_WAIT_S * len(self.profile.processes) + 5)
+            except subprocess.TimeoutExpired:
+                self._process.kill()  # its processes notice and end themselves
+                self._process.wait()
+        shutil.rmtree(self._socket_folder, ignore_errors=True)
+
+    def log_tail(self, service: str, lines: int = 5) -> str:
+        """The last lines that a process logged."""
+        try:
+            text = (self.logs / f"{service}.log").read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return ""
+        return "\n".join(text.splitlines()[-lines:])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def _config_text(self, profile: Path) -> str:
+        config = configparser.RawConfigParser()
+        config.read_dict(
+            {
+                "unix_http_server": {"file": _escaped(str(self._socket)), "chmod": "0700"},
+                "rpcinterface:supervisor": {
+                    "supervisor.rpcinterface_factory": (
+                        "supervisor.rpcinterface:make_main_rpcinterface"
+                    )
+                },
+                "supervisord": {
+                    "logfile": _escaped(str(self.logs / "supervisord.log")),
+                    "logfile_maxbytes": "5MB",
+                    "logfile_backups": "2",
+                    "pidfile": _escaped(str(self.folder / "supervisord.pid")),
+                    "childlogdir": _escaped(str(self.logs)),
+                    "nodaemon": "true",
+                    "nocleanup": "true",
+                    "minfds": "256",
+                    "minprocs": "32",
+                    "identifier": "palpate",
+                },
+            }
+        )
+        for priority, service in enumerate(START_ORDER, start=1):
+            if service in self.profile.processes:
+                config.read_dict({f"program:{service}": self._program(service, priority, profile)})
+        text = io.StringIO()
+        config.write(text)
+        return text.getvalue()
+
+    def _program(self, service: Service, priority: int, profile: Path) -> dict[str, str]:
+        # A finite source that has come to its end is done; anything else that ends starts again.
+        finite = service == "gateway" and self.profile.gateway.exit_at_end
+        return {
+            "command": _escaped(shlex.join(command_line(service, profile))),
+            "directory": _escaped(str(Path.cwd())),
+            "priority": str(priority),
+            "autostart": "true",
+            "autorestart": "unexpected" if finite else "true",
+            "exitcodes": "0",
+            # One that ends within a second is tried again after growing pauses, not at once.
+            "startsecs": "1",
+            "startretries": "1000000",
+            "stopsignal": "TERM",
+            "stopwaitsecs": str(STOP_WAIT_S),
+            "stopasgroup": "false",
+            "killasgroup": "true",
+            "redirect_stderr": "true",
+            "stdout_logfile": _escaped(str(self.logs / f"{service}.log")),
+            "stdout_logfile_maxbytes": "10MB",
+            "stdout_logfile_backups": "3",
+        }
+
+    def _spawn(self, config: Path) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
+        with open(self.logs / "supervisord.out", "wb") as output:
+            return subprocess.Popen(
+                [*command, "-n", "-s", "-c", str(config)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment_for_children(),
+                # Ctrl-C in the terminal is for `palpate up`, which stops the rest in order.
+                start_new_session=True,
+            )
+
+    def _wait_for_rpc(self) -> None:
+        deadline = time.monotonic() + _START_WAIT_S
+        while time.monotonic() < deadline:
+            if self._process.poll() is not None:
+                break
+            if self._socket.exists():
+                try:
+                    self.processes()
+                except SupervisorError:
+                    pass
+                else:
+                    return
+            time.sleep(0.05)
+        output = (self.logs / "supervisord.out").read_text(encoding="utf-8", errors="replace")
+        raise SupervisorError(
+            f"supervisord did not start: {output.strip()[-500:] or 'no answer'}",
+            remedy=f"see the logs in {self.logs}",
+        )
+
+
+def _escaped(text: str) -> str:
+    """``%`` begins an expansion in supervisord's configuration."""
+    return text.replace("%", "%%")
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    def __init__(self, path: Path) -> None:
+        super().__init__("localhost", timeout=5)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(self.timeout)
+        self.sock.connect(os.fspath(self._path))
+
+
+def _transport(path: Path) -> xmlrpc.client.Transport:
+    class UnixTransport(xmlrpc.client.Transport):
+        def make_connection(self, host: Any) -> http.client.HTTPConnection:
+            return _UnixConnection(path)
+
+    return UnixTransport()

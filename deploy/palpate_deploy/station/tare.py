@@ -1,0 +1,66 @@
+"""``palpate tare``: the present load of a sensor as its zero."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from palpate.bus import Session, endpoints
+from palpate.config import LinkConfig
+from palpate.errors import LinkError
+from palpate.messages import FloatArray, Tare, TareRequest, WrenchZero, WrenchZeroRequest
+
+
+def take_tare(
+    link: LinkConfig, station: str, sensor: str, *, frames: int, timeout_s: float
+) -> None:
+    """Tare a sensor, whichever kind it is, and print what has become zero.
+
+    Raises:
+        LinkError: There is no router, or nobody serves that sensor.
+        RemoteError: The gateway refuses.
+        StreamTimeout: It does not answer in time.
+    """
+    with Session.open(link, station=station) as session:
+        try:
+            tare = _ask_tare(session, sensor, frames, timeout_s)
+        except LinkError as nobody:
+            # A force/torque sensor has no baseline to be asked for, but a zero.
+            try:
+                zero = _ask_zero(session, sensor, frames, timeout_s)
+            except LinkError:
+                raise nobody from None
+            _print_zero(sensor, zero)
+        else:
+            _print_tare(sensor, tare)
+
+
+def _ask_tare(session: Session, sensor: str, frames: int, timeout_s: float) -> Tare:
+    return session.query(
+        endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
+    )
+
+
+def _ask_zero(session: Session, sensor: str, readings: int, timeout_s: float) -> WrenchZero:
+    return session.query(
+        endpoints.ZERO, WrenchZeroRequest(readings=readings), sensor=sensor, timeout_s=timeout_s
+    )
+
+
+def _print_tare(sensor: str, tare: Tare) -> None:
+    numbers = " ".join(f"{value:.0f}" for value in tare.electrodes)
+    print(f"tared {sensor} ({tare.sensor_serial}) over {tare.frames_averaged} frames")
+    print(f"tare id   {tare.tare_id}")
+    print(f"baseline  {numbers} counts")
+    print(f"noise     {float(np.median(tare.electrodes_sd)):.2f} counts (median of electrodes)")
+
+
+def _print_zero(sensor: str, zero: WrenchZero) -> None:
+    print(f"zeroed {sensor} ({zero.sensor_serial}, {zero.device})")
+    print(f"before  {_wrench(zero.force_before, zero.torque_before)}")
+    print(f"after   {_wrench(zero.force_after, zero.torque_after)}")
+    print(f"means of {zero.readings_averaged} readings each")
+
+
+def _wrench(force: FloatArray, torque: FloatArray) -> str:
+    newtons = " ".join(f"{value:+.3f}" for value in force)
+    return f"{newtons} N  " + " ".join(f"{value:+.4f}" for value in torque) + " N m"

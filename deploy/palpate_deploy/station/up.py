@@ -1,0 +1,169 @@
+"""``palpate up``: a station in the foreground, on one screen."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from types import FrameType
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from palpate.bus import Delivery, Session, Subscriber
+from palpate.bus.topics import STATUS
+from palpate.errors import StreamTimeout
+from palpate.messages import ServiceState, Status
+from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.profile import Profile
+from palpate_deploy.station.status import duration_text, state_text, telling
+from palpate_deploy.station.supervisor import ProcessState, Supervisor, SupervisorError
+
+_REFRESH_S = 0.25
+_SILENT_AFTER_S = 3.0
+
+_STATE_COLOURS = {"RUNNING": "green", "STARTING": "yellow", "STOPPING": "yellow"}
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that ``SIGINT``, ``SIGTERM`` and ``SIGHUP`` set."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, on_signal)
+    return stop
+
+
+def run_up(profile: Profile, name: str) -> int:
+    """Run a station until a signal, or until its finite source has ended.
+
+    Args:
+        profile: What to run.
+        name: Its name, for the screen and the run's folder.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        LinkError: The router's port is in use.
+        SupervisorError: supervisord does not start, or dies.
+    """
+    console = Console()
+    stop = stop_on_signals()
+    with Supervisor(profile, name) as supervisor:
+        console.print(
+            f"station {profile.station!r} is up: {', '.join(profile.processes)}\n"
+            f"router {', '.join(profile.link.connect)}   logs {supervisor.logs}\n"
+            "Ctrl-C stops it",
+            soft_wrap=True,
+            markup=False,
+        )
+        link = profile.link.model_copy(update={"wait_for_router_s": -1.0})
+        with Session.open(link, station=profile.station) as session:
+            statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
+            if console.is_terminal:
+                finished = _watch_on_screen(console, supervisor, statuses, stop)
+            else:
+                finished = _watch_plainly(console, supervisor, stop)
+        if not stop.is_set() and not finished:
+            raise SupervisorError(
+                "supervisord is gone", remedy=f"see {supervisor.logs / 'supervisord.log'}"
+            )
+        console.print("stopping ...")
+    console.print("stopped")
+    return 0 if finished in (None, 0) else FAILED
+
+
+def _watch_on_screen(
+    console: Console,
+    supervisor: Supervisor,
+    statuses: Subscriber[Status],
+    stop: threading.Event,
+) -> int | None:
+    """Redraw the screen until a signal (None) or the end of a finite source (its status)."""
+    known: dict[str, tuple[Status, float]] = {}
+    with Live(console=console, auto_refresh=False) as live:
+        while not stop.is_set() and supervisor.running:
+            _take(statuses, known)
+            processes = supervisor.processes()
+            live.update(_screen(processes, known), refresh=True)
+            if (finished := _finished(supervisor, processes)) is not None:
+                return finished
+            stop.wait(_REFRESH_S)
+    return None
+
+
+def _watch_plainly(console: Console, supervisor: Supervisor, stop: threading.Event) -> int | None:
+    """Say only what changes, for a log file or a service manager."""
+    before: dict[str, tuple[str, int]] = {}
+    while not stop.is_set() and supervisor.running:
+        processes = supervisor.processes()
+        for process in processes:
+            now = (process.state, process.pid)
+            if before.get(process.service) != now:
+                before[process.service] = now
+                console.print(
+                    f"{time.strftime('%H:%M:%S')} {process.service}: {process.state.lower()}"
+                    + (f", pid {process.pid}" if process.pid else "")
+                    + (f", restart {process.restarts}" if process.restarts else ""),
+                    highlight=False,
+                )
+        if (finished := _finished(supervisor, processes)) is not None:
+            return finished
+        stop.wait(_REFRESH_S)
+    return None
+
+
+def _finished(supervisor: Supervisor, processes: list[ProcessState]) -> int | None:
+    """Exit status of a finite gateway that has ended."""
+    if not supervisor.profile.gateway.exit_at_end:
+        return None
+    for process in processes:
+        if process.service == "gateway" and process.state == "EXITED":
+            return process.exit_status
+    return None
+
+
+def _take(statuses: Subscriber[Status], known: dict[str, tuple[Status, float]]) -> None:
+    while True:
+        try:
+            status = statuses.next(timeout_s=0).message
+        except StreamTimeout:
+            return
+        if status.instance == status.service:
+            known[status.service] = (status, time.monotonic())
+
+
+def _screen(processes: list[ProcessState], known: dict[str, tuple[Status, float]]) -> Group:
+    table = Table(expand=True)
+    for column in ("process", "runs", "pid", "up", "restarts", "says", "counters"):
+        table.add_column(column, overflow="fold")
+    problems: list[str] = []
+    for process in processes:
+        colour = _STATE_COLOURS.get(process.state, "red")
+        status, heard_s = known.get(process.service, (None, 0.0))
+        says = counters = ""
+        if status is not None and time.monotonic() - heard_s < _SILENT_AFTER_S:
+            says = f"{state_text(status.state)} {escape(status.message)}"
+            counters = telling(status)
+            if status.last_error is not None and status.state is ServiceState.DEGRADED:
+                problems.append(
+                    f"{process.service}: {status.last_error.message}\n"
+                    f"  fix: {status.last_error.remedy}"
+                )
+        table.add_row(
+            process.service,
+            f"[{colour}]{process.state.lower()}[/]",
+            str(process.pid or "-"),
+            duration_text(process.uptime_s),
+            str(process.restarts or "-"),
+            says,
+            counters,
+        )
+    return Group(table, *(Text(problem, style="red") for problem in problems))

@@ -1,0 +1,1 @@
+"""A bundle on disk to estimates on the bus."""

@@ -1,0 +1,100 @@
+"""Meshes of fields by content hash: whatever bundle holds one can lend it to a picture."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from palpate.errors import BundleError, ConfigError
+from palpate.files.bundle import read_mesh
+from palpate.files.field_mesh import FieldMesh
+
+MANIFEST = "manifest.json"
+
+PACKAGED = Path(__file__).parent.parent / "models"
+"""Bundles that come with palpate: ``<name>/<version>/{model.onnx,manifest.json,golden.npz}``."""
+
+
+def available(models: Path = PACKAGED) -> list[str]:
+    """Bundles of a repository as ``name:version``, oldest version first.
+
+    Args:
+        models: Folder of the repository.
+    """
+    found = [
+        (folder.parent.name, int(folder.name))
+        for folder in models.glob("*/*")
+        if folder.name.isdigit() and (folder / MANIFEST).is_file()
+    ]
+    return [f"{name}:{version}" for name, version in sorted(found)]
+
+
+def resolve(bundle: str, models: Path = PACKAGED) -> Path:
+    """Find the folder of a bundle.
+
+    Args:
+        bundle: ``name`` (newest version), ``name:version``, or the path of a bundle's folder.
+        models: Folder of the repository.
+
+    Raises:
+        ConfigError: There is no such bundle; the error lists what exists.
+    """
+    # Only a separator or a dot makes it a path: a folder of the same name in the working directory
+    # must not silently take the place of a packaged bundle.
+    if "/" in bundle or bundle.startswith("."):
+        folder = Path(bundle).expanduser()
+        if (folder / MANIFEST).is_file():
+            return folder
+        raise ConfigError(
+            f"bundle {bundle!r}: no {MANIFEST} in {folder.absolute()}",
+            remedy="give the folder that holds model.onnx, manifest.json and golden.npz",
+        )
+    known = available(models)
+    name, _, version = bundle.partition(":")
+    versions = [int(entry.partition(":")[2]) for entry in known if entry.startswith(f"{name}:")]
+    if versions and not version:
+        return models / name / str(max(versions))
+    if version.isdigit() and int(version) in versions:
+        return models / name / str(int(version))
+    raise ConfigError(
+        f"bundle {bundle!r} is not in the repository {models}",
+        remedy=f"available: {', '.join(known)}" if known else "make one with: make bundle",
+    )
+
+
+log = logging.getLogger(__name__)
+
+
+class MeshLibrary:
+    """Knows the meshes of the packaged bundles and of some more.
+
+    Args:
+        bundles: More bundles, by name or folder.
+        models: Folder of the packaged ones.
+
+    Raises:
+        ConfigError: One of ``bundles`` does not exist.
+    """
+
+    def __init__(self, bundles: Sequence[str] = (), models: Path = PACKAGED) -> None:
+        self._folders = [resolve(bundle, models) for bundle in bundles]
+        self._models = models
+        self._known: dict[bytes, FieldMesh] | None = None
+
+    def find(self, sha256: bytes) -> FieldMesh | None:
+        """The mesh of this content hash; None if no bundle holds it."""
+        if self._known is None:
+            self._known = {mesh.sha256: mesh for mesh in self._read()}
+        return self._known.get(sha256)
+
+    def _read(self) -> Iterator[FieldMesh]:
+        packaged = (resolve(name, self._models) for name in available(self._models))
+        for folder in (*packaged, *self._folders):
+            try:
+                mesh = read_mesh(folder)
+            except BundleError as error:  # a picture needs no bundle but the one with its mesh
+                log.warning("no mesh from this bundle: %s", error)
+                continue
+            if mesh is not None:
+                yield mesh

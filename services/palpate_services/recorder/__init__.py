@@ -1,0 +1,1 @@
+"""Everything that is published on the bus, written to MCAP records."""

@@ -1,0 +1,1 @@
+"""Pictures of records and simulations: Rerun views and plots."""

@@ -1,0 +1,265 @@
+"""The Rerun view of simulations: a store in, one ``.rrd`` with an explicit layout out.
+
+For looking only. A tab for each trajectory: the pressurised skin coloured by how far it moved, the
+core, the indenter, what touches and pushes where, and curves, over the steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate.extras import require
+from palpate_services.viewer.layout import (
+    AXES,
+    SIDES,
+    STEP,
+    TRUTH_COLOUR,
+    border_of,
+    layout,
+    normals_of,
+    series,
+    shades,
+)
+from palpate_services.viewer.rerun import APPLICATION
+from palpate_services.viewer.simulation_file import Finger, Floats, Press, Simulations, choose
+
+MOST = 8
+"""Trajectories in one view unless asked for more: 4 MB each, and as many tabs as fit."""
+
+LONGEST_ARROW_M = 3e-3
+"""Length of a trajectory's largest nodal force."""
+
+NET_ARROW_M_PER_N = 5e-4
+
+_TOUCH_COLOUR = (240, 82, 96)
+_CORE_PUSH_COLOUR = (120, 200, 255)
+_CORE_COLOUR = (92, 108, 140)
+_INDENTER_COLOUR = (226, 182, 120)
+
+
+def review_simulations(
+    store: Path,
+    view: Path | None = None,
+    *,
+    trajectories: Sequence[str] = (),
+    most: int = MOST,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Make the view of a store.
+
+    Args:
+        store: A folder ``NAME.sim`` or an exported file.
+        view: The file to write; None = beside the store with the ending ``.rrd``.
+        trajectories: Which, by id or pattern; none = a choice from all.
+        most: How many at most.
+        progress: Told how many of how many are drawn.
+
+    Returns:
+        The file written.
+
+    Raises:
+        DatasetError: The store is damaged, has none of these, or the view cannot be written.
+        MissingExtraError: Rerun or h5py is not installed.
+    """
+    rr = require("rerun", extra="services")
+    simulations = Simulations(store)
+    names = choose(simulations.ids(), trajectories, most)
+    finger = simulations.finger()
+    # One scale for all, so that colours can be compared between tabs.
+    longest_m = max(_furthest(simulations.press(name)) for name in names) or 1e-3
+    target = store.with_suffix(".rrd") if view is None else view
+    stream = rr.RecordingStream(APPLICATION)
+    try:
+        stream.save(target, default_blueprint=layout(names, longest_m))
+        stream.send_recording_name(store.stem)
+        for count, name in enumerate(names):
+            if progress is not None:
+                progress(count, len(names))
+            _Drawing(rr, stream, finger, simulations.press(name), longest_m).draw()
+        stream.flush(timeout_sec=30.0)
+    except DatasetError:
+        raise
+    except Exception as error:  # Rerun's errors share no base of their own
+        raise DatasetError(
+            f"{target}: Rerun cannot write the view: {error}",
+            remedy="check the folder's rights and free space; the store is not affected",
+        ) from error
+    finally:
+        stream.disconnect()
+    return target
+
+
+def _furthest(press: Press) -> float:
+    return float(np.linalg.norm(press.displacement, axis=2).max(initial=0.0))
+
+
+class _Drawing:
+    """One trajectory on its way into the stream."""
+
+    def __init__(
+        self, rr: Any, stream: Any, finger: Finger, press: Press, longest_m: float
+    ) -> None:
+        self._rr, self._stream, self._finger, self._press = rr, stream, finger, press
+        self._longest_m = longest_m
+        self._count = len(press.pose)
+        self._positions = (finger.nodes + press.displacement).astype(np.float32)
+
+    def draw(self) -> None:
+        self._fixed()
+        self._skin()
+        self._indenter()
+        self._patch()
+        press = self._press
+        largest = max(_largest(press.indenter_force), _largest(press.core_force)) or 1.0
+        for name, force, colour in (
+            ("indenter", press.indenter_force, _TOUCH_COLOUR),
+            ("core", press.core_force, _CORE_PUSH_COLOUR),
+        ):
+            loaded = np.abs(force).max(axis=2) > 1e-3 * largest
+            self._arrows(
+                f"finger/push/{name}",
+                [self._positions[at][loaded[at]] for at in range(self._count)],
+                [LONGEST_ARROW_M / largest * force[at][loaded[at]] for at in range(self._count)],
+                colour,
+                4e-5,
+            )
+        self._net_force()
+        for at, axis in enumerate(AXES):
+            self._curve(f"force/{axis}", press.force[:, at])
+        self._curve("pressure", press.fluid_pressure_pa)
+        self._curve("area", press.contact_area_m2)
+        self._curve("newton", press.iterations)
+
+    def _fixed(self) -> None:
+        """What does not change: core, looks, words."""
+        rr, press, finger = self._rr, self._press, self._finger
+        vertices = finger.core_vertices.astype(np.float32)
+        core = rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=finger.core_faces,
+            vertex_normals=normals_of(vertices, finger.core_faces),
+            albedo_factor=_CORE_COLOUR,
+        )
+        self._log("finger/core", core)
+        for entity, look in series(rr).items():
+            self._log(entity, look)
+        peak = np.linalg.norm(press.force, axis=1).max(initial=0.0)
+        facts = {
+            "indenter": press.indenter,
+            "outcome": press.outcome + (f": {press.reason}" if press.reason else ""),
+            "steps": str(self._count - 1),
+            "largest force": f"{peak:.3g} N",
+            **finger.facts,
+        }
+        lines = [f"| {name} | {value} |" for name, value in facts.items()]
+        text = "\n".join([f"**{press.id}**", "", "| | |", "|---|---|", *lines])
+        self._log("about", rr.TextDocument(text, media_type="text/markdown"))
+
+    def _skin(self) -> None:
+        """Outer and inner surface, as two halves."""
+        rr, finger = self._rr, self._finger
+        faces = np.concatenate([finger.outer, finger.inner])
+        lateral = finger.nodes[faces][:, :, 1].mean(axis=1)
+        moved = np.linalg.norm(self._press.displacement, axis=2)
+        colours = shades(moved / self._longest_m)
+        normals = np.stack([normals_of(positions, faces) for positions in self._positions])
+        for side, chosen in zip(SIDES, (lateral >= 0, lateral < 0), strict=True):
+            used, triangles = np.unique(faces[chosen], return_inverse=True)
+            if not len(used):
+                continue
+            entity = f"finger/skin/{side}"
+            indices = triangles.reshape(-1, 3).astype(np.uint32)
+            self._log(entity, rr.Mesh3D.from_fields(triangle_indices=indices))
+            columns = rr.Mesh3D.columns(
+                vertex_positions=self._positions[:, used].reshape(-1, 3),
+                vertex_normals=normals[:, used].reshape(-1, 3),
+                vertex_colors=colours[:, used].reshape(-1),
+            )
+            self._send(entity, columns.partition([len(used)] * self._count))
+
+    def _indenter(self) -> None:
+        rr, press = self._rr, self._press
+        w, x, y, z = press.pose[:, 3:].T
+        columns = rr.Transform3D.columns(
+            translation=press.pose[:, :3], quaternion=np.stack([x, y, z, w], axis=1)
+        )
+        self._send("finger/indenter", columns)
+        if press.shape is None:
+            self._log("finger/indenter/tip", rr.Points3D([[0.0, 0.0, 0.0]], radii=[3e-4]))
+            return
+        vertices, faces = press.shape[0].astype(np.float32), press.shape[1]
+        # Each face its own corners: an edge of a cube must look like one.
+        corners = vertices[faces].reshape(-1, 3)
+        alone = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+        body = rr.Mesh3D(
+            vertex_positions=corners,
+            triangle_indices=alone,
+            vertex_normals=normals_of(corners, alone),
+            albedo_factor=_INDENTER_COLOUR,
+        )
+        self._log("finger/indenter/shape", body)
+
+    def _patch(self) -> None:
+        """Outline of the triangles that the indenter pushes at, and the centre of pressure."""
+        rr, press = self._rr, self._press
+        strips = []
+        for positions, force in zip(self._positions, press.indenter_force, strict=True):
+            loaded = np.abs(force).max(axis=1) > 0
+            touched = self._finger.outer[loaded[self._finger.outer].all(axis=1)]
+            strips.append(list(positions[border_of(touched)]))
+        self._log("finger/patch", rr.LineStrips3D.from_fields(colors=[_TOUCH_COLOUR], radii=[7e-5]))
+        columns = rr.LineStrips3D.columns(strips=[strip for step in strips for strip in step])
+        self._send("finger/patch", columns.partition([len(step) for step in strips]))
+        there = np.isfinite(press.centre_of_pressure).all(axis=1)
+        centres = press.centre_of_pressure[there]
+        self._log(
+            "finger/centre_of_pressure",
+            rr.Points3D.from_fields(colors=[TRUTH_COLOUR], radii=[2e-4]),
+        )
+        columns = rr.Points3D.columns(positions=centres).partition(there.astype(int))
+        self._send("finger/centre_of_pressure", columns)
+
+    def _net_force(self) -> None:
+        press = self._press
+        steps = range(self._count)
+        known = [[k] if np.isfinite(press.centre_of_pressure[k]).all() else [] for k in steps]
+        at = [press.centre_of_pressure[k] for k in known]
+        vectors = [NET_ARROW_M_PER_N * press.force[k] for k in known]
+        self._arrows("finger/force", at, vectors, TRUTH_COLOUR, 1.5e-4)
+
+    def _arrows(
+        self,
+        entity: str,
+        ends: Sequence[Floats],
+        vectors: Sequence[Floats],
+        colour: tuple[int, int, int],
+        radius_m: float,
+    ) -> None:
+        """Forces on the skin: each arrow ends where it pushes."""
+        rr = self._rr
+        self._log(entity, rr.Arrows3D.from_fields(colors=[colour], radii=[radius_m]))
+        flat = np.concatenate(vectors).astype(np.float32)
+        origins = np.concatenate(ends).astype(np.float32) - flat
+        columns = rr.Arrows3D.columns(vectors=flat, origins=origins)
+        self._send(entity, columns.partition([len(step) for step in vectors]))
+
+    def _curve(self, entity: str, values: npt.NDArray[Any]) -> None:
+        columns = self._rr.Scalars.columns(scalars=np.asarray(values, np.float64))
+        self._send(entity, columns)
+
+    def _log(self, entity: str, value: Any) -> None:
+        self._stream.log(f"{self._press.id}/{entity}", value, static=True)
+
+    def _send(self, entity: str, columns: Any) -> None:
+        steps = self._rr.TimeColumn(STEP, sequence=range(self._count))
+        self._stream.send_columns(f"{self._press.id}/{entity}", [steps], columns)
+
+
+def _largest(force: Floats) -> float:
+    return float(np.linalg.norm(force, axis=2).max(initial=0.0))

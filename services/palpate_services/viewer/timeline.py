@@ -1,0 +1,305 @@
+"""What is drawn of one sensor: messages sorted into rows, estimates matched with their truth.
+
+Knows no drawing library, so ``view`` stays a thin adapter.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.messages import (
+    NO_TARE,
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    FieldFrame,
+    FloatArray,
+    IndenterPoseFrame,
+    SensorType,
+    Stamp,
+    SynthesisEstimate,
+    Tare,
+    WrenchFrame,
+    as_field_frame,
+)
+
+DRAW_PERIOD_NS = 200_000_000
+"""Fields are drawn five times a second at most, by the clock of their stamps: 16 bytes a vertex."""
+
+VISIBLE_M = 2e-5
+"""A field that differs less than this from the one drawn last is not drawn again: a hundredth of
+the colour scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldRow:
+    """One field to draw.
+
+    Attributes:
+        time_ns: Wall clock [ns since the Unix epoch].
+        sequence: Sequence number of the reading.
+        mesh_sha256: Content hash of its mesh.
+        displacement: Nodal displacement [m], shape ``(V, 3)``.
+    """
+
+    time_ns: int
+    sequence: int
+    mesh_sha256: bytes
+    displacement: FloatArray
+
+
+class FieldThinner:
+    """Chooses, of one stream of fields, those to draw."""
+
+    def __init__(self) -> None:
+        self._period: int | None = None
+        self._drawn: FieldRow | None = None
+
+    def row(self, field: FieldFrame) -> FieldRow | None:
+        """The field as a row; None if it need not be drawn."""
+        stamp = field.stamp
+        period = stamp.wall_ns // DRAW_PERIOD_NS
+        if period == self._period:
+            return None
+        self._period = period
+        row = FieldRow(stamp.wall_ns, stamp.sequence, field.mesh_sha256, field.displacement)
+        if self._drawn is not None and _alike(row, self._drawn):
+            return None
+        self._drawn = row
+        return row
+
+
+def _alike(one: FieldRow, other: FieldRow) -> bool:
+    return (
+        one.mesh_sha256 == other.mesh_sha256
+        and one.displacement.shape == other.displacement.shape
+        and float(np.abs(one.displacement - other.displacement).max()) < VISIBLE_M
+    )
+
+
+Values = npt.NDArray[Any]
+
+REMEMBERED = 4096
+"""Readings whose truth and estimate may wait for one another: 40 s at 100 Hz."""
+
+_NOWHERE = np.full(3, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One reading of one quantity.
+
+    Attributes:
+        time_ns: Wall clock [ns since the Unix epoch].
+        sequence: Sequence number of the reading.
+        values: The quantity, shape ``(n,)``; None = nothing there (no contact).
+        at: Where a force acts [m], shape ``(3,)``; None = unknown or no contact.
+        slot_period_ns: Time between two slots of the frame [ns].
+    """
+
+    time_ns: int
+    sequence: int
+    values: Any
+    at: Values | None = None
+    slot_period_ns: int = 0
+
+
+def _by_source() -> dict[str, list[Row]]:
+    return {"truth": [], "estimate": []}
+
+
+@dataclass(slots=True)
+class Rows:
+    """What has come since the last drawing.
+
+    Attributes:
+        electrodes: Counts by ``raw`` or ``tared``, values of shape ``(19,)`` (SP: 24) [counts].
+        pressure: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28); NaN
+            where not valid, e.g. lost.
+        force: Force by ``truth`` or ``estimate`` [N], shape ``(3,)``.
+        arrow: The same where it is known whether and where it acts.
+        location: Contact location likewise [m], shape ``(3,)`` or None.
+        error: Magnitude of the error of ``force`` [N] and ``location`` [m], shape ``(1,)``.
+        fields: Fields to draw by ``truth`` or ``estimate``.
+        synthesised: Tared counts synthesised from a field, shape ``(19,)`` [counts].
+    """
+
+    electrodes: dict[str, list[Row]] = field(default_factory=lambda: {"raw": [], "tared": []})
+    pressure: list[Row] = field(default_factory=list)
+    force: dict[str, list[Row]] = field(default_factory=_by_source)
+    arrow: dict[str, list[Row]] = field(default_factory=_by_source)
+    location: dict[str, list[Row]] = field(default_factory=_by_source)
+    error: dict[str, list[Row]] = field(default_factory=lambda: {"force": [], "location": []})
+    fields: dict[str, list[FieldRow]] = field(default_factory=lambda: {"truth": [], "estimate": []})
+    synthesised: list[Row] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Reading:
+    """The messages of one reading, matched by sensor and monotonic time."""
+
+    wrench: WrenchFrame | None = None
+    pose: IndenterPoseFrame | None = None
+    estimate: FeatureEstimate | None = None
+
+    def force_error(self) -> Values | None:
+        """Estimate minus truth [N], shape ``(3,)``; None without both."""
+        if self.estimate is None or self.wrench is None:
+            return None
+        return self.estimate.force.astype(np.float64) - self.wrench.force
+
+    def location_error(self) -> Values | None:
+        """Estimate minus truth [m], shape ``(3,)``; None without both, or without contact."""
+        if self.estimate is None or self.pose is None or not self.pose.in_contact:
+            return None
+        if self.estimate.contact_location is None:
+            return None
+        return self.estimate.contact_location.astype(np.float64) - self.pose.position
+
+
+class Matcher:
+    """Brings messages of the same reading together, whatever order they come in.
+
+    Args:
+        remember: Readings kept; the oldest is forgotten first. None = all.
+    """
+
+    def __init__(self, remember: int | None = REMEMBERED) -> None:
+        self._remember = remember
+        self._readings: OrderedDict[int, Reading] = OrderedDict()
+
+    def add(self, message: WrenchFrame | IndenterPoseFrame | FeatureEstimate) -> Reading:
+        """Add a message and return its reading as far as it is known."""
+        stamp = message.source if isinstance(message, FeatureEstimate) else message.stamp
+        reading = self._readings.setdefault(stamp.monotonic_ns, Reading())
+        if isinstance(message, FeatureEstimate):
+            reading.estimate = message
+        elif isinstance(message, WrenchFrame):
+            reading.wrench = message
+        else:
+            reading.pose = message
+        if self._remember is not None and len(self._readings) > self._remember:
+            self._readings.popitem(last=False)
+        return reading
+
+    def readings(self) -> Mapping[int, Reading]:
+        """Readings by monotonic time [ns]."""
+        return self._readings
+
+
+class SensorScene:
+    """Sorts the messages of one sensor into rows to draw."""
+
+    TOPICS: ClassVar[frozenset[str]] = frozenset(
+        {"electrodes", "tare", "wrench", "pose", "features", "field", "field_truth", "synthesis"}
+    )
+
+    def __init__(self) -> None:
+        self._rows = Rows()
+        self._matcher = Matcher()
+        self._tares: dict[int, Tare] = {}
+        self._thinners = {"truth": FieldThinner(), "estimate": FieldThinner()}
+        self.pending = False
+        self.has_fields = False
+        self.sensor_type = SensorType.BIOTAC
+        """Type of the last frame; before the first that of most sensors."""
+
+    def add(self, message: Any) -> None:
+        """Take one decoded message."""
+        if isinstance(message, Tare):
+            self._tares[message.tare_id] = message
+            return
+        self.pending = True
+        if isinstance(message, ElectrodeFrame):
+            self._add_frame(message)
+        elif isinstance(message, FeatureEstimate):
+            self._add_estimate(message)
+        elif isinstance(message, WrenchFrame):
+            self._add_wrench(message)
+        elif isinstance(message, IndenterPoseFrame):
+            self._add_pose(message)
+        elif isinstance(message, FieldFrame):
+            self._add_field("truth", message)
+        elif isinstance(message, FieldEstimate):
+            self._add_field("estimate", as_field_frame(message))
+        elif isinstance(message, SynthesisEstimate):
+            self.has_fields = True
+            self._rows.synthesised.append(_row(message.source, message.tared_counts))
+
+    def take(self) -> Rows:
+        """Hand over what has come, and start afresh."""
+        rows, self._rows, self.pending = self._rows, Rows(), False
+        return rows
+
+    def _add_frame(self, frame: ElectrodeFrame) -> None:
+        self.sensor_type = frame.sensor_type
+        tare = self._tares.get(frame.tare_id) if frame.tare_id != NO_TARE else None
+        if tare is None or tare.electrodes.shape != frame.electrodes.shape:
+            kind, counts = "raw", frame.electrodes.astype(np.float32)
+        else:
+            kind, counts = "tared", frame.electrodes - tare.electrodes
+        self._rows.electrodes[kind].append(_row(frame.stamp, counts))
+        pressure = np.concatenate([[frame.pdc], frame.pac]).astype(np.float32)
+        layout = frame.sensor_type.layout
+        if frame.validity != layout.all_valid:
+            bits = (layout.pdc_bit, *range(layout.first_pac_bit, layout.slots))
+            pressure[[not frame.validity >> bit & 1 for bit in bits]] = np.nan
+        stamp = frame.stamp
+        self._rows.pressure.append(
+            Row(stamp.wall_ns, stamp.sequence, pressure, slot_period_ns=frame.slot_period_ns)
+        )
+
+    def _add_estimate(self, estimate: FeatureEstimate) -> None:
+        reading = self._matcher.add(estimate)
+        location = estimate.contact_location
+        row = _row(estimate.source, estimate.force, at=location)
+        self._rows.force["estimate"].append(row)
+        self._rows.arrow["estimate"].append(row)
+        self._rows.location["estimate"].append(_row(estimate.source, location))
+        self._add_error("force", estimate.source, reading.force_error())
+        self._add_location_error(estimate.source, reading)
+
+    def _add_wrench(self, wrench: WrenchFrame) -> None:
+        reading = self._matcher.add(wrench)
+        self._rows.force["truth"].append(_row(wrench.stamp, wrench.force))
+        self._add_true_arrow(reading)
+        self._add_error("force", wrench.stamp, reading.force_error())
+
+    def _add_pose(self, pose: IndenterPoseFrame) -> None:
+        reading = self._matcher.add(pose)
+        position = pose.position if pose.in_contact else None
+        self._rows.location["truth"].append(_row(pose.stamp, position))
+        self._add_true_arrow(reading)
+        self._add_location_error(pose.stamp, reading)
+
+    def _add_field(self, name: str, known: FieldFrame) -> None:
+        self.has_fields = True
+        row = self._thinners[name].row(known)
+        if row is not None:
+            self._rows.fields[name].append(row)
+
+    def _add_true_arrow(self, reading: Reading) -> None:
+        if reading.wrench is not None and reading.pose is not None:
+            at = reading.pose.position if reading.pose.in_contact else None
+            row = _row(reading.wrench.stamp, reading.wrench.force, at=at)
+            self._rows.arrow["truth"].append(row)
+
+    def _add_location_error(self, stamp: Stamp, reading: Reading) -> None:
+        error = reading.location_error()
+        if error is None and reading.estimate is not None and reading.pose is not None:
+            error = _NOWHERE  # a gap in the line, not a line across the time without contact
+        self._add_error("location", stamp, error)
+
+    def _add_error(self, what: str, stamp: Stamp, error: Values | None) -> None:
+        if error is not None:
+            self._rows.error[what].append(_row(stamp, np.array([np.linalg.norm(error)])))
+
+
+def _row(stamp: Stamp, values: Any, *, at: Values | None = None) -> Row:
+    return Row(stamp.wall_ns, stamp.sequence, values, at=at)
