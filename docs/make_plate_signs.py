@@ -22,13 +22,14 @@ from palpate_fem.population.answers import Population
 from palpate_fem.population.member import read_population
 from palpate_fem.service.biotac import BiotacTip
 from palpate_gateway.biotac.conversions import BIOTAC
-from palpate_training.twin_figures.plate import (
+from palpate_training.figures.plate import (
     TOUCHED_COUNTS,
     VENTRAL_COS,
+    agreement,
     plate_response,
     read_plate_logs,
+    signs,
 )
-from palpate_training.twin_figures.signs import agreement, signs
 
 Floats = NDArray[np.float64]
 

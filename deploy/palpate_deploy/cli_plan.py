@@ -13,7 +13,7 @@ from palpate.errors import ConfigError
 from palpate_deploy.cli.options import JsonOption, show_left_out
 
 if TYPE_CHECKING:
-    from palpate_training.testbed.plan import Eliminated, Plan
+    from palpate_training.experiment.plan import Eliminated, Plan
 
 plan_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -63,9 +63,9 @@ def plan(
     from palpate_fem.cli.show import console, progress_bar
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_fem.store.read import SimulationStore
-    from palpate_training.testbed.given import arms_of, by_arm
-    from palpate_training.testbed.registration_file import read_registrations
-    from palpate_training.testbed.trajectory_file import write_trajectories
+    from palpate_training.cli.experiment import arms_of, by_arm
+    from palpate_training.experiment.registration import read_registrations
+    from palpate_training.experiment.trajectory_file import write_trajectories
 
     if store is not None and (edge_mm is not None or fill_ml is not None):
         raise ConfigError(

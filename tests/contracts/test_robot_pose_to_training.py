@@ -109,7 +109,7 @@ def until(true: Callable[[], bool]) -> None:
 def test_a_robots_pose_is_the_contact_location_of_a_dataset(
     link: LinkConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ingest = pytest.importorskip("palpate_training.ingest_record")
+    ingest = pytest.importorskip("palpate_training.datasets.ingest")
     module: Any = types.ModuleType("driver_without_pose")
     module.WithoutPose = WithoutPose
     monkeypatch.setitem(sys.modules, "driver_without_pose", module)
@@ -145,9 +145,9 @@ def test_a_robots_pose_is_the_contact_location_of_a_dataset(
 
 def test_a_registration_of_the_testbed_gives_base_sensor(tmp_path: Path) -> None:
     """As docs/devices/robot-pose.md says: the pose that is written there, turned round."""
-    registrations = pytest.importorskip("palpate_training.testbed.registration_file")
-    testbed = pytest.importorskip("palpate_training.testbed.registration")
-    transforms = pytest.importorskip("palpate_training.testbed.transform")
+    registrations = pytest.importorskip("palpate_training.experiment.registration")
+    testbed = pytest.importorskip("palpate_training.experiment.registration")
+    transforms = pytest.importorskip("palpate_training.experiment.transform")
     turn = np.array([0.1, 0.9, -0.2, 0.3])
     truth = transforms.Transform.from_pose([0.41, -0.2, 0.13, *(turn / np.linalg.norm(turn))])
     places = [(0.0, 0.0, -0.05), (0.04, 0.0, -0.05), (0.0, 0.05, -0.05), (0.03, 0.06, -0.05)]

@@ -37,10 +37,10 @@ def _frames(record: Path) -> tuple[list[ElectrodeFrame], dict[int, Tare], list[f
 @pytest.mark.slow
 def test_a_bundle_that_training_writes_is_served(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from palpate_training.ingest_record import ingest_record
-    from palpate_training.schema import write_dataset
-    from palpate_training.train import TrainConfig
-    from palpate_training.train_features import train_features
+    from palpate_training.datasets.features_file import write_dataset
+    from palpate_training.datasets.ingest import ingest_record
+    from palpate_training.learning.fit import TrainConfig
+    from palpate_training.tasks.features import train_features
 
     record = tmp_path / "virtual.mcap"
     write_virtual_record(record, frames=6000, seed=3)

@@ -19,16 +19,20 @@ from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
-from palpate_training.dataset import Provenance
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.perform import perform
-from palpate_training.testbed.plan import Motion, Plan, Station, Trajectory, make_plan
-from palpate_training.testbed.trajectory_file import write_trajectories
-from palpate_training.twin.content import ExperimentDataset
-from palpate_training.twin.hdf5 import read_experiment, read_mixed
-from palpate_training.twin.processing import process
-from palpate_training.twin.raw_file import read_trials, write_trials
-from palpate_training.twin.trials import RawTrial, TrialHeader, TrialRows
+from palpate_training.datasets.experiment import ExperimentDataset, read_experiment, read_mixed
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.processing import process
+from palpate_training.datasets.trials import (
+    RawTrial,
+    TrialHeader,
+    TrialRows,
+    read_trials,
+    write_trials,
+)
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.plan import Motion, Plan, Station, Trajectory, make_plan
+from palpate_training.experiment.trajectory_file import write_trajectories
+from palpate_training.experiment.virtual_testbed import perform
 
 sys.path.append(str(Path(__file__).parents[1] / "training"))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -20,11 +20,10 @@ from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.trajectory import Campaign
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.plan import APPROACH_M
-from palpate_training.testbed.registration import Registration
-from palpate_training.testbed.registration_file import write_registrations
-from palpate_training.testbed.trajectory_file import read_trajectories
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.plan import APPROACH_M
+from palpate_training.experiment.registration import Registration, write_registrations
+from palpate_training.experiment.trajectory_file import read_trajectories
 
 
 def run(*words: object) -> Result:

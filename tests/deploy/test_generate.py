@@ -26,7 +26,7 @@ from palpate_deploy.generate.trials import FOLDER
 from palpate_fem.electrodes.unit import UnitParameters
 from palpate_fem.population.member import PAPER, Member
 from palpate_fem.store.read import SimulationStore
-from palpate_training.twin.hdf5 import read_experiment, read_mixed
+from palpate_training.datasets.experiment import read_experiment, read_mixed
 
 SPEC = ExperimentSpec(
     points=1, angled=1, edge_m=1.2e-3, overtravel_m=0.2e-3, indenters=("sphere_medium",)

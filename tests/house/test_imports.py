@@ -32,7 +32,7 @@ HOMES = {
     "can": ("gateway/", "deploy/palpate_deploy/bench/hand_parts.py"),
     "torch": ("training/",),
     "warp": ("fem/",),
-    "onnxruntime": ("services/", "training/palpate_training/export.py", FLOOR),
+    "onnxruntime": ("services/", "training/palpate_training/learning/export.py", FLOOR),
     "rerun": ("services/",),
     "google": ("protos/",),
     "palpate.v1": ("protos/", FLOOR),

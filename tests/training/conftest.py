@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from palpate_training.dataset import FeatureDataset, Provenance
-from palpate_training.twin.assemble import assemble_experiment, assemble_mixed
-from palpate_training.twin.basis import fit_basis
-from palpate_training.twin.content import ExperimentDataset, MixedDataset, SkinMesh
-from palpate_training.twin.trials import MixedRows, TrialHeader, TrialRows
+from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed
+from palpate_training.datasets.basis import fit_basis
+from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset, SkinMesh
+from palpate_training.datasets.features import FeatureDataset, Provenance
+from palpate_training.datasets.trials import MixedRows, TrialHeader, TrialRows
 
 TRIALS = [
     ("biotac-1", "cube/00/normal"),

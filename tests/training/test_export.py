@@ -13,13 +13,13 @@ import torch
 
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
-from palpate_training import export
-from palpate_training.dataset import FeatureDataset
-from palpate_training.export import FeaturesGraph, check_parity, export_features, to_onnx
-from palpate_training.models import Mlp
-from palpate_training.schema import write_dataset
-from palpate_training.train import TrainConfig
-from palpate_training.train_features import train_features
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features_file import write_dataset
+from palpate_training.learning import export
+from palpate_training.learning.export import FeaturesGraph, check_parity, export_features, to_onnx
+from palpate_training.learning.fit import TrainConfig
+from palpate_training.learning.networks import Mlp
+from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
 QUICK = TrainConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)

@@ -20,8 +20,7 @@ from palpate.messages import (
     Tare,
     WrenchFrame,
 )
-from palpate_training.ingest_lasa import ingest_lasa
-from palpate_training.ingest_record import ingest_record, number_presses
+from palpate_training.datasets.ingest import ingest_lasa, ingest_record, number_presses
 
 PERIOD_NS = 10_000_000
 

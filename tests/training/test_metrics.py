@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from palpate_training import baselines
-from palpate_training.metrics import (
+from palpate_training.learning import baselines
+from palpate_training.learning.metrics import (
     cluster_bootstrap,
     force_errors,
     force_metrics,
@@ -106,4 +106,4 @@ def test_baselines() -> None:
     y = x @ weight + offset
     np.testing.assert_allclose(baselines.linear(x, y).predict(x), y, atol=1e-8)
     np.testing.assert_allclose(baselines.constant(x, y).predict(x[:2]), [y.mean(axis=0)] * 2)
-    assert not baselines.zero(x).predict(x).any()
+    assert not baselines.zero(x, y).predict(x).any()

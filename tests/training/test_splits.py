@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import DatasetError
-from palpate_training import splits
-from palpate_training.splits import (
+from palpate_training.datasets.features import cut_into_blocks
+from palpate_training.learning import splits
+from palpate_training.learning.splits import (
     Split,
     by_group,
     contiguous_folds,
-    cut_into_blocks,
     unseen_sensor,
 )
 
@@ -101,8 +101,10 @@ def test_no_function_splits_rows_at_random() -> None:
     public = [name for name, _ in inspect.getmembers(splits, inspect.isfunction) if name[0] != "_"]
     assert sorted(public) == [
         "by_group",
+        "by_trajectory",
         "contiguous_folds",
-        "cut_into_blocks",
         "dataclass",
+        "of_units",
+        "unit_sets",
         "unseen_sensor",
     ]

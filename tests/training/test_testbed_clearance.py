@@ -9,8 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from palpate.errors import ConfigError
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.clearance import (
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.clearance import (
     ErrorModel,
     RegistrationErrors,
     link_sensitivity,
@@ -19,8 +19,8 @@ from palpate_training.testbed.clearance import (
     plate_holes,
     simulate_registrations,
 )
-from palpate_training.testbed.kinematics import Arm
-from palpate_training.testbed.registration import register
+from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.registration import register
 
 Floats = npt.NDArray[np.float64]
 NONE = ErrorModel(0.0, 0.0, 0.0, 0.0, 0.0)

@@ -13,14 +13,13 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_training.cli import data_app
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.clearance import plate_holes
-from palpate_training.testbed.kinematics import Arm
-from palpate_training.testbed.plan import Plan, commanded_travel
-from palpate_training.testbed.registration_file import COLUMNS, read_registrations
-from palpate_training.twin.raw_file import read_contents, read_trials
-from palpate_training.twin.trials import RawTrial
+from palpate_training.cli.__init__ import data_app
+from palpate_training.datasets.trials import RawTrial, read_contents, read_trials
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.clearance import plate_holes
+from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.plan import Plan, commanded_travel
+from palpate_training.experiment.registration import COLUMNS, read_registrations
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

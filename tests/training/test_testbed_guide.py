@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_training.testbed.trajectory_file import read_trajectories
+from palpate_training.experiment.trajectory_file import read_trajectories
 
 
 def test_the_guides_code_runs(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

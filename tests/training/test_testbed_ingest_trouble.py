@@ -15,9 +15,9 @@ import pytest
 from palpate.bus.topics import ELECTRODES, POSE, WRENCH
 from palpate.errors import DatasetError, RecordingError
 from palpate.messages import ElectrodeFrame, IndenterPoseFrame, SensorType, WrenchFrame
-from palpate_training.testbed.ingest import ingest_experiment
-from palpate_training.testbed.plan import Plan
-from palpate_training.twin.trials import RawTrial
+from palpate_training.datasets.trials import RawTrial
+from palpate_training.experiment.executed_plan import ingest_experiment
+from palpate_training.experiment.plan import Plan
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

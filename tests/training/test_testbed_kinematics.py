@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, MissingExtraError
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.kinematics import ACCURACY_M, Arm
-from palpate_training.testbed.transform import Transform, facing, rotation_matrices
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.kinematics import ACCURACY_M, Arm
+from palpate_training.experiment.transform import Transform, facing, rotation_matrices
 
 PLANAR = """<robot name="planar">
 <link name="base"/><link name="upper"/><link name="fore"/><link name="hand"/>

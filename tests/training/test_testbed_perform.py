@@ -9,9 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from palpate.errors import ConfigError
-from palpate_training.testbed.perform import contact_travel, perform
-from palpate_training.testbed.wrench_sensor import WrenchSensor
-from palpate_training.twin.trials import RawTrial, TrialHeader
+from palpate_training.datasets.trials import RawTrial, TrialHeader
+from palpate_training.experiment.virtual_testbed import WrenchSensor, contact_travel, perform
 
 Floats = npt.NDArray[np.float64]
 HEADER = TrialHeader("biotac-1", "sphere_3-5mm/00/normal", "sphere_3-5mm", "left")

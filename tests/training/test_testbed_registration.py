@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import ConfigError
-from palpate_training.testbed.clearance import plate_holes
-from palpate_training.testbed.registration import average, frame_of, register
-from palpate_training.testbed.transform import (
+from palpate_training.experiment.clearance import plate_holes
+from palpate_training.experiment.registration import average, frame_of, register
+from palpate_training.experiment.transform import (
     Transform,
     facing,
     quaternions,

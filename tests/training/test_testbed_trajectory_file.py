@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.plan import Plan
-from palpate_training.testbed.trajectory_file import read_trajectories, write_trajectories
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.plan import Plan
+from palpate_training.experiment.trajectory_file import read_trajectories, write_trajectories
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from palpate_training.dataset import FeatureDataset
-from palpate_training.models import Mlp, predict
-from palpate_training.splits import by_group
-from palpate_training.train import TrainConfig, drift, train
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.learning.fit import TrainConfig, drift, train
+from palpate_training.learning.networks import Mlp, predict
+from palpate_training.learning.splits import by_group
 
 MakeData = Callable[..., FeatureDataset]
 QUICK = TrainConfig(widths=(32, 32), epochs=30, batch_rows=64)

@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate_training.cli import data_app, train_app
-from palpate_training.dataset import FeatureDataset
-from palpate_training.force_real import (
+from palpate_training.cli.__init__ import data_app, train_app
+from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
+from palpate_training.datasets.features_file import write_dataset
+from palpate_training.datasets.ingest import ingest_lasa
+from palpate_training.learning.fit import TrainConfig
+from palpate_training.tasks.force_real import (
     experiment_count,
     run_force_real,
     write_report,
 )
-from palpate_training.ingest_lasa import ingest_lasa
-from palpate_training.schema import write_dataset
-from palpate_training.splits import cut_into_blocks
-from palpate_training.train import TrainConfig
 
 MakeData = Callable[..., FeatureDataset]
 MAGNITUDE, ANGLE = "force_magnitude_median_n", "force_angle_median_rad"

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.dataset import Provenance
-from palpate_training.twin.assemble import assemble_experiment, assemble_mixed
-from palpate_training.twin.content import ExperimentDataset, MixedDataset
-from palpate_training.twin.features import features
-from palpate_training.twin.hdf5 import content_sha256
-from palpate_training.twin.subset import subset
-from palpate_training.twin.trials import MixedRows, TrialRows
+from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed
+from palpate_training.datasets.basis import subset
+from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset, content_sha256
+from palpate_training.datasets.export import features
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.trials import MixedRows, TrialRows
 
 MakeRows = Callable[..., TrialRows]
 

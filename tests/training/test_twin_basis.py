@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.twin.basis import Blocks, encode, fit_basis, loss
-from palpate_training.twin.content import FloatArray
+from palpate_training.datasets.basis import Blocks, encode, fit_basis, loss
+from palpate_training.datasets.experiment import FloatArray
 
 NODES = 30
 

@@ -10,13 +10,18 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_training.cli import data_app
-from palpate_training.dataset import FeatureDataset
-from palpate_training.schema import open_dataset, write_dataset
-from palpate_training.twin.content import ExperimentDataset, MixedDataset
-from palpate_training.twin.export import export_published
-from palpate_training.twin.hdf5 import content_sha256, write_experiment, write_mixed
-from palpate_training.twin.published import read_published
+from palpate_training.cli.__init__ import data_app
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    MixedDataset,
+    content_sha256,
+    write_experiment,
+    write_mixed,
+)
+from palpate_training.datasets.export import export_published
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features_file import open_dataset, write_dataset
+from palpate_training.datasets.published import read_published
 
 
 def _run(*words: object) -> Result:

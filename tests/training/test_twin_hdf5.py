@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.twin.content import EXPERIMENT_ARRAYS, ExperimentDataset, MixedDataset
-from palpate_training.twin.hdf5 import (
+from palpate_training.datasets.experiment import (
+    EXPERIMENT_ARRAYS,
     MIXED_COLUMNS,
+    ExperimentDataset,
+    MixedDataset,
     content_sha256,
     read_experiment,
     read_mixed,

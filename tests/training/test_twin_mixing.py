@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.twin.mixing import common_trajectories, interpolate, mix
-from palpate_training.twin.trials import SimulatedTrial, TrialHeader, TrialRows
+from palpate_training.datasets.assembly import common_trajectories, interpolate, mix
+from palpate_training.datasets.trials import SimulatedTrial, TrialHeader, TrialRows
 
 HEADER = TrialHeader("biotac-1", "sphere/03/normal", "sphere", "left")
 

@@ -10,18 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import DatasetError
-from palpate_training.twin.processing import (
+from palpate_training.datasets.processing import (
+    Floats,
     above_threshold,
+    crossing,
     filter_force,
     from_half_newton,
+    from_threshold,
     last_of_increments,
+    onset,
     prepend_threshold_row,
     process,
     process_all,
     tare,
 )
-from palpate_training.twin.threshold import Floats, crossing, from_threshold, onset
-from palpate_training.twin.trials import RawTrial, TrialHeader, TrialRows
+from palpate_training.datasets.trials import RawTrial, TrialHeader, TrialRows
 
 HEADER = TrialHeader("biotac-1", "sphere/03/normal", "sphere", "left")
 DWELL = 50

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.dataset import Provenance
-from palpate_training.twin.assemble import assemble_experiment
-from palpate_training.twin.content import ExperimentDataset, MixedDataset
-from palpate_training.twin.export import export_csv, export_published
-from palpate_training.twin.published import read_published
-from palpate_training.twin.trials import TrialRows
+from palpate_training.datasets.assembly import assemble_experiment
+from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
+from palpate_training.datasets.export import export_csv, export_published
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.published import read_published
+from palpate_training.datasets.trials import TrialRows
 
 PLAN = ["cube/00/n", "cube/01/n", "sphere/00/n", "sphere/00/a", "sphere/01/n"]
 ON_UNIT = {"biotac-1": PLAN[2:], "biotac-2": PLAN, "biotac-3": PLAN[:4]}

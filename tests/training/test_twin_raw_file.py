@@ -12,10 +12,16 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.dataset import Provenance
-from palpate_training.twin.processing import process
-from palpate_training.twin.raw_file import COLUMNS, read_contents, read_trials, write_trials
-from palpate_training.twin.trials import RawTrial, TrialHeader
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.processing import process
+from palpate_training.datasets.trials import (
+    COLUMNS,
+    RawTrial,
+    TrialHeader,
+    read_contents,
+    read_trials,
+    write_trials,
+)
 
 RATE_HZ = 20
 SAMPLES = 20

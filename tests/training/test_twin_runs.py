@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.twin.runs import Floats, Run, Texts, find_runs, name_trajectories
+from palpate_training.datasets.published import Floats, Run, Texts, find_runs, name_trajectories
 
 
 def _rows(force: list[float], z_mm: list[float], kinds: str) -> list[tuple[int, int]]:

@@ -19,12 +19,12 @@ from palpate.messages import (
     Stamp,
     WrenchFrame,
 )
-from palpate_training.testbed import arm as stand_in
-from palpate_training.testbed.kinematics import Arm
-from palpate_training.testbed.perform import perform
-from palpate_training.testbed.plan import Plan, Station, Trajectory, assign_arm, make_plan
-from palpate_training.testbed.trajectory_file import write_trajectories
-from palpate_training.twin.trials import RawTrial, TrialHeader
+from palpate_training.datasets.trials import RawTrial, TrialHeader
+from palpate_training.experiment import stand_in_arm as stand_in
+from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.plan import Plan, Station, Trajectory, assign_arm, make_plan
+from palpate_training.experiment.trajectory_file import write_trajectories
+from palpate_training.experiment.virtual_testbed import perform
 
 START_NS = 1_700_000_000_000_000_000
 BOOT_NS = START_NS - 7_000_000_000_000  # monotonic clock = wall clock minus this

@@ -187,9 +187,9 @@ def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
     """
     for module in EXTRA_MODULES:
         require(module, extra="training")
-    from palpate_training.ingest_record import ingest_record
-    from palpate_training.schema import write_dataset
-    from palpate_training.train_features import train_features
+    from palpate_training.datasets.features_file import write_dataset
+    from palpate_training.datasets.ingest import ingest_record
+    from palpate_training.tasks.features import train_features
 
     folder = PACKAGED / NAME / str(_next_version()) if out is None else out
     version = int(folder.name) if folder.name.isdigit() else 1

@@ -16,16 +16,15 @@ from palpate_fem.result import Trajectory
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import CLEARANCE_M
-from palpate_training.dataset import Provenance
-from palpate_training.twin.assemble import assemble_experiment, assemble_mixed
-from palpate_training.twin.basis import fit_basis
-from palpate_training.twin.content import (
+from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed, mix
+from palpate_training.datasets.basis import fit_basis
+from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,
     SkinMesh,
 )
-from palpate_training.twin.mixing import mix
-from palpate_training.twin.trials import MixedRows, SimulatedTrial, TrialRows
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.trials import MixedRows, SimulatedTrial, TrialRows
 
 Floats = npt.NDArray[np.float64]
 

@@ -15,17 +15,27 @@ from palpate_deploy.generate.mechanics import OnProgress
 from palpate_fem.population.mount import clear_steps
 from palpate_fem.result import Trajectory
 from palpate_fem.store.read import SimulationStore
-from palpate_training.dataset import Provenance
-from palpate_training.schema import palpate_version
-from palpate_training.testbed.ingest import OFFSET_M
-from palpate_training.twin.assemble import assemble_experiment
-from palpate_training.twin.container import schema_of
-from palpate_training.twin.content import ExperimentDataset, MixedDataset
-from palpate_training.twin.hdf5 import write_experiment, write_mixed
-from palpate_training.twin.mixing import common_trajectories
-from palpate_training.twin.processing import process_all, trial_name
-from palpate_training.twin.raw_file import TRIALS_SCHEMA, read_contents, read_trials
-from palpate_training.twin.trials import RawTrial, SimulatedTrial, TrialRows
+from palpate_training.datasets.assembly import assemble_experiment, common_trajectories
+from palpate_training.datasets.container import schema_of
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    MixedDataset,
+    write_experiment,
+    write_mixed,
+)
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.features_file import palpate_version
+from palpate_training.datasets.processing import process_all
+from palpate_training.datasets.trials import (
+    TRIALS_SCHEMA,
+    RawTrial,
+    SimulatedTrial,
+    TrialRows,
+    read_contents,
+    read_trials,
+    trial_name,
+)
+from palpate_training.experiment.executed_plan import OFFSET_M
 
 Dropped = tuple[tuple[str, str], ...]
 """Trial and reason, of each that was left out."""

@@ -16,9 +16,9 @@ from palpate_deploy.generate.spread import Processes, Ray, Spread
 from palpate_deploy.generate.trials import FOLDER, make_trials
 from palpate_fem.population.member import Member
 from palpate_fem.store.read import SimulationStore
-from palpate_training.dataset import Provenance
-from palpate_training.schema import palpate_version
-from palpate_training.twin.hdf5 import write_experiment, write_mixed
+from palpate_training.datasets.experiment import write_experiment, write_mixed
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.features_file import palpate_version
 
 EXPERIMENT, MIXED = "experiment.h5", "mixed.h5"
 

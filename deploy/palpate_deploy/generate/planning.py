@@ -14,9 +14,8 @@ from palpate_deploy.generate.spec import ExperimentSpec
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import Indentation
-from palpate_training.testbed.arm import HOME, sensor_robot
-from palpate_training.testbed.kinematics import Arm
-from palpate_training.testbed.plan import (
+from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.plan import (
     ARMS,
     Eliminated,
     Plan,
@@ -25,7 +24,8 @@ from palpate_training.testbed.plan import (
     assign_arm,
     make_plan,
 )
-from palpate_training.testbed.registration import Registration
+from palpate_training.experiment.registration import Registration
+from palpate_training.experiment.stand_in_arm import HOME, sensor_robot
 
 SAME_PATH = 1e-6
 """Paths of the same plan agree to this, in metres and in numbers of a quaternion."""

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fem.population.member import Member
-from palpate_training.testbed.arm import FLANGE, sensor_robot, tool, write_arm_urdf
-from palpate_training.testbed.clearance import pad_poses, simulate_registrations
-from palpate_training.testbed.kinematics import Arm
-from palpate_training.testbed.plan import ARMS
+from palpate_training.experiment.clearance import pad_poses, simulate_registrations
+from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.plan import ARMS
+from palpate_training.experiment.stand_in_arm import FLANGE, sensor_robot, tool, write_arm_urdf
 
 Floats = NDArray[np.float64]
 

@@ -18,15 +18,16 @@ from palpate_deploy.generate.trials import FOLDER, read_trials
 from palpate_fem.population.member import Member
 from palpate_fem.result import Trajectory
 from palpate_fem.store.read import SimulationStore
-from palpate_training.twin.basis import encode, fit_basis
-from palpate_training.twin.content import ExperimentDataset, FloatArray, MixedDataset
-from palpate_training.twin.hdf5 import (
+from palpate_training.datasets.basis import encode, fit_basis, subset
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    FloatArray,
+    MixedDataset,
     read_experiment,
     read_mixed,
     write_experiment,
     write_mixed,
 )
-from palpate_training.twin.subset import subset
 
 Floats = NDArray[np.float64]
 

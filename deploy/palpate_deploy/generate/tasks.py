@@ -26,10 +26,10 @@ from palpate_fem.result import Trajectory
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.trajectory import CLEARANCE_M
-from palpate_training.testbed.perform import contact_travel, perform
-from palpate_training.testbed.plan import APPROACH_M
-from palpate_training.twin.processing import process
-from palpate_training.twin.trials import TrialHeader, TrialRows
+from palpate_training.datasets.processing import process
+from palpate_training.datasets.trials import TrialHeader, TrialRows
+from palpate_training.experiment.plan import APPROACH_M
+from palpate_training.experiment.virtual_testbed import contact_travel, perform
 
 Floats = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from palpate_fem.population.member import Member
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import Indentation
-from palpate_training.testbed.plan import assign_arm
+from palpate_training.experiment.plan import assign_arm
 
 FOLDER = "trials"
 SUFFIX = ".npz"

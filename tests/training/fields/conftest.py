@@ -9,14 +9,14 @@ import numpy.typing as npt
 import pytest
 
 from palpate.anatomy import ELECTRODE_POSITIONS
-from palpate_training.dataset import Provenance
-from palpate_training.fields.fit import FitConfig
-from palpate_training.twin.content import (
+from palpate_training.datasets.experiment import (
     ExperimentDataset,
     FieldBasis,
     MixedDataset,
     SkinMesh,
 )
+from palpate_training.datasets.features import Provenance
+from palpate_training.tasks.field_fit import FitConfig
 
 Floats = npt.NDArray[np.float64]
 

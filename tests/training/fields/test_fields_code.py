@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.fields.code import FieldCode, fit_code
-from palpate_training.fields.fit import synthesis_features
-from palpate_training.fields.sites import CORE_RADIUS_M, RADII_M, SITES, core_normal, pooling
-from palpate_training.fields.split import by_trajectory
-from palpate_training.splits import Split
-from palpate_training.twin.content import MixedDataset
+from palpate_training.datasets.experiment import MixedDataset
+from palpate_training.learning.field_code import (
+    CORE_RADIUS_M,
+    RADII_M,
+    SITES,
+    FieldCode,
+    core_normal,
+    fit_code,
+    pooling,
+)
+from palpate_training.learning.splits import Split, by_trajectory
+from palpate_training.tasks.field_fit import synthesis_features
 
 
 @pytest.fixture(scope="module")

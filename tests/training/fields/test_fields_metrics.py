@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate_training.fields.metrics import (
+from palpate_training.learning.metrics import (
     electrode_errors,
     electrode_summary,
     field_errors,

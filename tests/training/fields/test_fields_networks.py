@@ -14,10 +14,13 @@ import torch
 
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
-from palpate_training.export import onnx_bytes
-from palpate_training.fields import export
-from palpate_training.fields.bundles import field_bundle, synthesis_bundle
-from palpate_training.fields.fit import (
+from palpate_training.datasets.experiment import MixedDataset
+from palpate_training.learning import export
+from palpate_training.learning.export import onnx_bytes
+from palpate_training.learning.networks import FieldGraph, SynthesisGraph
+from palpate_training.learning.splits import Held, by_trajectory, of_units
+from palpate_training.tasks.bundles import field_bundle, synthesis_bundle
+from palpate_training.tasks.field_fit import (
     FieldModel,
     FitConfig,
     fit_field,
@@ -25,9 +28,6 @@ from palpate_training.fields.fit import (
     synthesis_features,
     tared_counts,
 )
-from palpate_training.fields.networks import FieldGraph, SynthesisGraph
-from palpate_training.fields.split import Held, by_trajectory, of_units
-from palpate_training.twin.content import MixedDataset
 
 
 @pytest.fixture(scope="module")

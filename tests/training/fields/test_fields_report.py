@@ -10,20 +10,23 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.files.bundle import read_bundle
-from palpate_training.cli import train_app
-from palpate_training.cli_fields import EPOCHS
-from palpate_training.evaluate import Result
-from palpate_training.fields.evaluate import ALL, MEAN, OWN, RIDGE, ZERO, TaskReport, typical
-from palpate_training.fields.evaluate_field import evaluate_field
-from palpate_training.fields.evaluate_synthesis import evaluate_synthesis
-from palpate_training.fields.features_report import evaluate_features, features_networks
-from palpate_training.fields.fit import FitConfig
-from palpate_training.fields.pictures import by_force, ventral_faces
-from palpate_training.fields.report import headline_table, table, write_report
-from palpate_training.fields.rivals import mean, ridge, zero
-from palpate_training.train import TrainConfig
-from palpate_training.twin.content import MixedDataset
-from palpate_training.twin.hdf5 import write_experiment, write_mixed
+from palpate_training.cli.__init__ import train_app
+from palpate_training.cli.train import EPOCHS
+from palpate_training.datasets.experiment import MixedDataset, write_experiment, write_mixed
+from palpate_training.learning.baselines import constant, ridge, zero
+from palpate_training.learning.fit import TrainConfig
+from palpate_training.tasks.features import evaluate_features, features_networks
+from palpate_training.tasks.field_fit import FitConfig
+from palpate_training.tasks.fields import evaluate_field
+from palpate_training.tasks.report import (
+    by_force,
+    headline_table,
+    table,
+    ventral_faces,
+    write_report,
+)
+from palpate_training.tasks.results import ALL, MEAN, OWN, RIDGE, ZERO, Result, TaskReport, typical
+from palpate_training.tasks.synthesis import evaluate_synthesis
 
 SHORT = TrainConfig(widths=(32,), epochs=15, batch_rows=64)
 
@@ -84,7 +87,7 @@ def test_numbers_hang_together(reports: list[TaskReport], mixed: MixedDataset) -
 
 
 def test_zero_is_the_motion_itself(reports: list[TaskReport], mixed: MixedDataset) -> None:
-    from palpate_training.fields.split import by_trajectory, of_units
+    from palpate_training.learning.splits import by_trajectory, of_units
 
     rows = of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-2"]).split.test
     truth = np.linalg.norm(mixed.displacement(rows), axis=2)
@@ -177,4 +180,4 @@ def test_ridge_finds_a_line_and_chooses_its_penalty_on_validation_rows() -> None
 def test_zero_and_mean_ignore_their_inputs() -> None:
     x, y = np.ones((4, 3)), np.arange(8.0).reshape(4, 2)
     np.testing.assert_array_equal(zero(x, y).predict(x), np.zeros((4, 2)))
-    np.testing.assert_array_equal(mean(x, y).predict(9 * x), np.tile([3.0, 4.0], (4, 1)))
+    np.testing.assert_array_equal(constant(x, y).predict(9 * x), np.tile([3.0, 4.0], (4, 1)))

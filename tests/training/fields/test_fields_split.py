@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.fields.split import by_trajectory, of_units, unit_sets
-from palpate_training.twin.content import MixedDataset
+from palpate_training.datasets.experiment import MixedDataset
+from palpate_training.learning.splits import by_trajectory, of_units, unit_sets
 
 
 @pytest.mark.parametrize("seed", range(4))

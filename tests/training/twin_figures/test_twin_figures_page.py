@@ -12,12 +12,16 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_training.cli import data_app
-from palpate_training.twin.content import ExperimentDataset, MixedDataset
-from palpate_training.twin.hdf5 import write_experiment, write_mixed
-from palpate_training.twin_figures.idle import IdleStream
-from palpate_training.twin_figures.page import PAGE, Sources, write_page
-from palpate_training.twin_figures.plate import PlateLog
+from palpate_training.cli.__init__ import data_app
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    MixedDataset,
+    write_experiment,
+    write_mixed,
+)
+from palpate_training.figures.noise import IdleStream
+from palpate_training.figures.page import PAGE, Sources, write_page
+from palpate_training.figures.plate import PlateLog
 
 pytest.importorskip("matplotlib", reason="matplotlib not installed (extra training)")
 pytest.importorskip("h5py", reason="h5py not installed (extra training)")

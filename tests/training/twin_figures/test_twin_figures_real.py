@@ -12,20 +12,23 @@ import numpy.typing as npt
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.twin.content import ExperimentDataset
-from palpate_training.twin_figures.idle import (
+from palpate_training.datasets.experiment import ExperimentDataset
+from palpate_training.figures.noise import (
     FORCE_CALIBRATION,
+    drift,
     read_idle_real,
     read_idle_twin,
+    spectrum,
 )
-from palpate_training.twin_figures.noise import drift, spectrum
-from palpate_training.twin_figures.plate import (
+from palpate_training.figures.plate import (
     CONTACT_NORMAL,
     PlateLog,
+    agreement,
+    flat_presses,
     plate_response,
     read_plate_logs,
+    signs,
 )
-from palpate_training.twin_figures.signs import agreement, flat_presses, signs
 
 pytest.importorskip("matplotlib", reason="matplotlib not installed (extra training)")
 

@@ -13,18 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import DatasetError
-from palpate_training.twin.content import ExperimentDataset, MixedDataset
-from palpate_training.twin_figures.boxes import box_of
-from palpate_training.twin_figures.contact import final_rows
-from palpate_training.twin_figures.motion import motion_share
-from palpate_training.twin_figures.outline import CORE_RADIUS_M, core_normal, unwrap
-from palpate_training.twin_figures.statistics import (
+from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
+from palpate_training.figures.boxes import box_of
+from palpate_training.figures.outline import CORE_RADIUS_M, core_normal, unwrap
+from palpate_training.figures.page import group_table, size_table, unit_table
+from palpate_training.figures.skin import final_rows, motion_share
+from palpate_training.figures.statistics import (
     ELECTRODE_GROUPS,
     angled_share,
     dataset_statistics,
     shear_ratio,
 )
-from palpate_training.twin_figures.tables import group_table, size_table, unit_table
 
 MakeTrials = Callable[..., ExperimentDataset]
 Floats = npt.NDArray[np.float64]

@@ -1,0 +1,304 @@
+"""Commands ``palpate data``: make data sets of rows, look into any, convert, draw, hand on."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from palpate.command import typed_command
+from palpate.errors import ConfigError
+from palpate_training.cli.experiment import print_trials
+from palpate_training.datasets.container import schema_of
+from palpate_training.datasets.experiment import MixedDataset
+from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features_file import SCHEMA, UNITS, open_dataset, write_dataset
+from palpate_training.datasets.ingest import (
+    BLOCKS_PER_RECORDING,
+    ELECTRODE_LAG_ROWS,
+    ingest_lasa,
+    ingest_record,
+)
+from palpate_training.datasets.inspect import Contents, load
+from palpate_training.datasets.inspect import contents as experiment_contents
+from palpate_training.datasets.trials import TRIALS_SCHEMA
+
+console = Console()
+
+DataArgument = Annotated[
+    Path, typer.Argument(help="Data set (.h5), or folder of published files (biotac1.hdf5, ...).")
+]
+AxesOption = Annotated[
+    str, typer.Option(help="Published files: where the sensor frame's x,y,z are in the file.")
+]
+ForceOption = Annotated[
+    bool, typer.Option("--force-on-indenter", help="Published files: the force has that sign.")
+]
+
+
+def data_ingest_lasa(
+    source: Annotated[Path, typer.Argument(help="force_calibration.npz")],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    blocks: Annotated[
+        int, typer.Option(min=10, help="Contiguous blocks that each recording is cut into.")
+    ] = BLOCKS_PER_RECORDING,
+    lag_rows: Annotated[
+        int, typer.Option(min=0, help="Rows by which electrodes lag the force; 0 = as stored.")
+    ] = ELECTRODE_LAG_ROWS,
+) -> None:
+    """LASA force calibration (two real BioTacs) -> data set. Its rows may not be redistributed.
+
+    palpate data ingest-lasa force_calibration.npz lasa.h5
+    """
+    data = ingest_lasa(
+        source, command=typed_command(), blocks_per_recording=blocks, lag_rows=lag_rows
+    )
+    write_dataset(out, data)
+    console.print(contents(data, str(out)))
+
+
+def data_ingest_record(
+    source: Annotated[Path, typer.Argument(help="Record (.mcap) with electrodes, tare, wrench.")],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    licence: Annotated[
+        str, typer.Option(help="What may be done with the rows; kept with them.")
+    ] = "own record",
+) -> None:
+    """Record of a sensor with its force/torque sensor and indenter -> data set.
+
+    palpate data ingest-record presses.mcap presses.h5
+    """
+    with console.status(f"reading {source.name}"):
+        data = ingest_record(source, command=typed_command(), licence=licence)
+        write_dataset(out, data)
+    console.print(contents(data, str(out)))
+
+
+def data_inspect(
+    path: DataArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+    axes: AxesOption = "x,y,z",
+    force_on_indenter: ForceOption = False,
+) -> None:
+    """Check a data set and show what is in it.
+
+    palpate data inspect presses.h5
+    """
+    schema = schema_of(path) if path.is_file() else ""
+    if schema == TRIALS_SCHEMA:
+        print_trials(path, as_json=as_json)
+        return
+    if schema == SCHEMA:
+        data = open_dataset(path)
+        if as_json:
+            console.print_json(json.dumps(_features_summary(data)))
+        else:
+            console.print(contents(data, str(path)))
+        return
+    kind, experiment = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
+    found = experiment_contents(kind, experiment)
+    if as_json:
+        console.print_json(json.dumps(found.as_dict()))
+    else:
+        console.print(experiment_table(found, str(path)))
+
+
+def data_export(
+    path: DataArgument,
+    out: Annotated[Path, typer.Argument(help="Folder or file to write; must not exist.")],
+    published: Annotated[
+        bool, typer.Option("--published", help="Folder with biotac1.hdf5 and so on.")
+    ] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="One table of text.")] = False,
+) -> None:
+    """Data set of an experiment -> published layout, or CSV.
+
+    palpate data export twin.h5 twin.csv --csv
+    """
+    if published == csv:
+        raise ConfigError("say one of --published and --csv", remedy="see palpate data export -h")
+    _, data = load(path)
+    if csv:
+        console.print(f"wrote {out}: {export_csv(out, data)} rows")
+    else:
+        for file in export_published(out, data):
+            console.print(f"wrote {file}")
+
+
+def data_features(
+    path: DataArgument,
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    untouched_rows: Annotated[
+        int, typer.Option(min=0, help="Rows at rest added to each trial.")
+    ] = UNTOUCHED_ROWS,
+    assumed_rest: Annotated[
+        int | None,
+        typer.Option(min=0, max=4095, help="Rest [counts] of trials that do not tell theirs."),
+    ] = None,
+    axes: AxesOption = "x,y,z",
+    force_on_indenter: ForceOption = False,
+) -> None:
+    """Data set of an experiment -> rows for `palpate train features`.
+
+    palpate data features twin.h5 twin-features.h5
+    """
+    _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
+    rows = features(
+        data.experiment if isinstance(data, MixedDataset) else data,
+        untouched_rows=untouched_rows,
+        assumed_rest=assumed_rest,
+    )
+    write_dataset(out, rows)
+    console.print(contents(rows, str(out)))
+
+
+def experiment_table(found: Contents, title: str) -> Table:
+    """What a data set of the experiment holds, by unit."""
+    lines = [
+        f"{found.kind}: {found.trajectories} trajectories, {found.trials} trials,"
+        f" {found.rows} rows",
+        *(f"{key}: {value or '-'}" for key, value in found.provenance.items()),
+        f"content sha256: {found.content_sha256}",
+    ]
+    if found.nodes:
+        lines.insert(
+            1,
+            f"field: {found.nodes} nodes in {found.modes} modes, loss"
+            f" {found.field_loss_mean_m * 1e6:.2f} um mean, {found.field_loss_max_m * 1e6:.1f} um"
+            f" at most; simulated force differs by {found.force_rms_n:.3g} N rms",
+        )
+    table = Table(title=title, caption="\n".join(lines), caption_justify="left")
+    table.add_column("unit")
+    for heading in (
+        "trials",
+        "indenters",
+        "rows",
+        "tared min",
+        "tared max",
+        "|force| max [N]",
+        "electrode sd",
+    ):
+        table.add_column(heading, justify="right")
+    for unit in found.units:
+        table.add_row(
+            unit.unit,
+            str(unit.trials),
+            str(unit.indenters),
+            str(unit.rows),
+            f"{unit.tared_min:.3f}",
+            f"{unit.tared_max:.3f}",
+            f"{unit.force_max_n:.2f}",
+            f"{min(unit.electrode_sd):.3f}..{max(unit.electrode_sd):.3f}",
+        )
+    return table
+
+
+def _features_summary(data: FeatureDataset) -> dict[str, Any]:
+    return {
+        "kind": SCHEMA,
+        "rows": len(data),
+        "groups": len(np.unique(data.group)),
+        "blocks": len(np.unique(data.block)),
+        "units": list(data.sensor_names),
+        "arrays": {
+            name: {"type": str(array.dtype), "shape": list(array.shape), "unit": UNITS[name]}
+            for name, array in data.arrays().items()
+        },
+        "content_sha256": data.content_sha256(),
+        "provenance": asdict(data.provenance),
+    }
+
+
+def contents(data: FeatureDataset, title: str) -> Table:
+    """What a data set holds: arrays, units, ranges, provenance."""
+    groups, blocks = len(np.unique(data.group)), len(np.unique(data.block))
+    table = Table(
+        title=title,
+        caption=f"{len(data)} rows, {groups} groups, {blocks} blocks,"
+        f" sensors {', '.join(data.sensor_names)}\n"
+        f"source: {data.provenance.source}\nlicence: {data.provenance.licence}\n"
+        f"made by: {data.provenance.command or '-'} (palpate {data.provenance.palpate_version})\n"
+        f"notes: {data.provenance.notes or '-'}\ncontent sha256: {data.content_sha256()}",
+        caption_justify="left",
+    )
+    for heading in ("dataset", "type", "shape", "unit"):
+        table.add_column(heading)
+    for heading in ("min", "median", "max"):
+        table.add_column(heading, justify="right")
+    for name, array in data.arrays().items():
+        values = array.astype(np.float64)
+        low, middle, high = np.nanpercentile(values, [0, 50, 100])
+        table.add_row(
+            name,
+            str(array.dtype),
+            str(array.shape),
+            UNITS[name],
+            *(f"{value:.6g}" for value in (low, middle, high)),
+        )
+    return table
+
+
+PUBLIC_DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+"""Real data beside the project; what is absent there is left out of the page."""
+
+
+def data_figures(
+    experiment: Annotated[Path, typer.Argument(help="Experimental data set (.h5).")],
+    out: Annotated[Path, typer.Option(help="Folder for statistics.md and its pictures.")],
+    mixed: Annotated[
+        Path | None, typer.Option(help="Mixed data set (.h5): skin and skin motion.")
+    ] = None,
+    idle: Annotated[
+        Path | None,
+        typer.Option(help="Untouched twin (.npz): rate_hz, and counts (T, 19) for each unit."),
+    ] = None,
+    public_data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Folder that holds lasa_force_calibration, lasa_contact_normal."
+        ),
+    ] = None,
+) -> None:
+    """Figures as in the paper and the statistics page of a data set of the experiment.
+
+    palpate data figures experiment.h5 --mixed mixed.h5 --out docs/results/twin
+    """
+    from palpate_training.datasets.experiment import read_experiment, read_mixed
+    from palpate_training.figures.noise import read_idle_real, read_idle_twin
+    from palpate_training.figures.page import PAGE, Sources, write_page
+    from palpate_training.figures.plate import read_plate_logs
+
+    if public_data is not None and not public_data.is_dir():
+        raise ConfigError(
+            f"--public-data {public_data}: there is no such folder",
+            remedy="give the folder with lasa_force_calibration and lasa_contact_normal",
+        )
+    console = Console()
+    folder = public_data or PUBLIC_DATA
+    with console.status("reading") as status:
+        sources = Sources(
+            experiment=read_experiment(experiment),
+            mixed=read_mixed(mixed) if mixed is not None else None,
+            idle=(
+                *(read_idle_twin(idle) if idle is not None else ()),
+                *read_idle_real(folder),
+            ),
+            plate=read_plate_logs(folder),
+        )
+        statistics = write_page(
+            out,
+            sources,
+            command=typed_command(),
+            on_step=lambda step: status.update(f"{step} ..."),
+        )
+    console.print(
+        f"{statistics.trajectories} unique trajectories, {statistics.trials} trials,"
+        f" {statistics.rows} rows\nwrote {out / PAGE}"
+    )

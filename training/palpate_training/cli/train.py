@@ -1,0 +1,206 @@
+"""Commands ``palpate train``: bundles of every task, and the tables of results."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from palpate.command import typed_command
+from palpate_training.datasets.features_file import open_dataset
+
+Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
+Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
+Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
+Epochs = Annotated[int, typer.Option(min=1, help="Passes over the training rows at most.")]
+Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
+
+EPOCHS = 150
+"""The default of ``FitConfig``, whose module needs torch."""
+
+console = Console()
+
+
+def train_field(
+    data: Mixed,
+    out: Bundle,
+    units: Annotated[
+        str, typer.Option(help="Units to train on, with commas between; empty = all.")
+    ] = "",
+    name: Annotated[str, typer.Option(help="Name of the bundle.")] = "field",
+    version: Version = 1,
+    seed: Seed = 0,
+    epochs: Epochs = EPOCHS,
+) -> None:
+    """Electrodes -> displacement of the whole skin: train, test on unseen trajectories, write.
+
+    palpate train field mixed.h5 models/field-twin/1 --name field-twin
+    """
+    from palpate_training.datasets.experiment import read_mixed
+    from palpate_training.tasks.bundles import field_bundle
+    from palpate_training.tasks.field_fit import FitConfig
+
+    config = FitConfig(epochs=epochs)
+    chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
+    with _progress() as progress:
+        task = progress.add_task("field", total=config.epochs)
+        metrics = field_bundle(
+            read_mixed(data),
+            out,
+            units=chosen,
+            name=name,
+            version=version,
+            config=config,
+            seed=seed,
+            on_epoch=lambda: progress.advance(task),
+        )
+    _show(metrics, f"{name} {version}: unseen trajectories", out)
+
+
+def train_synthesis(
+    data: Mixed,
+    out: Bundle,
+    unit: Annotated[str, typer.Option(help="The unit whose electrodes are synthesised.")],
+    name: Annotated[str, typer.Option(help="Name of the bundle.")] = "synthesis",
+    version: Version = 1,
+    seed: Seed = 0,
+    epochs: Epochs = EPOCHS,
+) -> None:
+    """Displacement of the skin -> electrodes of one unit: train, test on unseen, write.
+
+    palpate train synthesis mixed.h5 models/synthesis-twin/1 --unit biotac-2 --name synthesis-twin
+    """
+    from palpate_training.datasets.experiment import read_mixed
+    from palpate_training.tasks.bundles import synthesis_bundle
+    from palpate_training.tasks.field_fit import FitConfig
+
+    config = FitConfig(epochs=epochs)
+    with _progress() as progress:
+        task = progress.add_task("synthesis", total=config.epochs)
+        metrics = synthesis_bundle(
+            read_mixed(data),
+            out,
+            unit=unit,
+            name=name,
+            version=version,
+            config=config,
+            seed=seed,
+            on_epoch=lambda: progress.advance(task),
+        )
+    _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
+
+
+def train_twin(
+    mixed: Mixed,
+    experiment: Annotated[Path, typer.Argument(help="Purely experimental data set (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Folder for twin.md, its figures and JSON.")],
+    seeds: Annotated[int, typer.Option(min=1, help="Networks of each kind.")] = 3,
+    split_seed: Annotated[int, typer.Option(help="Seed of the split.")] = 0,
+    epochs: Epochs = EPOCHS,
+) -> None:
+    """Field, synthesis, force and location on unseen trajectories, beside the paper's numbers.
+
+    palpate train twin mixed.h5 experiment.h5 docs/results/twin-learning
+    """
+    from palpate_training.datasets.experiment import read_experiment, read_mixed
+    from palpate_training.tasks.features import (
+        PAPER_CONFIG,
+        evaluate_features,
+        features_networks,
+    )
+    from palpate_training.tasks.field_fit import FitConfig
+    from palpate_training.tasks.fields import evaluate_field
+    from palpate_training.tasks.report import write_report
+    from palpate_training.tasks.results import networks
+    from palpate_training.tasks.synthesis import evaluate_synthesis
+
+    fields, presses = read_mixed(mixed), read_experiment(experiment)
+    with _progress() as progress:
+        total = networks(fields.experiment, seeds) + features_networks(presses, seeds)
+        task = progress.add_task("networks", total=total)
+
+        def tick() -> None:
+            progress.advance(task)
+
+        config = FitConfig(epochs=epochs)
+        paper = replace(PAPER_CONFIG, epochs=min(epochs, PAPER_CONFIG.epochs))
+        reports = [
+            evaluate(fields, seeds=seeds, split_seed=split_seed, config=config, on_network=tick)
+            for evaluate in (evaluate_field, evaluate_synthesis)
+        ]
+        reports += evaluate_features(
+            presses, seeds=seeds, split_seed=split_seed, config=paper, on_network=tick
+        )
+    command = typed_command()
+    for path in write_report(out, reports, fields.mesh, command=command, seeds=seeds):
+        console.print(f"wrote {path}")
+
+
+def train_force_real(
+    data: Annotated[Path, typer.Option(help="Data set from `palpate data ingest-lasa`.")],
+    out: Annotated[Path, typer.Option(help="Folder for force-real.md, .json and .png.")],
+    seeds: Annotated[int, typer.Option(min=1, help="Networks for each fold.")] = 5,
+) -> None:
+    """Force on real BioTacs: blocks held out and a BioTac never seen, beside the baselines.
+
+    palpate train force-real --data lasa.h5 --out docs/results
+    """
+    from palpate_training.tasks.force_real import experiment_count, run_force_real, write_report
+    from palpate_training.tasks.results import rich_table
+
+    dataset = open_dataset(data)
+    with _progress() as progress:
+        task = progress.add_task("networks", total=experiment_count(dataset, seeds))
+        report = run_force_real(dataset, seeds=seeds, on_network=lambda: progress.advance(task))
+    write_report(out, report, command=typed_command())
+    console.print(rich_table(report.results, "Force on real BioTacs"))
+    console.print(f"wrote {out}/force-real.md, .json, .png")
+
+
+def train_features_command(
+    data: Annotated[Path, typer.Option(help="Data set (.h5).")],
+    out: Annotated[Path, typer.Option(help="Folder of the bundle; must not exist.")],
+    name: Annotated[str, typer.Option(help="Name of the bundle.")] = "features",
+    version: Annotated[int, typer.Option(min=1, help="Its version.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of split and weights.")] = 0,
+) -> None:
+    """Train force and contact location, test on unseen presses, write the bundle.
+
+    palpate train features --data presses.h5 --out models/features-virtual/1 --name features-virtual
+    """
+    from palpate_training.tasks.features import train_features
+
+    with _progress() as progress:
+        tasks = {}
+
+        def on_epoch(quantity: str, done: int, total: int) -> None:
+            if quantity not in tasks:
+                tasks[quantity] = progress.add_task(quantity, total=total)
+            progress.update(tasks[quantity], completed=done)
+
+        report = train_features(data, out, name=name, version=version, seed=seed, on_epoch=on_epoch)
+    _show(report.metrics, f"{name} {version}: unseen presses", out)
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+    )
+
+
+def _show(metrics: dict[str, float], title: str, out: Path) -> None:
+    table = Table(title=title, caption=f"wrote {out}")
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    for key, value in metrics.items():
+        table.add_row(key, f"{value:.5g}")
+    console.print(table)

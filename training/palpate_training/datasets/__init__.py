@@ -1,0 +1,1 @@
+"""Data sets: rows of features, the experiment of the paper, how they are made, read and written."""

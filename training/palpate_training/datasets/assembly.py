@@ -1,0 +1,318 @@
+"""Experiment and simulation at the same displacements.
+
+Paper, section "Experimental and simulation data processing".
+
+
+Trials put together to the data sets, in an order that does not depend on who finished first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate_training.datasets.basis import encode
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    FieldBasis,
+    FloatArray,
+    MixedDataset,
+    SkinMesh,
+)
+from palpate_training.datasets.features import ELECTRODES, Provenance
+from palpate_training.datasets.processing import (
+    THRESHOLD_N,
+    DroppedTrial,
+    Floats,
+    Values,
+    from_threshold,
+)
+from palpate_training.datasets.trials import MixedRows, SimulatedTrial, TrialRows, trial_name
+
+INCREMENTS = 20
+"""Evenly spaced displacements of a mixed trial (paper, step 5)."""
+
+
+def common_trajectories(
+    trials: Iterable[TrialRows], simulated: Collection[str]
+) -> tuple[list[TrialRows], list[DroppedTrial]]:
+    """Trials whose trajectory was simulated, and the others with the reason (paper, step 1).
+
+    Args:
+        trials: Processed trials.
+        simulated: Ids of the trajectories that were simulated.
+    """
+    both, dropped = [], []
+    for rows in trials:
+        if rows.header.trajectory in simulated:
+            both.append(rows)
+        else:
+            dropped.append(DroppedTrial(rows.header, "its trajectory was not simulated"))
+    return both, dropped
+
+
+def mix(rows: TrialRows, simulated: SimulatedTrial, count: int = INCREMENTS) -> MixedRows:
+    """Bring a trial and its simulation to the same displacements (paper, steps 2 to 5).
+
+    The simulation is cut where it diverged, begins at exactly 0.5 N like the experiment, and both
+    end at the smaller of their final displacements, counted from 0.5 N.
+
+    Args:
+        rows: Processed trial; begins at exactly 0.5 N.
+        simulated: Its trajectory in finite elements; its first step is below 0.5 N.
+        count: Rows of the result, from 0.5 N to the common final displacement.
+
+    Raises:
+        DatasetError: They are of different trajectories, the simulation begins above 0.5 N or never
+            reaches it before it diverges, or nothing but one row is common.
+    """
+    name = trial_name(rows.header)
+    if rows.header.trajectory != simulated.trajectory:
+        raise DatasetError(
+            f"{name}: the simulation is of {simulated.trajectory}",
+            remedy="mix a trial with the simulation of its own trajectory",
+        )
+    travel_m, force, displacement = _aligned(name, simulated)
+    final_m = min(float(rows.travel_m[-1]), float(travel_m[-1]))
+    if final_m <= 0.0:
+        short = "experiment" if len(rows.travel_m) < 2 else "simulation"
+        raise DatasetError(
+            f"{name}: the {short} has one row at {THRESHOLD_N} N and none beyond",
+            remedy="press deeper, or drop the trial",
+        )
+    at_m = np.linspace(0.0, final_m, count)
+    measured = replace(
+        rows,
+        travel_m=at_m,
+        tared=interpolate(at_m, rows.travel_m, rows.tared),
+        force=interpolate(at_m, rows.travel_m, rows.force),
+        location=interpolate(at_m, rows.travel_m, rows.location),
+    )
+    return MixedRows(
+        rows=measured,
+        simulated_force=interpolate(at_m, travel_m, force),
+        displacement=interpolate(at_m, travel_m, displacement),
+    )
+
+
+def interpolate(at: Floats, where: Floats, values: Values) -> Values:
+    """Linear interpolation along the first axis, in the type of ``values``.
+
+    Args:
+        at: Where to, within ``where``, shape (Q,).
+        where: Increasing, shape (R,), two or more.
+        values: Shape (R, ...).
+
+    Returns:
+        Shape (Q, ...).
+    """
+    after = np.clip(np.searchsorted(where, at), 1, len(where) - 1)
+    low, high = where[after - 1], where[after]
+    share = ((at - low) / (high - low)).reshape(-1, *[1] * (values.ndim - 1))
+    first, second = values[after - 1], values[after]
+    return np.asarray(first + share * (second - first), values.dtype)
+
+
+def _aligned(
+    name: str, simulated: SimulatedTrial
+) -> tuple[Floats, Floats, npt.NDArray[np.float32]]:
+    """Travel since 0.5 N, force and displacement of the steps to be believed."""
+    believed = slice(0, simulated.converged)
+    force = simulated.force[believed]
+    if not (np.isfinite(force).all() and np.isfinite(simulated.displacement[believed]).all()):
+        raise DatasetError(
+            f"{name}: a step counted as converged is not finite",
+            remedy="let converged count the steps before the divergence",
+        )
+    start = from_threshold(force)
+    if start is None:
+        largest = float(np.linalg.norm(force, axis=1).max(initial=0.0))
+        first = float(np.linalg.norm(force[0])) if len(force) else 0.0
+        if first >= THRESHOLD_N:
+            raise DatasetError(
+                f"{name}: the simulation begins at {first:.3g} N, above {THRESHOLD_N} N",
+                remedy="give the step at first touch too, where the force is zero",
+            )
+        raise DatasetError(
+            f"{name}: the simulation reaches {largest:.3g} N in its {len(force)} converged steps",
+            remedy="smaller steps may converge further; else drop the trial",
+        )
+    travel_m = start.rows(simulated.travel_m[believed])
+    if (np.diff(travel_m) <= 0).any():
+        raise DatasetError(
+            f"{name}: travel of the simulation does not increase",
+            remedy="give its steps in order of travel",
+        )
+    displacement = start.rows(simulated.displacement[believed])
+    return travel_m - travel_m[0], start.rows(force), displacement
+
+
+def assemble_experiment(
+    trials: Iterable[TrialRows], provenance: Provenance, *, unit_names: tuple[str, ...] = ()
+) -> ExperimentDataset:
+    """The purely experimental data set, sorted by unit and trajectory.
+
+    Args:
+        trials: Processed trials, in any order.
+        provenance: Where they come from.
+        unit_names: Names and order of the units; those of the trials, sorted, if not given.
+
+    Raises:
+        DatasetError: A trial is there twice, has wrong shapes, values that are not finite or a unit
+            that is not named; or one trajectory has two indenters. Names the trial.
+    """
+    return _experiment(list(trials), provenance, unit_names)[0]
+
+
+def assemble_mixed(
+    mixed: Iterable[MixedRows],
+    basis: FieldBasis,
+    mesh: SkinMesh,
+    provenance: Provenance,
+    *,
+    unit_names: tuple[str, ...] = (),
+) -> MixedDataset:
+    """The mixed data set; fields are compressed one by one, so ``mixed`` may be a stream.
+
+    Args:
+        mixed: Trials with their simulation, in any order.
+        basis: From ``fit_basis`` of the same fields.
+        mesh: Whose nodes move.
+        provenance: Where they come from.
+        unit_names: As in ``assemble_experiment``.
+
+    Raises:
+        DatasetError: As in ``assemble_experiment``, or a field is of another mesh.
+    """
+    found = [_compress(one, basis, mesh) for one in mixed]
+    experiment, order = _experiment([one.rows for one in found], provenance, unit_names)
+    return MixedDataset(
+        experiment=experiment,
+        simulated_force=np.concatenate([found[i].simulated_force for i in order]),
+        coefficients=np.concatenate([found[i].coefficients for i in order]),
+        basis=basis,
+        mesh=mesh,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Compressed:
+    rows: TrialRows
+    simulated_force: FloatArray
+    coefficients: FloatArray
+
+
+def _compress(mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh) -> _Compressed:
+    count = len(mixed.rows.travel_m)
+    for what, shape, expected in (
+        ("displacement", mixed.displacement.shape, (count, *mesh.nodes.shape)),
+        ("simulated force", mixed.simulated_force.shape, (count, 3)),
+    ):
+        if shape != expected:
+            raise DatasetError(
+                f"{trial_name(mixed.rows.header)}: {what} has shape {shape}, expected {expected}",
+                remedy="simulate with the mesh that the data set names",
+            )
+    for what, values in (
+        ("displacement", mixed.displacement),
+        ("simulated force", mixed.simulated_force),
+    ):
+        _check_finite(mixed.rows, what, values)
+    return _Compressed(
+        mixed.rows,
+        mixed.simulated_force.astype(np.float32),
+        encode(basis, mixed.displacement),
+    )
+
+
+def _experiment(
+    trials: list[TrialRows], provenance: Provenance, unit_names: tuple[str, ...]
+) -> tuple[ExperimentDataset, list[int]]:
+    """The data set, and the order in which it holds the trials."""
+    indenter = _checked(trials)
+    units = unit_names or tuple(sorted({rows.header.unit for rows in trials}))
+    for rows in trials:
+        if rows.header.unit not in units:
+            raise DatasetError(
+                f"{trial_name(rows.header)}: its unit is not among {', '.join(units)}",
+                remedy="name all units",
+            )
+    trajectories = tuple(sorted(indenter))
+    place = {trajectory: i for i, trajectory in enumerate(trajectories)}
+    keys = [(units.index(rows.header.unit), place[rows.header.trajectory]) for rows in trials]
+    order = sorted(range(len(trials)), key=keys.__getitem__)
+    held = [trials[i] for i in order]
+    experiment = ExperimentDataset(
+        unit_names=units,
+        trajectories=trajectories,
+        indenters=tuple(indenter[trajectory] for trajectory in trajectories),
+        trial_unit=np.array([keys[i][0] for i in order], np.int32),
+        trial_trajectory=np.array([keys[i][1] for i in order], np.int32),
+        trial_rest=np.array([rows.rest for rows in held], np.float32),
+        trial=np.repeat(
+            np.arange(len(held), dtype=np.int32), [len(rows.travel_m) for rows in held]
+        ),
+        travel_m=np.concatenate([rows.travel_m for rows in held]).astype(np.float32),
+        tared=np.concatenate([rows.tared for rows in held]).astype(np.float32),
+        force=np.concatenate([rows.force for rows in held]).astype(np.float32),
+        location=np.concatenate([rows.location for rows in held]).astype(np.float32),
+        provenance=provenance,
+    )
+    return experiment, order
+
+
+def _checked(trials: list[TrialRows]) -> dict[str, str]:
+    """Check every trial; the indenter of each unique trajectory."""
+    if not trials:
+        raise DatasetError("no trials", remedy="process or ingest at least one")
+    seen: set[tuple[str, str]] = set()
+    indenter: dict[str, str] = {}
+    for rows in trials:
+        name = trial_name(rows.header)
+        key = (rows.header.unit, rows.header.trajectory)
+        if key in seen:
+            raise DatasetError(
+                f"{name} is there twice",
+                remedy="a unit executes a trajectory once; remove one of the trials",
+            )
+        seen.add(key)
+        known = indenter.setdefault(rows.header.trajectory, rows.header.indenter)
+        if known != rows.header.indenter:
+            raise DatasetError(
+                f"{name}: indenter {rows.header.indenter}, on another unit {known}",
+                remedy="give each trajectory one indenter; its id begins with it",
+            )
+        _check_trial(rows)
+    return indenter
+
+
+def _check_trial(rows: TrialRows) -> None:
+    count = len(rows.travel_m)
+    for what, values, shape in (
+        ("rest", rows.rest, (ELECTRODES,)),
+        ("travel_m", rows.travel_m, (count,)),
+        ("tared", rows.tared, (count, ELECTRODES)),
+        ("force", rows.force, (count, 3)),
+        ("location", rows.location, (count, 3)),
+    ):
+        if values.shape != shape or count == 0:
+            raise DatasetError(
+                f"{trial_name(rows.header)}: {what} has shape {values.shape}, expected {shape}"
+                " with at least one row",
+                remedy="give one row of every quantity for each displacement",
+            )
+        if what != "rest":  # NaN there says that the source does not tell
+            _check_finite(rows, what, values)
+
+
+def _check_finite(rows: TrialRows, what: str, values: npt.NDArray[np.floating]) -> None:
+    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+    if bad.size:
+        raise DatasetError(
+            f"{trial_name(rows.header)}: {what} is not finite in row {bad[0]}",
+            remedy="drop the row or the trial",
+        )

@@ -1,0 +1,206 @@
+"""A data set for learning features, in memory: arrays, what they mean, and the checks they pass."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate.messages import COUNTS_MAX
+
+FloatArray = npt.NDArray[np.float32]
+CountArray = npt.NDArray[np.uint16]
+IndexArray = npt.NDArray[np.int32]
+TimeArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+ELECTRODES = 19
+"""Sensing electrodes of a BioTac."""
+
+SENSOR_FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
+"""The only frame of schema version 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where a data set comes from.
+
+    Attributes:
+        source: What was measured or simulated, one line for people.
+        command: The command that wrote the data set.
+        input_sha256: SHA-256 of the input file, hex; empty where there was none.
+        licence: What may be done with the rows.
+        palpate_version: Version of palpate that wrote it.
+        notes: Assumptions made on the way in, e.g. how axes were matched.
+    """
+
+    source: str
+    command: str
+    input_sha256: str
+    licence: str
+    palpate_version: str
+    notes: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureDataset:
+    """Rows of electrodes with the force, and where known the contact location, at the same time.
+
+    Rows are in order of time within one sensor. Checked on construction (``DatasetError``).
+
+    Attributes:
+        electrodes: Raw counts [counts], uint16, shape ``(N, 19)``.
+        baseline: Untouched counts in force at that row [counts], shape ``(N, 19)``.
+        force: Force on the BioTac [N], sensor frame, shape ``(N, 3)``.
+        group: Recording, trajectory or press that the row belongs to, shape ``(N,)``.
+        block: Contiguous piece that is held out as a whole, shape ``(N,)``; unique over groups.
+        sensor: Index into ``sensor_names``, shape ``(N,)``.
+        sensor_names: Names of the sensors.
+        provenance: Where it comes from.
+        contact_location: Tip of the indenter [m], sensor frame, shape ``(N, 3)``; NaN where there
+            is no contact; None where nobody knows.
+        in_contact: Whether the indenter touches, shape ``(N,)``; None = not known.
+        time_ns: Time of the row [ns] on one clock per sensor, shape ``(N,)``; None = not known.
+    """
+
+    electrodes: CountArray
+    baseline: FloatArray
+    force: FloatArray
+    group: IndexArray
+    block: IndexArray
+    sensor: IndexArray
+    sensor_names: tuple[str, ...]
+    provenance: Provenance
+    contact_location: FloatArray | None = None
+    in_contact: BoolArray | None = None
+    time_ns: TimeArray | None = None
+    name: str = field(default="dataset", compare=False)
+
+    def __post_init__(self) -> None:
+        _check_shapes(self)
+        _check_values(self)
+
+    def __len__(self) -> int:
+        return len(self.electrodes)
+
+    @property
+    def tared_counts(self) -> FloatArray:
+        """Raw minus baseline [counts], float32, shape ``(N, 19)``."""
+        tared = self.electrodes.astype(np.float32) - self.baseline
+        return tared.astype(np.float32, copy=False)
+
+    def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
+        """The arrays that are present, by name, in the order of the schema."""
+        named: dict[str, npt.NDArray[np.generic] | None] = {
+            "electrodes": self.electrodes,
+            "baseline": self.baseline,
+            "force": self.force,
+            "group": self.group,
+            "block": self.block,
+            "sensor": self.sensor,
+            "contact_location": self.contact_location,
+            "in_contact": self.in_contact,
+            "time_ns": self.time_ns,
+        }
+        return {name: array for name, array in named.items() if array is not None}
+
+    def content_sha256(self) -> str:
+        """SHA-256 of names, shapes and values, hex; does not depend on how the file is laid out."""
+        digest = hashlib.sha256()
+        digest.update("\n".join(self.sensor_names).encode())
+        for name, array in self.arrays().items():
+            little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
+            digest.update(f"{name}:{little.dtype.str}:{little.shape}".encode())
+            digest.update(little.tobytes())
+        return digest.hexdigest()
+
+
+def cut_into_blocks(rows: int, blocks: int) -> IndexArray:
+    """Number the contiguous pieces of one recording, of equal length to within a row.
+
+    Args:
+        rows: Rows of the recording.
+        blocks: How many pieces.
+
+    Returns:
+        Block of every row, ``0 .. blocks - 1``, shape ``(rows,)``.
+    """
+    return (np.arange(rows, dtype=np.int64) * blocks // rows).astype(np.int32)
+
+
+SHAPES: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
+    "electrodes": ((ELECTRODES,), np.uint16),
+    "baseline": ((ELECTRODES,), np.float32),
+    "force": ((3,), np.float32),
+    "group": ((), np.int32),
+    "block": ((), np.int32),
+    "sensor": ((), np.int32),
+    "contact_location": ((3,), np.float32),
+    "in_contact": ((), np.bool_),
+    "time_ns": ((), np.int64),
+}
+"""Shape of one row and type of every array."""
+
+
+def _check_shapes(data: FeatureDataset) -> None:
+    rows = len(data.electrodes)
+    if rows == 0:
+        raise DatasetError(f"{data.name}: no rows", remedy="record or ingest at least one press")
+    for name, array in data.arrays().items():
+        row_shape, dtype = SHAPES[name]
+        if name == "electrodes" and array.ndim == 2 and array.shape[1] != ELECTRODES:
+            raise DatasetError(
+                f"{data.name}: electrodes has {array.shape[1]} columns, a BioTac has {ELECTRODES}",
+                remedy="write one column for each of E1..E19; a BioTac SP needs another schema",
+            )
+        if array.shape != (rows, *row_shape):
+            raise DatasetError(
+                f"{data.name}: {name} has shape {array.shape}, expected {(rows, *row_shape)}",
+                remedy="write one row of every array for each row of electrodes",
+            )
+        if array.dtype != dtype:
+            raise DatasetError(
+                f"{data.name}: {name} is {array.dtype}, expected {np.dtype(dtype)}",
+                remedy=f"convert {name} before writing; see training/README.md",
+            )
+
+
+def _check_values(data: FeatureDataset) -> None:
+    must_be_finite = {"baseline": data.baseline, "force": data.force}
+    if data.contact_location is not None:
+        touching = data.in_contact if data.in_contact is not None else np.ones(len(data), np.bool_)
+        # Where nothing touches there is no location, so NaN is right there and only there.
+        must_be_finite["contact_location"] = np.where(
+            touching[:, None], data.contact_location, np.float32(0)
+        )
+    for name, values in must_be_finite.items():
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            raise DatasetError(
+                f"{data.name}: {name} is not finite in row {bad[0]} ({bad.size} rows in all)",
+                remedy="drop these rows where the data set is made",
+            )
+    above = np.flatnonzero((data.electrodes > COUNTS_MAX).any(axis=1))
+    if above.size:
+        raise DatasetError(
+            f"{data.name}: electrodes is above {COUNTS_MAX} counts in row {above[0]}",
+            remedy="raw counts have 12 bits; write them as read, nothing subtracted or scaled",
+        )
+    if data.sensor.min() < 0 or data.sensor.max() >= len(data.sensor_names):
+        raise DatasetError(
+            f"{data.name}: sensor holds {data.sensor.max()}, but {len(data.sensor_names)} sensors"
+            " are named",
+            remedy="sensor is an index into sensor_names",
+        )
+    order = np.lexsort((data.group, data.block))
+    block, group = data.block[order], data.group[order]
+    mixed = np.flatnonzero((np.diff(block) == 0) & (np.diff(group) != 0))
+    if mixed.size:
+        raise DatasetError(
+            f"{data.name}: block {block[mixed[0]]} spans groups {group[mixed[0]]} and"
+            f" {group[mixed[0] + 1]}",
+            remedy="number blocks uniquely over all groups",
+        )

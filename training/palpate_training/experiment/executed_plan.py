@@ -1,0 +1,324 @@
+"""A real experiment: a record and the plan that was executed -> raw trials, as the twin makes them.
+
+The record (`palpate record`, or the station's own) holds electrodes and wrench of the finger, and
+the indenter's pose; instead of poses the robot's joint angles may come as a CSV file. The plan is
+the trajectory file that the robot executed. When it did so is the one thing neither holds: the
+robot's program notes the wall-clock instant at which it stood at a start pose and began, for the
+whole plan or for each trajectory. Whether the tip then moved as commanded is checked at the end of
+every increment.
+
+
+Joint angles that a robot logged, as a CSV file.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.alignment import linear
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.datasets.ingest import (
+    Streams,
+    middles,
+    read_streams,
+    refuse_other_types,
+    time_of,
+)
+from palpate_training.datasets.trials import RawTrial, TrialHeader
+from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.plan import DWELL_S, Motion, commanded_travel
+from palpate_training.experiment.trajectory_file import read_trajectories
+from palpate_training.experiment.transform import Floats, Transform
+
+GAP_S = 0.05
+"""How old the last sample of an increment may be at its end [s]: five frames at 100 Hz."""
+
+MISMATCH_M = 0.07e-3
+"""How far an increment's end may be from its command, apart from what all of a trajectory share
+[m]: less than an increment, so that a schedule that is off by one shows at its first or last, and
+six standard deviations of the repeatability of the paper's robot (0.02 mm in three axes)."""
+
+OFFSET_M = 5.0e-3
+"""How far a whole trajectory may be from its command [m]: a few times the worst registration."""
+
+Times = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    """Samples that have electrodes and a wrench, and times at which they were taken."""
+
+    time_ns: Times
+    wall_ns: Times
+    electrodes: npt.NDArray[np.uint16]
+    force: Floats
+
+
+def ingest_experiment(
+    record: Path,
+    plan: Path,
+    *,
+    unit: str,
+    sensor: str,
+    start_wall_ns: int | Mapping[str, int],
+    joint_logs: Mapping[str, JointLog] | None = None,
+) -> list[RawTrial]:
+    """Cut a record into the trials of a plan.
+
+    Args:
+        record: ``NAME.mcap``.
+        plan: The trajectory file that was executed.
+        unit: Name of the BioTac, for the headers.
+        sensor: Name of the sensor in the record's keys.
+        start_wall_ns: Wall clock when the plan started, or by trajectory when it started; with a
+            mapping, trajectories that are not in it were not executed.
+        joint_logs: By arm; None = poses come from the record.
+
+    Returns:
+        Trials in the order of the plan.
+
+    Raises:
+        RecordingError: Not a whole record.
+        DatasetError: A stream is missing, the schedule does not match, or there is a gap of more
+            than 50 ms at the end of an increment; names the trajectory and increment.
+        ConfigError: Joints that the arm cannot have.
+    """
+    planned = read_trajectories(plan)
+    streams = read_streams(record).get(sensor)
+    if streams is None:
+        raise DatasetError(
+            f"{record}: no stream of sensor {sensor!r}", remedy="name the sensor as in the record"
+        )
+    samples = _samples(record, sensor, streams)
+    starts = _starts(plan, planned.motions, start_wall_ns)
+    tips: dict[str, tuple[Floats, npt.NDArray[np.bool_]]] = {}
+    trials = []
+    for motion in planned.motions:
+        item = motion.trajectory
+        if item.trajectory not in starts:
+            continue
+        if item.arm not in tips:
+            if joint_logs is None:
+                tips[item.arm] = _tip_of_poses(record, sensor, streams, samples)
+            elif item.arm in joint_logs:
+                registered = planned.stations[item.arm].sensor_robot
+                tips[item.arm] = _tip_of_joints(joint_logs[item.arm], registered, samples)
+            else:
+                raise DatasetError(
+                    f"{plan}: {item.trajectory!r} was executed by the {item.arm} arm, which has no"
+                    " joint log",
+                    remedy="pass the joint log of every arm of the plan",
+                )
+        tip, known = tips[item.arm]
+        trials.append(_cut(record, motion, unit, starts[item.trajectory], samples, tip, known))
+    return trials
+
+
+def _samples(record: Path, sensor: str, streams: Streams) -> _Stream:
+    if not streams.wrenches:
+        raise DatasetError(
+            f"{record}: sensor {sensor!r} has no wrench stream",
+            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
+        )
+    refuse_other_types(record, sensor, streams)
+    frames = [frame for frame in streams.frames if frame.electrodes_valid]
+    if not frames:
+        raise DatasetError(
+            f"{record}: sensor {sensor!r} has no valid BioTac frame",
+            remedy="record the stream electrodes of the finger",
+        )
+    times, first = np.unique(
+        np.array([time_of(frame.stamp, streams) for frame in frames], dtype=np.int64),
+        return_index=True,
+    )
+    frames = [frames[i] for i in first]
+    at = times + middles(frames)
+    force, known = linear(
+        at,
+        np.array([time_of(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
+        np.array([w.force for w in streams.wrenches], dtype=np.float64),
+    )
+    walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
+    return _Stream(
+        at[known],
+        (walls + at - times)[known],
+        np.array([frame.electrodes for frame in frames], dtype=np.uint16)[known],
+        force[known],
+    )
+
+
+def _tip_of_poses(
+    record: Path, sensor: str, streams: Streams, samples: _Stream
+) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    if not streams.poses:
+        raise DatasetError(
+            f"{record}: sensor {sensor!r} has no pose stream",
+            remedy="record the indenter's pose, or pass the joint log of each arm",
+        )
+    return linear(
+        samples.time_ns,
+        np.array([time_of(p.stamp, streams) for p in streams.poses], dtype=np.int64),
+        np.array([p.position for p in streams.poses], dtype=np.float64),
+    )
+
+
+def _tip_of_joints(
+    log: JointLog, registered: Transform, samples: _Stream
+) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    times, joints = read_joint_log(log.path, log.arm)
+    try:
+        positions, _ = log.arm.tip(joints)
+    except ConfigError as error:
+        raise ConfigError(f"{log.path}: {error.problem}", remedy=error.remedy) from error
+    sensor_robot = registered if log.sensor_robot is None else log.sensor_robot
+    return linear(samples.wall_ns, times, sensor_robot.apply(positions))
+
+
+def _starts(
+    plan: Path, motions: tuple[Motion, ...], start_wall_ns: int | Mapping[str, int]
+) -> dict[str, int]:
+    if not isinstance(start_wall_ns, Mapping):
+        return {
+            motion.trajectory.trajectory: start_wall_ns + round(motion.start_s * 1e9)
+            for motion in motions
+        }
+    unknown = set(start_wall_ns) - {motion.trajectory.trajectory for motion in motions}
+    if unknown:
+        raise DatasetError(
+            f"{plan}: no trajectory {sorted(unknown)[0]!r}",
+            remedy="give the file that was executed, and start times by its ids",
+        )
+    return dict(start_wall_ns)
+
+
+def _cut(
+    record: Path,
+    motion: Motion,
+    unit: str,
+    start_ns: int,
+    samples: _Stream,
+    tip: Floats,
+    known: npt.NDArray[np.bool_],
+) -> RawTrial:
+    """One trial: the samples from its start to its end that have everything."""
+    item = motion.trajectory
+    where = f"{record}: trajectory {item.trajectory!r}"
+    # the wall clock says when it started; from there on the steadier one counts
+    first = int((samples.wall_ns >= start_ns).argmax())
+    since_ns = samples.time_ns - samples.time_ns[first] + samples.wall_ns[first] - start_ns
+    kept = np.flatnonzero(known & (since_ns >= 0) & (since_ns < round(item.duration_s * 1e9)))
+    if not len(kept):
+        raise DatasetError(
+            f"{where}: nothing was recorded in its {item.duration_s:g} s",
+            remedy="check the start time: wall clock, in nanoseconds; leave out what was not run",
+        )
+    time_s = since_ns[kept] * 1e-9
+    if time_s[0] > GAP_S:
+        raise DatasetError(
+            f"{where}: no sample with electrodes, wrench and tip in its first"
+            f" {time_s[0] * 1e3:.0f} ms; at most {GAP_S * 1e3:g} ms",
+            remedy="record from before the start on, all streams at 100 Hz",
+        )
+    ends = DWELL_S * np.arange(1, len(item.travel_m))
+    last = np.searchsorted(time_s, ends) - 1
+    late = ends - time_s[last]
+    if late.max() > GAP_S:
+        worst = int(late.argmax())
+        raise DatasetError(
+            f"{where}: no sample with electrodes, wrench and tip in the last"
+            f" {late[worst] * 1e3:.0f} ms of increment {worst + 1}; at most {GAP_S * 1e3:g} ms",
+            remedy="record all streams at 100 Hz; leave this trajectory out by start_wall_ns",
+        )
+    stops = kept[np.concatenate([[0], last])]
+    _check_schedule(where, tip[stops] - item.poses[:, :3])
+    return RawTrial(
+        header=TrialHeader(unit, item.trajectory, item.indenter, item.arm),
+        time_s=time_s,
+        electrodes=samples.electrodes[kept],
+        force=samples.force[kept],
+        tip=tip[kept],
+        travel_m=commanded_travel(time_s, item.travel_m),
+        increment_end=last.astype(np.int64),
+    )
+
+
+def _check_schedule(where: str, missed: Floats) -> None:
+    """Compare tip and command where it starts and at the ends of increments.
+
+    The start is what tells a schedule that is early by a whole increment, the end one that is late.
+
+    Args:
+        where: For the message.
+        missed: Tip minus command [m], shape (I + 1, 3).
+    """
+    shared = np.median(missed, axis=0)  # by registration, as the fingertip sees it
+    if np.linalg.norm(shared) > OFFSET_M:
+        raise DatasetError(
+            f"{where}: the tip is {np.linalg.norm(shared) * 1e3:.1f} mm from every command",
+            remedy="check the start time, and that pose and plan have one registration and tip",
+        )
+    off = np.linalg.norm(missed - shared, axis=1)
+    if off.max() > MISMATCH_M:
+        worst = int(off.argmax())
+        at = f"at the end of increment {worst}" if worst else "at the start"
+        raise DatasetError(
+            f"{where}: {at} the tip is {off[worst] * 1e3:.2f} mm from where the schedule has it;"
+            f" at most {MISMATCH_M * 1e3:g} mm",
+            remedy="check the start time, and that the robot executed this plan",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class JointLog:
+    """Joint angles of an arm instead of poses.
+
+    Attributes:
+        path: CSV with a header ``time_s,<joint>,...``: wall clock [s since the Unix epoch], then
+            the joints [rad or m] in the order of the arm's.
+        arm: Its kinematics, with the tool that was used.
+        sensor_robot: Its registration; None = the one in the trajectory file.
+    """
+
+    path: Path
+    arm: Arm
+    sensor_robot: Transform | None = None
+
+
+def read_joint_log(path: Path, arm: Arm) -> tuple[Times, Floats]:
+    """Wall clock [ns], shape (T,), and joints [rad or m], shape (T, n), of a CSV file.
+
+    Raises:
+        DatasetError: It cannot be read, or its columns are not time_s and the arm's joints; names
+            the line.
+    """
+    n = len(arm.joint_names)
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DatasetError(f"{path} cannot be read: {error}", remedy="check the path") from error
+    if len(rows) < 2 or rows[0][:1] != ["time_s"] or len(rows[0]) != n + 1:
+        raise DatasetError(
+            f"{path}: columns {', '.join(rows[0]) if rows else 'none'}",
+            remedy=f"write time_s and {n} joints of {arm.name}, a header first",
+        )
+    values = np.empty((len(rows) - 1, n + 1))
+    for number, row in enumerate(rows[1:], 2):
+        try:
+            values[number - 2] = [float(cell) for cell in row]
+        except ValueError as error:
+            raise DatasetError(
+                f"{path}, line {number}: {error}", remedy=f"write {n + 1} numbers"
+            ) from error
+    if not np.isfinite(values).all() or (np.diff(values[:, 0]) <= 0.0).any():
+        raise DatasetError(
+            f"{path}: times do not increase, or a value is not finite",
+            remedy="leave such lines out of the log",
+        )
+    return np.round(values[:, 0] * 1e9).astype(np.int64), values[:, 1:]

@@ -1,0 +1,160 @@
+"""A stand-in for the robot: an open seven-axis arm of our own dimensions, as a URDF.
+
+Of the size of a small two-armed assembly robot: 0.5 m from shoulder to wrist. It is no copy of a
+product; anybody with a robot gives its URDF instead. Axes: shoulder yaw, pitch, roll; elbow pitch;
+wrist roll, pitch; flange roll, with offsets at shoulder, elbow and wrist so that no two share a
+point and the tip depends on all of them. The left arm is the mirror image of the right one.
+
+Two of them stand on the bench on either side of the finger, which lies with its pad up, its tip
+towards them and its origin 150 mm above the bench; the plate with the holes is below it
+(`palpate_training.experiment.clearance`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import ConfigError
+from palpate.files.atomic import written_whole
+from palpate_training.experiment.transform import Floats, Transform
+
+SIDES = ("left", "right")
+FLANGE = "flange"
+"""Frame that carries pin or indenter, z along the tool."""
+
+TOOL_LENGTH_M = 0.06
+"""From flange to the tip of pin and indenters [m]; ours."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Joint:
+    """Place in the link before [m], axis, limits [rad]; of the right arm."""
+
+    origin: tuple[float, float, float]
+    axis: tuple[int, int, int]
+    limits: tuple[float, float]
+
+
+_JOINTS = (
+    _Joint((0.0, 0.0, 0.16), (0, 0, 1), (-2.9, 2.9)),
+    _Joint((0.03, 0.0, 0.09), (0, 1, 0), (-1.9, 2.3)),
+    _Joint((-0.03, 0.0, 0.11), (0, 0, 1), (-2.9, 2.9)),
+    _Joint((0.04, 0.0, 0.14), (0, 1, 0), (-0.3, 2.6)),
+    _Joint((-0.04, 0.0, 0.12), (0, 0, 1), (-2.9, 2.9)),
+    _Joint((0.025, 0.0, 0.13), (0, 1, 0), (-2.2, 2.2)),
+    _Joint((0.025, 0.0, 0.05), (0, 0, 1), (-3.1, 3.1)),
+)
+_FLANGE_M = 0.03  # from the last joint to the flange
+JOINTS = len(_JOINTS)
+
+HOME = np.array([0.0, 0.45, 0.0, 1.45, 0.0, 1.25, 0.0])
+"""Posture over the finger that inverse kinematics starts from [rad], of both arms."""
+
+
+def arm_urdf(side: str, link_errors: npt.ArrayLike | None = None) -> str:
+    """URDF of an arm.
+
+    Args:
+        side: ``left`` or ``right``.
+        link_errors: How the far end of each link is off, in the frame that moves with its joint:
+            displacement [m] and rotation vector [rad], shape (7, 6). None = the drawing.
+
+    Raises:
+        ConfigError: Another side.
+    """
+    mirror = -1.0 if _checked_side(side) == "left" else 1.0
+    errors = np.zeros((JOINTS, 6)) if link_errors is None else np.asarray(link_errors, np.float64)
+    lines = ['<?xml version="1.0"?>', f'<robot name="palpate_stand_in_{side}">', _link("base")]
+    parent = "base"
+    off = np.zeros(6)  # the base link has none: registration would take it up
+    for number, joint in enumerate(_JOINTS, 1):
+        # Mirrored in the plane y = 0: turns about x and z change sign, about y not.
+        axis = (mirror * joint.axis[0], float(joint.axis[1]), mirror * joint.axis[2])
+        child = f"link{number}"
+        lines += [
+            _link(child),
+            f'<joint name="{side}_joint{number}" type="revolute">',
+            f'  <parent link="{parent}"/><child link="{child}"/>',
+            _origin(off, np.array(joint.origin)),
+            f'  <axis xyz="{axis[0]:g} {axis[1]:g} {axis[2]:g}"/>',
+            f'  <limit lower="{joint.limits[0]}" upper="{joint.limits[1]}" effort="50"'
+            ' velocity="3"/>',
+            "</joint>",
+        ]
+        parent, off = child, errors[number - 1]
+    lines += [
+        _link(FLANGE),
+        f'<joint name="{side}_{FLANGE}" type="fixed">',
+        f'  <parent link="{parent}"/><child link="{FLANGE}"/>',
+        _origin(off, np.array([0.0, 0.0, _FLANGE_M])),
+        "</joint>",
+        "</robot>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def write_arm_urdf(side: str, path: Path) -> Path:
+    """Write the URDF of an arm; whole or not at all.
+
+    Raises:
+        ConfigError: Another side.
+        DatasetError: The disk refused.
+    """
+    with written_whole(path) as partial:
+        partial.write_text(arm_urdf(side), encoding="utf-8")
+    return path
+
+
+def tool() -> Transform:
+    """Pose of the tip of pin or indenter in the flange."""
+    return Transform(np.eye(3), np.array([0.0, 0.0, TOOL_LENGTH_M]))
+
+
+def sensor_robot(side: str) -> Transform:
+    """Where an arm stands: pose of its base in the sensor frame, which registration finds.
+
+    Raises:
+        ConfigError: Another side.
+    """
+    lateral = 0.20 if _checked_side(side) == "left" else -0.20
+    # Bench to sensor frame: pad up, so z (dorsal) is down; y (lateral) is the robot's left and the
+    # fingertip looks at the robot. A half turn about y.
+    half_turn = np.diag([-1.0, 1.0, -1.0])
+    finger_on_bench = np.array([0.30, -lateral, 0.15])
+    return Transform(half_turn, -half_turn @ finger_on_bench)
+
+
+def _checked_side(side: str) -> str:
+    if side not in SIDES:
+        raise ConfigError(f"arm {side!r} is unknown", remedy="use left or right")
+    return side
+
+
+def _link(name: str) -> str:
+    return f'<link name="{name}"/>'
+
+
+def _origin(off: Floats, xyz: Floats) -> str:
+    """Origin element of a joint at ``xyz`` in a link whose far end is off."""
+    rotation = _rotation(off[3:])
+    x, y, z = rotation @ xyz + off[:3]
+    pitch = math.asin(-rotation[2, 0])
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    return f'  <origin xyz="{x:.15g} {y:.15g} {z:.15g}" rpy="{roll:.15g} {pitch:.15g} {yaw:.15g}"/>'
+
+
+def _rotation(vector: Floats) -> Floats:
+    """Matrix of a rotation vector [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return np.asarray(turned)

@@ -1,0 +1,1 @@
+"""Figures as in the paper, and the statistics page of a data set of the experiment."""

@@ -1,0 +1,1 @@
+"""What every task learns with: splits, networks, the training loop, metrics, baselines, export."""

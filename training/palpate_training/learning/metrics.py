@@ -1,0 +1,267 @@
+"""How wrong an estimate is: the metrics of the protocol, defined once, in pure NumPy.
+
+Force: magnitude error ``| |F^| - |F| |`` [N] (also over the standard deviation of the true
+magnitudes, and over the true magnitude of the row), vector error ``|F^ - F|`` [N], root mean square
+per axis [N], angle ``arccos(cos)`` [rad] and ``1 - cos`` [-]. Both angles are given because the
+literature writes "cosine error" for either. Contact location: distance ``|p^ - p|`` [m].
+
+Field: the distance of a node's estimated displacement from its true one [m]; of a row its mean over
+the paper's 128-node subset, over all nodes, over the nodes that truly move by more than 0.1 mm, and
+its largest value over all nodes. Electrodes: the root mean square over rows and the 19 electrodes,
+over full scale [-] and in counts, and the median over rows of the norm in R^19 [counts]. Skill is
+one minus the error over that of predicting zero.
+
+Rows of one block are nearly copies, so confidence intervals resample whole blocks (clusters).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.messages import COUNTS_MAX
+
+Float = npt.NDArray[np.floating]
+Labels = npt.NDArray[np.int32]
+Statistic = Callable[[npt.NDArray[np.float64]], float]
+
+MIN_MAGNITUDE_N = 1e-3
+"""Below this true force a direction has no meaning [N]; such rows have no angle."""
+
+
+_SUMMARY = {
+    "magnitude_n": "force_magnitude_{}_n",
+    "magnitude_over_norm": "force_magnitude_over_norm_{}",
+    "vector_n": "force_vector_{}_n",
+    "angle_rad": "force_angle_{}_rad",
+    "one_minus_cos": "force_one_minus_cos_{}",
+}
+"""Names of the summaries: the unit stands last, as everywhere."""
+
+
+def force_errors(estimate: Float, truth: Float) -> dict[str, npt.NDArray[np.float64]]:
+    """Errors of every row.
+
+    Args:
+        estimate: Estimated force [N], shape ``(N, 3)``.
+        truth: True force [N], shape ``(N, 3)``.
+
+    Returns:
+        ``magnitude_n``, ``magnitude_over_norm``, ``vector_n``, ``angle_rad``, ``one_minus_cos``,
+        each of shape ``(N,)``; NaN where the true force is too small to have a direction.
+    """
+    estimate, truth = _pair(estimate, truth)
+    true_norm = np.linalg.norm(truth, axis=1)
+    norm = np.linalg.norm(estimate, axis=1)
+    directed = true_norm >= MIN_MAGNITUDE_N
+    # An estimate of exactly zero has no direction: counted as perpendicular, not as perfect.
+    product = np.where(norm > 0, norm * true_norm, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.clip(np.sum(estimate * truth, axis=1) / product, -1.0, 1.0)
+        over_norm = np.abs(norm - true_norm) / true_norm
+    return {
+        "magnitude_n": np.abs(norm - true_norm),
+        "magnitude_over_norm": np.where(directed, over_norm, np.nan),
+        "vector_n": np.linalg.norm(estimate - truth, axis=1),
+        "angle_rad": np.where(directed, np.arccos(cosine), np.nan),
+        "one_minus_cos": np.where(directed, 1.0 - cosine, np.nan),
+    }
+
+
+def force_metrics(estimate: Float, truth: Float) -> dict[str, float]:
+    """Summary of ``force_errors``: median, mean, IQR; over std; root mean square per axis."""
+    summary: dict[str, float] = {}
+    for name, values in force_errors(estimate, truth).items():
+        summary |= summarise(_SUMMARY[name], values)
+    estimate, truth = _pair(estimate, truth)
+    spread = float(np.std(np.linalg.norm(truth, axis=1)))
+    median = summary["force_magnitude_median_n"]
+    summary["force_magnitude_over_std_median"] = median / spread if spread > 0 else float("nan")
+    for axis, value in zip("xyz", rms(estimate - truth), strict=True):
+        summary[f"force_rmse_{axis}_n"] = float(value)
+    return summary
+
+
+def location_errors(estimate: Float, truth: Float) -> dict[str, npt.NDArray[np.float64]]:
+    """Distance of every row: ``distance_m``, shape ``(N,)``; positions [m], shape ``(N, 3)``."""
+    estimate, truth = _pair(estimate, truth)
+    return {"distance_m": np.linalg.norm(estimate - truth, axis=1)}
+
+
+def location_metrics(estimate: Float, truth: Float) -> dict[str, float]:
+    """Summary of ``location_errors``: median, mean, IQR; root mean square per axis."""
+    summary = summarise("location_distance_{}_m", location_errors(estimate, truth)["distance_m"])
+    estimate, truth = _pair(estimate, truth)
+    for axis, value in zip("xyz", rms(estimate - truth), strict=True):
+        summary[f"location_rmse_{axis}_m"] = float(value)
+    return summary
+
+
+def summarise(pattern: str, values: npt.NDArray[np.float64]) -> dict[str, float]:
+    """Median, mean and inter-quartile range of the rows that are not NaN.
+
+    Args:
+        pattern: Name with ``{}`` where the word goes, so that the unit can stand last.
+        values: Errors of every row, shape ``(N,)``.
+    """
+    kept = values[~np.isnan(values)]
+    if not kept.size:
+        return {pattern.format(word): float("nan") for word in ("median", "mean", "iqr")}
+    low, median, high = np.percentile(kept, [25, 50, 75])
+    return {
+        pattern.format("median"): float(median),
+        pattern.format("mean"): float(np.mean(kept)),
+        pattern.format("iqr"): float(high - low),
+    }
+
+
+def rms(residual: Float) -> npt.NDArray[np.float64]:
+    """Root mean square over rows, one value for each column."""
+    return np.asarray(np.sqrt(np.mean(np.square(residual, dtype=np.float64), axis=0)))
+
+
+def cluster_bootstrap(
+    errors: Mapping[str, npt.NDArray[np.float64]],
+    cluster: Labels,
+    *,
+    statistic: Statistic = lambda values: float(np.nanmedian(values)),
+    draws: int = 2000,
+    level: float = 0.95,
+    seed: int = 0,
+) -> dict[str, tuple[float, float]]:
+    """Confidence interval of a statistic when only whole clusters are independent.
+
+    Args:
+        errors: Errors of every row by name; each of shape ``(N,)`` or ``(N, S)`` (S seeds: the
+            statistic is taken for each seed and averaged).
+        cluster: Block, press or trajectory of every row, shape ``(N,)``.
+        statistic: Number made of the rows of one draw.
+        draws: How often whole clusters are drawn with replacement.
+        level: Share of the draws inside the interval.
+        seed: Seed of the draws.
+
+    Returns:
+        ``(low, high)`` for each name.
+    """
+    names = list(errors)
+    members = [np.flatnonzero(cluster == one) for one in np.unique(cluster)]
+    rng = np.random.default_rng(seed)
+    results = np.empty((draws, len(names)))
+    columns = [np.atleast_2d(errors[name].T) for name in names]  # each (S, N)
+    for draw in range(draws):
+        picked = rng.integers(len(members), size=len(members))
+        rows = np.concatenate([members[i] for i in picked])
+        for i, column in enumerate(columns):
+            results[draw, i] = np.mean([statistic(seed_errors[rows]) for seed_errors in column])
+    tail = 50.0 * (1.0 - level)
+    low, high = np.percentile(results, [tail, 100.0 - tail], axis=0)
+    return {name: (float(low[i]), float(high[i])) for i, name in enumerate(names)}
+
+
+def _pair(estimate: Float, truth: Float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    if estimate.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 3:
+        raise ValueError(f"shapes {estimate.shape} and {truth.shape}, expected twice (N, 3)")
+    return estimate.astype(np.float64), truth.astype(np.float64)
+
+
+Rows64 = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.integer]
+
+MOVING_M = 1e-4
+"""The paper's "significant motion": nodes that move by more [m]."""
+
+
+def field_errors(
+    estimate: Float, truth: Float, subset: Indices, *, moving_m: float = MOVING_M
+) -> dict[str, Rows64]:
+    """Errors of every row [m].
+
+    Args:
+        estimate: Estimated displacement [m], shape ``(N, V, 3)``.
+        truth: True displacement [m], shape ``(N, V, 3)``.
+        subset: The 128 nodes of the paper's metric.
+        moving_m: True length from which a node counts as moving [m].
+
+    Returns:
+        ``subset_m``, ``all_m``, ``moving_m``, ``max_m``, each of shape ``(N,)``; ``moving_m`` is
+        NaN in a row in which no node moves.
+    """
+    if estimate.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3:
+        raise ValueError(f"shapes {estimate.shape} and {truth.shape}, expected twice (N, V, 3)")
+    distance = np.linalg.norm(estimate - truth, axis=2).astype(np.float64)
+    moves = np.linalg.norm(truth, axis=2) > moving_m
+    count = moves.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        moving = np.where(moves, distance, 0.0).sum(axis=1) / np.where(count > 0, count, np.nan)
+    return {
+        "subset_m": distance[:, subset].mean(axis=1),
+        "all_m": distance.mean(axis=1),
+        "moving_m": moving,
+        "max_m": distance.max(axis=1),
+    }
+
+
+def join(parts: Iterable[dict[str, Rows64]]) -> dict[str, Rows64]:
+    """Errors of rows that were computed part by part."""
+    listed = list(parts)
+    return {name: np.concatenate([part[name] for part in listed]) for name in listed[0]}
+
+
+def field_summary(errors: dict[str, Rows64], zero: dict[str, Rows64]) -> dict[str, float]:
+    """Mean over rows of each error [m], and the skill over predicting zero.
+
+    Args:
+        errors: From ``field_errors``.
+        zero: The same of an estimate of zero on the same rows.
+    """
+    summary: dict[str, float] = {}
+    for name, values in errors.items():
+        summary[f"nodal_{name}"] = _mean(values)
+    for name in ("subset_m", "all_m", "moving_m"):
+        summary[f"skill_{name.removesuffix('_m')}"] = 1.0 - _over(
+            _mean(errors[name]), _mean(zero[name])
+        )
+    return summary
+
+
+def electrode_errors(estimate: Float, truth: Float) -> dict[str, Rows64]:
+    """Errors of every row.
+
+    Args:
+        estimate: Estimated tared counts [counts], shape ``(N, 19)``.
+        truth: True tared counts [counts], shape ``(N, 19)``.
+
+    Returns:
+        ``mean_square`` over the electrodes [counts^2] and ``l2_counts``, each ``(N,)``.
+    """
+    if estimate.shape != truth.shape or truth.ndim != 2:
+        raise ValueError(f"shapes {estimate.shape} and {truth.shape}, expected twice (N, 19)")
+    squares = np.square(np.asarray(estimate, np.float64) - truth)
+    return {"mean_square": squares.mean(axis=1), "l2_counts": np.sqrt(squares.sum(axis=1))}
+
+
+def root_mean(squares: Rows64) -> float:
+    """Root of the mean over rows."""
+    return float(np.sqrt(np.mean(squares)))
+
+
+def electrode_summary(errors: dict[str, Rows64], zero: dict[str, Rows64]) -> dict[str, float]:
+    """RMSE [-] and [counts], median norm [counts], and the skill over predicting zero."""
+    rmse = root_mean(errors["mean_square"])
+    return {
+        "electrode_rmse": rmse / COUNTS_MAX,
+        "electrode_rmse_counts": rmse,
+        "electrode_l2_median_counts": float(np.median(errors["l2_counts"])),
+        "skill_rmse": 1.0 - _over(rmse, root_mean(zero["mean_square"])),
+    }
+
+
+def _mean(values: Rows64) -> float:
+    kept = values[~np.isnan(values)]
+    return float(kept.mean()) if kept.size else float("nan")
+
+
+def _over(value: float, reference: float) -> float:
+    return value / reference if reference > 0 else float("nan")

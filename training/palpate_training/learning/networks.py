@@ -1,0 +1,216 @@
+"""The paper's fully connected network, with its normalisation inside.
+
+The networks as they are shipped: the whole field in, or the whole field out.
+
+The modes lie in the graph in half precision and are cast to single, so torch and ONNX Runtime
+compute with the same numbers and the file is half as large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from palpate_training.datasets.features import ELECTRODES
+from palpate_training.learning.field_code import FieldCode, Pooling
+
+PAPER_WIDTHS = (256, 128, 128)
+"""Hidden layers of the paper's MLP."""
+
+Activation = Literal["silu", "relu"]
+"""The paper does not state its activation. SiLU won on validation blocks (training/LOG.md)."""
+
+_SMALLEST_SD = 1e-6
+"""Keeps a channel that never moves (a dead electrode) from dividing by zero."""
+
+
+class Mlp(nn.Module):
+    """Tared counts ``(N, 19)`` -> one quantity, by default ``(N, 3)``, in its own unit.
+
+    Standardisation of the inputs and of the outputs are constants of the graph, so whoever runs
+    it needs to know nothing about the training data.
+
+    Args:
+        widths: Hidden layers.
+        inputs: Number of input channels.
+        activation: After each hidden layer.
+        outputs: Number of output channels.
+    """
+
+    input_mean: Tensor
+    input_sd: Tensor
+    output_mean: Tensor
+    output_sd: Tensor
+
+    def __init__(
+        self,
+        widths: Sequence[int] = PAPER_WIDTHS,
+        inputs: int = ELECTRODES,
+        activation: Activation = "silu",
+        outputs: int = 3,
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for before, after in zip((inputs, *widths[:-1]), widths, strict=True):
+            layers += [nn.Linear(before, after), nn.SiLU() if activation == "silu" else nn.ReLU()]
+        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+        self.register_buffer("input_mean", torch.zeros(inputs))
+        self.register_buffer("input_sd", torch.ones(inputs))
+        self.register_buffer("output_mean", torch.zeros(outputs))
+        self.register_buffer("output_sd", torch.ones(outputs))
+
+    def forward(self, tared_counts: Tensor) -> Tensor:
+        """Estimate of the quantity, shape ``(N, outputs)``."""
+        scaled = (tared_counts - self.input_mean) / self.input_sd
+        estimate: Tensor = self.layers(scaled) * self.output_sd + self.output_mean
+        return estimate
+
+    def normalise_from(
+        self, inputs: npt.NDArray[np.float32], targets: npt.NDArray[np.float32]
+    ) -> None:
+        """Set the constants from training rows: inputs ``(N, I)`` and targets ``(N, O)``."""
+        for values, mean, sd in (
+            (inputs, self.input_mean, self.input_sd),
+            (targets, self.output_mean, self.output_sd),
+        ):
+            mean.copy_(torch.from_numpy(values.mean(axis=0, dtype=np.float64)))
+            spread = np.maximum(values.std(axis=0, dtype=np.float64), _SMALLEST_SD)
+            sd.copy_(torch.from_numpy(spread))
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of trained parameters; the paper's network has 54,915."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+
+def predict(
+    net: nn.Module, inputs: npt.NDArray[np.float32], *, batch_rows: int = 8192
+) -> npt.NDArray[np.float32]:
+    """Run a network over rows: ``(N, I)`` -> ``(N, O)``."""
+    net.eval()
+    with torch.inference_mode():
+        parts = [net(part).numpy() for part in torch.split(torch.from_numpy(inputs), batch_rows)]
+    return np.concatenate(parts)
+
+
+FloatArray = npt.NDArray[np.float32]
+
+THINNEST_FILM = 0.02
+"""Relative thickness below which a film counts as closed; keeps the logarithm finite."""
+
+SMALLEST_MODE = 0.1
+"""Modes that vary less than this share of the first are not blown up to unit variance: they hold
+little but the rounding and the peculiarities of single trajectories."""
+
+
+class FieldGraph(nn.Module):
+    """Tared counts ``(N, 19)`` -> nodal displacement ``(N, 3V)`` [m] and its spread ``(N, V)``.
+
+    Args:
+        net: Tared counts -> coefficients [m], shape ``(N, K)``.
+        code: What they are coefficients of.
+        node_sd: Root mean square length of the nodal error on validation rows [m], shape ``(V,)``.
+    """
+
+    modes: Tensor
+    scale: Tensor
+    mean: Tensor
+    node_spread: Tensor
+
+    def __init__(self, net: Mlp, code: FieldCode, node_sd: FloatArray) -> None:
+        super().__init__()
+        self.net = net
+        self.register_buffer("modes", torch.from_numpy(code.modes))
+        self.register_buffer("scale", torch.from_numpy(code.scale))
+        self.register_buffer("mean", torch.from_numpy(code.mean))
+        self.register_buffer("node_spread", torch.from_numpy(node_sd.astype(np.float32)))
+
+    def forward(self, electrodes: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacement ``(N, 3V)`` and standard deviation ``(N, V)``, both [m]."""
+        coefficients = self.net(electrodes) * self.scale  # (N, K)
+        field = coefficients @ self.modes.to(torch.float32) + self.mean  # (N, 3V)
+        return field, self.node_spread.expand(electrodes.shape[0], -1)
+
+
+class FilmNet(nn.Module):
+    """Coefficients and pooled film change -> tared counts; adds the film's relative thickness.
+
+    The impedance of an electrode under a thin film is nearly inverse in its thickness, so its
+    logarithm is what the counts follow (learning notes, section 4.2).
+
+    Args:
+        mlp: ``(N, K + 2P)`` -> tared counts ``(N, 19)``.
+        modes: K.
+        rest_m: Pooled film of the untouched finger [m], shape ``(P,)``.
+    """
+
+    rest_m: Tensor
+
+    def __init__(self, mlp: Mlp, modes: int, rest_m: FloatArray) -> None:
+        super().__init__()
+        self.mlp = mlp
+        self.modes = modes
+        self.register_buffer("rest_m", torch.from_numpy(rest_m))
+
+    def widen(self, features: Tensor) -> Tensor:
+        """Features ``(N, K + P)`` [m] with the logarithms behind them, ``(N, K + 2P)``."""
+        thickness = 1.0 + features[:, self.modes :] / self.rest_m
+        return torch.cat([features, torch.log(torch.clamp(thickness, min=THINNEST_FILM))], dim=1)
+
+    def normalise_from(self, features: FloatArray, tared_counts: FloatArray) -> None:
+        """Set the constants from training rows: ``(N, K + P)`` [m] and ``(N, 19)`` [counts]."""
+        self.mlp.normalise_from(self.widen(torch.from_numpy(features)).numpy(), tared_counts)
+        modes = self.mlp.input_sd[: self.modes]
+        modes.clamp_(min=SMALLEST_MODE * float(modes.max()))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Tared counts ``(N, 19)`` of features ``(N, K + P)`` [m]."""
+        counts: Tensor = self.mlp(self.widen(features))
+        return counts
+
+
+class SynthesisGraph(nn.Module):
+    """Nodal displacement ``(N, 3V)`` [m] -> tared counts and their spread, each ``(N, 19)``.
+
+    Args:
+        net: Coefficients and pooled film change -> tared counts.
+        code: Modes to project on.
+        pooling: How the film near the electrodes is pooled.
+        counts_sd: Root mean square residual on validation rows [counts], shape ``(19,)``.
+    """
+
+    modes: Tensor
+    scale: Tensor
+    mean: Tensor
+    nodes: Tensor
+    normals: Tensor
+    weights: Tensor
+    counts_spread: Tensor
+
+    def __init__(
+        self, net: FilmNet, code: FieldCode, pooling: Pooling, counts_sd: FloatArray
+    ) -> None:
+        super().__init__()
+        self.net = net
+        self.register_buffer("modes", torch.from_numpy(code.modes))
+        self.register_buffer("scale", torch.from_numpy(code.scale))
+        self.register_buffer("mean", torch.from_numpy(code.mean))
+        self.register_buffer("nodes", torch.from_numpy(pooling.nodes))
+        self.register_buffer("normals", torch.from_numpy(pooling.normals))
+        self.register_buffer("weights", torch.from_numpy(pooling.weights))
+        self.register_buffer("counts_spread", torch.from_numpy(counts_sd.astype(np.float32)))
+
+    def forward(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
+        """Tared counts and standard deviation, each ``(N, 19)`` [counts]."""
+        modes = self.modes.to(torch.float32)
+        coefficients = nn.functional.linear(displacement - self.mean, modes) * self.scale
+        vectors = displacement.reshape(displacement.shape[0], -1, 3)
+        near = torch.index_select(vectors, 1, self.nodes)  # (N, I, 3)
+        pooled = (near * self.normals).sum(dim=2) @ self.weights  # (N, P)
+        counts: Tensor = self.net(torch.cat([coefficients, pooled], dim=1))
+        return counts, self.counts_spread.expand(displacement.shape[0], -1)

@@ -1,0 +1,224 @@
+"""Train, validation, test: whole blocks, groups, trajectories or sensors, never single rows.
+
+Neighbouring rows of a recording are nearly copies of one another, so a split by rows flatters
+every model (the idle drift of an untouched sensor alone correlates with force). There is no
+function here that could make one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate_training.datasets.experiment import ExperimentDataset
+
+Rows = npt.NDArray[np.int64]
+Labels = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Row numbers of each side; ``guard`` rows are on none.
+
+    Attributes:
+        train: Rows to fit on.
+        validation: Rows to choose on (early stop, settings).
+        test: Rows to report on.
+        guard: Rows left out because they lie next to another side.
+    """
+
+    train: Rows
+    validation: Rows
+    test: Rows
+    guard: Rows
+
+
+def contiguous_folds(
+    block: Labels, recording: Labels, *, folds: int = 5, guard_rows: int = 100
+) -> list[Split]:
+    """Hold out whole blocks; every block is tested in exactly one fold.
+
+    In each recording the blocks are counted in order of time: fold ``k`` tests those with
+    ``i % folds == k`` and validates on those with ``i % (2 * folds) == (k + 2) % (2 * folds)``.
+
+    Args:
+        block: Block of every row, shape ``(N,)``.
+        recording: Recording of every row, shape ``(N,)``; rows in order of time.
+        folds: Number of folds, at least 3.
+        guard_rows: Rows left out on either side of a border between two sides.
+
+    Returns:
+        One split for each fold.
+    """
+    if folds < 3:
+        raise ValueError(f"folds must be at least 3, not {folds}")
+    position = np.empty(len(block), dtype=np.int64)
+    for one in np.unique(recording):
+        rows = np.flatnonzero(recording == one)
+        starts, inverse = np.unique(block[rows], return_inverse=True)
+        if len(starts) < 2 * folds:
+            raise DatasetError(
+                f"recording {one} has {len(starts)} blocks, {folds} folds need {2 * folds}",
+                remedy="cut the recording into more blocks, or ask for fewer folds",
+            )
+        first_row = np.array([rows[inverse == i][0] for i in range(len(starts))])
+        position[rows] = np.argsort(np.argsort(first_row))[inverse]
+    splits = []
+    for fold in range(folds):
+        test = position % folds == fold
+        validation = position % (2 * folds) == (fold + 2) % (2 * folds)
+        split = _guarded(validation, test, recording, guard_rows)
+        if not (len(split.train) and len(split.validation)):
+            raise DatasetError(
+                f"fold {fold}: a guard of {guard_rows} rows leaves nothing to train or validate on",
+                remedy="cut the recordings into fewer, longer blocks",
+            )
+        splits.append(split)
+    return splits
+
+
+def unseen_sensor(
+    sensor: Labels, block: Labels, *, test_sensor: int, guard_rows: int = 100
+) -> Split:
+    """Train on the other sensors, test on all rows of one that was never seen.
+
+    Args:
+        sensor: Sensor of every row, shape ``(N,)``.
+        block: Block of every row, shape ``(N,)``; each tenth block of the others validates.
+        test_sensor: The sensor to hold out.
+        guard_rows: Rows left out between training and validation.
+    """
+    test = sensor == test_sensor
+    if not test.any() or test.all():
+        raise DatasetError(
+            f"sensor {test_sensor} cannot be held out: it has {test.sum()} of {len(test)} rows",
+            remedy="use a data set with at least two sensors",
+        )
+    seen = np.unique(block[~test])
+    validation = np.isin(block, seen[2::10] if len(seen) > 2 else seen[-1:]) & ~test
+    return _guarded(validation, test, sensor, guard_rows)
+
+
+def by_group(
+    group: Labels, *, test_share: float = 0.2, validation_share: float = 0.1, seed: int = 0
+) -> Split:
+    """Deal whole groups (presses, trajectories) to test, validation and train.
+
+    Args:
+        group: Group of every row, shape ``(N,)``.
+        test_share: Share of the groups to test on.
+        validation_share: Share of the groups to validate on.
+        seed: Seed of the deal.
+    """
+    groups = np.unique(group)
+    if len(groups) < 3:
+        raise DatasetError(
+            f"{len(groups)} groups cannot be dealt to train, validation and test",
+            remedy="record more presses: at least three, better a hundred",
+        )
+    dealt = np.random.default_rng(seed).permutation(groups)
+    tests = max(1, round(test_share * len(groups)))
+    validations = max(1, round(validation_share * len(groups)))
+    test = np.isin(group, dealt[:tests])
+    validation = np.isin(group, dealt[tests : tests + validations])
+    # No guard: a group starts and ends without contact, so neighbours across it share nothing.
+    return _guarded(validation, test, group, guard_rows=0)
+
+
+def _guarded(validation: Mask, test: Mask, recording: Labels, guard_rows: int) -> Split:
+    near_test = _near(test, recording, guard_rows)
+    near_validation = _near(validation, recording, guard_rows)
+    train = ~test & ~validation & ~near_test & ~near_validation
+    validation = validation & ~near_test
+    guard = ~train & ~validation & ~test
+    return Split(*(np.flatnonzero(side) for side in (train, validation, test, guard)))
+
+
+def _near(mask: Mask, recording: Labels, distance: int) -> Mask:
+    """Rows within ``distance`` rows of a marked row of the same recording."""
+    near = mask.copy()
+    if distance == 0:
+        return near
+    for one in np.unique(recording):
+        rows = np.flatnonzero(recording == one)
+        marked = np.concatenate([[0], np.cumsum(mask[rows])])
+        index = np.arange(len(rows))
+        low = np.maximum(index - distance, 0)
+        high = np.minimum(index + distance + 1, len(rows))
+        near[rows] = marked[high] > marked[low]
+    return near
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Rows of some units, dealt by trajectory.
+
+    Attributes:
+        units: Their names.
+        split: Rows of train, validation and test.
+    """
+
+    units: tuple[str, ...]
+    split: Split
+
+
+def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> Split:
+    """Deal 70, 20 and 10 % of the unique trajectories to train, test and validation.
+
+    The paper keeps a trajectory's rows together (section "Contiguity"); here every execution of
+    it, on whatever unit, is also on the same side, so that no network has seen the same press on a
+    sister finger.
+
+    Args:
+        data: Rows with their unique trajectories.
+        seed: Seed of the deal.
+
+    Raises:
+        DatasetError: There are fewer than three trajectories.
+    """
+    return by_group(data.row_trajectory, test_share=0.2, validation_share=0.1, seed=seed)
+
+
+def of_units(data: ExperimentDataset, split: Split, units: Sequence[str]) -> Held:
+    """The rows of a split that belong to some units.
+
+    Args:
+        data: Rows with their units.
+        split: Rows of all units.
+        units: Names of units.
+
+    Raises:
+        DatasetError: A unit is not in the data set, or one side of the split has no row of them.
+    """
+    unknown = [unit for unit in units if unit not in data.unit_names]
+    if unknown or not units:
+        raise DatasetError(
+            f"the data set has no unit {', '.join(unknown) or '(none was asked for)'}",
+            remedy=f"choose from {', '.join(data.unit_names)}",
+        )
+    wanted = np.isin(data.row_unit, [data.unit_names.index(unit) for unit in units])
+
+    def keep(rows: Rows) -> npt.NDArray[np.int64]:
+        return rows[wanted[rows]]
+
+    sides = {side: keep(getattr(split, side)) for side in ("train", "validation", "test")}
+    for side, rows in sides.items():
+        if not rows.size:
+            raise DatasetError(
+                f"no {side} row of {', '.join(units)} is left after holding trajectories out",
+                remedy="use a data set with more trajectories of these units, or another seed",
+            )
+    guard = keep(split.guard)
+    return Held(tuple(units), Split(sides["train"], sides["validation"], sides["test"], guard))
+
+
+def unit_sets(data: ExperimentDataset) -> list[tuple[str, ...]]:
+    """Each unit that has rows by itself, then all of them together if there are several."""
+    present = [name for i, name in enumerate(data.unit_names) if bool(np.any(data.row_unit == i))]
+    each = [(name,) for name in present]
+    return each + ([tuple(present)] if len(present) > 1 else [])

@@ -1,0 +1,1 @@
+"""What is learned: features, fields, synthesis, and the reports of their results."""

@@ -1,0 +1,349 @@
+"""The bundle of the ``features`` task: force and contact location, held out by press.
+
+Force is learned from all rows, untouched ones included, so that nothing reads as nothing; contact
+location only from rows in contact. What is reported was measured with exactly the weights that are
+shipped: nothing is refitted on the held-out presses afterwards.
+
+
+Force and contact location on held-out trajectories, with the paper's network and metrics.
+
+For every unit a network of its own, and one of all units tested on each, as in the paper's table.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import BundleError, DatasetError
+from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.experiment import ExperimentDataset
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features_file import open_dataset
+from palpate_training.learning import baselines
+from palpate_training.learning.export import FeaturesGraph, export_features
+from palpate_training.learning.fit import TrainConfig, Trained, train
+from palpate_training.learning.metrics import (
+    cluster_bootstrap,
+    force_errors,
+    force_metrics,
+    location_errors,
+    location_metrics,
+    rms,
+)
+from palpate_training.learning.networks import Mlp, predict
+from palpate_training.learning.splits import (
+    Rows,
+    Split,
+    by_group,
+    by_trajectory,
+    of_units,
+    unit_sets,
+)
+from palpate_training.tasks.results import (
+    ALL,
+    MEAN,
+    OWN,
+    RIDGE,
+    ZERO,
+    OnNetwork,
+    Result,
+    TaskReport,
+    averaged,
+    label_of,
+    tick,
+)
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float32]
+OnEpoch = Callable[[str, int, int], None]
+"""Called with the quantity, the epoch and the number of epochs at most."""
+
+FEATURES_CONFIG = TrainConfig(epochs=40, patience=12, batch_rows=512)
+"""Under two minutes for 100,000 rows on one core."""
+
+FALSE_CONTACT_SHARE = 0.001
+"""One untouched frame in a thousand may read as contact."""
+
+MIN_CONTACT_THRESHOLD_N = 0.05
+"""No lower threshold than this, however quiet the training data [N]."""
+
+_GOLDEN_ROWS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class FeaturesReport:
+    """What was trained.
+
+    Attributes:
+        digest: The bundle's digest, 32 bytes.
+        metrics: Held-out results, as in the manifest.
+        rows: Rows of train, validation and test.
+    """
+
+    digest: bytes
+    metrics: dict[str, float]
+    rows: tuple[int, int, int]
+
+
+def train_features(
+    dataset_path: Path,
+    bundle_dir: Path,
+    *,
+    name: str = "features",
+    version: int = 1,
+    config: TrainConfig = FEATURES_CONFIG,
+    seed: int = 0,
+    on_epoch: OnEpoch | None = None,
+) -> FeaturesReport:
+    """Train, evaluate on presses that were never seen, and write the bundle.
+
+    Args:
+        dataset_path: HDF5 data set (``palpate_training.datasets.features_file``).
+        bundle_dir: Folder of the bundle; must not exist yet.
+        name: Name of the bundle.
+        version: Its version, from 1.
+        config: Settings of both trainings.
+        seed: Seed of the split, of the weights and of the order of rows.
+        on_epoch: Called after each epoch, for a progress bar.
+
+    Raises:
+        DatasetError: The data set breaks its schema or has too few presses.
+        BundleError: The folder exists, or parity fails; nothing is left on disk.
+    """
+    if bundle_dir.exists():  # say so before minutes of training, not after
+        raise BundleError(
+            f"{bundle_dir} exists and bundles are immutable", remedy="write the next version"
+        )
+    data = open_dataset(dataset_path)
+    split = by_group(data.group, seed=seed)
+    x = data.tared_counts
+
+    def fit(quantity: str, targets: FloatArray, fit_on: Rows, stop_on: Rows) -> Trained:
+        done = 0
+
+        def tick() -> None:
+            nonlocal done
+            done += 1
+            if on_epoch is not None:
+                on_epoch(quantity, done, config.epochs)
+
+        return train(
+            x[fit_on],
+            targets[fit_on],
+            x[stop_on],
+            targets[stop_on],
+            baseline=data.baseline[fit_on],
+            config=config,
+            seed=seed,
+            on_epoch=tick,
+        )
+
+    force = fit("force", data.force, split.train, split.validation)
+    force_sd = _residual_sd(predict(force.net, x[split.validation]), data.force[split.validation])
+    threshold = _contact_threshold(data, predict(force.net, x[split.validation]), split)
+    metrics = _force_report(data, x, predict(force.net, x[split.test]), split, threshold)
+
+    location, location_sd = None, None
+    if data.contact_location is not None and data.in_contact is not None:
+        where = data.contact_location
+        fit_on, stop_on, test_on = (
+            rows[data.in_contact[rows]] for rows in (split.train, split.validation, split.test)
+        )
+        if min(len(fit_on), len(stop_on), len(test_on)) == 0:
+            raise DatasetError(
+                f"{dataset_path}: a side of the split has no row in contact",
+                remedy="record more presses",
+            )
+        trained = fit("contact location", where, fit_on, stop_on)
+        location = trained.net
+        location_sd = _residual_sd(predict(location, x[stop_on]), where[stop_on])
+        metrics |= _location_report(data, x, where, predict(location, x[test_on]), fit_on, test_on)
+
+    graph = FeaturesGraph(force.net, force_sd, location, location_sd)
+    digest = export_features(
+        bundle_dir,
+        graph,
+        x[split.test][np.linspace(0, len(split.test) - 1, _GOLDEN_ROWS).astype(int)],
+        name=name,
+        version=version,
+        contact_threshold_n=threshold,
+        training_data_sha256=data.content_sha256(),
+        trained_on=(
+            f"{data.provenance.source}: {len(split.train)} rows of"
+            f" {len(np.unique(data.group[split.train]))} presses; tested on"
+            f" {len(np.unique(data.group[split.test]))} other presses"
+        ),
+        metrics=metrics,
+        normalisation={
+            "inputs": "standardised by mean and sd of the training rows, inside the graph",
+            "force_sd": "constant per axis: rms residual on the validation presses",
+            "contact_location_sd": "likewise, rows in contact",
+            "contact_threshold_n": f"{1 - FALSE_CONTACT_SHARE:.1%} of the untouched validation rows"
+            f" are estimated below it; at least {MIN_CONTACT_THRESHOLD_N} N",
+        },
+        seed=seed,
+    )
+    return FeaturesReport(
+        digest, metrics, (len(split.train), len(split.validation), len(split.test))
+    )
+
+
+def _residual_sd(estimate: FloatArray, truth: FloatArray) -> FloatArray:
+    return np.asarray(rms(estimate - truth), dtype=np.float32)
+
+
+def _contact_threshold(data: FeatureDataset, estimate: FloatArray, split: Split) -> float:
+    if data.in_contact is None or data.in_contact[split.validation].all():
+        return MIN_CONTACT_THRESHOLD_N
+    untouched = np.linalg.norm(estimate[~data.in_contact[split.validation]], axis=1)
+    quantile = float(np.quantile(untouched, 1.0 - FALSE_CONTACT_SHARE))
+    return round(max(MIN_CONTACT_THRESHOLD_N, quantile), 4)
+
+
+def _force_report(
+    data: FeatureDataset, x: FloatArray, estimate: FloatArray, split: Split, threshold: float
+) -> dict[str, float]:
+    """Force metrics of the rows in contact, and how often contact itself is told right."""
+    truth = data.force[split.test]
+    touching = (
+        data.in_contact[split.test]
+        if data.in_contact is not None
+        else np.linalg.norm(truth, axis=1) > threshold
+    )
+    metrics = force_metrics(estimate[touching], truth[touching])
+    for model, fitted in (
+        ("constant", baselines.constant(x[split.train], data.force[split.train])),
+        ("linear", baselines.linear(x[split.train], data.force[split.train])),
+    ):
+        rival = force_metrics(fitted.predict(x[split.test])[touching], truth[touching])
+        for key in ("force_magnitude_median_n", "force_angle_median_rad"):
+            metrics[f"{model}_{key}"] = rival[key]
+    errors = force_errors(estimate[touching], truth[touching])
+    wanted = {key: errors[key] for key in ("magnitude_n", "angle_rad")}
+    ends = cluster_bootstrap(wanted, data.group[split.test][touching])
+    for key, (low, high) in ends.items():
+        quantity, unit = key.split("_")
+        metrics[f"force_{quantity}_median_ci95_low_{unit}"] = low
+        metrics[f"force_{quantity}_median_ci95_high_{unit}"] = high
+    said = np.linalg.norm(estimate, axis=1) >= threshold
+    metrics["contact_found_share"] = float(np.mean(said[touching]))
+    if not touching.all():
+        metrics["contact_false_share"] = float(np.mean(said[~touching]))
+        untouched = np.linalg.norm(estimate[~touching], axis=1)
+        metrics["force_untouched_median_n"] = float(np.median(untouched))
+    return metrics
+
+
+def _location_report(
+    data: FeatureDataset,
+    x: FloatArray,
+    where: FloatArray,
+    estimate: FloatArray,
+    fit_on: Rows,
+    test_on: Rows,
+) -> dict[str, float]:
+    metrics = location_metrics(estimate, where[test_on])
+    for model, fitted in (
+        ("constant", baselines.constant(x[fit_on], where[fit_on])),
+        ("linear", baselines.linear(x[fit_on], where[fit_on])),
+    ):
+        rival = location_metrics(fitted.predict(x[test_on]), where[test_on])
+        metrics[f"{model}_location_distance_median_m"] = rival["location_distance_median_m"]
+    ends = cluster_bootstrap(location_errors(estimate, where[test_on]), data.group[test_on])
+    low, high = ends["distance_m"]
+    metrics["location_distance_median_ci95_low_m"] = low
+    metrics["location_distance_median_ci95_high_m"] = high
+    return metrics
+
+
+Floating = npt.NDArray[np.floating]
+
+PAPER_CONFIG = TrainConfig(epochs=60, patience=20)
+"""The paper's layers; epochs at most."""
+
+Metrics = Callable[[Floating, Floating], dict[str, float]]
+RowErrors = Callable[[Floating, Floating], dict[str, npt.NDArray[np.float64]]]
+_QUANTITIES: dict[str, tuple[Metrics, RowErrors, tuple[str, ...]]] = {
+    "force": (force_metrics, force_errors, ("magnitude_n", "angle_rad")),
+    "location": (location_metrics, location_errors, ("distance_m",)),
+}
+
+
+def features_networks(data: ExperimentDataset, seeds: int) -> int:
+    """How many networks ``evaluate_features`` trains."""
+    return len(_QUANTITIES) * seeds * len(unit_sets(data))
+
+
+def evaluate_features(
+    data: ExperimentDataset,
+    *,
+    seeds: int = 3,
+    split_seed: int = 0,
+    config: TrainConfig = PAPER_CONFIG,
+    draws: int = 2000,
+    on_network: OnNetwork | None = None,
+) -> list[TaskReport]:
+    """Force and contact location, every unit and all units.
+
+    Args:
+        data: The purely experimental data set.
+        seeds: Networks of each kind; they share the split.
+        split_seed: Seed of the split.
+        config: Settings of every training.
+        draws: Draws of the bootstrap over trajectories.
+        on_network: Called after each training.
+
+    Returns:
+        Task ``force`` and task ``location``.
+    """
+    split = by_trajectory(data, seed=split_seed)
+    sets = unit_sets(data)
+    x = np.asarray(data.tared * np.float32(COUNTS_MAX), np.float32)
+    reports = []
+    for quantity, (metrics_of, errors_of, headlines) in _QUANTITIES.items():
+        y: FloatArray = getattr(data, quantity)
+        results: list[Result] = []
+        nets: dict[tuple[str, ...], list[Mlp]] = {}
+        held = {units: of_units(data, split, units).split for units in sets}
+        for units, fold in held.items():
+            nets[units] = []
+            for seed in range(seeds):
+                sides = (x[fold.train], y[fold.train], x[fold.validation], y[fold.validation])
+                nets[units].append(train(*sides, config=config, seed=seed).net)
+                tick(on_network)
+        for units, fold in held.items():
+            seen, test = x[fold.train], x[fold.test]
+            line = baselines.ridge(seen, y[fold.train], x[fold.validation], y[fold.validation])
+            estimates: dict[str, list[Floating]] = {
+                MEAN: [baselines.constant(seen, y[fold.train]).predict(test)],
+                RIDGE: [line.predict(test)],
+                OWN: [predict(net, test) for net in nets[units]],
+            }
+            if quantity == "force":  # a contact at the origin of the frame is nobody's guess
+                estimates = {ZERO: [baselines.zero(seen, y[fold.train]).predict(test)], **estimates}
+            if len(units) == 1 and len(sets) > 1:
+                estimates[ALL] = [predict(net, test) for net in nets[sets[-1]]]
+            truth, cluster = y[fold.test], data.row_trajectory[fold.test]
+            for model, each in estimates.items():
+                errors = [errors_of(one, truth) for one in each]
+                stacked = {
+                    name: np.stack([one[name] for one in errors], axis=1) for name in headlines
+                }
+                found = [metrics_of(one, truth) for one in each]
+                ends = cluster_bootstrap(stacked, cluster, draws=draws)
+                results.append(averaged(label_of(units), model, found, ends))
+        facts: dict[str, object] = {
+            "source": data.provenance.source,
+            "rows": len(data),
+            "trajectories": len(np.unique(data.row_trajectory)),
+            "seeds": seeds,
+        }
+        reports.append(TaskReport(quantity, results, facts))
+    return reports

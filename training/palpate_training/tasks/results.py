@@ -1,0 +1,333 @@
+"""Results beside their baselines: one row for each model, as a rich table, Markdown and JSON.
+
+Results of networks and their rivals on held-out trajectories: what every task shares.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.table import Table
+
+from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
+from palpate_training.learning.metrics import (
+    Rows64,
+    cluster_bootstrap,
+    force_errors,
+    force_metrics,
+    root_mean,
+)
+from palpate_training.learning.splits import Rows, unit_sets
+from palpate_training.tasks.field_fit import FitConfig
+
+Labels = npt.NDArray[np.int32]
+Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One model on one test.
+
+    Attributes:
+        test: What was held out.
+        model: Name of the model.
+        metrics: By name, averaged over the seeds.
+        seed_sd: Standard deviation over the seeds, by name; empty for one.
+        interval: 95 % confidence interval by name of the error (median), from whole blocks.
+    """
+
+    test: str
+    model: str
+    metrics: dict[str, float]
+    seed_sd: dict[str, float] = field(default_factory=dict)
+    interval: dict[str, Interval] = field(default_factory=dict)
+
+
+def force_result(
+    test: str,
+    model: str,
+    estimates: Sequence[Floats],
+    truth: Floats,
+    cluster: Labels,
+    *,
+    draws: int = 2000,
+) -> Result:
+    """Metrics of one model, from the estimates of each of its seeds.
+
+    Args:
+        test: What was held out.
+        model: Name of the model.
+        estimates: Estimated force [N], shape ``(N, 3)``, one array for each seed.
+        truth: True force [N], shape ``(N, 3)``.
+        cluster: Block of every row, shape ``(N,)``.
+        draws: Draws of the bootstrap.
+    """
+    each = [force_metrics(estimate, truth) for estimate in estimates]
+    errors = [force_errors(estimate, truth) for estimate in estimates]
+    stacked = {
+        name: np.stack([one[name] for one in errors], axis=1)
+        for name in ("magnitude_n", "angle_rad", "vector_n")
+    }
+    return Result(
+        test=test,
+        model=model,
+        metrics={name: float(np.mean([one[name] for one in each])) for name in each[0]},
+        seed_sd={name: float(np.std([one[name] for one in each], ddof=1)) for name in each[0]}
+        if len(each) > 1
+        else {},
+        interval=cluster_bootstrap(stacked, cluster, draws=draws),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of the table: heading, metric, digits, and the interval to put behind it."""
+
+    heading: str
+    metric: str
+    digits: int
+    interval: str = ""
+
+
+FORCE_COLUMNS = (
+    Column("magnitude median [N]", "force_magnitude_median_n", 3, "magnitude_n"),
+    Column("mean [N]", "force_magnitude_mean_n", 3),
+    Column("IQR [N]", "force_magnitude_iqr_n", 3),
+    Column("/ std", "force_magnitude_over_std_median", 2),
+    Column("/ norm", "force_magnitude_over_norm_median", 3),
+    Column("angle median [rad]", "force_angle_median_rad", 3, "angle_rad"),
+    Column("1 - cos", "force_one_minus_cos_median", 4),
+    Column("vector median [N]", "force_vector_median_n", 3, "vector_n"),
+    Column("RMSE x [N]", "force_rmse_x_n", 3),
+    Column("RMSE y [N]", "force_rmse_y_n", 3),
+    Column("RMSE z [N]", "force_rmse_z_n", 3),
+)
+
+
+def _cells(result: Result, columns: Sequence[Column]) -> list[str]:
+    cells = []
+    for column in columns:
+        text = f"{result.metrics[column.metric]:.{column.digits}f}"
+        if column.interval in result.interval:
+            low, high = result.interval[column.interval]
+            text += f" ({low:.{column.digits}f}-{high:.{column.digits}f})"
+        cells.append(text)
+    return cells
+
+
+def rich_table(results: Sequence[Result], title: str) -> Table:
+    """The main columns for a terminal; the Markdown and the JSON hold them all."""
+    columns = [column for column in FORCE_COLUMNS if column.interval or column.digits == 4]
+    table = Table(title=title)
+    for heading in ("held out", "model"):
+        table.add_column(heading)
+    for column in columns:
+        table.add_column(column.heading, justify="right")
+    for before, result in zip((None, *results), results, strict=False):
+        if before is not None and before.test != result.test:
+            table.add_section()
+        table.add_row(result.test, result.model, *_cells(result, columns))
+    return table
+
+
+def markdown_table(results: Sequence[Result]) -> str:
+    """All columns as a Markdown table."""
+    headings = ["held out", "model", *(column.heading for column in FORCE_COLUMNS)]
+    lines = ["| " + " | ".join(headings) + " |", "|---|---|" + "---:|" * len(FORCE_COLUMNS)]
+    lines += [
+        "| " + " | ".join([result.test, result.model, *_cells(result, FORCE_COLUMNS)]) + " |"
+        for result in results
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def write_json(path: Path, results: Sequence[Result], facts: dict[str, object]) -> None:
+    """Write every metric with six digits, and what produced it."""
+    rows = [
+        {
+            "held_out": result.test,
+            "model": result.model,
+            "metrics": {name: _short(value) for name, value in result.metrics.items()},
+            "seed_sd": {name: _short(value) for name, value in result.seed_sd.items()},
+            "interval_95": {
+                name: [_short(v) for v in ends] for name, ends in result.interval.items()
+            },
+        }
+        for result in results
+    ]
+    path.write_text(json.dumps({**facts, "results": rows}, indent=1) + "\n", encoding="utf-8")
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+FloatArray = npt.NDArray[np.float32]
+Errors = dict[str, Rows64]
+OnNetwork = Callable[[], None]
+
+ZERO, MEAN, RIDGE, OWN, ALL = "zero", "training mean", "ridge", "network", "network, all units"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """What the figure of a task shows.
+
+    Attributes:
+        force_n: True force magnitude of the held-out rows [N], by unit.
+        error: Their error by unit: mean over all nodes [m], or norm in R^19 [counts].
+        example: What the example is, for its title.
+        truth: Field (V, 3) [m] or tared counts (19,) of the example.
+        estimate: The same, estimated.
+    """
+
+    force_n: dict[str, Rows64]
+    error: dict[str, Rows64]
+    example: str
+    truth: FloatArray
+    estimate: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class TaskReport:
+    """Results of one task.
+
+    Attributes:
+        task: ``field``, ``synthesis``, ``force`` or ``location``.
+        results: One for each model and unit.
+        facts: What produced them.
+        picture: For the figure, if the task has one.
+    """
+
+    task: str
+    results: list[Result]
+    facts: dict[str, object] = field(default_factory=dict)
+    picture: Picture | None = None
+
+
+def networks(data: ExperimentDataset, seeds: int) -> int:
+    """How many networks ``evaluate_field`` and ``evaluate_synthesis`` train together."""
+    sets = unit_sets(data)
+    return seeds * (len(sets) + sum(len(units) == 1 for units in sets))
+
+
+def typical(error: Rows64, force: FloatArray) -> int:
+    """The row whose error is the median among the harder half of the presses.
+
+    Args:
+        error: Error of every row, shape (N,).
+        force: True force [N], shape (N, 3).
+    """
+    magnitude = np.linalg.norm(force, axis=1)
+    hard = np.flatnonzero(magnitude >= np.median(magnitude))
+    return int(hard[np.argsort(error[hard], kind="stable")[len(hard) // 2]])
+
+
+def interval_of(
+    errors: Sequence[Errors], cluster: npt.NDArray[np.int32], draws: int
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals of the headline numbers, whole trajectories drawn with replacement."""
+
+    def stack(name: str) -> Rows64:
+        return np.stack([one[name] for one in errors], axis=1)
+
+    if "subset_m" in errors[0]:
+        wanted = {f"nodal_{name}": stack(name) for name in ("subset_m", "all_m")}
+        return cluster_bootstrap(
+            wanted, cluster, statistic=lambda values: float(np.nanmean(values)), draws=draws
+        )
+    rmse = cluster_bootstrap(
+        {"electrode_rmse_counts": stack("mean_square")}, cluster, statistic=root_mean, draws=draws
+    )
+    norm = {"electrode_l2_median_counts": stack("l2_counts")}
+    return rmse | cluster_bootstrap(norm, cluster, draws=draws)
+
+
+def result_of(
+    test: str,
+    model: str,
+    errors: Sequence[Errors],
+    zero: Errors,
+    data: MixedDataset,
+    rows: Rows,
+    draws: int,
+    summary: Callable[[Errors, Errors], dict[str, float]],
+) -> Result:
+    """One row of the table, averaged over seeds.
+
+    Args:
+        test: What was held out.
+        model: Name of the model.
+        errors: Errors of every row, one for each seed.
+        zero: Those of predicting zero.
+        data: Rows with their trajectories.
+        rows: The held-out rows.
+        draws: Draws of the bootstrap.
+        summary: Metrics of one seed, from its errors and those of predicting zero.
+    """
+    interval = interval_of(errors, data.experiment.row_trajectory[rows], draws)
+    return averaged(test, model, [summary(one, zero) for one in errors], interval)
+
+
+def averaged(
+    test: str,
+    model: str,
+    seeds: Sequence[dict[str, float]],
+    interval: dict[str, tuple[float, float]],
+) -> Result:
+    """Metrics averaged over seeds, with their standard deviation where there are several.
+
+    Args:
+        test: What was held out.
+        model: Name of the model.
+        seeds: Metrics of each seed.
+        interval: 95 % intervals by name.
+    """
+    values = {name: [one[name] for one in seeds] for name in seeds[0]}
+    return Result(
+        test,
+        model,
+        {name: float(np.mean(each)) for name, each in values.items()},
+        {name: float(np.std(each, ddof=1)) for name, each in values.items()}
+        if len(seeds) > 1
+        else {},
+        interval,
+    )
+
+
+def tick(on_network: OnNetwork | None) -> None:
+    """One more network is trained."""
+    if on_network is not None:
+        on_network()
+
+
+def label_of(units: Sequence[str]) -> str:
+    """How a set of units is called in tables."""
+    return units[0] if len(units) == 1 else "all units"
+
+
+def name_of(data: MixedDataset, row: int) -> str:
+    """Trial and force of a row, for the title of a picture."""
+    trial = int(data.experiment.trial[row])
+    force = float(np.linalg.norm(data.experiment.force[row]))
+    return f"{data.experiment.trial_name(trial)}, {force:.1f} N"
+
+
+def facts_of(data: MixedDataset, seeds: int, config: FitConfig | None) -> dict[str, object]:
+    """What produced the results of a task."""
+    config = config or FitConfig()
+    return {
+        "source": data.experiment.provenance.source,
+        "rows": len(data),
+        "trajectories": len(np.unique(data.experiment.row_trajectory)),
+        "seeds": seeds,
+        "nodes": len(data.mesh.nodes),
+        "basis_loss_mean_m": data.basis.loss_mean_m,
+        "config": {key: getattr(config, key) for key in FitConfig.__slots__},
+    }
