@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo test check bench fuzz docs fmt proto bundle build clean
+.PHONY: help setup demo quick test durations check bench fuzz docs fmt proto bundle build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,6 +14,12 @@ BIN := $(VENV)/bin
 PYTHONS := $(or $(PYTHON),python3 python3.13 python3.12 python3.11)
 TORCH := torch==2.13.0
 BASELINE := tests/golden/palpate-v1.binpb
+# One worker more than cores, four at most: many tests wait for a process or for time to pass. A file
+# stays on one worker, so that its fixtures are made once. Numerical libraries would start threads
+# for every core in every worker.
+WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) < 3 ? $$(getconf _NPROCESSORS_ONLN) + 1 : 4)))
+PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+pytest_parallel = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL)
 
 help:  ## this list
 	@echo "palpate: make <target>"
@@ -25,8 +31,16 @@ setup: $(VENV)/.dev  ## make the full environment in .venv, with torch and tools
 demo: $(VENV)/.demo  ## virtual finger -> features -> recorder: live table and pictures | 30 s after a first install of 1-3 min
 	@$(BIN)/palpate demo
 
-test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 5-10 min after setup
-	@$(BIN)/pytest
+quick: $(VENV)/.dev  ## for every save: lint, borders and most tests; types once checked before | 1-2 min
+	@if [ -d .mypy_cache ]; then $(BIN)/mypy; \
+	else echo "palpate: types are left out: make check fills mypy's cache, later runs use it"; fi
+	@$(pytest_parallel) --quick
+
+test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 5-12 min after setup
+	@$(pytest_parallel)
+
+durations: $(VENV)/.dev  ## all tests; measure anew which ones `quick` leaves out | 5-12 min
+	@$(pytest_parallel) --record-durations
 
 # The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.
 check: $(VENV)/.dev  ## format, lint, types, borders, wire contract, house tests | 1-2 min

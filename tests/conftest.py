@@ -1,12 +1,22 @@
-"""Fixtures that every room's tests may use."""
+"""Fixtures that every room's tests may use, the quick tier, and the order of a parallel run.
+
+`make quick` runs what `tests/durations.json` does not leave out: in each file the fastest tests
+until the file has used `QUICK_S`. `make durations` measures all tests and writes that file anew; a
+test that it does not know yet belongs to the quick tier.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -15,6 +25,19 @@ from palpate.bus import run_router
 from palpate.config import LinkConfig
 
 ROOT = Path(__file__).resolve().parents[1]
+DURATIONS = Path(__file__).with_name("durations.json")
+
+QUICK_S = 0.7
+"""What a test file may take in the quick tier [s]."""
+
+ALWAYS_QUICK_S = 0.02
+"""Tests this short are in the quick tier however many a file has [s]."""
+
+FIRST_S = 2.0
+"""The fastest test of a file is in the quick tier if it takes no longer [s]."""
+
+PORTS = range(20_000, 32_000)
+"""Below the ports that Linux hands out itself, so that no connection takes one meanwhile."""
 
 # No example has a time limit: first calls import and compile, and machines here are noisy.
 settings.register_profile("palpate", deadline=None)
@@ -25,6 +48,67 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write golden files anew (review the diff)"
     )
+    parser.addoption(
+        "--quick", action="store_true", help="leave out what tests/durations.json calls slow"
+    )
+    parser.addoption(
+        "--record-durations", action="store_true", help="write tests/durations.json anew"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Reports of a parallel run arrive at the process that started the workers.
+    if config.getoption("--record-durations") and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_Recording())
+
+
+class _Recording:
+    """Adds up what each test takes, and writes what the quick tier leaves out."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        file, _, test = report.nodeid.partition("::")
+        self._seconds[file][test] += report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        table = {
+            file: {"seconds": round(sum(tests.values()), 1), "slow": slow_tests(tests)}
+            for file, tests in sorted(self._seconds.items())
+            if sum(tests.values()) > QUICK_S
+        }
+        DURATIONS.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
+def slow_tests(seconds: dict[str, float]) -> list[str]:
+    """Tests of one file that the quick tier leaves out: all but the fastest."""
+    slow, used = [], 0.0
+    for number, (test, took) in enumerate(sorted(seconds.items(), key=lambda item: item[1])):
+        fits = used + took <= QUICK_S or took < ALWAYS_QUICK_S
+        if fits or (number == 0 and took < FIRST_S):
+            used += took
+        else:
+            slow.append(test)
+    return sorted(slow)
+
+
+def _file(item: pytest.Item) -> str:
+    return item.nodeid.partition("::")[0]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Select the quick tier; begin a parallel run with the files that take longest."""
+    recorded: dict[str, dict[str, Any]] = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    if config.getoption("--quick"):
+        slow = {f"{file}::{test}" for file, entry in recorded.items() for test in entry["slow"]}
+        left_out = [i for i in items if i.nodeid in slow or i.get_closest_marker("slow")]
+        config.hook.pytest_deselected(items=left_out)
+        gone = set(left_out)
+        items[:] = [item for item in items if item not in gone]
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: -recorded.get(_file(item), {}).get("seconds", 0.0))
 
 
 @pytest.fixture(scope="session")
@@ -42,29 +126,70 @@ def shared_data() -> Path:
     return folder
 
 
+class _Ports:
+    """Loopback ports; each worker of a parallel run has its own share, and uses none twice."""
+
+    def __init__(self) -> None:
+        worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+        workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+        share = PORTS[worker::workers]
+        # Two runs on one machine begin at different places.
+        start = os.getpid() * 37 % len(share)
+        self._left = iter([*share[start:], *share[:start]])
+
+    def __call__(self) -> int:
+        for port in self._left:
+            with socket.socket() as probe:
+                try:
+                    probe.bind(("127.0.0.1", port))
+                except OSError:
+                    continue
+                return port
+        raise AssertionError(f"no free port in {PORTS}")
+
+
+@pytest.fixture(scope="session")
+def new_port() -> Callable[[], int]:
+    """Gives loopback ports that nobody listens on, each once."""
+    return _Ports()
+
+
 @pytest.fixture
-def free_port() -> int:
+def free_port(new_port: Callable[[], int]) -> int:
     """A loopback port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    return new_port()
+
+
+@pytest.fixture(scope="session")
+def router(new_port: Callable[[], int]) -> Callable[[], AbstractContextManager[LinkConfig]]:
+    """Starts routers on free loopback ports; each gives the link of a process that joins it."""
+
+    @contextmanager
+    def run() -> Iterator[LinkConfig]:
+        port = new_port()
+        endpoint = f"tcp/127.0.0.1:{port}"
+        stop = threading.Event()
+        thread = threading.Thread(target=run_router, args=((endpoint,), stop), daemon=True)
+        thread.start()
+        deadline = time.monotonic() + 20
+        while True:  # so that no session has to wait for its second attempt to connect
+            try:
+                socket.create_connection(("127.0.0.1", port), timeout=1).close()
+                break
+            except OSError:
+                assert time.monotonic() < deadline, "the router did not start"
+                time.sleep(0.01)
+        try:
+            yield LinkConfig(connect=(endpoint,), wait_for_router_s=20)
+        finally:
+            stop.set()
+            thread.join(timeout=20)
+
+    return run
 
 
 @pytest.fixture
-def link(free_port: int) -> Iterator[LinkConfig]:
+def link(router: Callable[[], AbstractContextManager[LinkConfig]]) -> Iterator[LinkConfig]:
     """A bus of one's own: how to join a router that runs on a free loopback port."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    stop = threading.Event()
-    router = threading.Thread(target=run_router, args=((endpoint,), stop), daemon=True)
-    router.start()
-    deadline = time.monotonic() + 10
-    while True:  # so that no session has to wait for its second attempt to connect
-        try:
-            socket.create_connection(("127.0.0.1", free_port), timeout=1).close()
-            break
-        except OSError:
-            assert time.monotonic() < deadline, "the router did not start"
-            time.sleep(0.01)
-    yield LinkConfig(connect=(endpoint,), wait_for_router_s=5)
-    stop.set()
-    router.join(timeout=5)
+    with router() as link:
+        yield link

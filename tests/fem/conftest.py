@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import socket
+import os
 import sys
 import threading
 import time
@@ -17,7 +17,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.bus import run_router
 from palpate.client import Client
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
@@ -32,6 +31,7 @@ from palpate_fem.service.config import FemConfig
 
 FOLDER = str(Path(__file__).parent)
 sys.path.append(FOLDER)  # tests import the fakes by name, as worker processes do
+SEARCH_PATH = os.pathsep.join([FOLDER, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 PATIENCE_S = 20.0
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -97,24 +97,16 @@ class Served:
 @pytest.fixture
 def own_bus(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> LinkConfig:
     """A bus for a service that does not outlive its test."""
-    monkeypatch.setenv("PYTHONPATH", FOLDER)
+    monkeypatch.setenv("PYTHONPATH", SEARCH_PATH)
     return link
 
 
 @pytest.fixture(scope="module")
-def bus() -> Iterator[LinkConfig]:
+def bus(router: Callable[[], AbstractContextManager[LinkConfig]]) -> Iterator[LinkConfig]:
     """A router on a free port, and workers that find the fakes."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    stop = threading.Event()
-    router = threading.Thread(target=run_router, args=((endpoint,), stop))
-    router.start()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", FOLDER)
-        yield LinkConfig(connect=(endpoint,), wait_for_router_s=PATIENCE_S)
-    stop.set()
-    router.join(PATIENCE_S)
+    with router() as link, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", SEARCH_PATH)
+        yield link
 
 
 @contextmanager
@@ -157,7 +149,7 @@ def starting(own_bus: LinkConfig) -> Iterator[Callable[..., Served]]:
 @pytest.fixture
 def workers_find_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that start worker processes themselves."""
-    monkeypatch.setenv("PYTHONPATH", FOLDER)
+    monkeypatch.setenv("PYTHONPATH", SEARCH_PATH)
 
 
 def _solid(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import importlib
-import socket
 import sys
 import threading
 import time
@@ -16,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Delivery, Session, Tap, endpoints, run_router
+from palpate.bus import Delivery, Session, Tap, endpoints
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
@@ -240,18 +239,7 @@ class Bus:
 
 
 @pytest.fixture
-def bus() -> Iterator[Bus]:
+def bus(link: LinkConfig) -> Iterator[Bus]:
     """A router of our own on a free port, and a session."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    stop = threading.Event()
-    router = threading.Thread(target=run_router, args=([endpoint], stop))
-    router.start()
-    link = LinkConfig(connect=(endpoint,), wait_for_router_s=PATIENCE_S)
-    try:
-        with Session.open(link) as session:
-            yield Bus(link, session)
-    finally:
-        stop.set()
-        router.join(PATIENCE_S)
+    with Session.open(link) as session:
+        yield Bus(link, session)

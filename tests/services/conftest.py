@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import socket
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,8 +14,6 @@ import numpy.typing as npt
 import pytest
 
 from palpate import clock
-from palpate.bus import run_router
-from palpate.config import LinkConfig
 from palpate.files.bundle import TASKS, Bundle, Manifest, read_bundle, write_bundle
 from palpate.messages import (
     ElectrodeFrame,
@@ -226,20 +222,6 @@ def make_truth() -> Callable[[ElectrodeFrame], tuple[WrenchFrame, IndenterPoseFr
         )
 
     return make
-
-
-@pytest.fixture
-def link() -> Iterator[LinkConfig]:
-    """A router on a free loopback port, and how to reach it."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    stop = threading.Event()
-    router = threading.Thread(target=run_router, args=((endpoint,), stop))
-    router.start()
-    yield LinkConfig(connect=(endpoint,), wait_for_router_s=10.0)
-    stop.set()
-    router.join(timeout=10)
 
 
 @pytest.fixture
