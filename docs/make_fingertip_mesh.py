@@ -14,8 +14,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from palpate_fem.mesh.geometry import Geometry
 from palpate_fem.mesh.parametric import biotac
+from palpate_fem.mesh.solid import FingertipGeometry
 
 PICTURE = Path(__file__).resolve().parent / "pictures" / "fingertip-mesh.png"
 # Title, direction to the viewer, axes to the right and up, sign of the axis to the right.
@@ -71,7 +71,7 @@ def cut(points: Points, faces: Ids, axis: int, value: float) -> list[Points]:
     return lines
 
 
-def draw_section(axes: Axes, geometry: Geometry, axis: int, value: float) -> None:
+def draw_section(axes: Axes, geometry: FingertipGeometry, axis: int, value: float) -> None:
     """Draw elements cut by a plane, and the core."""
     mesh, core = geometry.mesh, geometry.core
     shown = [i for i in range(3) if i != axis]

@@ -14,9 +14,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
-from palpate_fem.indenter.distance import distance, signed_distance
 from palpate_fem.indenter.pose import unit
-from palpate_fem.indenter.shape import Indenter
+from palpate_fem.indenter.shape import Indenter, distance, signed_distance
 
 PICTURE = Path(__file__).resolve().parent / "pictures" / "indenters.png"
 HALF_M, PIXELS = 16e-3, 420  # of each picture

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from palpate_deploy.generate.spec import ExperimentSpec
 from palpate_fem.indenter.pose import rotation_matrix
-from palpate_fem.indenter.shape import Indenter, Kind, Primitive
-from palpate_fem.mechanics.solver import Fingertip, Settings
+from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
+from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.population.answers import Population
 from palpate_fem.population.member import read_population
@@ -37,7 +38,7 @@ OUT = Path(__file__).parent / "results" / "twin" / "plate.md"
 EDGE_M = 1e-3
 PLATE = Indenter(
     "plate",
-    (Primitive(Kind.BOX, (0.0, 0.0, -2.5e-3), (19e-3, 11e-3, 1.5e-3, 0.0), EDGE_M),),
+    (Primitive(PrimitiveKind.BOX, (0.0, 0.0, -2.5e-3), (19e-3, 11e-3, 1.5e-3, 0.0), EDGE_M),),
 )
 STEP_M = 1e-4
 STEPS = 34
@@ -99,7 +100,7 @@ def main(folder: Path) -> None:
     leans, side, rises = tilts(folder)
     spec = ExperimentSpec()
     geometry = biotac(edge_m=spec.edge_m, layers=2)
-    tip = Fingertip.pressurised(geometry, spec.parameters, Settings())
+    tip = Fingertip.pressurised(geometry, spec.parameters, SolverSettings())
     members = [member for member in read_population() if member.wanted.pressed_with("cube")]
     population = Population(BiotacTip(tip).describe(), [member.unit for member in members])
     found: dict[str, list[Floats]] = {member.unit.name: [] for member in members}

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from palpate_fem.indenter.approach import Surface
+from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import Multifrontal
 from palpate_fem.trajectory import angled_path, normal_path, sample_targets
@@ -70,7 +70,7 @@ def run(
     metrics["system.unknowns"] = float(len(tip.system.pattern.free))
     metrics["solver.name"] = tip.newton.factor.name
     spent = _watch(tip)
-    surface = Surface(tip.nodes, mesh.outer_faces)
+    surface = OuterSurface(tip.nodes, mesh.outer_faces)
     targets, normals = sample_targets(surface, 1, seed=0)
     indenter = make_indenter(INDENTER)
     paths = {
@@ -78,7 +78,7 @@ def run(
         "angled": angled_path(indenter, targets[0], normals[0], surface, azimuth_rad=0.0),
     }
     for name, path in paths.items():
-        best: Trajectory | None = None
+        best: IndentationResult | None = None
         parts: dict[str, float] = {}
         for attempt in range(repeats):
             say(f"{name} trajectory, {attempt + 1} of {repeats}")
@@ -122,7 +122,7 @@ def _of_factor(tip: Fingertip, peak: float) -> Metrics:
     }
 
 
-def _of_trajectory(name: str, trajectory: Trajectory, parts: dict[str, float]) -> Metrics:
+def _of_trajectory(name: str, trajectory: IndentationResult, parts: dict[str, float]) -> Metrics:
     work = [step.convergence for step in trajectory.steps]
     metrics: Metrics = {
         f"{name}.seconds": trajectory.seconds,
@@ -133,7 +133,7 @@ def _of_trajectory(name: str, trajectory: Trajectory, parts: dict[str, float]) -
         f"{name}.factorisations": float(sum(w.factorisations for w in work)),
         f"{name}.force_n": float(np.linalg.norm(trajectory.forces[-1])) if work else 0.0,
     }
-    if trajectory.outcome is Outcome.COMPLETE:
+    if trajectory.outcome is IndentationOutcome.COMPLETE:
         metrics[f"{name}.share_of_goal"] = trajectory.seconds / TARGET_S
     for part, seconds in parts.items():
         metrics[f"{name}.{part}_s"] = seconds

@@ -1,4 +1,4 @@
-"""What a simulation says: one `Step` per converged pose, and a `Trajectory` of them."""
+"""What a simulation returns: an `IndentationResult` of one `IndentationStep` for each pose."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-class Outcome(StrEnum):
+class IndentationOutcome(StrEnum):
     """How a trajectory ended."""
 
     COMPLETE = "complete"
@@ -35,7 +35,7 @@ class Convergence:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class IndentationStep:
     """One converged step; all in the sensor frame, SI.
 
     Attributes:
@@ -66,7 +66,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectory:
+class IndentationResult:
     """The converged steps of one indentation, and why there are no more.
 
     The first pose is where it starts, untouched; each further one makes a step, so a complete
@@ -84,8 +84,8 @@ class Trajectory:
 
     indenter: str
     path: Floats
-    steps: tuple[Step, ...]
-    outcome: Outcome
+    steps: tuple[IndentationStep, ...]
+    outcome: IndentationOutcome
     reason: str = ""
     travel_m: float = 0.0
     seconds: float = field(default=0.0, compare=False)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
-from palpate_fem.indenter.approach import Surface
+from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.trajectory import press_path
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ DISPLACEMENT_CHANGE_M = 0.02e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StudyRow:
     """One press in a study.
 
     Attributes:
@@ -91,15 +91,15 @@ class Row:
         return {k: None if v != v else v for k, v in values.items()} | {"accepted": self.accepted}
 
 
-Told = Callable[[Row], None]
+Told = Callable[[StudyRow], None]
 
 
 def mesh_study(
     *, edges_m: Sequence[float] = EDGES_M, steps: int = 20, on_row: Told | None = None
-) -> list[Row]:
+) -> list[StudyRow]:
     """The presses on finer and finer meshes."""
-    rows: list[Row] = []
-    last: dict[str, _Field] = {}
+    rows: list[StudyRow] = []
+    last: dict[str, _SkinDisplacement] = {}
     for edge in edges_m:
         tip = Fingertip.pressurised(biotac(edge_m=edge))
         for name in PRESSES:
@@ -111,11 +111,11 @@ def mesh_study(
 
 def step_study(
     *, edge_m: float = 0.5e-3, steps: Sequence[int] = STEPS, on_row: Told | None = None
-) -> list[Row]:
+) -> list[StudyRow]:
     """The presses in smaller and smaller steps."""
     tip = Fingertip.pressurised(biotac(edge_m=edge_m))
-    rows: list[Row] = []
-    last: dict[str, _Field] = {}
+    rows: list[StudyRow] = []
+    last: dict[str, _SkinDisplacement] = {}
     for count in steps:
         for name in PRESSES:
             rows.append(_press(tip, name, edge_m, count, last))
@@ -125,7 +125,7 @@ def step_study(
 
 
 @dataclass(frozen=True, slots=True)
-class _Field:
+class _SkinDisplacement:
     """Displacement of the outer skin in the last refinement."""
 
     nodes: Floats
@@ -133,15 +133,17 @@ class _Field:
     force: float
 
 
-def _press(tip: Fingertip, name: str, edge: float, steps: int, last: dict[str, _Field]) -> Row:
+def _press(
+    tip: Fingertip, name: str, edge: float, steps: int, last: dict[str, _SkinDisplacement]
+) -> StudyRow:
     indenter, mesh = make_indenter(name), tip.geometry.mesh
-    surface = Surface(tip.nodes, mesh.outer_faces)
+    surface = OuterSurface(tip.nodes, mesh.outer_faces)
     path = press_path(indenter, TARGET_M, PRESSES[name], surface, depth_m=DEPTH_M, steps=steps)
     trajectory = tip.indent(indenter, path)
     force = float(np.linalg.norm(trajectory.forces[-1])) if trajectory.steps else float("nan")
     change = mean = largest = float("nan")
-    if trajectory.outcome is Outcome.COMPLETE:
-        now = _Field(
+    if trajectory.outcome is IndentationOutcome.COMPLETE:
+        now = _SkinDisplacement(
             tip.nodes[mesh.outer_nodes], trajectory.steps[-1].displacement[mesh.outer_nodes], force
         )
         if name in last:
@@ -152,7 +154,7 @@ def _press(tip: Fingertip, name: str, edge: float, steps: int, last: dict[str, _
             away = np.linalg.norm(moved - last[name].displacement, axis=1)
             mean, largest = float(away.mean()), float(away.max())
         last[name] = now
-    return Row(
+    return StudyRow(
         indenter=name,
         edge_m=edge,
         steps=steps,
@@ -169,7 +171,7 @@ def _press(tip: Fingertip, name: str, edge: float, steps: int, last: dict[str, _
     )
 
 
-def _at(field: _Field, points: Floats) -> Floats:
+def _at(field: _SkinDisplacement, points: Floats) -> Floats:
     """A field at other points of the skin [m]; at its own nodes it is itself."""
     between = RBFInterpolator(
         field.nodes / SCALE_M, field.displacement, neighbors=16, kernel="linear", degree=0

@@ -11,6 +11,8 @@ leaves open and we choose:
   touches far from the point it aims at, as the paper reports;
 * a path starts just clear of the skin, not 3 mm away, and its 20 steps are equal parts of the depth
   from first contact on, the displacements to which the paper resamples.
+
+A point of the pad by where it lies along and across the finger.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigError
-from palpate_fem.indenter.approach import Surface, first_contact
+from palpate_fem.indenter.approach import OuterSurface, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.pose import facing, unit
 from palpate_fem.indenter.shape import Indenter
@@ -57,7 +59,7 @@ class Region:
 
 
 @dataclass(frozen=True, slots=True)
-class Indentation:
+class PlannedIndentation:
     """One planned trajectory.
 
     Attributes:
@@ -85,7 +87,7 @@ def press_path(
     indenter: Indenter,
     target: ArrayLike,
     direction: ArrayLike,
-    surface: Surface,
+    surface: OuterSurface,
     *,
     depth_m: float,
     steps: int = STEPS,
@@ -116,7 +118,7 @@ def normal_path(
     indenter: Indenter,
     target: ArrayLike,
     normal: ArrayLike,
-    surface: Surface,
+    surface: OuterSurface,
     *,
     depth_m: float = NORMAL_DEPTH_M,
     steps: int = STEPS,
@@ -131,7 +133,7 @@ def angled_path(
     indenter: Indenter,
     target: ArrayLike,
     normal: ArrayLike,
-    surface: Surface,
+    surface: OuterSurface,
     *,
     azimuth_rad: float,
     angle_rad: float = ANGLE_RAD,
@@ -162,7 +164,11 @@ def angled_direction(normal: ArrayLike, angle_rad: float, azimuth_rad: float) ->
 
 
 def sample_targets(
-    surface: Surface, count: int, *, seed: int | Sequence[int] = 0, region: Region | None = None
+    surface: OuterSurface,
+    count: int,
+    *,
+    seed: int | Sequence[int] = 0,
+    region: Region | None = None,
 ) -> tuple[Floats, Floats]:
     """Random points of a region of the surface, evenly by area.
 
@@ -227,7 +233,7 @@ class Campaign:
             its registration error may reach.
     """
 
-    surface: Surface
+    surface: OuterSurface
     indenters: tuple[str, ...] = indenter_names()
     points: int = POINTS
     seed: int = 0
@@ -240,7 +246,7 @@ class Campaign:
     def __len__(self) -> int:
         return len(self.indenters) * self.points * (1 + self.angled)
 
-    def __iter__(self) -> Iterator[Indentation]:
+    def __iter__(self) -> Iterator[PlannedIndentation]:
         for name in self.indenters:
             indenter = make_indenter(name)
             key = [self.seed, *indenter.name.encode()]
@@ -265,20 +271,22 @@ class Campaign:
         normal: Floats,
         direction: Floats,
         depth_m: float,
-    ) -> Indentation:
+    ) -> PlannedIndentation:
         depth_m += self.overtravel_m
         steps = self.steps if self.increment_m is None else round(depth_m / self.increment_m)
         path, contact_m = _press(
             indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
         )
-        return Indentation(name, indenter.name, target, normal, direction, contact_m, depth_m, path)
+        return PlannedIndentation(
+            name, indenter.name, target, normal, direction, contact_m, depth_m, path
+        )
 
 
 def _press(
     indenter: Indenter,
     target: ArrayLike,
     direction: ArrayLike,
-    surface: Surface,
+    surface: OuterSurface,
     depth_m: float,
     steps: int,
     clearance_m: float,
@@ -300,3 +308,28 @@ def _press(
     path[:, :3] = target + travel[:, None] * direction
     path[:, 3:] = quaternion
     return path, contact_m
+
+
+_FACES_DOWN = -0.3  # of the normal's z: what is steeper is a side, not the pad
+_NEAR_M = 1.0e-3  # twice the edge of a coarse mesh
+
+
+def pad_point(surface: OuterSurface, x_m: float, y_m: float) -> tuple[Floats, Floats]:
+    """Point and outward unit normal of the pad nearest to (x, y), both shape (3,), sensor frame.
+
+    Raises:
+        ConfigError: The pad does not reach there; says how far it does.
+    """
+    normals = node_normals(surface.nodes, surface.faces)
+    on_skin = np.unique(surface.faces)
+    pad = on_skin[normals[on_skin, 2] < _FACES_DOWN]
+    away = np.hypot(surface.nodes[pad, 0] - x_m, surface.nodes[pad, 1] - y_m)
+    nearest = pad[int(away.argmin())]
+    if not away.min() <= _NEAR_M:
+        low, high = surface.nodes[pad].min(axis=0) * 1e3, surface.nodes[pad].max(axis=0) * 1e3
+        raise ConfigError(
+            f"there is no pad at x = {x_m * 1e3:g} mm, y = {y_m * 1e3:g} mm",
+            remedy=f"the pad reaches from x = {low[0]:.0f} to {high[0]:.0f} mm and from "
+            f"y = {low[1]:.0f} to {high[1]:.0f} mm",
+        )
+    return surface.nodes[nearest], normals[nearest]

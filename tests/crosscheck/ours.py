@@ -8,14 +8,13 @@ import numpy as np
 from tests.crosscheck.contact import Grading, SphereOnBlock, half_block
 from tests.crosscheck.problem import Bools, Floats, Ints, Problem, Solution
 
-from palpate_fem.indenter.shape import Indenter, Kind, Primitive
-from palpate_fem.mechanics.balance import Balance
-from palpate_fem.mechanics.laws import ContactSettings, Press
-from palpate_fem.mechanics.newton import Newton, NewtonSettings
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
+from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.state import ForceBalance, SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.sparse.factor import Factor, make_factor
+from palpate_fem.sparse.factor import SparseFactor, make_factor
 
 UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)  # half a turn about x: the indenter's body points to +z
 NO_FACES = np.zeros((0, 3), np.int32)
@@ -41,9 +40,9 @@ def _mesh(
     )
 
 
-def _system(mesh: SolidMesh, mu: float, bulk_ratio: float, held: Bools) -> System:
+def _system(mesh: SolidMesh, mu: float, bulk_ratio: float, held: Bools) -> EquilibriumSystem:
     # The other codes have no barrier against a pinch, and a punch's edges come to it.
-    return System(
+    return EquilibriumSystem(
         mesh,
         None,
         shear_modulus_pa=mu,
@@ -62,8 +61,8 @@ def deform(problem: Problem) -> Solution:
     settings = NewtonSettings(
         tolerance=TIGHT, volume_tolerance=1e-9, iterations=30, keep_elastic=0.0
     )
-    newton = Newton(system, _factor(system), settings)
-    state, done, size = State.at_rest(mesh), 0.0, 1.0 / problem.steps
+    newton = NewtonSolver(system, _factor(system), settings)
+    state, done, size = SolutionState.at_rest(mesh), 0.0, 1.0 / problem.steps
     while done < 1.0 - 1e-9:
         share = min(1.0, done + size)
         trial = state.copy()
@@ -85,7 +84,7 @@ def deform(problem: Problem) -> Solution:
     return Solution(state.position - problem.nodes, np.where(problem.held, unbalanced, 0.0))
 
 
-def _factor(system: System) -> Factor:
+def _factor(system: EquilibriumSystem) -> SparseFactor:
     return make_factor(
         system.pattern.indptr,
         system.pattern.indices,
@@ -106,12 +105,12 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
     outer = tops[(nodes[tops][:, :, 2] == contact.height_m).all(axis=1)]
     mesh = _mesh(nodes, hexes, outer_faces=outer)
     system = _system(mesh, contact.shear_modulus_pa, 1e4, held)
-    newton = Newton(system, _factor(system), NewtonSettings())
+    newton = NewtonSolver(system, _factor(system), NewtonSettings())
     radius = contact.radius_m
-    ball = Primitive(Kind.REVOLVED, (0.0, 0.0, -radius), (0.0, 0.0, 0.0, 0.0), radius)
+    ball = Primitive(PrimitiveKind.REVOLVED, (0.0, 0.0, -radius), (0.0, 0.0, 0.0, 0.0), radius)
     start = np.array([0.0, 0.0, contact.height_m, *UPSIDE_DOWN])
-    press = Press(Indenter("ball", (ball,)), start, contact.friction)
-    state, forces = State.at_rest(mesh), []
+    press = PosedIndenter(Indenter("ball", (ball,)), start, contact.friction)
+    state, forces = SolutionState.at_rest(mesh), []
     system.settle(state, press)
     was = np.zeros(3)
     for to in contact.path():
@@ -134,6 +133,6 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
     return np.array(forces)
 
 
-def _on_block(balance: Balance) -> Floats:
+def _on_block(balance: ForceBalance) -> Floats:
     half = -balance.indenter.sum(axis=0)
     return np.array([2 * half[0], 0.0, 2 * half[2]])

@@ -21,11 +21,11 @@ from palpate.client import Client
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.solver import Fingertip, Settings
-from palpate_fem.mechanics.system import System
-from palpate_fem.mesh.core import Core, DistanceGrid
-from palpate_fem.mesh.geometry import Geometry
-from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mechanics.system import EquilibriumSystem
+from palpate_fem.mesh.core import DistanceGrid, RigidCore
+from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
 from palpate_fem.service import node
 from palpate_fem.service.config import FemConfig
 
@@ -214,14 +214,14 @@ def make_shell(
     return replace(solid, mirror=mirror.astype(np.int32)) if corners == 8 else solid
 
 
-def make_ball(radius_m: float, spacing_m: float = 0.25e-3) -> Core:
+def make_ball(radius_m: float, spacing_m: float = 0.25e-3) -> RigidCore:
     """A ball about the origin as a core."""
     axis = spacing_m * np.arange(-16.0, 17.0)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     values = np.linalg.norm(points, axis=-1) - radius_m
     grid = DistanceGrid.sampled(np.full(3, axis[0]), spacing_m, values)
     none = np.zeros((0, 3))
-    return Core(grid, none, none.astype(np.int32), 4 / 3 * np.pi * radius_m**3, "ball")
+    return RigidCore(grid, none, none.astype(np.int32), 4 / 3 * np.pi * radius_m**3, "ball")
 
 
 @pytest.fixture(scope="session")
@@ -235,7 +235,7 @@ def shell() -> Shell:
 
 
 @pytest.fixture(scope="session")
-def ball() -> Callable[..., Core]:
+def ball() -> Callable[..., RigidCore]:
     return make_ball
 
 
@@ -254,10 +254,10 @@ def assembled() -> Callable[..., Floats]:
 
 
 @pytest.fixture(scope="session")
-def dense() -> Callable[[System], Floats]:
+def dense() -> Callable[[EquilibriumSystem], Floats]:
     """The symmetric tangent of a system's last balance, over its free unknowns."""
 
-    def tangent(system: System) -> Floats:
+    def tangent(system: EquilibriumSystem) -> Floats:
         pattern, size = system.pattern, len(system.pattern.free)
         upper = np.zeros((size, size))
         rows = np.repeat(np.arange(size), np.diff(pattern.indptr))
@@ -268,18 +268,18 @@ def dense() -> Callable[[System], Floats]:
 
 
 @pytest.fixture(scope="session")
-def finger_geometry() -> Geometry:
+def finger_geometry() -> FingertipGeometry:
     """Half a sphere of skin, the other half held, about a ball: 1,900 unknowns."""
     mesh = make_shell(8, 2, 3e-3, 4.5e-3)
     held = np.flatnonzero(mesh.nodes[:, 2] > 0.2e-3).astype(np.int32)
-    return Geometry(replace(mesh, fixed=held, name="half sphere"), make_ball(2.5e-3))
+    return FingertipGeometry(replace(mesh, fixed=held, name="half sphere"), make_ball(2.5e-3))
 
 
 @pytest.fixture(scope="session")
-def fill(finger_geometry: Geometry) -> Fill:
+def fill(finger_geometry: FingertipGeometry) -> Fill:
     """The same finger, filled, with other settings and parameters."""
 
-    def make(settings: Settings | None = None, **parameters: float) -> Fingertip:
+    def make(settings: SolverSettings | None = None, **parameters: float) -> Fingertip:
         parameters = {"fluid_volume_m3": 61e-9, **parameters}
         return Fingertip.pressurised(finger_geometry, FingertipParameters(**parameters), settings)
 

@@ -18,7 +18,13 @@ import numpy as np
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.result import Convergence, Floats, Outcome, Step, Trajectory
+from palpate_fem.result import (
+    Convergence,
+    Floats,
+    IndentationOutcome,
+    IndentationResult,
+    IndentationStep,
+)
 from palpate_fem.service.fingertips import OnFraction
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.sample import sample_fingertip
@@ -83,12 +89,12 @@ class FakeTip:
         path: Floats,
         *,
         friction_coefficient: float,
-        on_step: Callable[[Step], None] | None = None,
-        should_stop: Callable[[], Outcome | None] | None = None,
-    ) -> Trajectory:
+        on_step: Callable[[IndentationStep], None] | None = None,
+        should_stop: Callable[[], IndentationOutcome | None] | None = None,
+    ) -> IndentationResult:
         began = time.monotonic()
-        steps: list[Step] = []
-        outcome, reason = Outcome.COMPLETE, ""
+        steps: list[IndentationStep] = []
+        outcome, reason = IndentationOutcome.COMPLETE, ""
         kind = friction_coefficient
         for k in range(1, len(path)):
             if kind == SLOW:
@@ -100,13 +106,17 @@ class FakeTip:
             if k == 3:
                 misbehave(kind)
             if k == 3 and kind in (DIVERGES, PINCHES):
-                outcome = Outcome.DIVERGED if kind == DIVERGES else Outcome.FORCE_LIMIT
+                outcome = (
+                    IndentationOutcome.DIVERGED
+                    if kind == DIVERGES
+                    else IndentationOutcome.FORCE_LIMIT
+                )
                 reason = "by design, 2.5 mm along the path"
                 break
             steps.append(self.step(path[k], kind))
             if on_step is not None:
                 on_step(steps[-1])
-        return Trajectory(
+        return IndentationResult(
             indenter,
             path,
             tuple(steps),
@@ -116,13 +126,13 @@ class FakeTip:
             seconds=time.monotonic() - began,
         )
 
-    def step(self, pose: Floats, kind: float) -> Step:
+    def step(self, pose: Floats, kind: float) -> IndentationStep:
         """Numbers that no float32 holds, so that rounding would show."""
         nodes = self.mesh.nodes
         field = nodes * (1.0 / 3.0) + pose[:3] / 7.0
         depth = pose[2] / 3.0
         force = np.array([depth, -depth / 7.0, depth * np.pi])
-        return Step(
+        return IndentationStep(
             pose=pose,
             displacement=field if kind != NAN else field * np.nan,
             fluid_pressure_pa=29e3 + depth / 11.0,
@@ -162,7 +172,7 @@ class RoundTip(FakeTip):
         )
         self.mesh = self.fingertip.mesh
 
-    def step(self, pose: Floats, kind: float) -> Step:
+    def step(self, pose: Floats, kind: float) -> IndentationStep:
         step = super().step(pose, kind)
         return replace(step, force=self.force(pose, kind), centre_of_pressure=pose[:3])
 

@@ -27,9 +27,9 @@ from palpate_fem.calibration.settings import (
     CalibrationSettings,
 )
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import plot_calibration
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 
 RADII_M = {"sphere_small": 1.75e-3, "sphere_medium": 3.5e-3, "sphere_large": 7e-3}
 
@@ -82,15 +82,15 @@ class Formula:
         tangent = slip * np.tanh(spring / slip) * (normal > 0)
         along = np.array([move[0], move[1], 0.0]) / max(math.hypot(move[0], move[1]), 1e-9)
         force = normal[:, None] * [0.0, 0.0, 1.0] + tangent[:, None] * along
-        outcome, count = Outcome.COMPLETE, len(way)
+        outcome, count = IndentationOutcome.COMPLETE, len(way)
         for end, at in (
-            (Outcome.FORCE_LIMIT, np.linalg.norm(force, axis=1) > self.limit_n),
-            (Outcome.DIVERGED, (way > self.stop_m) & (indenter == self.stops)),
+            (IndentationOutcome.FORCE_LIMIT, np.linalg.norm(force, axis=1) > self.limit_n),
+            (IndentationOutcome.DIVERGED, (way > self.stop_m) & (indenter == self.stops)),
         ):
             if at[:count].any():
                 outcome, count = end, int(at.argmax())
         volume = 366e-9 + 474e-9 * bulge / 1.46e-3
-        reason = "" if outcome is Outcome.COMPLETE else "by design"
+        reason = "" if outcome is IndentationOutcome.COMPLETE else "by design"
         return Simulated(force[:count], way[:count], total, volume, outcome, reason)
 
 

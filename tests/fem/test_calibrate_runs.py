@@ -15,8 +15,8 @@ from palpate_fem.calibration.measured import Indentation
 from palpate_fem.calibration.runs import Runs, Simulated
 from palpate_fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.path import path_lengths
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate_fem.result import IndentationOutcome, IndentationResult
 
 TRUTH = FingertipParameters()
 
@@ -29,7 +29,7 @@ class Spring:
             raise ConfigError("no such indenter", remedy="none")
         way = path_lengths(path)
         force = np.outer(way * parameters.shear_modulus_pa, np.array([0.0, 0.0, 1.0]))
-        return Simulated(force, way, 0.0151, 8e-7, Outcome.COMPLETE)
+        return Simulated(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
 
 
 def press(
@@ -56,14 +56,14 @@ def test_a_refused_run_is_that_runs_trouble_only() -> None:
     bad, good = Runs(Spring()).run(
         [(TRUTH, replace(press(), indenter="unknown")), (TRUTH, press())]
     )
-    assert (len(bad.forces), bad.outcome) == (0, Outcome.DIVERGED)
+    assert (len(bad.forces), bad.outcome) == (0, IndentationOutcome.DIVERGED)
     assert "no such indenter" in bad.reason
     assert len(good.forces) == 5
 
 
 def test_a_solvers_steps_begin_at_the_second_pose() -> None:
     path = press().pose
-    stopped = Trajectory("cube", path, (), Outcome.DIVERGED, "at once")
+    stopped = IndentationResult("cube", path, (), IndentationOutcome.DIVERGED, "at once")
     run = Simulated.of(stopped, thickness_m=0.0151, fluid_volume_m3=8e-7)
     np.testing.assert_array_equal(run.forces, np.zeros((1, 3)))
     np.testing.assert_array_equal(run.travel, [0.0])

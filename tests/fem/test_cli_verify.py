@@ -12,17 +12,22 @@ from typer.testing import CliRunner, Result
 from palpate.errors import ConfigError
 from palpate_fem.cli.app import fem_app
 from palpate_fem.verify import PUBLIC_SKIN
-from palpate_fem.verify.check import Absent, Case, Check, Measured
+from palpate_fem.verify.check import (
+    Measurement,
+    MissingDataError,
+    VerificationCase,
+    VerificationCheck,
+)
 
 
-def _absent() -> Measured:
-    raise Absent("no public mesh [here]")
+def _absent() -> Measurement:
+    raise MissingDataError("no public mesh [here]")
 
 
 CASES = (
-    Case("hertz", lambda: Measured(1.01, 1.0), 1e-3, "N"),
-    Case("patch test", lambda: Measured(0.0, note="to the last bit"), 1e-12),
-    Case("skin/filled", _absent, 1e-2, "kPa"),
+    VerificationCase("hertz", lambda: Measurement(1.01, 1.0), 1e-3, "N"),
+    VerificationCase("patch test", lambda: Measurement(0.0, note="to the last bit"), 1e-12),
+    VerificationCase("skin/filled", _absent, 1e-2, "kPa"),
 )
 
 
@@ -33,7 +38,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path | None]:
 
     def run(
         *, only: str, slow: bool, shared_data: Path | None, on_check: Callable[..., None]
-    ) -> list[Check]:
+    ) -> list[VerificationCheck]:
         folders.append(shared_data)
         checks = [case() for case in CASES if only in case.name]
         for done, check in enumerate(checks, start=1):

@@ -10,22 +10,20 @@ import numpy as np
 import pytest
 import warp as wp
 from numpy.typing import NDArray
+from tests.fem.numpy_mechanics import Contact, ContactLaw, contact, elements, return_map
 
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.distance import distance
-from palpate_fem.mechanics.contact import Contact, ContactLaw, contact, return_map
-from palpate_fem.mechanics.element import elements
-from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.indenter.shape import distance
+from palpate_fem.mechanics.contact import ContactSettings, ContactSurface, PosedIndenter
 from palpate_fem.mechanics.material import NeoHooke
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.surface import Surface
-from palpate_fem.mechanics.system import System
-from palpate_fem.mesh.core import Core
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
+from palpate_fem.mesh.core import RigidCore
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Make = Callable[..., Any]
-Dense = Callable[[System], Floats]
+Dense = Callable[[EquilibriumSystem], Floats]
 
 SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
 MU, BULK_RATIO, OUTER_M = 2.8e5, 10.0, 4e-3
@@ -52,10 +50,10 @@ def difference(found: Floats, wanted: Floats) -> float:
 class Pressed:
     """A shell between an indenter and a ball inside, at a state that solves nothing."""
 
-    system: System
-    core: Core
-    state: State
-    press: Press
+    system: EquilibriumSystem
+    core: RigidCore
+    state: SolutionState
+    press: PosedIndenter
     assembled: Callable[..., Floats]
 
     @property
@@ -67,7 +65,7 @@ class Pressed:
         )
         return ContactLaw(normal, friction, tangential, SOFT.complement)
 
-    def points(self, surface: Surface, faces: Ints, nodal: Floats | None = None) -> Floats:
+    def points(self, surface: ContactSurface, faces: Ints, nodal: Floats | None = None) -> Floats:
         """Positions of contact points, or what another nodal field has there."""
         corners = (self.state.position if nodal is None else nodal)[faces]
         at = np.einsum("qa,fai->fqi", surface.shape_values, corners)
@@ -77,7 +75,7 @@ class Pressed:
         """Gap to the indenter, normal, hessian and arm of the outer points, sensor frame."""
         turn, anchor = self.press.rotation, self.state.anchor.reshape(-1, 3)
         x = self.points(self.system.outer, self.system.mesh.outer_faces)
-        gap, normal, hessian = distance(self.press.indenter, self.press.to_local(x))
+        gap, normal, hessian = distance(self.press.shape, self.press.to_local(x))
         arm = x - (self.press.tip + anchor @ turn.T)
         return gap, normal @ turn.T, turn @ hessian @ turn.T, arm
 
@@ -111,14 +109,14 @@ class Pressed:
         traction = return_map(self.law, pressure, normal, arm)
         state.traction = traction.reshape(state.traction.shape)
 
-    def scattered(self, surface: Surface, faces: Ints, load: Floats) -> Floats:
+    def scattered(self, surface: ContactSurface, faces: Ints, load: Floats) -> Floats:
         """Nodal forces of loads per area at the points, (V, 3)."""
         force = np.zeros_like(self.state.position)
         at = surface.area_values[..., None] * load.reshape(len(faces), -1, 3)
         np.add.at(force, faces, np.einsum("qa,fqi->fai", surface.shape_values, at))
         return force
 
-    def matrix(self, surface: Surface, faces: Ints, stiffness: Floats) -> Floats:
+    def matrix(self, surface: ContactSurface, faces: Ints, stiffness: Floats) -> Floats:
         """Dense matrix of stiffnesses per point."""
         shape, area = surface.shape_values, surface.area_values
         blocks = stiffness.reshape(*area.shape, 3, 3)
@@ -138,13 +136,13 @@ def squeeze(shell: Make, ball: Make, assembled: Make) -> Squeeze:
         mesh = shell(6, 1, 3e-3, OUTER_M, corners=corners)
         core = ball(3e-3)
         held = np.zeros(mesh.nodes.shape, bool)
-        system = System(mesh, core.grid, **SKIN, contact=SOFT, held=held)
-        state = State.at_rest(mesh)
+        system = EquilibriumSystem(mesh, core.grid, **SKIN, contact=SOFT, held=held)
+        state = SolutionState.at_rest(mesh)
         state.position += random.normal(0.0, 2e-5, mesh.nodes.shape)
         state.fluid_pressure = 3e4
         turn = np.array([1.0, 0.1, 0.2, -0.3])
         pose = np.array([1e-4, 2e-4, 0.3e-3 - OUTER_M, *turn / np.linalg.norm(turn)])
-        press = Press(make_indenter(indenter), pose, friction)
+        press = PosedIndenter(make_indenter(indenter), pose, friction)
         pressed = Pressed(system, core, state, press, assembled)
         points = pressed.points(system.outer, mesh.outer_faces)
         away = random.normal(size=points.shape)
@@ -163,7 +161,7 @@ def at_random(pressed: Pressed) -> None:
     state.traction[:] = random.normal(0.0, 2e4, state.traction.shape)
 
 
-def friction_arrays(surface: Surface, twin: Contact) -> list[tuple[wp.array, Floats]]:
+def friction_arrays(surface: ContactSurface, twin: Contact) -> list[tuple[wp.array, Floats]]:
     """What the kernel leaves, and what it should be."""
     area = surface.area_values.ravel()
     return [
@@ -214,7 +212,7 @@ def test_kernels_equal_the_twin(
         assert not system.slides
     state.core_pressure[:] = 0.0
     held = np.zeros(mesh.nodes.shape, bool)
-    apart = System(mesh, None, **SKIN, contact=SOFT, held=held)
+    apart = EquilibriumSystem(mesh, None, **SKIN, contact=SOFT, held=held)
     apart.balance(state, None)
     alone = dense(apart)
     assert np.abs(with_contact - alone - expected).max() < SAME * np.abs(with_contact).max()

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.fem.numpy_mechanics import Elements, elements
 
-from palpate_fem.mechanics.element import Elements, elements
-from palpate_fem.mechanics.laws import ContactSettings
+from palpate_fem.mechanics.contact import ContactSettings
 from palpate_fem.mechanics.material import BARRIER_FROM, NeoHooke
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
 Mesh = Callable[..., SolidMesh]
 Assembled = Callable[..., Floats]
-Dense = Callable[[System], Floats]
+Dense = Callable[[EquilibriumSystem], Floats]
 
 SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
 MU, BULK_RATIO = 2.8e5, 1e4
@@ -31,9 +31,9 @@ def difference(found: Floats, wanted: Floats) -> float:
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
 
 
-def system_of(mesh: SolidMesh) -> System:
+def system_of(mesh: SolidMesh) -> EquilibriumSystem:
     held = np.zeros(mesh.nodes.shape, bool)
-    return System(
+    return EquilibriumSystem(
         mesh,
         None,
         shear_modulus_pa=MU,
@@ -43,17 +43,17 @@ def system_of(mesh: SolidMesh) -> System:
     )
 
 
-def strained(mesh: SolidMesh, seed: int) -> State:
+def strained(mesh: SolidMesh, seed: int) -> SolutionState:
     """A stretched, sheared, uneven state with pressures that do not belong to it."""
     random = np.random.default_rng(seed)
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     gradient = np.eye(3) + random.uniform(-0.2, 0.2, (3, 3))
     state.position[:] = mesh.nodes @ gradient.T + random.normal(0.0, 2e-5, mesh.nodes.shape)
     state.pressure[:] = random.normal(0.0, 1e5, len(mesh.elements))
     return state
 
 
-def twin(mesh: SolidMesh, state: State) -> Elements:
+def twin(mesh: SolidMesh, state: SolutionState) -> Elements:
     return elements(mesh, NeoHooke(MU), BULK_RATIO * MU, state.position, state.pressure)
 
 
@@ -128,7 +128,7 @@ def test_nodal_forces_and_tangent_are_derivatives_of_one_energy(
     assert difference(product, (force_up - force_down).ravel() / (2 * step)) < 1e-6
 
 
-def replace_position(state: State, position: Floats) -> State:
+def replace_position(state: SolutionState, position: Floats) -> SolutionState:
     other = state.copy()
     other.position = position
     return other
@@ -203,7 +203,7 @@ def test_patch_test(block: Mesh, corners: int) -> None:
     random = np.random.default_rng(10)
     inside = ((mesh.nodes > 1e-6) & (mesh.nodes < 3e-3 - 1e-6)).all(axis=1)
     mesh.nodes[inside] += random.uniform(-1.5e-4, 1.5e-4, (inside.sum(), 3))
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     state.position[:] = mesh.nodes @ (np.eye(3) + random.uniform(-0.3, 0.3, (3, 3))).T
     state.pressure[:] = 4e5
     force = system_of(mesh).balance(state, None).internal

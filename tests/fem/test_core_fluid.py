@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.fem.numpy_mechanics import cavity
 
-from palpate_fem.mechanics.fluid import cavity
-from palpate_fem.mechanics.laws import ContactSettings
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.contact import ContactSettings
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
@@ -20,7 +20,7 @@ Ints = NDArray[np.int32]
 Mesh = Callable[..., SolidMesh]
 Sphere = Callable[[int, int], SolidMesh]
 Assembled = Callable[..., Floats]
-Dense = Callable[[System], Floats]
+Dense = Callable[[EquilibriumSystem], Floats]
 
 SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
 BOTH = pytest.mark.parametrize("corners", [8, 6])
@@ -113,10 +113,10 @@ def test_kernels_equal_the_twin(
     mesh = sphere(4, corners)
     random = np.random.default_rng(3)
     held = random.random(mesh.nodes.shape) < 0.2
-    system = System(
+    system = EquilibriumSystem(
         mesh, None, shear_modulus_pa=1.0, bulk_ratio=10.0, contact=ContactSettings(), held=held
     )
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     state.position[:], state.fluid_pressure = uneven(mesh, 4), pressure
     expected = cavity(mesh.inner_faces, state.position)
     balance = system.balance(state, None)
@@ -143,7 +143,9 @@ def test_kernels_equal_the_twin(
 def test_a_solid_without_a_cavity_has_no_volume(block: Mesh) -> None:
     mesh = block((2, 1, 1))
     mesh = replace(mesh, fixed=np.array([0, 1, 2], np.int32))
-    system = System(mesh, None, shear_modulus_pa=1.0, bulk_ratio=10.0, contact=ContactSettings())
-    balance = system.balance(State.at_rest(mesh), None)
+    system = EquilibriumSystem(
+        mesh, None, shear_modulus_pa=1.0, bulk_ratio=10.0, contact=ContactSettings()
+    )
+    balance = system.balance(SolutionState.at_rest(mesh), None)
     assert balance.volume == 0.0
     assert not balance.volume_gradient.any()

@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-
-from palpate_fem.mechanics.contact import ContactLaw, friction_law, normal_law, return_map
+from tests.fem.numpy_mechanics import ContactLaw, friction_law, normal_law, return_map
 
 Floats = NDArray[np.float64]
 

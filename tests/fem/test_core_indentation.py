@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics.indentation import Indentation
-from palpate_fem.mechanics.newton import Newton, NewtonSettings
-from palpate_fem.mechanics.solver import Fingertip, Settings
-from palpate_fem.mechanics.state import State
-from palpate_fem.result import Outcome, Step, Trajectory
+from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 
 Floats = NDArray[np.float64]
 Fill = Callable[..., Fingertip]
@@ -43,14 +43,16 @@ def path(finger: Fingertip) -> Floats:
 
 
 @pytest.fixture(scope="module")
-def whole(finger: Fingertip, path: Floats) -> Trajectory:
+def whole(finger: Fingertip, path: Floats) -> IndentationResult:
     """All of it."""
     trajectory = finger.indent(BALL, path)
-    assert trajectory.outcome is Outcome.COMPLETE
+    assert trajectory.outcome is IndentationOutcome.COMPLETE
     return trajectory
 
 
-def assert_same_steps(found: tuple[Step, ...], wanted: tuple[Step, ...]) -> None:
+def assert_same_steps(
+    found: tuple[IndentationStep, ...], wanted: tuple[IndentationStep, ...]
+) -> None:
     for step, other in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(step.displacement, other.displacement)
         np.testing.assert_array_equal(step.indenter_force, other.indenter_force)
@@ -63,8 +65,10 @@ def test_a_start_within_the_skin_is_refused(finger: Fingertip) -> None:
         finger.indent(BALL, path)
 
 
-def test_steps_are_told_as_they_come(finger: Fingertip, path: Floats, whole: Trajectory) -> None:
-    told: list[Step] = []
+def test_steps_are_told_as_they_come(
+    finger: Fingertip, path: Floats, whole: IndentationResult
+) -> None:
+    told: list[IndentationStep] = []
     trajectory = finger.indent(BALL, path, on_step=told.append)
     assert_same_steps(tuple(told), whole.steps)
     assert all(step is other for step, other in zip(told, trajectory.steps, strict=True))
@@ -73,7 +77,7 @@ def test_steps_are_told_as_they_come(finger: Fingertip, path: Floats, whole: Tra
 def test_without_contact_nothing_happens(finger: Fingertip) -> None:
     path = press_path(finger, -1e-3, -2e-3, side_m=1e-3)
     trajectory = finger.indent(BALL, path)
-    assert trajectory.outcome is Outcome.COMPLETE
+    assert trajectory.outcome is IndentationOutcome.COMPLETE
     for step in trajectory.steps:
         assert not step.force.any()
         assert not step.torque.any()
@@ -89,7 +93,7 @@ def test_pressing_leaves_the_fingertip_as_it_was(finger: Fingertip) -> None:
     elsewhere = press_path(finger, 0.3e-3)
     elsewhere[:, 0] += 0.2e-3
     finger.indent(BALL, elsewhere)
-    for name in State.__slots__:
+    for name in SolutionState.__slots__:
         np.testing.assert_array_equal(getattr(finger.state, name), getattr(before, name))
 
 
@@ -132,28 +136,28 @@ def test_the_skin_turns_with_the_indenter(finger: Fingertip, sense: float) -> No
 
 
 def test_a_force_limit_ends_it_with_the_step_that_passed_it(
-    finger: Fingertip, path: Floats, whole: Trajectory, monkeypatch: pytest.MonkeyPatch
+    finger: Fingertip, path: Floats, whole: IndentationResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     forces = np.linalg.norm(whole.forces, axis=1)
-    limit = Settings(force_limit_n=float(forces[1] * 0.95))
+    limit = SolverSettings(force_limit_n=float(forces[1] * 0.95))
     monkeypatch.setattr(finger, "settings", limit)
     trajectory = finger.indent(BALL, path)
-    assert trajectory.outcome is Outcome.FORCE_LIMIT
+    assert trajectory.outcome is IndentationOutcome.FORCE_LIMIT
     assert_same_steps(trajectory.steps, whole.steps[:2])
     assert trajectory.travel_m == pytest.approx(0.402e-3, rel=1e-9)
     assert trajectory.reason == f"{forces[1]:.1f} N, 0.402 mm along the path"
 
 
 def test_an_increment_that_goes_far_past_the_limit_is_cut_back(
-    finger: Fingertip, path: Floats, whole: Trajectory, monkeypatch: pytest.MonkeyPatch
+    finger: Fingertip, path: Floats, whole: IndentationResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends between the limit and a tenth more, and says where."""
     forces = np.linalg.norm(whole.forces, axis=1)
     limit = float(forces[0] + 0.4 * (forces[1] - forces[0]))
     assert forces[1] > 1.2 * limit
-    monkeypatch.setattr(finger, "settings", Settings(force_limit_n=limit))
+    monkeypatch.setattr(finger, "settings", SolverSettings(force_limit_n=limit))
     trajectory = finger.indent(BALL, path)
-    assert trajectory.outcome is Outcome.FORCE_LIMIT
+    assert trajectory.outcome is IndentationOutcome.FORCE_LIMIT
     assert_same_steps(trajectory.steps, whole.steps[:1])
     assert 0.201e-3 < trajectory.travel_m < 0.402e-3
     assert limit < float(trajectory.reason.split()[0]) < 1.1 * limit + 0.05
@@ -163,7 +167,10 @@ def test_an_increment_that_goes_far_past_the_limit_is_cut_back(
 def hasty(fill: Fill) -> Fingertip:
     """Gives up soon."""
     return fill(
-        Settings(newton=NewtonSettings(iterations=8, creep_iterations=8), smallest_increment=0.6)
+        SolverSettings(
+            newton=NewtonSettings(iterations=8, pseudo_transient_iterations=8),
+            smallest_increment=0.6,
+        )
     )
 
 
@@ -171,27 +178,27 @@ def test_what_cannot_be_solved_is_reported_with_what_could(hasty: Fingertip) -> 
     """Three millimetres at once, onto the core."""
     path = press_path(hasty, 0.2e-3, 0.4e-3, 3.4e-3, 3.5e-3)
     trajectory = hasty.indent(BALL, path)
-    assert trajectory.outcome is Outcome.DIVERGED
+    assert trajectory.outcome is IndentationOutcome.DIVERGED
     assert_same_steps(trajectory.steps, hasty.indent(BALL, path[:3]).steps)
     assert len(trajectory.steps) == 2
     assert trajectory.travel_m == pytest.approx(0.402e-3, rel=1e-9)
     assert trajectory.reason.endswith(", 0.402 mm along the path")
     assert len(trajectory.reason) > len(", 0.402 mm along the path")
     # and it can be used again
-    assert hasty.indent(BALL, path[:3]).outcome is Outcome.COMPLETE
+    assert hasty.indent(BALL, path[:3]).outcome is IndentationOutcome.COMPLETE
 
 
 def test_an_increment_that_fails_changes_nothing(hasty: Fingertip) -> None:
     path = press_path(hasty, 0.2e-3, 3.4e-3)
-    run = Indentation(hasty, BALL, path, None, None)
+    run = hasty.load_stepping(BALL, path)
     report, _ = run.increment(path[1], 1.0)
     assert report.converged
-    before, press = run.state.copy(), run.press
+    before, press = run.at.state.copy(), run.at.indenter
     report, _ = run.increment(path[2], 1.0)
     assert not report.converged
-    assert run.press is press
-    for name in State.__slots__:
-        np.testing.assert_array_equal(getattr(run.state, name), getattr(before, name))
+    assert run.at.indenter is press
+    for name in SolutionState.__slots__:
+        np.testing.assert_array_equal(getattr(run.at.state, name), getattr(before, name))
 
 
 def test_a_step_is_cut_until_it_goes(finger: Fingertip, hasty: Fingertip) -> None:
@@ -199,28 +206,30 @@ def test_a_step_is_cut_until_it_goes(finger: Fingertip, hasty: Fingertip) -> Non
     hasty_settings = replace(hasty.settings, smallest_increment=1 / 64)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hasty, "settings", hasty_settings)
-        patch.setattr(hasty.newton, "settings", NewtonSettings(iterations=5, creep_iterations=5))
+        patch.setattr(
+            hasty.newton, "settings", NewtonSettings(iterations=5, pseudo_transient_iterations=5)
+        )
         cut = hasty.indent(BALL, path)
-    assert cut.outcome is Outcome.COMPLETE
+    assert cut.outcome is IndentationOutcome.COMPLETE
     assert cut.steps[0].convergence.increments > 1
     wanted = finger.indent(BALL, path).steps[0].force[2]
     assert cut.steps[0].force[2] == pytest.approx(wanted, rel=0.05)  # friction knows the way
 
 
-@pytest.mark.parametrize("outcome", [Outcome.CANCELLED, Outcome.DEADLINE])
+@pytest.mark.parametrize("outcome", [IndentationOutcome.CANCELLED, IndentationOutcome.DEADLINE])
 @pytest.mark.parametrize("patience", [1, 2, 4, 9])
 def test_a_request_to_stop_is_honoured_within_an_iteration(
     finger: Fingertip,
     path: Floats,
-    whole: Trajectory,
+    whole: IndentationResult,
     monkeypatch: pytest.MonkeyPatch,
-    outcome: Outcome,
+    outcome: IndentationOutcome,
     patience: int,
 ) -> None:
     asked = iterations = 0
-    step = Newton._step
+    step = NewtonSolver._step
 
-    def should_stop() -> Outcome | None:
+    def should_stop() -> IndentationOutcome | None:
         nonlocal asked
         asked += 1
         return outcome if asked == patience else None
@@ -231,7 +240,7 @@ def test_a_request_to_stop_is_honoured_within_an_iteration(
         assert asked < patience, "goes on after it was told to stop"
         return step(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Newton, "_step", count)
+    monkeypatch.setattr(NewtonSolver, "_step", count)
     trajectory = finger.indent(BALL, path, should_stop=should_stop)
     assert asked == patience
     assert trajectory.outcome is outcome
@@ -243,18 +252,18 @@ def test_a_request_to_stop_is_honoured_within_an_iteration(
 def test_a_request_to_stop_is_honoured_before_the_skin_is_touched(finger: Fingertip) -> None:
     """Where no increment needs an iteration."""
     path = press_path(finger, *[-2e-6 - 1e-5 * k for k in range(20)])
-    told: list[Step] = []
+    told: list[IndentationStep] = []
 
-    def should_stop() -> Outcome | None:
-        return Outcome.CANCELLED if len(told) == 3 else None
+    def should_stop() -> IndentationOutcome | None:
+        return IndentationOutcome.CANCELLED if len(told) == 3 else None
 
     trajectory = finger.indent(BALL, path, on_step=told.append, should_stop=should_stop)
-    assert trajectory.outcome is Outcome.CANCELLED
+    assert trajectory.outcome is IndentationOutcome.CANCELLED
     assert len(trajectory.steps) == 3
 
 
 def test_superlu_gives_the_same_forces(finger: Fingertip, fill: Fill) -> None:
-    other = fill(Settings(solver="superlu"))
+    other = fill(SolverSettings(solver="superlu"))
     assert (finger.newton.factor.name, other.newton.factor.name) == ("fronts", "superlu")
     path = press_path(finger, 0.4e-3, 0.8e-3)
     first, second = finger.indent(BALL, path), other.indent(BALL, path)

@@ -11,11 +11,11 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.mechanics.laws import ContactSettings
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.contact import ContactSettings
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.sparse.factor import Factor, Multifrontal, make_factor
+from palpate_fem.sparse.factor import Multifrontal, SparseFactor, make_factor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -51,11 +51,11 @@ def solver(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def factor(solver: str) -> Factor:
+def factor(solver: str) -> SparseFactor:
     return make_factor(*pattern_of(indefinite(0)), solver=solver)
 
 
-def test_solves_an_indefinite_matrix(factor: Factor, solver: str) -> None:
+def test_solves_an_indefinite_matrix(factor: SparseFactor, solver: str) -> None:
     assert solver.startswith(factor.name)
     matrix = indefinite(0)
     assert np.linalg.eigvalsh(matrix)[[0, -1]].prod() < 0.0
@@ -66,7 +66,7 @@ def test_solves_an_indefinite_matrix(factor: Factor, solver: str) -> None:
     np.testing.assert_allclose(answer, np.linalg.solve(matrix, right), rtol=SAME, atol=SAME)
 
 
-def test_factorises_new_values_and_forgets_the_old(factor: Factor) -> None:
+def test_factorises_new_values_and_forgets_the_old(factor: SparseFactor) -> None:
     right = np.random.default_rng(2).normal(size=SIZE)
     for seed in (0, 3, 4, 0):
         matrix = indefinite(seed)
@@ -78,7 +78,9 @@ def test_factorises_new_values_and_forgets_the_old(factor: Factor) -> None:
 
 
 @pytest.mark.parametrize("columns", [1, 5])
-def test_solves_many_right_hand_sides_and_leaves_them_alone(factor: Factor, columns: int) -> None:
+def test_solves_many_right_hand_sides_and_leaves_them_alone(
+    factor: SparseFactor, columns: int
+) -> None:
     matrix = indefinite(0)
     factor.factorise(values_of(matrix, *pattern_of(matrix)))
     wide = np.random.default_rng(5).normal(size=(SIZE, 2 * columns))
@@ -92,7 +94,7 @@ def test_solves_many_right_hand_sides_and_leaves_them_alone(factor: Factor, colu
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_numbers_that_are_none_are_refused_and_the_next_matrix_is_not(
-    factor: Factor, bad: float
+    factor: SparseFactor, bad: float
 ) -> None:
     matrix = indefinite(0)
     good = values_of(matrix, *pattern_of(matrix))
@@ -137,10 +139,10 @@ def test_solvers_agree_on_a_tangent(shell: Callable[..., SolidMesh]) -> None:
     mesh = shell(4, 2, 3e-3, 4e-3)
     held = np.zeros(mesh.nodes.shape, bool)
     held[mesh.nodes[:, 2] > 0.0] = True
-    system = System(
+    system = EquilibriumSystem(
         mesh, None, shear_modulus_pa=2.8e5, bulk_ratio=1e7, contact=ContactSettings(), held=held
     )
-    system.balance(State.at_rest(mesh), None)
+    system.balance(SolutionState.at_rest(mesh), None)
     values = system.tangent_values()
     right = np.random.default_rng(6).normal(size=len(system.pattern.free))
     answers = []

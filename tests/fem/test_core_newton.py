@@ -8,16 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.fem.numpy_mechanics import cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics.element import elements
-from palpate_fem.mechanics.fluid import cavity
-from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.material import NeoHooke
-from palpate_fem.mechanics.newton import Newton, NewtonSettings
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.sparse.factor import make_factor
 
@@ -38,16 +37,18 @@ PURE = NewtonSettings(
 )
 
 
-def newton_of(mesh: SolidMesh, settings: NewtonSettings | None = None, **options: object) -> Newton:
+def newton_of(
+    mesh: SolidMesh, settings: NewtonSettings | None = None, **options: object
+) -> NewtonSolver:
     arguments = {"shear_modulus_pa": MU, "bulk_ratio": BULK_RATIO, "contact": ContactSettings()}
-    system = System(mesh, None, **{**arguments, **options})  # type: ignore[arg-type]
+    system = EquilibriumSystem(mesh, None, **{**arguments, **options})  # type: ignore[arg-type]
     factor = make_factor(
         system.pattern.indptr,
         system.pattern.indices,
         groups=system.pattern.free // 3,
         solver="fronts-double",
     )
-    return Newton(system, factor, settings or NewtonSettings())
+    return NewtonSolver(system, factor, settings or NewtonSettings())
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def assert_quadratic(residuals: list[float]) -> None:
 
 @pytest.mark.parametrize("held_volume", [True, False])
 def test_convergence_is_quadratic(cup: SolidMesh, held_volume: bool) -> None:
-    newton, state = newton_of(cup, PURE), State.at_rest(cup)
+    newton, state = newton_of(cup, PURE), SolutionState.at_rest(cup)
     volume = 1.15 * newton.system.balance(state, None).volume if held_volume else None
     state.fluid_pressure = 0.0 if held_volume else 3e4
     report, _ = newton.solve(state, None, volume=volume)
@@ -77,11 +78,13 @@ def test_convergence_is_quadratic(cup: SolidMesh, held_volume: bool) -> None:
 @pytest.mark.parametrize("friction", [0.0, 0.5], ids=["smooth", "sticking"])
 def test_convergence_is_quadratic_in_contact(cup: SolidMesh, friction: float) -> None:
     newton = newton_of(cup, replace(PURE, largest_move_m=0.25e-3, iterations=20))
-    state, surface = State.at_rest(cup), newton.system.outer
+    state, surface = SolutionState.at_rest(cup), newton.system.outer
     volume = 1.1 * newton.system.balance(state, None).volume
     newton.solve(state, None, volume=volume)
     low = state.position[:, 2].min()
-    press = Press(make_indenter("sphere_medium"), np.array([1e-4, 0, low, 1, 0, 0, 0]), friction)
+    press = PosedIndenter(
+        make_indenter("sphere_medium"), np.array([1e-4, 0, low, 1, 0, 0, 0]), friction
+    )
     for depth in (0.2e-3, 0.3e-3):
         stretch = state.traction / newton.system.contact.tangential_stiffness
         state.anchor[:] = press.to_local(state.position[cup.outer_faces] - stretch)
@@ -93,7 +96,7 @@ def test_convergence_is_quadratic_in_contact(cup: SolidMesh, friction: float) ->
 
 
 def test_volume_is_met_exactly_by_the_border(cup: SolidMesh) -> None:
-    newton, state = newton_of(cup), State.at_rest(cup)
+    newton, state = newton_of(cup), SolutionState.at_rest(cup)
     rest = newton.system.balance(state, None).volume
     for ratio in (1.05, 1.1, 1.08):
         report, balance = newton.solve(state, None, volume=ratio * rest)
@@ -104,10 +107,10 @@ def test_volume_is_met_exactly_by_the_border(cup: SolidMesh) -> None:
 
 
 def test_a_given_pressure_and_the_volume_it_makes_are_one_state(cup: SolidMesh) -> None:
-    newton, by_volume = newton_of(cup, PURE), State.at_rest(cup)
+    newton, by_volume = newton_of(cup, PURE), SolutionState.at_rest(cup)
     rest = newton.system.balance(by_volume, None).volume
     newton.solve(by_volume, None, volume=1.08 * rest)
-    by_pressure = State.at_rest(cup)
+    by_pressure = SolutionState.at_rest(cup)
     by_pressure.fluid_pressure = by_volume.fluid_pressure
     assert by_pressure.fluid_pressure > 1e3
     _, balance = newton.solve(by_pressure, None, volume=None)
@@ -119,7 +122,7 @@ def test_kept_and_fresh_factors_agree(cup: SolidMesh) -> None:
     positions, costs = [], []
     for keep in (0.0, 0.9):
         newton = newton_of(cup, NewtonSettings(keep_factor=keep, tolerance=1e-9))
-        state = State.at_rest(cup)
+        state = SolutionState.at_rest(cup)
         volume = 1.1 * newton.system.balance(state, None).volume
         report, _ = newton.solve(state, None, volume=volume)
         assert report.converged
@@ -131,7 +134,7 @@ def test_kept_and_fresh_factors_agree(cup: SolidMesh) -> None:
 
 def test_a_body_at_rest_is_in_equilibrium(cup: SolidMesh) -> None:
     """Also without any force to measure the unbalanced ones against."""
-    newton, state = newton_of(cup), State.at_rest(cup)
+    newton, state = newton_of(cup), SolutionState.at_rest(cup)
     volume = newton.system.balance(state, None).volume
     for target in (None, volume):
         report, _ = newton.solve(state, None, volume=target)
@@ -148,7 +151,7 @@ def test_prescribed_displacements_alone_stretch_a_block(block: Mesh) -> None:
     held[top, 2] = True
     # One layer has all of the stretch at first: far into the barrier, which is not of this test.
     newton = newton_of(mesh, held=held, bulk_ratio=1e6, volume_barrier=0.0)
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     state.position[top, 2] *= stretch
     report, balance = newton.solve(state, None, volume=None)
     assert report.converged, report.reason
@@ -167,7 +170,7 @@ def test_a_solid_may_lack_a_surface(shell: Mesh, corners: int, faces: str) -> No
     mesh = shell(2, 1, 3e-3, 4e-3, corners=corners)
     none: dict[str, NDArray[np.int32]] = {faces: getattr(mesh, faces)[:0]}
     mesh = replace(mesh, **none, fixed=np.arange(8, dtype=np.int32))  # type: ignore[arg-type]
-    newton, state = newton_of(mesh), State.at_rest(mesh)
+    newton, state = newton_of(mesh), SolutionState.at_rest(mesh)
     state.position[0, 0] += 1e-5
     report, balance = newton.solve(state, None, volume=None)
     assert report.converged
@@ -179,7 +182,7 @@ def test_dead_loads_are_borne_by_what_is_held(block: Mesh) -> None:
     mesh = replace(mesh, fixed=np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32))
     newton = newton_of(mesh)
     newton.system.load[-1] = (0.01, -0.02, 0.03)
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     report, balance = newton.solve(state, None, volume=None)
     assert report.converged
     borne = balance.internal[mesh.fixed].sum(axis=0)
@@ -190,7 +193,7 @@ def test_dead_loads_are_borne_by_what_is_held(block: Mesh) -> None:
 
 def test_no_node_moves_farther_than_it_may(cup: SolidMesh) -> None:
     newton = newton_of(cup, NewtonSettings(largest_move_m=1e-5, iterations=1))
-    state = State.at_rest(cup)
+    state = SolutionState.at_rest(cup)
     volume = 1.5 * newton.system.balance(state, None).volume
     report, _ = newton.solve(state, None, volume=volume)
     assert not report.converged
@@ -200,7 +203,7 @@ def test_no_node_moves_farther_than_it_may(cup: SolidMesh) -> None:
 
 
 def test_asks_whether_to_stop_once_an_iteration(cup: SolidMesh) -> None:
-    newton, state = newton_of(cup, PURE), State.at_rest(cup)
+    newton, state = newton_of(cup, PURE), SolutionState.at_rest(cup)
     volume = 1.1 * newton.system.balance(state, None).volume
     asked = 0
 
@@ -219,7 +222,7 @@ def test_a_solver_that_fails_ends_the_increment_not_the_program(
     cup: SolidMesh, monkeypatch: pytest.MonkeyPatch, culprit: str
 ) -> None:
     """So that a smaller increment can be tried; the next one starts afresh."""
-    newton, state = newton_of(cup), State.at_rest(cup)
+    newton, state = newton_of(cup), SolutionState.at_rest(cup)
     volume = 1.1 * newton.system.balance(state, None).volume
 
     def fail(_: Floats) -> Floats:
@@ -229,7 +232,7 @@ def test_a_solver_that_fails_ends_the_increment_not_the_program(
         patch.setattr(newton.factor, culprit, fail)
         report, _ = newton.solve(state, None, volume=volume)
         assert (report.converged, report.reason) == (False, "no memory left")
-    report, _ = newton.solve(State.at_rest(cup), None, volume=volume)
+    report, _ = newton.solve(SolutionState.at_rest(cup), None, volume=volume)
     assert report.converged
 
 
@@ -237,13 +240,13 @@ def test_a_body_that_nothing_holds_is_reported(block: Mesh) -> None:
     mesh = block((2, 2, 1))
     newton = newton_of(mesh, held=np.zeros(mesh.nodes.shape, bool))
     newton.system.load[0, 2] = 0.1
-    report, _ = newton.solve(State.at_rest(mesh), None, volume=None)
+    report, _ = newton.solve(SolutionState.at_rest(mesh), None, volume=None)
     assert not report.converged
     assert report.reason
 
 
 def test_an_inverted_start_is_reported(cup: SolidMesh) -> None:
-    newton, state = newton_of(cup), State.at_rest(cup)
+    newton, state = newton_of(cup), SolutionState.at_rest(cup)
     inside = np.setdiff1d(np.arange(len(cup.nodes)), cup.fixed)
     state.position[inside[0]] = 0.0
     report, _ = newton.solve(state, None, volume=None)

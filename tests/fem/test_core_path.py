@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate_fem.indenter.pose import rotation_matrix
-from palpate_fem.mechanics.path import interpolate_pose, path_lengths
+from palpate_fem.mechanics.load_stepping import interpolate_pose, path_lengths
 
 Floats = NDArray[np.float64]
 

@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.fem.numpy_mechanics import elements
 
-from palpate_fem.mechanics.element import elements
-from palpate_fem.mechanics.laws import ContactSettings
+from palpate_fem.mechanics.contact import ContactSettings
 from palpate_fem.mechanics.material import NeoHooke
-from palpate_fem.mechanics.pattern import Pattern, make_pattern
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem, TangentPattern, make_pattern
 from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
@@ -25,7 +24,7 @@ Assembled = Callable[..., Floats]
 NO_FACES = np.zeros((0, 4), np.int32)
 
 
-def upper(pattern: Pattern, values: Floats) -> Floats:
+def upper(pattern: TangentPattern, values: Floats) -> Floats:
     size = len(pattern.free)
     matrix = np.zeros((size, size))
     rows = np.repeat(np.arange(size), np.diff(pattern.indptr))
@@ -109,17 +108,17 @@ def test_nodes_that_share_no_element_share_no_entry(block: Callable[..., SolidMe
 def test_system_holds_single_components(
     shell: Callable[..., SolidMesh],
     assembled: Assembled,
-    dense: Callable[[System], Floats],
+    dense: Callable[[EquilibriumSystem], Floats],
     corners: int,
 ) -> None:
     """Rollers: the tangent is that of all unknowns without the rows and columns that are held."""
     mesh = shell(3, 1, 3e-3, 4e-3, corners=corners)
     random = np.random.default_rng(0)
     held = random.random(mesh.nodes.shape) < 0.3
-    system = System(
+    system = EquilibriumSystem(
         mesh, None, shear_modulus_pa=1e5, bulk_ratio=100.0, contact=ContactSettings(), held=held
     )
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     state.position += random.normal(0.0, 2e-5, mesh.nodes.shape)
     state.pressure += random.normal(0.0, 1e4, len(mesh.elements))
     balance = system.balance(state, None)

@@ -8,22 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.fem.numpy_mechanics import Elements, cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.distance import signed_distance
-from palpate_fem.mechanics.element import Elements, elements
-from palpate_fem.mechanics.fluid import cavity
-from palpate_fem.mechanics.indentation import Indentation
+from palpate_fem.indenter.shape import signed_distance
+from palpate_fem.mechanics.load_stepping import VOIGT, LoadStepping, SolverSettings
 from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.newton import NewtonSettings
-from palpate_fem.mechanics.outputs import VOIGT
-from palpate_fem.mechanics.solver import Fingertip, Settings
-from palpate_fem.mesh.core import Core
-from palpate_fem.mesh.geometry import Geometry
-from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.result import Outcome, Step, Trajectory
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.core import RigidCore
+from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 
 Floats = NDArray[np.float64]
 Fill = Callable[..., Fingertip]
@@ -50,21 +47,21 @@ class Pressed:
     """A finished trajectory and the state that it ended in."""
 
     tip: Fingertip
-    run: Indentation
-    trajectory: Trajectory
+    run: LoadStepping
+    trajectory: IndentationResult
 
     @property
-    def last(self) -> Step:
+    def last(self) -> IndentationStep:
         return self.trajectory.steps[-1]
 
     @property
     def position(self) -> Floats:
-        return self.run.state.position
+        return self.run.at.state.position
 
     @property
     def skin(self) -> Elements:
         """Its elements by the twin."""
-        mesh, state, parameters = self.tip.geometry.mesh, self.run.state, self.tip.parameters
+        mesh, state, parameters = self.tip.geometry.mesh, self.run.at.state, self.tip.parameters
         mu = parameters.shear_modulus_pa
         kappa = parameters.bulk_ratio * mu
         return elements(mesh, NeoHooke(mu), kappa, state.position, state.pressure)
@@ -73,12 +70,12 @@ class Pressed:
 @pytest.fixture(scope="module")
 def pressed(finger: Fingertip) -> Pressed:
     """Pressed to the core and dragged, with friction."""
-    run = Indentation(finger, BALL, press_path(finger, 1.5e-3, side_m=0.2e-3), None, None)
+    run = finger.load_stepping(BALL, press_path(finger, 1.5e-3, side_m=0.2e-3))
     return Pressed(finger, run, run.run())
 
 
 def test_fill_makes_the_volume_and_reports_its_progress(
-    finger: Fingertip, shell: Callable[..., SolidMesh], ball: Callable[..., Core]
+    finger: Fingertip, shell: Callable[..., SolidMesh], ball: Callable[..., RigidCore]
 ) -> None:
     mesh = finger.geometry.mesh
     volume = cavity(mesh.inner_faces, finger.nodes).volume.sum()
@@ -89,7 +86,7 @@ def test_fill_makes_the_volume_and_reports_its_progress(
 
     large = shell(4, 1, 5.5e-3, 7.07e-3)
     large = replace(large, fixed=np.flatnonzero(large.nodes[:, 2] > 0.5e-3).astype(np.int32))
-    geometry, fractions = Geometry(large, ball(3e-3)), list[float]()
+    geometry, fractions = FingertipGeometry(large, ball(3e-3)), list[float]()
     wanted = FingertipParameters(total_thickness_m=14.6e-3)
     tip = Fingertip.pressurised(geometry, wanted, progress=fractions.append)
     assert tip.total_thickness_m == pytest.approx(14.6e-3, abs=1e-8)
@@ -110,14 +107,14 @@ def exact(fill: Fill) -> Pressed:
         keep_factor=0.0,
         keep_elastic=0.0,
     )
-    tip = fill(Settings(newton=newton, solver="fronts-double"))
-    run = Indentation(tip, BALL, press_path(tip, 1.5e-3, side_m=0.2e-3), None, None)
+    tip = fill(SolverSettings(newton=newton, solver="fronts-double"))
+    run = tip.load_stepping(BALL, press_path(tip, 1.5e-3, side_m=0.2e-3))
     return Pressed(tip, run, run.run())
 
 
 def test_every_step_comes_in_order(pressed: Pressed) -> None:
     trajectory = pressed.trajectory
-    assert (trajectory.outcome, trajectory.reason) == (Outcome.COMPLETE, "")
+    assert (trajectory.outcome, trajectory.reason) == (IndentationOutcome.COMPLETE, "")
     assert trajectory.indenter == BALL.name
     np.testing.assert_array_equal([s.pose for s in trajectory.steps], trajectory.path[1:])
     length = np.linalg.norm(trajectory.path[-1, :3] - trajectory.path[0, :3])
@@ -128,7 +125,7 @@ def test_every_step_comes_in_order(pressed: Pressed) -> None:
 
 def test_all_forces_and_moments_on_the_skin_cancel(pressed: Pressed) -> None:
     """Indenter, core and supports, whose reactions the twins give."""
-    mesh, state, last = pressed.tip.geometry.mesh, pressed.run.state, pressed.last
+    mesh, state, last = pressed.tip.geometry.mesh, pressed.run.at.state, pressed.last
     skin = pressed.skin
     fluid = state.fluid_pressure * cavity(mesh.inner_faces, state.position).gradient
     left = skin.force - fluid - last.indenter_force - last.core_force
@@ -149,7 +146,7 @@ def test_the_fluid_keeps_its_volume(pressed: Pressed) -> None:
     for step in pressed.trajectory.steps:
         volume = cavity(mesh.inner_faces, tip.nodes + step.displacement).volume.sum()
         assert volume - tip.core_volume == pytest.approx(tip.fluid_volume_m3, rel=1e-5)
-        assert abs(volume - tip.cavity) <= 1e-6 * tip.cavity
+        assert abs(volume - tip.cavity_m3) <= 1e-6 * tip.cavity_m3
         assert step.convergence.volume_error <= 1e-6
 
 
@@ -159,7 +156,7 @@ def test_the_skin_keeps_its_volume_in_every_element(pressed: Pressed) -> None:
     strain = skin.volume / skin.rest_volume - 1.0
     parameters = pressed.tip.parameters
     kappa = parameters.bulk_ratio * parameters.shear_modulus_pa
-    assert np.abs(strain - pressed.run.state.pressure / kappa).max() < 1e-6
+    assert np.abs(strain - pressed.run.at.state.pressure / kappa).max() < 1e-6
     assert np.abs(strain).max() < 1e-3
 
 
@@ -181,8 +178,8 @@ def test_friction_obeys_coulomb_at_every_point(
     request: pytest.FixtureRequest, which: str, tolerance: float
 ) -> None:
     pressed: Pressed = request.getfixturevalue(which)
-    assert pressed.trajectory.outcome is Outcome.COMPLETE
-    state, surface = pressed.run.state, pressed.tip.system.outer
+    assert pressed.trajectory.outcome is IndentationOutcome.COMPLETE
+    state, surface = pressed.run.at.state, pressed.tip.system.outer
     traction = np.linalg.norm(state.traction, axis=2)
     limit = FRICTION * state.indenter_pressure
     status = surface.status.numpy()
@@ -192,7 +189,7 @@ def test_friction_obeys_coulomb_at_every_point(
     sliding = status == 3
     np.testing.assert_allclose(traction[sliding], limit[sliding], rtol=tolerance)
     points = pressed.position[pressed.tip.geometry.mesh.outer_faces]
-    away = points - pressed.run.press.tip - (0.0, 0.0, -3.5e-3)
+    away = points - pressed.run.at.indenter.tip - (0.0, 0.0, -3.5e-3)
     normal = away / np.linalg.norm(away, axis=2, keepdims=True)
     across = np.abs((normal * state.traction).sum(axis=2))
     assert across.max() < tolerance * traction.max()
@@ -200,9 +197,9 @@ def test_friction_obeys_coulomb_at_every_point(
 
 def test_nodal_forces_are_those_of_pressure_and_friction(pressed: Pressed) -> None:
     """Normals point out of the ball; friction drags the skin along with it."""
-    state, surface, last = pressed.run.state, pressed.tip.system.outer, pressed.last
+    state, surface, last = pressed.run.at.state, pressed.tip.system.outer, pressed.last
     faces = pressed.tip.geometry.mesh.outer_faces
-    away = pressed.position[faces] - pressed.run.press.tip - (0.0, 0.0, -3.5e-3)
+    away = pressed.position[faces] - pressed.run.at.indenter.tip - (0.0, 0.0, -3.5e-3)
     normal = away / np.linalg.norm(away, axis=2, keepdims=True)
     load = state.indenter_pressure[..., None] * normal - state.traction
     force = np.zeros_like(state.position)
@@ -235,7 +232,7 @@ def test_step_outputs_agree_with_one_another(pressed: Pressed) -> None:
 
 def test_stress_carries_the_loads(pressed: Pressed) -> None:
     """In any state its integral is the sum of position times nodal force; so it is symmetric."""
-    mesh, state = pressed.tip.geometry.mesh, pressed.run.state.copy()
+    mesh, state = pressed.tip.geometry.mesh, pressed.run.at.state.copy()
     mu, ratio = pressed.tip.parameters.shear_modulus_pa, pressed.tip.parameters.bulk_ratio
 
     def cauchy() -> Floats:

@@ -18,10 +18,9 @@ from palpate_fem.electrodes.gap import GapFinder
 from palpate_fem.electrodes.residual import CLAMP_X_M, fit_of, thickness
 from palpate_fem.electrodes.table import DISC_TERMINAL, TERMINALS
 from palpate_fem.electrodes.unit import UnitParameters
-from palpate_fem.mesh.core import Core
-from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
 from palpate_fem.mesh.surface import node_areas, open_edges
 
 Floats = NDArray[np.float64]
@@ -29,7 +28,7 @@ Shell = Callable[..., SolidMesh]
 
 
 @cache
-def finger() -> Geometry:
+def finger() -> FingertipGeometry:
     return biotac(edge_m=0.9e-3, layers=1)
 
 
@@ -90,7 +89,7 @@ def test_film_mesh_refuses_slips_of_units(key: str) -> None:
         film_mesh(finger().core, **{key: 2.5})
 
 
-def test_electrodes_must_fit_the_core(ball: Callable[..., Core]) -> None:
+def test_electrodes_must_fit_the_core(ball: Callable[..., RigidCore]) -> None:
     with pytest.raises(ConfigError, match="disc"):
         film_mesh(ball(2.5e-3))
 

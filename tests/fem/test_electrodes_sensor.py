@@ -22,7 +22,7 @@ from palpate_fem.electrodes.unit import UnitParameters
 from palpate_fem.mesh.nvlabs import read_nvlabs
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.surface import node_areas
-from palpate_fem.result import Step
+from palpate_fem.result import IndentationStep
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def test_of_step_adds_rest_and_displacement(sensor: Electrodes) -> None:
     rng = np.random.default_rng(4)
     displacement = 1e-5 * rng.normal(size=rest.shape)
     force = 1e-4 * rng.normal(size=rest.shape)
-    step = cast(Step, SimpleNamespace(displacement=displacement, core_force=force))
+    step = cast(IndentationStep, SimpleNamespace(displacement=displacement, core_force=force))
     direct = sensor.respond(rest + displacement, force)
     np.testing.assert_array_equal(sensor.of_step(rest, step).counts, direct.counts)
     assert direct.gap.pressure.max() > 0

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.indenter.approach import Surface, check_clear, first_contact
+from palpate_fem.indenter.approach import OuterSurface, check_clear, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.indenter.pose import facing, rotation_matrix, to_indenter, unit
+from palpate_fem.indenter.shape import signed_distance
 
 Floats = NDArray[np.float64]
 Direction = tuple[float, float, float]
@@ -23,17 +23,17 @@ UP = np.array([0.0, 0.0, 1.0])
 DIRECTION = st.tuples(*3 * [st.floats(-1, 1)]).filter(lambda d: np.linalg.norm(d) > 1e-3)
 
 
-def plate(height_m: float, count: int = 41, half_m: float = 12e-3) -> Surface:
+def plate(height_m: float, count: int = 41, half_m: float = 12e-3) -> OuterSurface:
     """A flat square at z = height that faces down, as a pad does; quads."""
     part = np.linspace(-half_m, half_m, count)
     x, y = (grid.ravel() for grid in np.meshgrid(part, part))
     nodes = np.stack([x, y, np.full_like(x, height_m)], axis=1)
     first = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     faces = np.stack([first, first + count, first + count + 1, first + 1], axis=1)
-    return Surface(nodes, faces.astype(np.int32))
+    return OuterSurface(nodes, faces.astype(np.int32))
 
 
-def ball(radius_m: float, count: int = 33) -> Surface:
+def ball(radius_m: float, count: int = 33) -> OuterSurface:
     """A sphere about the origin, a cube of quads blown up."""
     nodes: list[Floats] = []
     faces: list[NDArray[np.int64]] = []
@@ -47,7 +47,7 @@ def ball(radius_m: float, count: int = 33) -> Surface:
             quads = np.stack([first, first + count, first + count + 1, first + 1], axis=1)
             faces.append((quads if side > 0 else quads[:, ::-1]) + len(nodes) * len(u))
             nodes.append(radius_m * face / np.linalg.norm(face, axis=1, keepdims=True))
-    return Surface(np.concatenate(nodes), np.concatenate(faces).astype(np.int32))
+    return OuterSurface(np.concatenate(nodes), np.concatenate(faces).astype(np.int32))
 
 
 @pytest.mark.parametrize("name", indenter_names())
@@ -74,7 +74,7 @@ def test_faces_count_not_only_their_corners() -> None:
     assert travel == pytest.approx(0.0, abs=2e-6)
     quads = coarse.faces
     triangles = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
-    halves = Surface(coarse.nodes, triangles)
+    halves = OuterSurface(coarse.nodes, triangles)
     travel = first_contact(make_indenter("sphere_small"), facing(UP), np.zeros(3), UP, halves)
     assert travel == pytest.approx(0.0, abs=2e-6)
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
 from palpate_fem.indenter.catalogue import ALIASES, BASE_M, indenter_names, make_indenter
-from palpate_fem.indenter.distance import signed_distance
-from palpate_fem.indenter.shape import Kind
+from palpate_fem.indenter.shape import PrimitiveKind, signed_distance
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +100,7 @@ def test_dimensions_are_the_published_ones() -> None:
 
 
 def test_the_texture_is_a_fixed_set_of_grains_on_a_plate() -> None:
-    grains = [p for p in make_indenter("texture").primitives if p.kind == Kind.REVOLVED]
+    grains = [p for p in make_indenter("texture").primitives if p.kind == PrimitiveKind.REVOLVED]
     assert len(grains) == 24
     radii = np.array([p.rounding for p in grains])
     assert (radii.min(), radii.max()) == (pytest.approx(0.5e-3, abs=25e-6), 1e-3)
@@ -111,7 +110,8 @@ def test_the_texture_is_a_fixed_set_of_grains_on_a_plate() -> None:
     np.testing.assert_array_equal(centres[:2, 2], -1e-3)
     make_indenter.cache_clear()
     np.testing.assert_array_equal(
-        [p.centre for p in make_indenter("texture").primitives if p.kind == Kind.REVOLVED], centres
+        [p.centre for p in make_indenter("texture").primitives if p.kind == PrimitiveKind.REVOLVED],
+        centres,
     )
 
 

@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.distance import distance, signed_distance, top
 from palpate_fem.indenter.kernels import distances
 from palpate_fem.indenter.pose import rotation_matrix, to_indenter
-from palpate_fem.indenter.shape import Indenter, Kind, Primitive
+from palpate_fem.indenter.shape import (
+    Indenter,
+    Primitive,
+    PrimitiveKind,
+    distance,
+    signed_distance,
+    top,
+)
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +44,9 @@ def one(primitive: Primitive) -> Indenter:
 
 def test_a_sphere_has_the_distance_of_a_sphere() -> None:
     centre, radius = np.array([1e-3, -2e-3, 0.5e-3]), 3.5e-3
-    ball = one(Primitive(Kind.REVOLVED, (1e-3, -2e-3, 0.5e-3), (0.0, 0.0, 0.0, 0.0), radius))
+    ball = one(
+        Primitive(PrimitiveKind.REVOLVED, (1e-3, -2e-3, 0.5e-3), (0.0, 0.0, 0.0, 0.0), radius)
+    )
     points = cloud(500)
     away = points - centre
     length = np.linalg.norm(away, axis=1)
@@ -52,7 +60,7 @@ def test_a_sphere_has_the_distance_of_a_sphere() -> None:
 
 
 def test_a_rounded_box_beside_its_faces_edges_and_corners() -> None:
-    box = one(Primitive(Kind.BOX, (0.0, 0.0, 0.0), (3.0, 2.0, 1.0, 0.0), 0.5))
+    box = one(Primitive(PrimitiveKind.BOX, (0.0, 0.0, 0.0), (3.0, 2.0, 1.0, 0.0), 0.5))
     points = np.array([[0, 0, 2.5], [3 + 3, 2 + 4, 0], [5, 4, 2], [0.2, 0.1, 0.7], [0, 0, 1.3]])
     gap, normal, hessian = distance(box, points)
     np.testing.assert_allclose(gap, [1.0, 4.5, 2.5, -0.8, -0.2], atol=1e-15)
@@ -69,7 +77,9 @@ def test_a_rounded_box_beside_its_faces_edges_and_corners() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_ring_curves_both_ways(axis: int) -> None:
     # Profile: distance from the axis 4..6, along -3..-1, grown by 0.5.
-    ring = one(Primitive(Kind.REVOLVED, (0.0, 0.0, 0.0), (4.0, 6.0, -3.0, -1.0), 0.5, axis=axis))
+    ring = one(
+        Primitive(PrimitiveKind.REVOLVED, (0.0, 0.0, 0.0), (4.0, 6.0, -3.0, -1.0), 0.5, axis=axis)
+    )
 
     def at(radius: float, position: float) -> list[float]:
         point = np.zeros((1, 3))
@@ -189,7 +199,9 @@ def test_values_are_finite_on_axes_and_at_corners(name: str) -> None:
 
 
 def test_a_line_curves_on_its_axis_as_beside_it() -> None:
-    capsule = one(Primitive(Kind.REVOLVED, (0.0, 0.0, 0.0), (0.0, 0.0, -5e-3, -2e-3), 2e-3))
+    capsule = one(
+        Primitive(PrimitiveKind.REVOLVED, (0.0, 0.0, 0.0), (0.0, 0.0, -5e-3, -2e-3), 2e-3)
+    )
     _, normal, hessian = distance(capsule, np.array([[0.0, 0.0, 0.0], [1e-9, 0.0, 0.0]]))
     np.testing.assert_allclose(normal[0], [0, 0, 1])
     np.testing.assert_allclose(np.diag(hessian[0]), [500, 500, 0], atol=1e-9)
@@ -199,7 +211,9 @@ def test_a_line_curves_on_its_axis_as_beside_it() -> None:
 @EVERY
 def test_inside_is_negative_and_outside_positive(name: str) -> None:
     indenter = make_indenter(name)
-    inner = [[*p.centre[:2], p.centre[2]] for p in indenter.primitives if p.kind == Kind.BOX]
+    inner = [
+        [*p.centre[:2], p.centre[2]] for p in indenter.primitives if p.kind == PrimitiveKind.BOX
+    ]
     if inner:
         assert (signed_distance(indenter, np.array(inner)) < 0.0).all()
     above = cloud(200) * (1, 1, 0) + (0, 0, 1e-6)

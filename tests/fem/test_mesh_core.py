@@ -8,9 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate_fem.mesh.core import DistanceGrid, volume_inside
-from palpate_fem.mesh.distance import box_around, grid_points, signed_distance, tabulate
-from palpate_fem.mesh.field import cast, nearest, plane, rounded, softplus
+from palpate_fem.mesh.core import (
+    DistanceGrid,
+    box_around,
+    grid_points,
+    signed_distance,
+    tabulate,
+    volume_inside,
+)
+from palpate_fem.mesh.shape import cast, nearest, plane, rounded, softplus
 
 Floats = NDArray[np.float64]
 

@@ -9,13 +9,20 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from palpate.errors import ConfigError
-from palpate_fem.mesh.distance import signed_distance
-from palpate_fem.mesh.geometry import Geometry
-from palpate_fem.mesh.nvlabs import PARTS, SKIN, read_nvlabs, to_sensor_frame
+from palpate_fem.mesh.check import scaled_jacobians, solid_volume
+from palpate_fem.mesh.core import signed_distance
+from palpate_fem.mesh.nvlabs import (
+    PARTS,
+    SKIN,
+    boundary,
+    read_nvlabs,
+    read_obj,
+    read_tet,
+    to_sensor_frame,
+)
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.mesh.quality import scaled_jacobians, solid_volume
+from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.mesh.surface import components, enclosed_volume, node_areas, node_normals
-from palpate_fem.mesh.tetfile import boundary, read_obj, read_tet
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +31,11 @@ def folder(shared_data: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def public(folder: Path) -> Geometry:
+def public(folder: Path) -> FingertipGeometry:
     return read_nvlabs(folder)
 
 
-def test_the_skin_has_the_public_volumes(public: Geometry) -> None:
+def test_the_skin_has_the_public_volumes(public: FingertipGeometry) -> None:
     mesh = public.mesh
     assert mesh.elements.shape == (2 * 3168, 6)
     assert len(mesh.nodes) == 3 * 1586
@@ -40,7 +47,7 @@ def test_the_skin_has_the_public_volumes(public: Geometry) -> None:
     np.testing.assert_allclose(high, [7.35, 7.11, 5.33], atol=0.06)
 
 
-def test_the_core_starts_free_of_the_skin(public: Geometry) -> None:
+def test_the_core_starts_free_of_the_skin(public: FingertipGeometry) -> None:
     mesh, core = public.mesh, public.core
     corner = mesh.nodes[mesh.inner_faces]
     points = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
@@ -53,7 +60,9 @@ SLABS = {"nail": (2, -1.0, 114.1e-6), "clamp": (0, 1.0, 53.4e-6)}  # axis, side,
 
 
 @pytest.mark.parametrize("name", SLABS)
-def test_nail_and_clamp_hold_what_lies_on_them(public: Geometry, folder: Path, name: str) -> None:
+def test_nail_and_clamp_hold_what_lies_on_them(
+    public: FingertipGeometry, folder: Path, name: str
+) -> None:
     # Their outlines are round: a box around them reaches 1 mm farther at its corners.
     axis, side, area = SLABS[name]
     vertices, faces = read_obj(folder / PARTS)
@@ -75,7 +84,9 @@ def test_nail_and_clamp_hold_what_lies_on_them(public: Geometry, folder: Path, n
     assert share[held].sum() == pytest.approx(area, rel=0.03)
 
 
-def test_nothing_else_is_held_whatever_the_thickness(public: Geometry, folder: Path) -> None:
+def test_nothing_else_is_held_whatever_the_thickness(
+    public: FingertipGeometry, folder: Path
+) -> None:
     mesh = public.mesh
     clamp = np.abs(mesh.nodes[mesh.fixed, 0] + 20.61e-3) < 0.1e-3
     nail = np.abs(mesh.nodes[mesh.fixed, 2] - 3.48e-3) < 0.1e-3
@@ -95,7 +106,9 @@ def test_slabs_away_from_the_skin_are_refused(folder: Path, tmp_path: Path) -> N
         read_nvlabs(copy(folder, tmp_path, obj="\n".join(lines)))
 
 
-def test_the_parametric_skin_lies_on_the_public_one(public: Geometry, folder: Path) -> None:
+def test_the_parametric_skin_lies_on_the_public_one(
+    public: FingertipGeometry, folder: Path
+) -> None:
     # Inner surfaces: those of the files, not what was grown from them.
     theirs, ours = public.mesh, biotac().mesh
     points = ours.nodes[ours.inner_nodes]

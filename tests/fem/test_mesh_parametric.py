@@ -10,11 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
-from palpate_fem.mesh.check import check_mesh
-from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.check import check_mesh, scaled_jacobians, solid_volume
 from palpate_fem.mesh.parametric import NAIL_X_M, NAIL_Y_M, biotac
-from palpate_fem.mesh.quality import scaled_jacobians, solid_volume
 from palpate_fem.mesh.shape import CavityShape, CoreShape
+from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.mesh.surface import enclosed_volume, face_vectors, node_normals
 
 Floats = NDArray[np.float64]
@@ -27,11 +26,11 @@ CLEARED = 0.14
 
 
 @pytest.fixture(scope="module")
-def tip() -> Geometry:
+def tip() -> FingertipGeometry:
     return biotac()
 
 
-def test_the_default_mesh_is_as_fine_as_asked(tip: Geometry) -> None:
+def test_the_default_mesh_is_as_fine_as_asked(tip: FingertipGeometry) -> None:
     mesh = tip.mesh
     assert mesh.elements.shape[1] == 8
     assert len(mesh.outer_nodes) + len(mesh.inner_nodes) > 4000
@@ -44,7 +43,7 @@ def test_the_default_mesh_is_as_fine_as_asked(tip: Geometry) -> None:
     assert edge[pad].max() < 0.75e-3
 
 
-def test_volumes_and_extent_are_those_of_the_public_part(tip: Geometry) -> None:
+def test_volumes_and_extent_are_those_of_the_public_part(tip: FingertipGeometry) -> None:
     mesh = tip.mesh
     cavity = enclosed_volume(mesh.nodes, mesh.inner_faces)
     assert cavity == pytest.approx(CAVITY_M3, rel=0.005)
@@ -55,7 +54,7 @@ def test_volumes_and_extent_are_those_of_the_public_part(tip: Geometry) -> None:
     np.testing.assert_allclose(high, [7.35, 7.11, 5.33], atol=0.03)
 
 
-def test_the_mesh_is_its_own_mirror_image_bit_by_bit(tip: Geometry) -> None:
+def test_the_mesh_is_its_own_mirror_image_bit_by_bit(tip: FingertipGeometry) -> None:
     mesh = tip.mesh
     np.testing.assert_array_equal(mesh.nodes[mesh.mirror] * [1, -1, 1], mesh.nodes)
     np.testing.assert_array_equal(np.sort(mesh.mirror[mesh.fixed]), mesh.fixed)
@@ -66,7 +65,7 @@ def test_the_mesh_is_its_own_mirror_image_bit_by_bit(tip: Geometry) -> None:
     np.testing.assert_allclose(grid.coefficients, grid.coefficients[:, ::-1], rtol=0, atol=1e-16)
 
 
-def test_the_core_starts_free_of_the_skin(tip: Geometry) -> None:
+def test_the_core_starts_free_of_the_skin(tip: FingertipGeometry) -> None:
     mesh = tip.mesh
     inner = mesh.nodes[mesh.inner_faces]
     between = (inner + np.roll(inner, 1, axis=1)) / 2
@@ -79,7 +78,7 @@ def test_the_core_starts_free_of_the_skin(tip: Geometry) -> None:
     assert 0.1e-3 < np.median(gap[facing[:, 2] > 0.7]) < 0.3e-3
 
 
-def test_nail_and_clamp_hold_what_they_touch(tip: Geometry) -> None:
+def test_nail_and_clamp_hold_what_they_touch(tip: FingertipGeometry) -> None:
     mesh = tip.mesh
     held = np.isin(mesh.outer_faces, mesh.fixed).all(axis=1)
     area = np.linalg.norm(face_vectors(mesh.nodes, mesh.outer_faces), axis=1)
@@ -96,7 +95,7 @@ def test_nail_and_clamp_hold_what_they_touch(tip: Geometry) -> None:
     assert np.abs(inner[:, 1]).max() == pytest.approx(NAIL_Y_M, abs=1e-5)
 
 
-def test_the_facet_is_where_the_electrode_table_says(tip: Geometry, root: Path) -> None:
+def test_the_facet_is_where_the_electrode_table_says(tip: FingertipGeometry, root: Path) -> None:
     page = (root / "docs" / "conventions.md").read_text()
     rows = re.findall(r"^\| E(\d+) \|((?: -?\d+\.\d+ \|){6})$", page, flags=re.MULTILINE)
     table = np.array([[float(word) for word in row.split("|")[:6]] for _, row in rows])
@@ -108,7 +107,7 @@ def test_the_facet_is_where_the_electrode_table_says(tip: Geometry, root: Path) 
     np.testing.assert_allclose(gap[np.r_[0:6, 10:19]], -0.25e-3, atol=0.03e-3)
 
 
-def test_the_tabulated_core_is_the_core(tip: Geometry) -> None:
+def test_the_tabulated_core_is_the_core(tip: FingertipGeometry) -> None:
     shape = CoreShape(CavityShape())
     grid = tip.core.grid
     on_surface, _, _ = grid.evaluate(tip.core.vertices)

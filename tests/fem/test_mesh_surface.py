@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
-from palpate_fem.mesh.check import check_mesh
-from palpate_fem.mesh.extrude import extrude
-from palpate_fem.mesh.quality import scaled_jacobians, solid_volume
-from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.mesh.check import check_mesh, scaled_jacobians, solid_volume
+from palpate_fem.mesh.grid import bag
+from palpate_fem.mesh.solid import SolidMesh, extrude
 from palpate_fem.mesh.surface import (
     components,
     enclosed_volume,
@@ -23,7 +22,6 @@ from palpate_fem.mesh.surface import (
     node_normals,
     open_edges,
 )
-from palpate_fem.mesh.topology import bag
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -13,7 +13,7 @@ from palpate.errors import ConfigError, DatasetError
 from palpate_fem.plot.curves import travel_m
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.step import plot_curves, plot_overview, plot_step, von_mises
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.files import StoreDiskError
 from palpate_fem.store.sample import (
@@ -38,7 +38,7 @@ def tip() -> StoredFingertip:
 
 
 @pytest.fixture(scope="module")
-def press(tip: StoredFingertip) -> Trajectory:
+def press(tip: StoredFingertip) -> IndentationResult:
     return sample_trajectory(tip, steps=6, angle=0.2)
 
 
@@ -128,7 +128,7 @@ def _is_picture(path: Path) -> bool:
 
 @pytest.mark.parametrize("quantity", ["displacement", "von_mises"])
 def test_step_is_drawn(
-    tip: StoredFingertip, press: Trajectory, tmp_path: Path, quantity: str
+    tip: StoredFingertip, press: IndentationResult, tmp_path: Path, quantity: str
 ) -> None:
     path = tmp_path / "new" / "step.png"
     body = indenter_outline("sphere_medium") if quantity == "displacement" else None
@@ -149,16 +149,16 @@ def test_wedges_and_no_contact_are_drawn(tip: StoredFingertip, tmp_path: Path) -
     assert _is_picture(path)
 
 
-def test_curves_are_drawn(press: Trajectory, tmp_path: Path) -> None:
+def test_curves_are_drawn(press: IndentationResult, tmp_path: Path) -> None:
     plot_curves(press, tmp_path / "whole.png", title="normal")
-    cut = replace(press, steps=(), outcome=Outcome.DIVERGED, reason="at once")
+    cut = replace(press, steps=(), outcome=IndentationOutcome.DIVERGED, reason="at once")
     plot_curves(cut, tmp_path / "nothing.png")
     assert _is_picture(tmp_path / "whole.png")
     assert _is_picture(tmp_path / "nothing.png")
 
 
 def test_what_cannot_be_drawn_is_refused(
-    tip: StoredFingertip, press: Trajectory, tmp_path: Path
+    tip: StoredFingertip, press: IndentationResult, tmp_path: Path
 ) -> None:
     path = tmp_path / "step.png"
     with pytest.raises(ConfigError, match="no step 6"):
@@ -175,12 +175,15 @@ def test_what_cannot_be_drawn_is_refused(
         plot_curves(press, path)
 
 
-def test_overview_counts_outcomes(press: Trajectory, tmp_path: Path) -> None:
-    outcomes = [Outcome.COMPLETE] * 5 + [Outcome.FORCE_LIMIT, Outcome.DIVERGED]
+def test_overview_counts_outcomes(press: IndentationResult, tmp_path: Path) -> None:
+    outcomes = [IndentationOutcome.COMPLETE] * 5 + [
+        IndentationOutcome.FORCE_LIMIT,
+        IndentationOutcome.DIVERGED,
+    ]
     summaries = [
         TrajectorySummary(
             id=f"{at}", indenter=("cube", "ring", "sphere")[at % 3], sensor="", outcome=outcome,
-            reason="", complete=outcome is Outcome.COMPLETE, travel_m=1e-3, seconds=8.0,
+            reason="", complete=outcome is IndentationOutcome.COMPLETE, travel_m=1e-3, seconds=8.0,
             path=press.path, pose=press.path[1:], force=press.forces, fluid_pressure_pa=np.zeros(6),
         )
         for at, outcome in enumerate(outcomes)
@@ -190,4 +193,4 @@ def test_overview_counts_outcomes(press: Trajectory, tmp_path: Path) -> None:
     assert _is_picture(path)
     measured = [replace(item, seconds=float("nan")) for item in summaries]
     measured.append(replace(measured[0], pose=np.zeros((0, 7)), force=np.zeros((0, 3))))
-    assert plot_overview(measured, path)[Outcome.COMPLETE] == 6
+    assert plot_overview(measured, path)[IndentationOutcome.COMPLETE] == 6

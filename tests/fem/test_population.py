@@ -30,7 +30,7 @@ from palpate_fem.population.member import (
     write_population,
 )
 from palpate_fem.population.mount import clear_steps
-from palpate_fem.result import Step, Trajectory
+from palpate_fem.result import IndentationResult, IndentationStep
 
 Floats = NDArray[np.float64]
 
@@ -155,13 +155,13 @@ def test_shipped_units_have_the_published_ranges() -> None:
 def test_a_trajectory_counts_until_it_bears_on_the_mount() -> None:
     held = np.array([0, 1])
 
-    def step(on_held: float) -> Step:
+    def step(on_held: float) -> IndentationStep:
         force = np.zeros((6, 3))
         force[4, 2], force[1, 2] = 1.0, on_held
-        return cast(Step, SimpleNamespace(indenter_force=force))
+        return cast(IndentationStep, SimpleNamespace(indenter_force=force))
 
     steps = tuple(step(share) for share in (0.0, 0.04, 0.2, 0.0))
-    trajectory = cast(Trajectory, SimpleNamespace(steps=steps))
+    trajectory = cast(IndentationResult, SimpleNamespace(steps=steps))
     assert clear_steps(trajectory, held) == 2
-    clear = cast(Trajectory, SimpleNamespace(steps=steps[:2]))
+    clear = cast(IndentationResult, SimpleNamespace(steps=steps[:2]))
     assert clear_steps(clear, held) == 2

@@ -16,7 +16,7 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.export import export
 from palpate_fem.store.files import StoreMismatchError, StoreTakenError
@@ -35,13 +35,13 @@ def tip() -> StoredFingertip:
 
 
 @pytest.fixture(scope="module")
-def press(tip: StoredFingertip) -> Trajectory:
+def press(tip: StoredFingertip) -> IndentationResult:
     return sample_trajectory(tip, steps=6)
 
 
 @pytest.fixture(scope="module")
 def whole_store(
-    tip: StoredFingertip, press: Trajectory, tmp_path_factory: pytest.TempPathFactory
+    tip: StoredFingertip, press: IndentationResult, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A store of two trajectories, one with another ending."""
     path = tmp_path_factory.mktemp("store") / "sweep.sim"
@@ -50,7 +50,7 @@ def whole_store(
         short = replace(
             press,
             steps=press.steps[:3],
-            outcome=Outcome.DIVERGED,
+            outcome=IndentationOutcome.DIVERGED,
             reason="at 1.2 mm",
             travel_m=1e-3,
         )
@@ -64,7 +64,9 @@ def path(whole_store: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole_store, tmp_path / "sweep.sim"))
 
 
-def _assert_same(read: Trajectory, written: Trajectory, *, stress: bool = False) -> None:
+def _assert_same(
+    read: IndentationResult, written: IndentationResult, *, stress: bool = False
+) -> None:
     for name in ("indenter", "outcome", "reason", "travel_m", "seconds"):
         assert getattr(read, name) == getattr(written, name), name
     np.testing.assert_array_equal(read.path, written.path)
@@ -86,7 +88,7 @@ def _assert_same(read: Trajectory, written: Trajectory, *, stress: bool = False)
             assert one.stress.shape == (0, 6)
 
 
-def test_round_trip(path: Path, tip: StoredFingertip, press: Trajectory) -> None:
+def test_round_trip(path: Path, tip: StoredFingertip, press: IndentationResult) -> None:
     store = SimulationStore.open(path)
     assert store.ids() == ["sphere_medium/03/angled", ID]
     _assert_same(store.trajectory(ID), press)
@@ -108,7 +110,9 @@ def test_round_trip(path: Path, tip: StoredFingertip, press: Trajectory) -> None
     assert not list(path.rglob("*.part"))
 
 
-def test_stress_is_kept_on_request(tip: StoredFingertip, press: Trajectory, tmp_path: Path) -> None:
+def test_stress_is_kept_on_request(
+    tip: StoredFingertip, press: IndentationResult, tmp_path: Path
+) -> None:
     with StoreWriter(tmp_path / "s.sim", tip, stress=True) as store:
         store.write(ID, press)
         _assert_same(store.trajectory(ID), press, stress=True)
@@ -116,9 +120,11 @@ def test_stress_is_kept_on_request(tip: StoredFingertip, press: Trajectory, tmp_
 
 
 def test_trajectory_without_any_step(
-    tip: StoredFingertip, press: Trajectory, tmp_path: Path
+    tip: StoredFingertip, press: IndentationResult, tmp_path: Path
 ) -> None:
-    nothing = replace(press, steps=(), outcome=Outcome.DIVERGED, reason="before the first pose")
+    nothing = replace(
+        press, steps=(), outcome=IndentationOutcome.DIVERGED, reason="before the first pose"
+    )
     with StoreWriter(tmp_path / "s.sim", tip, stress=True) as store:
         store.write(ID, nothing)
         _assert_same(store.trajectory(ID), nothing)
@@ -127,9 +133,9 @@ def test_trajectory_without_any_step(
 
 
 def test_resuming_runs_only_what_is_not_done(
-    path: Path, tip: StoredFingertip, press: Trajectory
+    path: Path, tip: StoredFingertip, press: IndentationResult
 ) -> None:
-    cancelled = replace(press, steps=press.steps[:1], outcome=Outcome.CANCELLED)
+    cancelled = replace(press, steps=press.steps[:1], outcome=IndentationOutcome.CANCELLED)
     with StoreWriter(path, tip) as store:
         assert store.done() == set(store.ids())
         store.write("cube/00/normal", cancelled)
@@ -190,13 +196,15 @@ def test_ids_stay_inside_the_store(path: Path, tip: StoredFingertip, name: str) 
 
 @pytest.mark.parametrize("name", ["sphere_medium", "sphere_medium/03", f"{ID}/again"])
 def test_no_trajectory_inside_another(
-    path: Path, tip: StoredFingertip, press: Trajectory, name: str
+    path: Path, tip: StoredFingertip, press: IndentationResult, name: str
 ) -> None:
     with StoreWriter(path, tip) as store, pytest.raises(DatasetError, match="inside another"):
         store.write(name, press)
 
 
-def test_export_is_the_same_store(path: Path, tip: StoredFingertip, press: Trajectory) -> None:
+def test_export_is_the_same_store(
+    path: Path, tip: StoredFingertip, press: IndentationResult
+) -> None:
     single = path.with_suffix(".h5")
     seen: list[tuple[int, int]] = []
     assert export(SimulationStore.open(path), single, progress=lambda *at: seen.append(at)) == 2

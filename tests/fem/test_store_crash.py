@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreDiskError, StoreTakenError
 from palpate_fem.store.read import SimulationStore
@@ -126,7 +126,7 @@ def tip() -> StoredFingertip:
 
 
 @pytest.fixture(scope="module")
-def press(tip: StoredFingertip) -> Trajectory:
+def press(tip: StoredFingertip) -> IndentationResult:
     return sample_trajectory(tip, steps=5)
 
 
@@ -152,7 +152,9 @@ def test_many_processes_share_the_work(tmp_path: Path, tip: StoredFingertip) -> 
     assert not list(path.rglob("*.part"))
 
 
-def test_second_writer_is_refused(tmp_path: Path, tip: StoredFingertip, press: Trajectory) -> None:
+def test_second_writer_is_refused(
+    tmp_path: Path, tip: StoredFingertip, press: IndentationResult
+) -> None:
     path = tmp_path / "sweep.sim"
     with StoreWriter(path, tip) as store:
         for shared in (False, True):
@@ -182,7 +184,7 @@ def test_second_writer_is_refused(tmp_path: Path, tip: StoredFingertip, press: T
 def test_disk_error_keeps_what_was_finished(
     tmp_path: Path,
     tip: StoredFingertip,
-    press: Trajectory,
+    press: IndentationResult,
     monkeypatch: pytest.MonkeyPatch,
     number: int,
     words: str,

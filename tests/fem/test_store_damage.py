@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreDiskError
 from palpate_fem.store.read import FINGERTIP, SimulationStore
@@ -28,7 +28,7 @@ def tip() -> StoredFingertip:
 
 
 @pytest.fixture(scope="module")
-def press(tip: StoredFingertip, whole_store: Path) -> Trajectory:
+def press(tip: StoredFingertip, whole_store: Path) -> IndentationResult:
     """As it is read from a sound store."""
     return SimulationStore.open(whole_store).trajectory(ID)
 
@@ -47,7 +47,7 @@ def path(whole_store: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole_store, tmp_path / "sweep.sim"))
 
 
-def _assert_same(read: Trajectory, sound: Trajectory) -> None:
+def _assert_same(read: IndentationResult, sound: IndentationResult) -> None:
     for name in ("indenter", "outcome", "reason", "travel_m", "seconds"):
         assert getattr(read, name) == getattr(sound, name), name
     np.testing.assert_array_equal(read.path, sound.path)
@@ -87,7 +87,7 @@ def test_broken_file_is_named(
     assert str(path / target) in str(caught.value)
 
 
-def test_flipped_bytes_are_errors_or_harmless(path: Path, press: Trajectory) -> None:
+def test_flipped_bytes_are_errors_or_harmless(path: Path, press: IndentationResult) -> None:
     """A damaged file gives the right numbers or a typed error: never others, never a crash."""
     target = path / "trajectories" / f"{ID}.h5"
     whole = target.read_bytes()
@@ -110,7 +110,7 @@ def test_flipped_bytes_are_errors_or_harmless(path: Path, press: Trajectory) -> 
 
 
 def test_trajectory_of_another_fingertip_is_found(
-    path: Path, press: Trajectory, tmp_path: Path
+    path: Path, press: IndentationResult, tmp_path: Path
 ) -> None:
     other = sample_fingertip(divisions=3)
     with StoreWriter(tmp_path / "other.sim", other) as store:

@@ -18,8 +18,8 @@ import pytest
 from palpate.errors import DatasetError, RemoteError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.distance import signed_distance
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.indenter.shape import signed_distance
+from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.service.batch import Batch, BatchReport, Press
 from palpate_fem.service.jobs import Setup
 from palpate_fem.service.sweep import sweep_into_store
@@ -48,8 +48,8 @@ def batch_of(kind: float, **more: Any) -> Batch:
 pytestmark = pytest.mark.usefixtures("workers_find_fakes")
 
 
-def run(kind: float, count: int, **more: Any) -> tuple[BatchReport, list[Trajectory]]:
-    kept: list[Trajectory] = []
+def run(kind: float, count: int, **more: Any) -> tuple[BatchReport, list[IndentationResult]]:
+    kept: list[IndentationResult] = []
     batch = batch_of(kind, **more)
     try:
         report = batch.run(
@@ -111,7 +111,7 @@ def test_a_store_is_filled_and_resumed(tmp_path: Path) -> None:
     assert (report.done, there) == (2, 3)
     store = SimulationStore.open(path)
     assert len(store.ids()) == 5
-    assert store.trajectory(store.ids()[0]).outcome is Outcome.COMPLETE
+    assert store.trajectory(store.ids()[0]).outcome is IndentationOutcome.COMPLETE
     for name in store.ids():
         outline = store.outline(name)
         assert outline is not None, "pictures show the indenter"

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.indenter.approach import Surface, check_clear
+from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import check_path
 from palpate_fem.indenter.pose import rotation_matrix
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 PAD = np.array([0.0, 0.0, -1.0])
 
 
-def make_finger(count: int = 25) -> Surface:
+def make_finger(count: int = 25) -> OuterSurface:
     """An ellipsoid as long and thick as a fingertip, made of a cube of quads."""
     nodes: list[Floats] = []
     faces: list[NDArray[np.int64]] = []
@@ -46,7 +46,9 @@ def make_finger(count: int = 25) -> Surface:
             faces.append((quads if side > 0 else quads[:, ::-1]) + len(nodes) * len(u))
             nodes.append(face / np.linalg.norm(face, axis=1, keepdims=True))
     scale, centre = np.array([14e-3, 7.1e-3, 7.5e-3]), np.array([-7.3e-3, 0.0, -0.8e-3])
-    return Surface(np.concatenate(nodes) * scale + centre, np.concatenate(faces).astype(np.int32))
+    return OuterSurface(
+        np.concatenate(nodes) * scale + centre, np.concatenate(faces).astype(np.int32)
+    )
 
 
 FINGER = make_finger()
@@ -138,18 +140,18 @@ def test_targets_are_even_by_area() -> None:
     nodes = np.column_stack([grid, np.full(len(grid), -8e-3)])
     first = (np.arange(len(x) - 1)[:, None] * 11 + np.arange(10)).ravel()
     faces = np.stack([first, first + 1, first + 12, first + 11], axis=1).astype(np.int32)
-    points, normals = sample_targets(Surface(nodes, faces), 4000)
+    points, normals = sample_targets(OuterSurface(nodes, faces), 4000)
     np.testing.assert_allclose(normals, np.broadcast_to(PAD, normals.shape), atol=1e-12)
     assert (points[:, 0] < -5e-3).mean() == pytest.approx(0.5, abs=0.03)  # 3.8 deviations
     assert points[:, 1].mean() == pytest.approx(0.0, abs=0.15e-3)
 
 
 def test_a_surface_without_the_region_is_refused() -> None:
-    inside_out = Surface(FINGER.nodes, FINGER.faces[:, ::-1])
+    inside_out = OuterSurface(FINGER.nodes, FINGER.faces[:, ::-1])
     with pytest.raises(ConfigError, match="no part of the surface lies in"):
         sample_targets(inside_out, 3, region=Region(half_width_m=1e-3))
     with pytest.raises(ConfigError, match="no part of the surface lies in"):
-        sample_targets(Surface(FINGER.nodes * 1e3, FINGER.faces), 3)
+        sample_targets(OuterSurface(FINGER.nodes * 1e3, FINGER.faces), 3)
 
 
 def test_the_campaign_is_the_papers() -> None:

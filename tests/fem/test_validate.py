@@ -15,9 +15,9 @@ from palpate_fem.calibration.align import Floats
 from palpate_fem.calibration.measured import SIMULATED, Indentation, write_indentations
 from palpate_fem.calibration.runs import Simulated, simulate_all
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
@@ -51,7 +51,9 @@ def measured(name: str, indenter: str, sensor: str = "biotac1") -> Indentation:
     return Indentation(f"{name}/{sensor}", indenter, sensor, way(), ramp())
 
 
-def run(force: Floats, outcome: Outcome = Outcome.COMPLETE, reason: str = "") -> Simulated:
+def run(
+    force: Floats, outcome: IndentationOutcome = IndentationOutcome.COMPLETE, reason: str = ""
+) -> Simulated:
     return Simulated(force, path_lengths(way())[: len(force)], 0.0151, 8e-7, outcome, reason)
 
 
@@ -71,9 +73,11 @@ def validation() -> Validation:
         {
             "ring/00/normal/biotac1": run(ramp()),
             "ring/00/normal/biotac2": run(ramp()),
-            "cube/00/normal/biotac1": run(stiffer[:35], Outcome.FORCE_LIMIT, "32.1 N"),
-            "texture/00/normal/biotac1": run(ramp()[:12], Outcome.DIVERGED, "at 1.1 mm"),
-            "texture/01/normal/biotac1": run(np.empty((0, 3)), Outcome.DIVERGED, "refused"),
+            "cube/00/normal/biotac1": run(stiffer[:35], IndentationOutcome.FORCE_LIMIT, "32.1 N"),
+            "texture/00/normal/biotac1": run(ramp()[:12], IndentationOutcome.DIVERGED, "at 1.1 mm"),
+            "texture/01/normal/biotac1": run(
+                np.empty((0, 3)), IndentationOutcome.DIVERGED, "refused"
+            ),
             "texture/03/normal/biotac1": run(ramp()),
         },
     )
@@ -94,7 +98,7 @@ def test_numbers_are_the_papers_formula(validation: Validation) -> None:
     assert cube.relative == pytest.approx(cube.rms_n / cube.peak_n)
     assert cube.depth_offset_m == pytest.approx(0.3e-3 + start * (1 / 1.1 - 1))
     assert cube.coverage == pytest.approx(common / (4e-3 - TOUCH_M - start))
-    assert (cube.outcome, cube.path_name) == (Outcome.FORCE_LIMIT, "cube/00/normal")
+    assert (cube.outcome, cube.path_name) == (IndentationOutcome.FORCE_LIMIT, "cube/00/normal")
 
 
 def test_table_has_means_and_the_median_of_indenters(validation: Validation) -> None:
@@ -209,7 +213,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SimulationStore:
     with StoreWriter(path, tip, command="test") as writer:
         press = sample_trajectory(tip, steps=12)
         writer.write("sphere_medium/00/normal", press)
-        short = replace(press, steps=press.steps[:1], outcome=Outcome.DIVERGED, reason="early")
+        short = replace(
+            press, steps=press.steps[:1], outcome=IndentationOutcome.DIVERGED, reason="early"
+        )
         writer.write("sphere_medium/01/normal", replace(short, steps=()))
     return SimulationStore.open(path)
 

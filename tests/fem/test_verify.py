@@ -10,9 +10,14 @@ import pytest
 
 from palpate.errors import SimulationError
 from palpate_fem import verify
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.verify import closed_forms
-from palpate_fem.verify.check import Absent, Case, Check, Measured
+from palpate_fem.verify.check import (
+    Measurement,
+    MissingDataError,
+    VerificationCase,
+    VerificationCheck,
+)
 
 
 def _quick() -> list[Any]:
@@ -26,15 +31,19 @@ def _quick() -> list[Any]:
 
 
 @pytest.mark.parametrize("case", _quick())
-def test_quick(case: Case) -> None:
+def test_quick(case: VerificationCase) -> None:
     check = case()
     if check.skipped:
         pytest.skip(check.note)
     assert check.passed, f"{check.value} is not {check.reference} within {check.tolerance}"
 
 
-def _check(value: float, reference: float, tolerance: float, *, at_least: bool = False) -> Check:
-    return Case("t/one", lambda: Measured(value, reference), tolerance, at_least=at_least)()
+def _check(
+    value: float, reference: float, tolerance: float, *, at_least: bool = False
+) -> VerificationCheck:
+    return VerificationCase(
+        "t/one", lambda: Measurement(value, reference), tolerance, at_least=at_least
+    )()
 
 
 def test_a_wrong_value_fails() -> None:
@@ -57,20 +66,20 @@ def test_a_lower_limit_is_one() -> None:
 
 
 def test_no_solution_is_a_failure_with_a_reason() -> None:
-    def measure() -> Measured:
+    def measure() -> Measurement:
         raise SimulationError("an element turns inside out", remedy="none")
 
-    check = Case("t/one", measure, 1.0)()
+    check = VerificationCase("t/one", measure, 1.0)()
     assert not check.passed
     assert math.isnan(check.value)
     assert "inside out" in check.note
 
 
 def test_what_is_absent_is_skipped_with_a_reason(tmp_path: Path) -> None:
-    def measure() -> Measured:
-        raise Absent("no such part")
+    def measure() -> Measurement:
+        raise MissingDataError("no such part")
 
-    assert Case("t/one", measure, 1.0)().skipped
+    assert VerificationCase("t/one", measure, 1.0)().skipped
     (check, *_) = verify.run(only="skin/filled", shared_data=tmp_path)
     assert check.skipped
     assert "no public BioTac" in check.note
@@ -78,9 +87,9 @@ def test_what_is_absent_is_skipped_with_a_reason(tmp_path: Path) -> None:
 
 def test_a_compressible_skin_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     def soft(*args: Any, bulk_ratio: float, **more: Any) -> Any:
-        return System(*args, bulk_ratio=20.0, **more)
+        return EquilibriumSystem(*args, bulk_ratio=20.0, **more)
 
-    monkeypatch.setattr("palpate_fem.verify.body.System", soft)
+    monkeypatch.setattr("palpate_fem.verify.bodies.EquilibriumSystem", soft)
     (check,) = verify.run(only="equibiaxial")
     assert not check.passed
     assert check.value == pytest.approx(check.reference, rel=0.2)

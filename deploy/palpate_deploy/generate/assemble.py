@@ -12,7 +12,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate_deploy.generate.mechanics import OnProgress
 from palpate_deploy.generate.trials import file_of, read_trials
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import CLEARANCE_M
@@ -130,7 +130,7 @@ def join(
     return mixed
 
 
-def simulated_trial(name: str, trajectory: Trajectory, believed: int) -> SimulatedTrial:
+def simulated_trial(name: str, trajectory: IndentationResult, believed: int) -> SimulatedTrial:
     """A simulated trajectory from first contact on, as it is mixed with trials.
 
     Args:

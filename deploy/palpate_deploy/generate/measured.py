@@ -13,7 +13,7 @@ from palpate.errors import ConfigError, DatasetError
 from palpate_deploy.generate.assemble import join, simulated_trial
 from palpate_deploy.generate.mechanics import OnProgress
 from palpate_fem.population.mount import clear_steps
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.assembly import assemble_experiment, common_trajectories
 from palpate_training.datasets.container import schema_of
@@ -223,7 +223,7 @@ def _nothing_mixed(store: SimulationStore, left_out: Sequence[tuple[str, str]]) 
     )
 
 
-def _away(rows: TrialRows, trajectory: Trajectory) -> float:
+def _away(rows: TrialRows, trajectory: IndentationResult) -> float:
     """Distance of the tip from the line along which the indenter was simulated [m]."""
     start, end = trajectory.path[0, :3], trajectory.path[-1, :3]
     along = (end - start) / np.linalg.norm(end - start)

@@ -21,7 +21,7 @@ from palpate_fem.service.sweep import sweep_into_store
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.writer import Place, StoreWriter
-from palpate_fem.trajectory import Campaign, Indentation
+from palpate_fem.trajectory import Campaign, PlannedIndentation
 
 STORE = "mechanics.sim"
 COMMAND = "palpate data generate"
@@ -38,7 +38,7 @@ def fingertip_of(spec: ExperimentSpec) -> StoredFingertip:
     return biotac(**spec.mesh_options)(spec.parameters, lambda _: None).describe()  # type: ignore[arg-type]
 
 
-def plans_of(spec: ExperimentSpec, fingertip: StoredFingertip) -> list[Indentation]:
+def plans_of(spec: ExperimentSpec, fingertip: StoredFingertip) -> list[PlannedIndentation]:
     """All planned trajectories, first points first: what is there early is a fair sample."""
     names = tuple(make_indenter(name).name for name in spec.indenters) or indenter_names()
     plans = list(

@@ -13,7 +13,7 @@ from palpate_deploy.generate.registration import stand_in_arm
 from palpate_deploy.generate.spec import ExperimentSpec
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.trajectory import Indentation
+from palpate_fem.trajectory import PlannedIndentation
 from palpate_training.experiment.kinematics import Arm
 from palpate_training.experiment.plan import (
     ARMS,
@@ -97,7 +97,7 @@ def plan_experiment(
     return found
 
 
-def _trajectory(plan: Indentation, stations: Mapping[str, Station]) -> Trajectory:
+def _trajectory(plan: PlannedIndentation, stations: Mapping[str, Station]) -> Trajectory:
     arm = assign_arm(plan.target) if len(stations) > 1 else next(iter(stations))
     return Trajectory(
         trajectory=plan.name,
@@ -110,7 +110,7 @@ def _trajectory(plan: Indentation, stations: Mapping[str, Station]) -> Trajector
     )
 
 
-def _check_same(plans: list[Indentation], store: SimulationStore) -> None:
+def _check_same(plans: list[PlannedIndentation], store: SimulationStore) -> None:
     """Names alone do not tell: with another seed they are the same, and the points are not."""
     there = set(store.ids())
     for plan in plans:

@@ -16,7 +16,7 @@ from palpate_deploy.generate.mechanics import STORE
 from palpate_deploy.generate.pipeline import EXPERIMENT, MIXED
 from palpate_deploy.generate.trials import FOLDER, read_trials
 from palpate_fem.population.member import Member
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.basis import encode, fit_basis, subset
 from palpate_training.datasets.experiment import (
@@ -142,7 +142,7 @@ def _write_tape(folder: Path, members: Sequence[Member], names: Sequence[str], p
     write_tape(path, build)
 
 
-def _press(name: str, trajectory: Trajectory, counts: Floats, rest_pa: float) -> TapePress:
+def _press(name: str, trajectory: IndentationResult, counts: Floats, rest_pa: float) -> TapePress:
     """Untouched, then a few of the converged steps."""
     steps = trajectory.steps[: counts.shape[1] - 1]
     some = np.unique(np.linspace(0, len(steps) - 1, TAPE_STEPS).round().astype(int))

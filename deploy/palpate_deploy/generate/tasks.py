@@ -22,7 +22,7 @@ from palpate_fem.electrodes.unit import UnitParameters
 from palpate_fem.population.answers import Population
 from palpate_fem.population.member import Member
 from palpate_fem.population.mount import clear_steps
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.trajectory import CLEARANCE_M
@@ -50,7 +50,7 @@ class MechanicsTask:
     path: Floats
 
 
-def simulate(task: MechanicsTask) -> Trajectory:
+def simulate(task: MechanicsTask) -> IndentationResult:
     """Run a trajectory on this process's fingertip."""
     tip = _fingertip(task.spec)
     friction = task.spec.parameters.friction_coefficient
@@ -83,7 +83,7 @@ class TrialTask:
     arm: str
     direction: Floats
     planned_m: float
-    trajectory: Trajectory
+    trajectory: IndentationResult
     members: tuple[Member, ...]
     errors_m: Floats
     seed: int

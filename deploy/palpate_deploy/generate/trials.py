@@ -19,7 +19,7 @@ from palpate_deploy.generate.tasks import TrialMaker, TrialsDone, TrialTask, pac
 from palpate_fem.population.member import Member
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.trajectory import Indentation
+from palpate_fem.trajectory import PlannedIndentation
 from palpate_training.experiment.plan import assign_arm
 
 FOLDER = "trials"
@@ -89,7 +89,7 @@ def _tasks(
     spec: ExperimentSpec,
     store: SimulationStore,
     members: Sequence[Member],
-    plans: Sequence[Indentation],
+    plans: Sequence[PlannedIndentation],
 ) -> Iterator[TrialTask]:
     errors = registration_errors(members, spec.seed)
     for plan in plans:

@@ -40,7 +40,7 @@ from palpate_fem.calibration.settings import (
     CalibrationSettings,
 )
 from palpate_fem.calibration.slsqp import minimise
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 
 _REACH = {THICKNESS: 0.15, FRICTION: 0.6, VOLUME: 0.15}
 """First and largest change of a logarithm in one step: about half a cell of the scan."""
@@ -140,7 +140,7 @@ class _Search:
 
     def _note_early_ends(self, batch: Sequence[Simulated]) -> None:
         for case, result in zip(self.cases, batch, strict=True):
-            if result.outcome is not Outcome.COMPLETE:
+            if result.outcome is not IndentationOutcome.COMPLETE:
                 why = f" ({result.reason})" if result.reason else ""
                 note = f"{case.item.name}: some runs ended early: {result.outcome}{why}"
                 if note not in self.notes:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from palpate_fem.aim import pad_point
 from palpate_fem.calibration.recover import Planned
-from palpate_fem.indenter.approach import Surface
+from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
-from palpate_fem.trajectory import angled_direction, press_path
+from palpate_fem.trajectory import angled_direction, pad_point, press_path
 
 
 class _Press(NamedTuple):
@@ -37,7 +36,7 @@ CLEARANCE_M = 1e-3
 
 def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
     """Poses for the presses, from first contact with this finger's pad on."""
-    surface = Surface(tip.nodes, tip.geometry.mesh.outer_faces)
+    surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
     planned = []
     for name, press in PRESSES.items():
         target, normal = pad_point(surface, press.x_m, 0.0)

@@ -27,7 +27,7 @@ from palpate_fem.calibration.settings import (
     CalibrationSettings,
 )
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.mechanics.load_stepping import path_lengths
 
 TOLERANCES = {THICKNESS: 0.02, MODULUS: 0.02, FRICTION: 0.05, VOLUME: 0.01}
 """Relative errors that the calibration must stay below."""

@@ -15,8 +15,8 @@ from palpate.errors import ConfigError, SimulationError
 from palpate_fem.calibration.align import Curve, Floats, along
 from palpate_fem.calibration.measured import Indentation
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.path import path_lengths
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate_fem.result import IndentationOutcome, IndentationResult
 
 Key = tuple[object, ...]
 
@@ -42,11 +42,13 @@ class Simulated:
     travel: Floats
     thickness_m: float
     fluid_volume_m3: float
-    outcome: Outcome
+    outcome: IndentationOutcome
     reason: str = ""
 
     @classmethod
-    def of(cls, trajectory: Trajectory, *, thickness_m: float, fluid_volume_m3: float) -> Simulated:
+    def of(
+        cls, trajectory: IndentationResult, *, thickness_m: float, fluid_volume_m3: float
+    ) -> Simulated:
         """From a solver's trajectory, whose steps begin at the second pose, and its finger."""
         forces = from_rest(trajectory.forces)
         return cls(
@@ -157,7 +159,12 @@ def _simulate(
     except (SimulationError, ConfigError) as error:
         nothing = np.empty(0)
         return Simulated(
-            np.empty((0, 3)), nothing, math.nan, math.nan, Outcome.DIVERGED, f"refused: {error}"
+            np.empty((0, 3)),
+            nothing,
+            math.nan,
+            math.nan,
+            IndentationOutcome.DIVERGED,
+            f"refused: {error}",
         )
 
 

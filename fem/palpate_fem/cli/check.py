@@ -20,7 +20,7 @@ from palpate.errors import ConfigError
 from palpate_fem.cli.show import progress_bar
 
 if TYPE_CHECKING:
-    from palpate_fem.verify import Check
+    from palpate_fem.verify import VerificationCheck
 
 
 def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as_json: bool) -> int:
@@ -46,11 +46,11 @@ def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as
             f"--public-data {shared_data}: there is no {PUBLIC_SKIN} in it",
             remedy=f"give the folder that holds {PUBLIC_SKIN}, or leave it out",
         )
-    checks: list[Check] = []
+    checks: list[VerificationCheck] = []
     with progress_bar() as bar:
         task = bar.add_task("verify", total=None)
 
-        def on_check(check: Check, done: int, total: int) -> None:
+        def on_check(check: VerificationCheck, done: int, total: int) -> None:
             checks.append(check)
             bar.update(task, completed=done, total=total, info=check.name)
 
@@ -90,7 +90,7 @@ def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
     return 0
 
 
-def _show_checks(checks: list[Check]) -> None:
+def _show_checks(checks: list[VerificationCheck]) -> None:
     skipped = sum(check.skipped for check in checks)
     passed = sum(check.passed and not check.skipped for check in checks)
     table = Table(
@@ -117,13 +117,13 @@ def _show_checks(checks: list[Check]) -> None:
     Console().print(table)
 
 
-def _verdict(check: Check) -> str:
+def _verdict(check: VerificationCheck) -> str:
     if check.skipped:
         return "[yellow]skipped[/]"
     return "[green]ok[/]" if check.passed else "[red]FAILED[/]"
 
 
-def _plain(check: Check) -> dict[str, object]:
+def _plain(check: VerificationCheck) -> dict[str, object]:
     """For JSON, which has no NaN and no infinity."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value

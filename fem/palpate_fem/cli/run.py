@@ -11,7 +11,6 @@ from pathlib import Path
 
 from palpate.command import typed_command
 from palpate.errors import ConfigError
-from palpate_fem.aim import pad_point
 from palpate_fem.cli.model import Model, workers_for
 from palpate_fem.cli.show import (
     console,
@@ -24,11 +23,11 @@ from palpate_fem.cli.show import (
 from palpate_fem.cli.stopping import stop_on_signal
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import read_path
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.service.batch import Batch, BatchReport, Plan, Press
 from palpate_fem.service.start import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip
-from palpate_fem.trajectory import Campaign, angled_direction, press_path
+from palpate_fem.trajectory import Campaign, angled_direction, pad_point, press_path
 
 DEFAULT_INDENTER = "sphere_medium"
 GOOD = ("complete", "force limit")
@@ -75,7 +74,7 @@ def run_command(
     _check(wanted, store)
     jobs = None if wanted.sweep else 1
     count, threads = workers_for(workers, jobs)
-    done: list[Trajectory] = []
+    done: list[IndentationResult] = []
     with stop_on_signal() as stop, _batch(model, count, threads, limit_s) as batch:
         with progress_bar() as bar:
             task = bar.add_task("pressurise", total=None)
@@ -171,7 +170,7 @@ def _plans(wanted: Wanted, fingertip: StoredFingertip) -> Sequence[Plan]:
 def _show(
     wanted: Wanted,
     fingertip: StoredFingertip,
-    done: Sequence[Trajectory],
+    done: Sequence[IndentationResult],
     report: BatchReport,
     plans: Sequence[Plan],
     store: Path | None,
@@ -210,7 +209,7 @@ def _show(
     console.print(f"drew {png}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _from_store(store: Path, plans: Sequence[Plan]) -> list[Trajectory]:
+def _from_store(store: Path, plans: Sequence[Plan]) -> list[IndentationResult]:
     from palpate_fem.store.read import SimulationStore
 
     opened = SimulationStore.open(store)

@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from palpate_fem.result import Outcome, Step, Trajectory
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.batch import FAILED, BatchReport
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 
@@ -56,7 +56,7 @@ def progress_bar() -> Progress:
     )
 
 
-def show_trajectory(fingertip: StoredFingertip, trajectory: Trajectory) -> None:
+def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -> None:
     """Its steps, one a row."""
     ending = trajectory.outcome.value + (f": {trajectory.reason}" if trajectory.reason else "")
     table = Table(
@@ -99,7 +99,7 @@ def show_summaries(store: Path, names: Sequence[str]) -> None:
     for indenter, found in rows.items():
         complete, limit = (
             sum(summary.outcome is how for summary in found)
-            for how in (Outcome.COMPLETE, Outcome.FORCE_LIMIT)
+            for how in (IndentationOutcome.COMPLETE, IndentationOutcome.FORCE_LIMIT)
         )
         peaks = [np.linalg.norm(s.force, axis=1).max() for s in found if len(s.force)]
         table.add_row(
@@ -140,7 +140,7 @@ def show_report(report: BatchReport, present: int, store: Path | None) -> None:
 
 def write_json(
     fingertip: StoredFingertip,
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[IndentationResult],
     report: BatchReport,
     present: int,
 ) -> None:
@@ -174,7 +174,7 @@ def write_json(
     typer.echo(json.dumps(content, indent=1, allow_nan=False))
 
 
-def _plain(step: Step) -> dict[str, object]:
+def _plain(step: IndentationStep) -> dict[str, object]:
     """A step without its fields; NaN, which JSON has not, as None."""
     return {
         **{

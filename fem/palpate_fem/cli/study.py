@@ -13,7 +13,7 @@ from rich.table import Table
 from palpate_fem.cli.show import progress_bar
 
 if TYPE_CHECKING:
-    from palpate_fem.study import Row
+    from palpate_fem.study import StudyRow
 
 
 def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
@@ -33,7 +33,7 @@ def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
     with progress_bar() as bar:
         task = bar.add_task(f"{what} study", total=total)
 
-        def on_row(row: Row) -> None:
+        def on_row(row: StudyRow) -> None:
             bar.update(task, advance=1, info=f"{row.indenter}, {row.seconds:.0f} s")
 
         rows = (mesh_study if what == "mesh" else step_study)(on_row=on_row)
@@ -48,7 +48,7 @@ def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
     return 0 if all(row.accepted for row in rows[-len(PRESSES) :]) else 1
 
 
-def _show(rows: list[Row]) -> None:
+def _show(rows: list[StudyRow]) -> None:
     table = Table(title="what refinement changes")
     for heading in (
         "indenter", "edge [mm]", "unknowns", "steps", "force [N]", "change [%]", "moved [um]",

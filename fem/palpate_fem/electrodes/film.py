@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay, cKDTree
 from palpate.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.errors import ConfigError
 from palpate_fem.electrodes.table import DISC_DIAMETER_M, DISC_TERMINAL
-from palpate_fem.mesh.core import Core
+from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.surface import face_vectors, open_edges
 
 Floats = NDArray[np.float64]
@@ -73,7 +73,7 @@ class FilmMesh:
 
 
 def film_mesh(
-    core: Core,
+    core: RigidCore,
     *,
     edge_m: float = EDGE_M,
     disc_diameter_m: float = DISC_DIAMETER_M,
@@ -130,7 +130,7 @@ def film_mesh(
     return mesh
 
 
-def onto(core: Core, points: Floats, level_m: float = 0.0) -> tuple[Floats, Floats]:
+def onto(core: RigidCore, points: Floats, level_m: float = 0.0) -> tuple[Floats, Floats]:
     """Nearest points of a level of the core's distance, and the unit normals there.
 
     Args:
@@ -148,7 +148,7 @@ def onto(core: Core, points: Floats, level_m: float = 0.0) -> tuple[Floats, Floa
 
 
 def _disc_points(
-    core: Core, centres: Floats, radius: float, recess: float
+    core: RigidCore, centres: Floats, radius: float, recess: float
 ) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
     """Rings about the discs, in which disc each point lies (-1 in none), about which it was laid.
 

@@ -16,7 +16,7 @@ from palpate.errors import SimulationError
 from palpate_fem.electrodes.film import FilmMesh
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.mesh.surface import face_vectors
-from palpate_fem.result import Step
+from palpate_fem.result import IndentationStep
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -123,7 +123,7 @@ class GapFinder:
             pressure = np.einsum("nk,nk->n", weights, nodal[nodes])
         return Gap(gap, nodes, weights, normal / along[:, None], pressure)
 
-    def of_step(self, rest: Floats, step: Step) -> Gap:
+    def of_step(self, rest: Floats, step: IndentationStep) -> Gap:
         """Gaps of a simulated step.
 
         Args:

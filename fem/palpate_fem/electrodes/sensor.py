@@ -15,8 +15,8 @@ from palpate_fem.electrodes.film import EDGE_M, film_mesh
 from palpate_fem.electrodes.gap import Gap, GapFinder
 from palpate_fem.electrodes.residual import fit_of, thickness
 from palpate_fem.electrodes.unit import UnitParameters
-from palpate_fem.mesh.geometry import Geometry
-from palpate_fem.result import Step
+from palpate_fem.mesh.solid import FingertipGeometry
+from palpate_fem.result import IndentationStep
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,11 @@ class Electrodes:
     """The electrodes of one geometry and one unit."""
 
     def __init__(
-        self, geometry: Geometry, unit: UnitParameters | None = None, *, edge_m: float = EDGE_M
+        self,
+        geometry: FingertipGeometry,
+        unit: UnitParameters | None = None,
+        *,
+        edge_m: float = EDGE_M,
     ) -> None:
         """Mesh the film and make it ready; half a second.
 
@@ -108,7 +112,7 @@ class Electrodes:
         """
         return self.of_gap(self.finder.measure(position, core_force), log_sigma=log_sigma)
 
-    def of_step(self, rest: Floats, step: Step, *, log_sigma: float = 0.0) -> Response:
+    def of_step(self, rest: Floats, step: IndentationStep, *, log_sigma: float = 0.0) -> Response:
         """Answer to a simulated step of a finger whose untouched nodes are at `rest` (V, 3) [m]."""
         return self.respond(rest + step.displacement, step.core_force, log_sigma=log_sigma)
 

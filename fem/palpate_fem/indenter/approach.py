@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import SimulationError
-from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.indenter.pose import rotation_matrix, to_indenter, unit
-from palpate_fem.indenter.shape import Indenter, Kind
+from palpate_fem.indenter.shape import Indenter, PrimitiveKind, signed_distance
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -26,7 +25,7 @@ _LEVELS = (3, 9, 25)  # points along a face's edge
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class OuterSurface:
     """The outer surface of a fingertip.
 
     Attributes:
@@ -56,7 +55,7 @@ def first_contact(
     quaternion: Floats,
     target: ArrayLike,
     direction: ArrayLike,
-    surface: Surface,
+    surface: OuterSurface,
 ) -> float:
     """Travel of the tip beyond a target at which the indenter first touches the surface.
 
@@ -108,7 +107,7 @@ def first_contact(
     return limit
 
 
-def check_clear(indenter: Indenter, pose: Floats, surface: Surface) -> float:
+def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> float:
     """Check that an indenter neither touches the skin nor is within the finger.
 
     Args:
@@ -151,7 +150,7 @@ def _point_of(indenter: Indenter) -> Floats:
     """A point within the indenter [m], indenter frame; the tip of a ring is not."""
     part = indenter.primitives[0]
     point = np.array(part.centre)
-    if part.kind == Kind.REVOLVED:
+    if part.kind == PrimitiveKind.REVOLVED:
         point[part.axis] += (part.sizes[2] + part.sizes[3]) / 2
         point[(part.axis + 1) % 3] += (part.sizes[0] + part.sizes[1]) / 2
     return point
@@ -161,7 +160,7 @@ def _reach(indenter: Indenter) -> float:
     """Radius of a ball about the tip that holds the indenter [m]."""
     far = []
     for part in indenter.primitives:
-        if part.kind == Kind.BOX:
+        if part.kind == PrimitiveKind.BOX:
             size = float(np.linalg.norm(part.sizes[:3]))
         else:
             size = float(np.hypot(part.sizes[1], max(abs(part.sizes[2]), abs(part.sizes[3]))))

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from functools import cache
 
 from palpate.errors import ConfigError
-from palpate_fem.indenter.shape import Indenter, Kind, Primitive
+from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 
 BASE_M = -17.859e-3
 _SHAFT_M = 3.6e-3  # half width of the square base; the published one is 3.6 x 3.612 mm
@@ -47,13 +47,13 @@ def _ball(radius_m: float) -> Primitive:
 
 
 def _grain(centre_m: tuple[float, float, float], radius_m: float) -> Primitive:
-    return Primitive(Kind.REVOLVED, centre_m, (0.0, 0.0, 0.0, 0.0), radius_m)
+    return Primitive(PrimitiveKind.REVOLVED, centre_m, (0.0, 0.0, 0.0, 0.0), radius_m)
 
 
 def _disc(radius_m: float, low_m: float, high_m: float, edge_m: float) -> Primitive:
     """An upright cylinder whose two rims are rounded."""
     return Primitive(
-        Kind.REVOLVED,
+        PrimitiveKind.REVOLVED,
         (0.0, 0.0, 0.0),
         (0.0, radius_m - edge_m, low_m + edge_m, high_m - edge_m),
         edge_m,
@@ -65,7 +65,7 @@ def _block(
 ) -> Primitive:
     """An upright box whose twelve edges are rounded."""
     return Primitive(
-        Kind.BOX,
+        PrimitiveKind.BOX,
         (0.0, 0.0, (low_m + high_m) / 2),
         (half_x_m - edge_m, half_y_m - edge_m, (high_m - low_m) / 2 - edge_m, 0.0),
         edge_m,
@@ -127,7 +127,7 @@ def _sphere_large() -> tuple[Primitive, ...]:
 def _lying(radius_m: float, half_flat_m: float) -> Primitive:
     """A cylinder along x whose top touches the tip, its ends rounded."""
     return Primitive(
-        Kind.REVOLVED,
+        PrimitiveKind.REVOLVED,
         (0.0, 0.0, -radius_m),
         (0.0, radius_m - _EDGE_M, -half_flat_m, half_flat_m),
         _EDGE_M,
@@ -161,7 +161,7 @@ def _cube() -> tuple[Primitive, ...]:
 def _ring() -> tuple[Primitive, ...]:
     """Outer radius 7 mm, bore 3.5 mm and 7 mm deep, flat from 4.5 to 6 mm."""
     wall = Primitive(
-        Kind.REVOLVED,
+        PrimitiveKind.REVOLVED,
         (0.0, 0.0, 0.0),
         (3.5e-3 + _EDGE_M, 7e-3 - _EDGE_M, -7e-3, -_EDGE_M),
         _EDGE_M,

@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import warp as wp
 
-from palpate_fem.indenter.distance import ON_AXIS
-from palpate_fem.indenter.shape import Kind
+from palpate_fem.indenter.shape import ON_AXIS, PrimitiveKind
 
 wp.set_module_options({"enable_backward": False})
 
-BOX = wp.constant(wp.float64(float(Kind.BOX)))
+BOX = wp.constant(wp.float64(float(PrimitiveKind.BOX)))
 NEAR_AXIS = wp.constant(wp.float64(ON_AXIS))
 
 
 @wp.struct
-class Near:
+class IndenterGap:
     """Gap [m], its gradient, and its second derivative [1/m]; indenter frame."""
 
     gap: wp.float64
@@ -84,10 +83,10 @@ def gap_of(primitives: wp.array2d(dtype=wp.float64), p: int, x: wp.vec3d) -> wp.
 
 
 @wp.func
-def box_derivatives(primitives: wp.array2d(dtype=wp.float64), p: int, x: wp.vec3d) -> Near:
+def box_derivatives(primitives: wp.array2d(dtype=wp.float64), p: int, x: wp.vec3d) -> IndenterGap:
     """Normal and hessian of a box."""
     zero = wp.float64(0.0)
-    near = Near()
+    near = IndenterGap()
     away = x - wp.vec3d(primitives[p, 2], primitives[p, 3], primitives[p, 4])
     side = wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
     out = wp.vec3d()
@@ -116,11 +115,13 @@ def box_derivatives(primitives: wp.array2d(dtype=wp.float64), p: int, x: wp.vec3
 
 
 @wp.func
-def revolved_derivatives(primitives: wp.array2d(dtype=wp.float64), p: int, x: wp.vec3d) -> Near:
+def revolved_derivatives(
+    primitives: wp.array2d(dtype=wp.float64), p: int, x: wp.vec3d
+) -> IndenterGap:
     """Normal and hessian of a solid of revolution."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
-    near = Near()
+    near = IndenterGap()
     axis = int(primitives[p, 1])
     away = x - wp.vec3d(primitives[p, 2], primitives[p, 3], primitives[p, 4])
     c = around(axis, away)
@@ -193,7 +194,7 @@ def revolved_derivatives(primitives: wp.array2d(dtype=wp.float64), p: int, x: wp
 @wp.func
 def indenter_distance(
     primitives: wp.array2d(dtype=wp.float64), x: wp.vec3d, margin: wp.float64
-) -> Near:
+) -> IndenterGap:
     """Gap, normal and hessian where the gap is below ``margin``.
 
     Elsewhere, which is most of a finger, cheap: normal and hessian are zero and the gap is a lower
@@ -204,7 +205,7 @@ def indenter_distance(
         x: Position [m], indenter frame.
         margin: Gap from which on nothing more is needed [m].
     """
-    near = Near()
+    near = IndenterGap()
     nearest = wp.int32(-1)
     below = margin
     skipped = wp.float64(1e300)

@@ -9,8 +9,7 @@ from warp.geometry import IsoSurfaceMarchingCubes
 
 from palpate_fem.device import DEVICE
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.distance import distance, signed_distance
-from palpate_fem.indenter.shape import Indenter, Kind
+from palpate_fem.indenter.shape import Indenter, PrimitiveKind, distance, signed_distance
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -56,7 +55,7 @@ def _box(indenter: Indenter) -> tuple[Floats, Floats]:
     """Corners of a box around it [m]."""
     halves = []
     for part in indenter.primitives:
-        if part.kind == Kind.BOX:
+        if part.kind == PrimitiveKind.BOX:
             low, high = -np.array(part.sizes[:3]), np.array(part.sizes[:3])
         else:
             low, high = np.full(3, -part.sizes[1]), np.full(3, part.sizes[1])

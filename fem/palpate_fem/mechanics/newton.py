@@ -1,4 +1,18 @@
-"""Newton's method for one increment: bordered by the fluid, with friction's unsymmetric share."""
+"""How strongly skin is held back when it creeps into an equilibrium that Newton cannot reach.
+
+Pinched between a hard indenter and the core, skin may have an unstable direction: a node of its
+inner surface that is let go moves *into* the core, and one that is held pulls. No order of touching
+and letting go ends then. Real skin is viscous and moves to its next stable state; so does this one,
+by implicit Euler steps of one Newton iteration each (pseudo-transient continuation; Kelley and
+Keyes 1998): a drag, of the skin's own shear stiffness times a factor, is added to the tangent, and
+not to the forces. What it converges to is an equilibrium without any drag.
+
+It is raised until no direction is unstable, which the inertia of the factorised matrix tells, and
+falls from iteration to iteration. (By what is unbalanced it cannot be steered: that grows while the
+skin leaves an unstable state.)
+
+Newton's method for one increment: bordered by the fluid, with friction's unsymmetric share.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +24,48 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from palpate.errors import SimulationError
-from palpate_fem.mechanics.balance import Balance
-from palpate_fem.mechanics.creep import Creep
-from palpate_fem.mechanics.laws import Press
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.state import ForceBalance, SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.sparse.blas import one_thread
-from palpate_fem.sparse.factor import Factor
+from palpate_fem.sparse.factor import SparseFactor
+
+START = 1.0
+FALL, RISE = 0.3, 3.0
+NONE, LEAST, MOST = 3e-3, 1e-2, 100.0
+STALLED = 0.8
+"""Unbalanced force over that two iterations ago from which it is taken not to fall."""
+
+
+@dataclass(slots=True)
+class PseudoTransient:
+    """Drag from iteration to iteration.
+
+    Attributes:
+        drag: Its factor now.
+    """
+
+    drag: float = START
+    _past: list[float] = field(default_factory=list)
+
+    @property
+    def may_rise(self) -> bool:
+        """Whether more drag is worth trying."""
+        return self.drag < MOST
+
+    def rise(self) -> None:
+        """A direction is unstable: hold back more."""
+        self.drag = min(MOST, max(LEAST, RISE * self.drag))
+
+    def after(self, residual: float) -> None:
+        """An iteration has left this much of the force unbalanced."""
+        stalled = len(self._past) >= 2 and residual > STALLED * self._past[-2]
+        if stalled and self.drag == 0.0:
+            self.drag = START
+        else:
+            self.drag = FALL * self.drag if FALL * self.drag > NONE else 0.0
+        self._past.append(residual)
+
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +88,7 @@ class NewtonSettings:
         gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
         traction_tolerance: Error of a point's friction over the largest traction.
         iterations: Give up after this many.
-        creep_iterations: The same where the skin is held back.
+        pseudo_transient_iterations: The same where the skin is held back.
         largest_move_m: A longer step of any node is shortened [m].
         keep_factor: A factor is kept while each iteration shrinks the error at least this much
             and no contact changes.
@@ -52,14 +101,14 @@ class NewtonSettings:
     gap_tolerance_m: float = 0.1e-6
     traction_tolerance: float = 0.01
     iterations: int = 20
-    creep_iterations: int = 40
+    pseudo_transient_iterations: int = 40
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
     keep_elastic: float = 0.15
 
 
 @dataclass(slots=True)
-class Report:
+class NewtonReport:
     """How an increment went."""
 
     iterations: int = 0
@@ -69,10 +118,12 @@ class Report:
     reason: str = ""
 
 
-class Newton:
+class NewtonSolver:
     """Solves increments of one system; keeps its factor between them."""
 
-    def __init__(self, system: System, factor: Factor, settings: NewtonSettings) -> None:
+    def __init__(
+        self, system: EquilibriumSystem, factor: SparseFactor, settings: NewtonSettings
+    ) -> None:
         self.system, self.factor, self.settings = system, factor, settings
         # Volume gradient at the factorised state, and the factor's answer to it.
         self._border: tuple[Floats, Floats] | None = None
@@ -80,13 +131,13 @@ class Newton:
 
     def solve(
         self,
-        state: State,
-        press: Press | None,
+        state: SolutionState,
+        press: PosedIndenter | None,
         *,
         volume: float | None,
         should_stop: Callable[[], bool] | None = None,
-        creep: bool = False,
-    ) -> tuple[Report, Balance]:
+        pseudo_transient: bool = False,
+    ) -> tuple[NewtonReport, ForceBalance]:
         """Bring ``state`` into equilibrium, in place.
 
         Args:
@@ -94,24 +145,25 @@ class Newton:
             press: Indenter at its pose.
             volume: Volume the cavity shall have [m^3]; None = the fluid pressure is given.
             should_stop: Asked once an iteration; True ends it unconverged.
-            creep: Whether to hold the skin back on the way, see `Creep`: slower, and it arrives
-                where plain steps go round in circles.
+            pseudo_transient: Whether to use pseudo-transient continuation, see `PseudoTransient`.
         """
         with one_thread():
-            return self._iterate(state, press, volume, should_stop, Creep() if creep else None)
+            return self._iterate(
+                state, press, volume, should_stop, PseudoTransient() if pseudo_transient else None
+            )
 
     def _iterate(
         self,
-        state: State,
-        press: Press | None,
+        state: SolutionState,
+        press: PosedIndenter | None,
         volume: float | None,
         should_stop: Callable[[], bool] | None,
-        creep: Creep | None,
-    ) -> tuple[Report, Balance]:
-        settings, system, report = self.settings, self.system, Report()
+        continuation: PseudoTransient | None,
+    ) -> tuple[NewtonReport, ForceBalance]:
+        settings, system, report = self.settings, self.system, NewtonReport()
         balance = system.balance(state, press)
         fits, elastic = False, not (self._has_elastic and settings.keep_elastic)
-        limit = settings.creep_iterations if creep else settings.iterations
+        limit = settings.pseudo_transient_iterations if continuation else settings.iterations
         error = self._error(balance, volume)
         report.residuals.append(error)
         while True:
@@ -125,12 +177,12 @@ class Newton:
                 report.reason = "stopped"
                 return report, balance
             try:
-                if creep:
-                    report.factorisations += self._held_back(creep)
+                if continuation:
+                    report.factorisations += self._held_back(continuation)
                 elif not fits:
                     self._factorise(elastic=elastic)
                     report.factorisations += 1
-                damping = 1.0 if creep else self._damping(report)
+                damping = 1.0 if continuation else self._damping(report)
                 balance = self._step(state, press, balance, volume, damping)
             except SimulationError as failure:
                 report.reason = failure.problem
@@ -146,8 +198,8 @@ class Newton:
             # has come near.
             elastic = report.iterations == 1 or error > settings.keep_elastic * before
             fits = error < settings.keep_factor * before and not system.sets_changed
-            if creep:
-                creep.after(balance.residual)
+            if continuation:
+                continuation.after(balance.residual)
 
     def forget(self) -> None:
         """Keep nothing of the last tangent: what follows does not depend on what came before."""
@@ -158,17 +210,17 @@ class Newton:
         self.factor.factorise(self.system.tangent_values(elastic=elastic, drag=drag))
         self._has_elastic = True
 
-    def _held_back(self, creep: Creep) -> int:
+    def _held_back(self, continuation: PseudoTransient) -> int:
         """Factorise with a drag that leaves no unstable direction; how many factorisations."""
-        self._factorise(elastic=True, drag=creep.drag)
+        self._factorise(elastic=True, drag=continuation.drag)
         count = 1
-        while self.factor.negative and creep.may_rise:
-            creep.rise()
-            self._factorise(elastic=False, drag=creep.drag)
+        while self.factor.negative and continuation.may_rise:
+            continuation.rise()
+            self._factorise(elastic=False, drag=continuation.drag)
             count += 1
         return count
 
-    def _damping(self, report: Report) -> float:
+    def _damping(self, report: NewtonReport) -> float:
         """Fraction of the next step: half where the error goes round in circles.
 
         Sets of sticking and sliding points may alternate between two, which a full step jumps over.
@@ -178,7 +230,7 @@ class Newton:
             return 1.0
         return 0.5 if report.iterations % 2 else 0.75
 
-    def _error(self, balance: Balance, volume: float | None) -> float:
+    def _error(self, balance: ForceBalance, volume: float | None) -> float:
         """Largest of the relative errors, each over its tolerance's size."""
         error = balance.residual
         if volume is not None:
@@ -191,7 +243,7 @@ class Newton:
             balance.traction_error * 1e-2,
         )
 
-    def _converged(self, balance: Balance, volume: float | None) -> bool:
+    def _converged(self, balance: ForceBalance, volume: float | None) -> bool:
         settings = self.settings
         if balance.residual > settings.tolerance:
             return False
@@ -205,12 +257,12 @@ class Newton:
 
     def _step(
         self,
-        state: State,
-        press: Press | None,
-        balance: Balance,
+        state: SolutionState,
+        press: PosedIndenter | None,
+        balance: ForceBalance,
         volume: float | None,
         damping: float,
-    ) -> Balance:
+    ) -> ForceBalance:
         """One linear solve and the move along it, shortened where needed."""
         settings, system = self.settings, self.system
         free = system.pattern.free

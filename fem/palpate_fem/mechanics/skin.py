@@ -1,4 +1,7 @@
-"""The skin's elements on the device, and the launches of their kernels."""
+"""The skin's elements on the device, and the launches of their kernels.
+
+The sealed fluid on the device: the volume inside the skin, and its derivatives.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,14 @@ from numpy.typing import NDArray
 
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.mechanics import element_kernels
-from palpate_fem.mechanics.reference_element import rest_gradients
+from palpate_fem.mechanics.contact import ContactSurface
+from palpate_fem.mechanics.reference_element import rest_gradients, volume_form
 from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
 
 
-class Skin:
+class SkinElements:
     """Elements of one mesh with one material; see ``element_kernels``."""
 
     def __init__(
@@ -153,3 +157,44 @@ class Skin:
             self._volume,
             self._frozen_gradient,
         ]
+
+
+class FluidCavity:
+    """What the inner surface encloses; without one the volume is zero."""
+
+    def __init__(self, surface: ContactSurface, nodes: int) -> None:
+        self.surface = surface
+        self.gradient = np.zeros((nodes, 3))
+        self._gradient = vec3s(self.gradient)
+        self._form = scalars(volume_form(surface.points if surface.count else 3))
+        self._volumes = scalars(np.zeros(max(surface.count, 1)))
+
+    @property
+    def volume(self) -> float:
+        """At the last evaluation [m^3]."""
+        return float(self._volumes.numpy().sum())
+
+    def evaluate(self, position: wp.array) -> None:
+        """Volume, and its gradient by the nodes."""
+        self.gradient[:] = 0.0
+        surface = self.surface
+        if surface.count:
+            wp.launch(
+                element_kernels.cavity_volume,
+                dim=surface.count,
+                inputs=[surface.faces, self._form, position],
+                outputs=[self._volumes, self._gradient],
+                device=DEVICE,
+            )
+
+    def add_tangent(self, position: wp.array, pressure: float, blocks: wp.array) -> None:
+        """Add what a fluid pressure [Pa] that follows the surface does to the tangent."""
+        surface = self.surface
+        if surface.count:
+            wp.launch(
+                element_kernels.cavity_tangent,
+                dim=surface.count,
+                inputs=[surface.faces, self._form, surface.pairs, wp.float64(-pressure), position],
+                outputs=[blocks],
+                device=DEVICE,
+            )

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.indenter.approach import Surface, check_clear
+from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.path import check_path
 from palpate_fem.indenter.shape import Indenter
-from palpate_fem.mechanics.balance import Balance
-from palpate_fem.mechanics.indentation import Indentation
-from palpate_fem.mechanics.laws import ContactSettings, Press
-from palpate_fem.mechanics.material import VOLUME_BARRIER
-from palpate_fem.mechanics.newton import Newton, NewtonSettings, Report
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.load_stepping import LoadStepping, SolverSettings
+from palpate_fem.mechanics.newton import NewtonSolver
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.check import check_mesh
-from palpate_fem.mesh.geometry import Geometry
-from palpate_fem.result import Outcome, Step, Trajectory
+from palpate_fem.mesh.solid import FingertipGeometry
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.sparse.factor import make_factor
 
 Floats = NDArray[np.float64]
@@ -33,40 +29,15 @@ REFERENCE_MODULUS_PA = 2.8e5
 THICKNESS_TOLERANCE_M = 1e-8
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How a fingertip is solved.
-
-    Attributes:
-        newton: Tolerances of one increment.
-        contact: Constants of the contact laws for a modulus of ``REFERENCE_MODULUS_PA``; every tip
-            scales them with its own, so that forces scale exactly with the modulus.
-        force_limit_n: A trajectory ends where the indenter's force exceeds this [N]; the paper saw
-            23-32 N at most.
-        smallest_increment: Fraction of a step below which it is given up.
-        volume_barrier: See ``NeoHooke.barrier``.
-        predict: Whether increments start from an extrapolation of the last two.
-        solver: See `make_factor`.
-    """
-
-    newton: NewtonSettings = field(default_factory=NewtonSettings)
-    contact: ContactSettings = field(default_factory=ContactSettings)
-    force_limit_n: float = 32.0
-    smallest_increment: float = 1 / 64
-    volume_barrier: float = VOLUME_BARRIER
-    predict: bool = True
-    solver: str = "auto"
-
-
 class Fingertip:
     """A pressurised fingertip that can be indented again and again."""
 
     def __init__(
-        self, geometry: Geometry, parameters: FingertipParameters, settings: Settings
+        self, geometry: FingertipGeometry, parameters: FingertipParameters, settings: SolverSettings
     ) -> None:
         """Use `pressurised`; this makes the unfilled one."""
         self.geometry, self.parameters, self.settings = geometry, parameters, settings
-        self.system = System(
+        self.system = EquilibriumSystem(
             geometry.mesh,
             geometry.core.grid if geometry.core else None,
             shear_modulus_pa=parameters.shear_modulus_pa,
@@ -75,22 +46,22 @@ class Fingertip:
             volume_barrier=settings.volume_barrier,
         )
         pattern = self.system.pattern
-        self.newton = Newton(
+        self.newton = NewtonSolver(
             self.system,
             make_factor(
                 pattern.indptr, pattern.indices, groups=pattern.free // 3, solver=settings.solver
             ),
             settings.newton,
         )
-        self.state = State.at_rest(geometry.mesh)
+        self.state = SolutionState.at_rest(geometry.mesh)
         self.core_volume = geometry.core.volume_m3 if geometry.core else 0.0
 
     @classmethod
     def pressurised(
         cls,
-        geometry: Geometry,
+        geometry: FingertipGeometry,
         parameters: FingertipParameters | None = None,
-        settings: Settings | None = None,
+        settings: SolverSettings | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Fingertip:
         """Fill the fluid in.
@@ -106,7 +77,7 @@ class Fingertip:
         """
         parameters = parameters or FingertipParameters()
         check_mesh(geometry.mesh)
-        tip = cls(geometry, parameters, settings or Settings())
+        tip = cls(geometry, parameters, settings or SolverSettings())
         tip._pressurise(progress or (lambda _: None))
         return tip
 
@@ -128,11 +99,11 @@ class Fingertip:
     @property
     def fluid_volume_m3(self) -> float:
         """Fluid between skin and core [m^3]."""
-        return self.cavity - self.core_volume
+        return self.cavity_m3 - self.core_volume
 
     def _pressurise(self, progress: Callable[[float], None]) -> None:
         parameters, state = self.parameters, self.state
-        self.cavity = self.system.balance(state, None).volume
+        self.cavity_m3 = self.system.balance(state, None).volume
         if parameters.fluid_volume_m3 is not None:
             self._fill_to(parameters.fluid_volume_m3 + self.core_volume, STEPS_TO_PRESSURISE)
             progress(1.0)
@@ -140,7 +111,7 @@ class Fingertip:
         wanted = parameters.total_thickness_m
         outer = self.geometry.mesh.outer_nodes
         area = float(np.ptp(state.position[outer, 0]) * np.ptp(state.position[outer, 1]))
-        low = (self.cavity, self.total_thickness_m)
+        low = (self.cavity_m3, self.total_thickness_m)
         if wanted < low[1] - THICKNESS_TOLERANCE_M:
             raise SimulationError(
                 f"the unpressurised skin is {low[1] * 1e3:.2f} mm thick already, "
@@ -157,8 +128,8 @@ class Fingertip:
                 return
             # Steps of at most 0.5 mm: the secant is good there and Newton starts near.
             aim = math.copysign(min(abs(missing), 0.5e-3), missing)
-            self._fill_to(self.cavity + aim / slope, 1)
-            now = (self.cavity, self.total_thickness_m)
+            self._fill_to(self.cavity_m3 + aim / slope, 1)
+            now = (self.cavity_m3, self.total_thickness_m)
             if abs(now[0] - previous[0]) > 1e-16:
                 slope = (now[1] - previous[1]) / (now[0] - previous[0])
             previous = now
@@ -173,14 +144,14 @@ class Fingertip:
         )
 
     def _fill_to(self, cavity: float, steps: int) -> None:
-        start, done, size = self.cavity, 0.0, 1.0 / steps
+        start, done, size = self.cavity_m3, 0.0, 1.0 / steps
         while done < 1.0 - 1e-12:
             kept = self.state.copy()
             goal = min(1.0, done + size)
             volume = start + goal * (cavity - start)
-            report, _ = self.equilibrium(self.state, None, volume, None)
+            report, _ = self.newton.solve(self.state, None, volume=volume)
             if report.converged:
-                done, self.cavity = goal, volume
+                done, self.cavity_m3 = goal, volume
                 continue
             self.state = kept
             size *= 0.5
@@ -190,26 +161,35 @@ class Fingertip:
                     remedy="check the mesh and the fluid volume",
                 )
 
-    def equilibrium(
+    def load_stepping(
         self,
-        state: State,
-        press: Press | None,
-        volume: float | None,
-        should_stop: Callable[[], bool] | None,
+        indenter: Indenter,
+        path: Floats,
         *,
-        creep: bool = False,
-    ) -> tuple[Report, Balance]:
-        """One increment."""
-        return self.newton.solve(state, press, volume=volume, should_stop=should_stop, creep=creep)
+        on_step: Callable[[IndentationStep], None] | None = None,
+        should_stop: Callable[[], IndentationOutcome | None] | None = None,
+    ) -> LoadStepping:
+        """An indentation that is ready to run; `indent` checks its path and runs it."""
+        return LoadStepping(
+            self.newton,
+            self.settings,
+            self.state,
+            self.cavity_m3,
+            indenter,
+            path,
+            friction=self.parameters.friction_coefficient,
+            on_step=on_step,
+            should_stop=should_stop,
+        )
 
     def indent(
         self,
         indenter: Indenter,
         path: Floats,
         *,
-        on_step: Callable[[Step], None] | None = None,
-        should_stop: Callable[[], Outcome | None] | None = None,
-    ) -> Trajectory:
+        on_step: Callable[[IndentationStep], None] | None = None,
+        should_stop: Callable[[], IndentationOutcome | None] | None = None,
+    ) -> IndentationResult:
         """Follow a path of poses (K, 7); the first does not touch the skin.
 
         Args:
@@ -226,6 +206,7 @@ class Fingertip:
             SimulationError: The indenter starts inside the skin.
         """
         path = check_path(path)
-        surface = Surface(self.nodes, self.geometry.mesh.outer_faces)
+        surface = OuterSurface(self.nodes, self.geometry.mesh.outer_faces)
         check_clear(indenter, path[0], surface)
-        return Indentation(self, indenter, path, on_step, should_stop).run()
+        stepping = self.load_stepping(indenter, path, on_step=on_step, should_stop=should_stop)
+        return stepping.run()

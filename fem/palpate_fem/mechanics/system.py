@@ -1,35 +1,117 @@
-"""The discrete equilibrium of skin, fluid, core and indenter: residual and tangent."""
+"""Sparsity of the tangent: node-pair blocks, and where they go in the matrix of free unknowns.
+
+The discrete equilibrium of skin, fluid, core and indenter: residual and tangent.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
-from palpate_fem.mechanics import contact_kernels, core_kernels, element_kernels, fluid_kernels
-from palpate_fem.mechanics.balance import TRACTION_FLOOR_PA, Balance
-from palpate_fem.mechanics.cavity import Cavity
-from palpate_fem.mechanics.laws import ContactSettings, Press
+from palpate_fem.mechanics import contact_kernels, element_kernels
+from palpate_fem.mechanics.contact import (
+    ContactSettings,
+    ContactSurface,
+    CoreContact,
+    IndenterContact,
+    PosedIndenter,
+)
 from palpate_fem.mechanics.material import VOLUME_BARRIER
-from palpate_fem.mechanics.pattern import make_pattern
-from palpate_fem.mechanics.skin import Skin
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.surface import Surface
-from palpate_fem.mechanics.touch import CoreContact, IndenterContact
+from palpate_fem.mechanics.skin import FluidCavity, SkinElements
+from palpate_fem.mechanics.state import TRACTION_FLOOR_PA, ForceBalance, SolutionState
 from palpate_fem.mesh.core import DistanceGrid
 from palpate_fem.mesh.solid import SolidMesh
+
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class TangentPattern:
+    """Upper node-pair blocks of a symmetric matrix, and its upper triangle over free unknowns.
+
+    Attributes:
+        blocks: Number of blocks (i <= j).
+        element_pairs: Block of each node pair of each element, (E, n, n); -1 where i > j.
+        outer_pairs: The same for the faces of the outer surface.
+        inner_pairs: The same for the faces of the inner surface.
+        free: Free unknowns among all 3 V, ascending.
+        indptr: Of the upper triangle in CSR.
+        indices: Of the upper triangle in CSR, sorted.
+        gather: Which entry of the flattened blocks each value of the triangle is.
+    """
+
+    blocks: int
+    element_pairs: Ints
+    outer_pairs: Ints
+    inner_pairs: Ints
+    free: Ints
+    indptr: Ints
+    indices: Ints
+    gather: Ints
+
+
+def make_pattern(
+    held: NDArray[np.bool_], elements: Ints, outer: Ints, inner: Ints
+) -> TangentPattern:
+    """Pattern of a mesh.
+
+    Args:
+        held: Which components of which nodes are prescribed, (V, 3).
+        elements: Node ids (E, n).
+        outer: Faces of the outer surface, each part of an element.
+        inner: Faces of the inner surface, each part of an element.
+    """
+    nodes = len(held)
+    keys = np.unique(_keys(elements, nodes))
+    keys = keys[keys >= 0]
+    free = np.flatnonzero(~held.reshape(-1))
+    renumber = np.full(3 * nodes, -1, np.int64)
+    renumber[free] = np.arange(len(free))
+
+    r, c = np.divmod(np.arange(9), 3)
+    rows = renumber[(3 * (keys // nodes)[:, None] + r).ravel()]
+    columns = renumber[(3 * (keys % nodes)[:, None] + c).ravel()]
+    source = np.flatnonzero((rows >= 0) & (columns >= rows))
+    rows, columns = rows[source], columns[source]
+    order = np.lexsort((columns, rows))
+    indptr = np.zeros(len(free) + 1, np.int64)
+    np.cumsum(np.bincount(rows, minlength=len(free)), out=indptr[1:])
+    return TangentPattern(
+        blocks=len(keys),
+        element_pairs=_find(keys, elements, nodes),
+        outer_pairs=_find(keys, outer, nodes),
+        inner_pairs=_find(keys, inner, nodes),
+        free=free.astype(np.int32),
+        indptr=indptr.astype(np.int32),
+        indices=columns[order].astype(np.int32),
+        gather=source[order].astype(np.int32),
+    )
+
+
+def _keys(cells: Ints, nodes: int) -> NDArray[np.int64]:
+    """Number of each ordered node pair of each cell; -1 below the diagonal."""
+    low, high = cells[:, :, None].astype(np.int64), cells[:, None, :].astype(np.int64)
+    return np.asarray(np.where(low <= high, low * nodes + high, -1))
+
+
+def _find(keys: NDArray[np.int64], cells: Ints, nodes: int) -> Ints:
+    wanted = _keys(cells, nodes)
+    return np.where(wanted >= 0, np.searchsorted(keys, wanted), -1).astype(np.int32)
+
 
 Floats = NDArray[np.float64]
 
 THREADS = 2
 
 
-class System:
-    """Equations of one mesh; the unknowns come and go as `State`."""
+class EquilibriumSystem:
+    """Equations of one mesh; the unknowns come and go as `SolutionState`."""
 
     def __init__(
         self,
@@ -55,7 +137,7 @@ class System:
                 those in the state.
         """
         # Compiled now: two threads that meet a new kernel would both compile it.
-        for module in (contact_kernels, core_kernels, element_kernels, fluid_kernels):
+        for module in (contact_kernels, element_kernels):
             wp.load_module(module, device=DEVICE)
         self.mesh, self.contact = mesh, contact
         if held is None:
@@ -64,7 +146,7 @@ class System:
         self.pattern = make_pattern(held, mesh.elements, mesh.outer_faces, mesh.inner_faces)
         self._held = np.flatnonzero(held)
         self.load = np.zeros(mesh.nodes.shape)  # dead nodal forces [N]; tests set them
-        self.skin = Skin(
+        self.skin = SkinElements(
             mesh,
             self.pattern.element_pairs,
             shear_modulus_pa=shear_modulus_pa,
@@ -72,11 +154,11 @@ class System:
             volume_barrier=volume_barrier,
         )
         nodes = len(mesh.nodes)
-        self.outer = Surface(mesh.nodes, mesh.outer_faces, self.pattern.outer_pairs)
-        self.inner = Surface(mesh.nodes, mesh.inner_faces, self.pattern.inner_pairs)
+        self.outer = ContactSurface(mesh.nodes, mesh.outer_faces, self.pattern.outer_pairs)
+        self.inner = ContactSurface(mesh.nodes, mesh.inner_faces, self.pattern.inner_pairs)
         self.on_indenter = IndenterContact(self.outer, nodes, contact)
         self.on_core = CoreContact(self.inner, nodes, contact, core)
-        self._cavity = Cavity(self.inner, nodes)
+        self._cavity = FluidCavity(self.inner, nodes)
         # One array a thread: nodal forces of the skin, and node-pair blocks of the tangent without
         # contact. The tangent of contact is added to a sum of these.
         self._forces = [np.zeros((nodes, 3)) for _ in range(THREADS)]
@@ -92,7 +174,7 @@ class System:
         self._drag = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
         self._at: tuple[wp.array, wp.array, float] | None = None
 
-    def balance(self, state: State, press: Press | None) -> Balance:
+    def balance(self, state: SolutionState, press: PosedIndenter | None) -> ForceBalance:
         """Evaluate the equations.
 
         Args:
@@ -184,7 +266,7 @@ class System:
         core, _ = self.inner.updated_pressure(moved)
         return self.skin.updated_pressure(moved), core, *self.outer.updated_pressure(moved)
 
-    def misfit_force(self, state: State) -> Floats:
+    def misfit_force(self, state: SolutionState) -> Floats:
         """Load that condensing the pressures puts on the free unknowns [N], (n,)."""
         force = np.zeros_like(self.mesh.nodes)
         array = vec3s(force)
@@ -203,7 +285,7 @@ class System:
         self.outer.add_load(self.outer.coupled, vec3s(force))
         return force.reshape(-1)[self.pattern.free]
 
-    def settle(self, state: State, press: Press) -> None:
+    def settle(self, state: SolutionState, press: PosedIndenter) -> None:
         """After an increment: anchors such that each point's spring carries its traction.
 
         Those of points that slid thereby move along; all others stay, or start where they are.
@@ -217,14 +299,14 @@ class System:
         first()
         other.result()
 
-    def _sum_up(self, state: State) -> Balance:
+    def _sum_up(self, state: SolutionState) -> ForceBalance:
         internal = self._forces[0] + self._forces[1]
         indenter, core = self.on_indenter.force.copy(), self.on_core.force.copy()
         gradient = self._cavity.gradient.copy()
         fluid = state.fluid_pressure * gradient
         free = self.pattern.free
         external = (indenter + core - fluid - self.load).reshape(-1)[free]
-        return Balance(
+        return ForceBalance(
             internal=internal,
             indenter=indenter,
             core=core,

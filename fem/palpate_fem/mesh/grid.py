@@ -1,4 +1,11 @@
-"""Places for the nodes of a bag on a smooth body: graded, mirror-symmetric, without slivers."""
+"""Quads of a closed bag: a tube of rings with a rectangular patch at either end.
+
+A ring has 2 (a + b) nodes; a and b are the quads along the sides of the patches: a ventrally and
+dorsally, b on either flank. So all nodes have four quads, but the eight corners of the patches
+three. Everything is symmetric to the plane of the midline.
+
+Places for the nodes of a bag on a smooth body: graded, mirror-symmetric, without slivers.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +16,91 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 
-from palpate_fem.mesh.field import Field, cast, project
+from palpate_fem.mesh.shape import Field, cast, project
 from palpate_fem.mesh.surface import edges
-from palpate_fem.mesh.topology import Bag, bag, rim
+
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class BagTopology:
+    """Nodes and quads of the bag.
+
+    Around a ring, node k = 0 is on the ventral midline and k = half on the dorsal one, k ascending
+    towards +y first. On a patch, (i, j) counts from its right ventral corner (-y) towards +y
+    and dorsally, and its rim is the ring that it closes.
+
+    Attributes:
+        rings: Node ids, shape (rings, around); ring 0 is the rim of the proximal patch, the last
+            that of the patch at the tip.
+        proximal: Node ids of the proximal patch, rim included, shape (a + 1, b + 1).
+        tip: Same of the patch at the tip.
+        faces: Quads, counter-clockwise seen from outside, shape (F, 4).
+        mirror: Node at the mirror image of each node, shape (V,).
+    """
+
+    rings: Ints
+    proximal: Ints
+    tip: Ints
+    faces: Ints
+    mirror: Ints
+
+    @property
+    def left(self) -> Ints:
+        """Nodes at y < 0: each is the mirror image of one on the right."""
+        half = self.rings.shape[1] // 2
+        middle = self.tip.shape[0] // 2
+        sides = [self.rings[:, half + 1 :], self.tip[:middle], self.proximal[:middle]]
+        return np.unique(np.concatenate([side.ravel() for side in sides]))
+
+
+def rim(a: int, b: int) -> tuple[Ints, Ints]:
+    """Patch position (i, j) of each ring node k, two arrays of shape (2 (a + b),); a is even."""
+    half = a // 2
+    first = [(i, 0) for i in range(half, a)]  # ventral, from the midline to +y
+    up = [(a, j) for j in range(b)]
+    over = [(i, b) for i in range(a, 0, -1)]
+    down = [(0, j) for j in range(b, 0, -1)]
+    last = [(i, 0) for i in range(half)]
+    pairs = np.array(first + up + over + down + last, np.int32)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def bag(rings: int, a: int, b: int) -> BagTopology:
+    """Number the nodes of a bag from the proximal patch to the tip.
+
+    Args:
+        rings: Rings, the rims of both patches among them, at least 2.
+        a: Quads across the ventral side of a patch, even.
+        b: Quads along each of its flanks.
+    """
+    around = 2 * (a + b)
+    on_i, on_j = rim(a, b)
+    interior = (a - 1) * (b - 1)
+    first = interior  # id of ring 0
+    ring = first + np.arange(rings * around, dtype=np.int32).reshape(rings, around)
+    proximal, tip = (np.empty((a + 1, b + 1), np.int32) for _ in range(2))
+    for patch, start, edge in (
+        (proximal, 0, ring[0]),
+        (tip, first + rings * around, ring[-1]),
+    ):
+        patch[1:-1, 1:-1] = start + np.arange(interior, dtype=np.int32).reshape(a - 1, b - 1)
+        patch[on_i, on_j] = edge
+    mirror = np.empty(2 * interior + rings * around, np.int32)
+    mirror[ring] = ring[:, -np.arange(around) % around]
+    for patch in (proximal, tip):
+        mirror[patch] = patch[::-1]
+    ahead = np.roll(ring, -1, axis=1)
+    tube = np.stack([ring[:-1], ahead[:-1], ahead[1:], ring[1:]], axis=-1).reshape(-1, 4)
+    cap = np.stack([tip[:-1, :-1], tip[1:, :-1], tip[1:, 1:], tip[:-1, 1:]], -1).reshape(-1, 4)
+    back = np.stack(
+        [proximal[:-1, :-1], proximal[:-1, 1:], proximal[1:, 1:], proximal[1:, :-1]], -1
+    ).reshape(-1, 4)
+    faces = np.ascontiguousarray(np.concatenate([back, tube, cap]), np.int32)
+    return BagTopology(ring, proximal, tip, faces, mirror)
+
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 REACH_M = 15e-3  # every ray leaves the body within
 DENSE = 401  # samples of a curve that is cut into equal parts
@@ -24,7 +110,7 @@ ANCHOR = 0.06  # share of a spring to its first place: without, rings would slip
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class RayOrigins:
     """Where rays start from that lay a bag over a body [m], sensor frame.
 
     Attributes:
@@ -69,7 +155,7 @@ def _count(curve: Floats, size: Spacing) -> float:
     return float((step / size((curve[1:] + curve[:-1]) / 2)).sum())
 
 
-def _angles(field: Field, frame: Frame, size: Spacing) -> tuple[Floats, int]:
+def _angles(field: Field, frame: RayOrigins, size: Spacing) -> tuple[Floats, int]:
     """Angles of the nodes of half a ring from the ventral midline [rad]; which is at the mark."""
     theta = np.linspace(0.0, np.pi, DENSE)
     start = np.tile([frame.section_x_m, 0.0, frame.axis_z_m], (DENSE, 1))
@@ -89,7 +175,7 @@ def _angles(field: Field, frame: Frame, size: Spacing) -> tuple[Floats, int]:
     return np.asarray(np.interp(index, np.arange(DENSE), theta)), parts
 
 
-def _rays(frame: Frame, way: Floats, theta: Floats) -> tuple[Floats, Floats]:
+def _rays(frame: RayOrigins, way: Floats, theta: Floats) -> tuple[Floats, Floats]:
     """Start and direction of the rays of one meridian.
 
     Args:
@@ -112,7 +198,7 @@ def _rays(frame: Frame, way: Floats, theta: Floats) -> tuple[Floats, Floats]:
     return start, ray
 
 
-def _meridian(field: Field, frame: Frame, theta: float) -> tuple[Floats, tuple[float, float]]:
+def _meridian(field: Field, frame: RayOrigins, theta: float) -> tuple[Floats, tuple[float, float]]:
     """Dense curve from patch to patch; fractional indices of the proximal edge and of the mark."""
     way = np.concatenate([np.linspace(0, 1, DENSE)[:-1], np.linspace(1, 3, 2 * DENSE)])
     start, ray = _rays(frame, way, np.full(len(way), theta))
@@ -144,7 +230,7 @@ def _coons(edge: Floats, a: int, b: int) -> Floats:
     return patch
 
 
-def lay(field: Field, frame: Frame, size: Spacing) -> tuple[Bag, Floats]:
+def lay(field: Field, frame: RayOrigins, size: Spacing) -> tuple[BagTopology, Floats]:
     """Lay a bag over a body.
 
     Args:
@@ -208,7 +294,7 @@ def _along(curve: Floats, ends: list[float], parts: list[int], size: Spacing) ->
 
 
 def relax(
-    field: Field, places: Floats, sheet: Bag, size: Spacing, lines: tuple[Line, ...]
+    field: Field, places: Floats, sheet: BagTopology, size: Spacing, lines: tuple[Line, ...]
 ) -> Floats:
     """Even out the places on the body, exactly symmetric.
 

@@ -1,4 +1,6 @@
-"""The public BioTac of NVlabs/biotac_sim (MIT) as a solid mesh of wedges, with its core.
+"""Readers for the two text formats of the public BioTac meshes: ``.tet`` and ``.obj``.
+
+The public BioTac of NVlabs/biotac_sim (MIT) as a solid mesh of wedges, with its core.
 
 The public tetrahedra lock (they inflate at twice the pressure), so only their *inner surface* is
 kept, and the skin is grown from it along smooth normals. Nothing of the files is stored here.
@@ -13,15 +15,97 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
 from palpate_fem.mesh.check import check_mesh
-from palpate_fem.mesh.core import Core, DistanceGrid, volume_inside
-from palpate_fem.mesh.distance import box_around, grid_points, signed_distance, tabulate
-from palpate_fem.mesh.extrude import extrude
-from palpate_fem.mesh.geometry import Geometry, check_limits
+from palpate_fem.mesh.core import (
+    DistanceGrid,
+    RigidCore,
+    box_around,
+    grid_points,
+    signed_distance,
+    tabulate,
+    volume_inside,
+)
+from palpate_fem.mesh.solid import FingertipGeometry, check_limits, extrude
 from palpate_fem.mesh.surface import components, edges, enclosed_volume, node_normals, open_edges
-from palpate_fem.mesh.tetfile import REMEDY, boundary, read_obj, read_tet
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
+
+REMEDY = "fetch the file anew from the NVlabs/biotac_sim repository, folder assets"
+
+
+def read_tet(path: Path) -> tuple[Floats, Ints]:
+    """Vertices ("v x y z w") and tetrahedra ("t a b c d", from 0) of a .tet file.
+
+    Returns:
+        Vertices [m], shape (V, 3), and node ids, shape (E, 4), both as in the file.
+
+    Raises:
+        ConfigError: The file cannot be read, holds no tetrahedron, or names an unknown vertex.
+    """
+    return _read(path, element="t", nodes=4, first=0)
+
+
+def read_obj(path: Path) -> tuple[Floats, Ints]:
+    """Vertices and triangles ("f a//n b//n c//n", from 1) of an .obj file; ids from 0.
+
+    Raises:
+        ConfigError: The file cannot be read, holds no triangle, or names an unknown vertex.
+    """
+    return _read(path, element="f", nodes=3, first=1)
+
+
+def _read(path: Path, *, element: str, nodes: int, first: int) -> tuple[Floats, Ints]:
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except FileNotFoundError as error:
+        raise ConfigError(f"there is no file {path}", remedy=REMEDY) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read as text: {error}", remedy=REMEDY) from error
+    vertices: list[list[float]] = []
+    elements: list[list[int]] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        try:
+            if words[:1] == ["v"]:
+                vertices.append([float(word) for word in words[1:4]])
+            elif words[:1] == [element]:
+                if len(words) != nodes + 1:
+                    raise ValueError(f"{len(words) - 1} nodes where {nodes} are due")
+                elements.append([int(word.partition("/")[0]) - first for word in words[1:]])
+        except ValueError as error:
+            raise ConfigError(f"{path}, line {number}: {error}", remedy=REMEDY) from error
+    try:
+        points, ids = np.array(vertices, np.float64), np.array(elements, np.int32)
+    except (ValueError, OverflowError) as error:
+        raise ConfigError(f"{path} has rows of different lengths", remedy=REMEDY) from error
+    if points.ndim != 2 or points.shape[1] != 3 or not ids.size:
+        raise ConfigError(f"{path} holds no mesh: no complete 'v' or '{element}'", remedy=REMEDY)
+    if ids.min() < 0 or ids.max() >= len(points):
+        raise ConfigError(
+            f"{path} names vertex {int(ids.max()) + first} of {len(points)}", remedy=REMEDY
+        )
+    if not np.isfinite(points).all():
+        raise ConfigError(f"{path} holds a vertex that is not finite", remedy=REMEDY)
+    return points, ids
+
+
+def boundary(tets: Ints, points: Floats) -> Ints:
+    """Faces that belong to one tetrahedron only, normals away from the solid, shape (F, 3)."""
+    corner = points[tets]
+    volume = np.einsum(
+        "ei,ei->e",
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
+        corner[:, 3] - corner[:, 0],
+    )
+    tets = np.where((volume < 0)[:, None], tets[:, [0, 2, 1, 3]], tets)
+    faces = np.concatenate(
+        [tets[:, [1, 2, 3]], tets[:, [0, 3, 2]], tets[:, [0, 1, 3]], tets[:, [0, 2, 1]]]
+    )
+    key = np.sort(faces, axis=1).astype(np.int64) @ np.array([len(points) ** 2, len(points), 1])
+    _, index, times = np.unique(key, return_index=True, return_counts=True)
+    return np.ascontiguousarray(faces[np.sort(index[times == 1])], np.int32)
+
+
 Surface = tuple[Floats, Ints]  # vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3)
 
 SKIN = Path("meshes/biotac/int_ext_skin/int_ext_skin_combined_ftw.tet")
@@ -44,7 +128,9 @@ def to_sensor_frame(points: Floats) -> Floats:
     return np.ascontiguousarray(np.stack([X0_M - points[:, 0], points[:, 2], points[:, 1]], axis=1))
 
 
-def read_nvlabs(folder: Path, *, thickness_m: float = 1.57e-3, layers: int = 2) -> Geometry:
+def read_nvlabs(
+    folder: Path, *, thickness_m: float = 1.57e-3, layers: int = 2
+) -> FingertipGeometry:
     """Build the fingertip from the public assets.
 
     Args:
@@ -79,7 +165,7 @@ def read_nvlabs(folder: Path, *, thickness_m: float = 1.57e-3, layers: int = 2) 
         name=f"nvlabs-{thickness_m * 1e3:.3f}mm-{layers}",
     )
     check_mesh(mesh)
-    return Geometry(mesh, _core(core, cavity))
+    return FingertipGeometry(mesh, _core(core, cavity))
 
 
 def _compact(points: Floats, faces: Ints) -> Surface:
@@ -141,7 +227,7 @@ def _held(outer: Floats, skin: Surface, slabs: list[Surface]) -> Ints:
     return np.flatnonzero(np.any(touching, axis=0)).astype(np.int32)
 
 
-def _core(body: Surface, cavity: Surface) -> Core:
+def _core(body: Surface, cavity: Surface) -> RigidCore:
     """The public core, kept within the cavity less a clearance, as a smooth distance."""
     from scipy import ndimage
 
@@ -161,7 +247,7 @@ def _core(body: Surface, cavity: Surface) -> Core:
         grid = DistanceGrid.sampled(origin, SPACING_M, values)
         gap = float(grid.evaluate(probes)[0].min())
         if gap > 0.9 * CLEARANCE_M:
-            return Core(grid, vertices, triangles, volume_inside(values, SPACING_M), "nvlabs")
+            return RigidCore(grid, vertices, triangles, volume_inside(values, SPACING_M), "nvlabs")
         clearance += CLEARANCE_M - gap
     raise SimulationError(
         f"the core cannot be cut back: it still starts {-gap * 1e6:.1f} um inside the skin",

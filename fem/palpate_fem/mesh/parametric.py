@@ -9,15 +9,11 @@ from numpy.typing import NDArray
 
 from palpate_fem.config import EDGE_M
 from palpate_fem.mesh.check import check_mesh
-from palpate_fem.mesh.core import Core, DistanceGrid
-from palpate_fem.mesh.distance import box_around, grid_points, spread
-from palpate_fem.mesh.extrude import extrude
-from palpate_fem.mesh.field import Field, nearest
-from palpate_fem.mesh.geometry import Geometry, check_limits
-from palpate_fem.mesh.grid import Frame, Spacing, lay
-from palpate_fem.mesh.shape import CavityShape, CoreShape
+from palpate_fem.mesh.core import DistanceGrid, RigidCore, box_around, grid_points, spread
+from palpate_fem.mesh.grid import BagTopology, RayOrigins, Spacing, lay
+from palpate_fem.mesh.shape import CavityShape, CoreShape, Field, nearest
+from palpate_fem.mesh.solid import FingertipGeometry, check_limits, extrude
 from palpate_fem.mesh.surface import enclosed_volume
-from palpate_fem.mesh.topology import Bag
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -31,7 +27,7 @@ NAIL_Y_M = 3.43e-3
 # the public part.
 NAIL_COSINE, CLAMP_COSINE = 0.97, 0.90
 
-FRAME = Frame(
+FRAME = RayOrigins(
     axis_z_m=-0.75e-3,
     tip_x_m=0.4e-3,
     tip_angle=0.7,
@@ -62,7 +58,7 @@ def biotac(
     layers: int = 2,
     cavity: CavityShape | None = None,
     core: CoreShape | None = None,
-) -> Geometry:
+) -> FingertipGeometry:
     """Build the fingertip.
 
     Topology and inner surface depend on edge_m and the shapes only. A node's position is linear in
@@ -98,7 +94,7 @@ def biotac(
         name=f"biotac-{thickness_m * 1e3:.3f}mm-{edge_m * 1e3:.3f}mm-{layers}",
     )
     check_mesh(mesh)
-    return Geometry(mesh, tabulated_core(core))
+    return FingertipGeometry(mesh, tabulated_core(core))
 
 
 def spacing(edge_m: float) -> Spacing:
@@ -118,7 +114,7 @@ def spacing(edge_m: float) -> Spacing:
     return size
 
 
-def _normals(field: Field, points: Floats, bag: Bag) -> Floats:
+def _normals(field: Field, points: Floats, bag: BagTopology) -> Floats:
     """Unit normals of a body, exactly symmetric, shape (V, 3)."""
     _, gradient = field(points)
     normal = gradient / np.linalg.norm(gradient, axis=1)[:, None]
@@ -127,7 +123,7 @@ def _normals(field: Field, points: Floats, bag: Bag) -> Floats:
     return np.asarray(normal)
 
 
-def _held(bag: Bag, inner: Floats, normal: Floats) -> Ints:
+def _held(bag: BagTopology, inner: Floats, normal: Floats) -> Ints:
     """Columns under the nail and at the clamp."""
     x, y, _ = inner.T
     slack = 1e-5  # the grid has lines on the rim of the nail
@@ -139,14 +135,14 @@ def _held(bag: Bag, inner: Floats, normal: Floats) -> Ints:
 
 
 @lru_cache(maxsize=4)
-def _surface(cavity: CavityShape, edge_m: float) -> tuple[Bag, Floats, Floats]:
+def _surface(cavity: CavityShape, edge_m: float) -> tuple[BagTopology, Floats, Floats]:
     """Inner surface and its normals: the same for every thickness, so a calibration needs one."""
     bag, inner = lay(cavity, FRAME, spacing(edge_m))
     return bag, inner, _normals(cavity, inner, bag)
 
 
 @lru_cache(maxsize=4)
-def tabulated_core(shape: CoreShape) -> Core:
+def tabulated_core(shape: CoreShape) -> RigidCore:
     """Tabulate the distance to a core, exactly symmetric.
 
     Within `CORE_BAND_M` of the surface the samples are the true distance to it. Between them the
@@ -166,4 +162,4 @@ def tabulated_core(shape: CoreShape) -> Core:
     half = spread(at, near.reshape(shape_of_half), foot, np.sign(value).reshape(shape_of_half))
     values = np.concatenate([half[:, :0:-1], half], axis=1)
     grid = DistanceGrid.sampled(origin, CORE_SPACING_M, values)
-    return Core(grid, vertices, faces, enclosed_volume(vertices, faces), "parametric")
+    return RigidCore(grid, vertices, faces, enclosed_volume(vertices, faces), "parametric")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fem.plot.style import AXES, AXIS_COLOURS, INK, KPA, MM, grid, label, new_figure, save
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def travel_m(path: Floats, pose: Floats) -> Floats:
     return found
 
 
-def plot_curves(trajectory: Trajectory, path: Path, *, title: str = "") -> None:
+def plot_curves(trajectory: IndentationResult, path: Path, *, title: str = "") -> None:
     """Draw how one indentation went, step by step.
 
     Args:
@@ -64,7 +64,7 @@ def plot_curves(trajectory: Trajectory, path: Path, *, title: str = "") -> None:
     save(figure, path)
 
 
-def travel_mm(trajectory: Trajectory) -> Floats:
+def travel_mm(trajectory: IndentationResult) -> Floats:
     """Travel of the indenter at each step, for people [mm], shape (K,)."""
     pose = np.array([step.pose for step in trajectory.steps]).reshape(-1, 7)
     return MM * travel_m(trajectory.path, pose)
@@ -86,7 +86,7 @@ def draw_force(axes: Any, travel_mm: Floats, force: Floats, *, mark: int | None 
     axes.legend(fontsize=8, frameon=False)
 
 
-def _draw_newton(axes: Any, trajectory: Trajectory) -> None:
+def _draw_newton(axes: Any, trajectory: IndentationResult) -> None:
     """Iterations and factorisations as bars, seconds as a line on its own scale."""
     table = [step.convergence for step in trajectory.steps]
     number = 1 + np.arange(len(table))

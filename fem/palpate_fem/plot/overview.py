@@ -12,7 +12,7 @@ import numpy as np
 from palpate.errors import DatasetError
 from palpate_fem.plot.curves import travel_m
 from palpate_fem.plot.style import INK, MM, OUTCOME_COLOURS, grid, label, new_figure, save
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.store.content import TrajectorySummary
 
 COLUMNS = 5
@@ -21,7 +21,7 @@ COLUMNS = 5
 
 def plot_overview(
     summaries: Sequence[TrajectorySummary], path: Path, *, title: str = ""
-) -> Counter[Outcome]:
+) -> Counter[IndentationOutcome]:
     """Draw all trajectories of a store, simulated or measured.
 
     Args:
@@ -65,7 +65,7 @@ def plot_overview(
         grid(axes)
     for axes in panels[len(names) :]:
         axes.set_axis_off()
-    complete = outcomes[Outcome.COMPLETE]
+    complete = outcomes[IndentationOutcome.COMPLETE]
     figure.suptitle(
         f"{title}\n{len(summaries)} trajectories, {complete} complete "
         f"({complete / len(summaries):.1%})".strip(),
@@ -98,8 +98,10 @@ def _draw_range(axes: Any, names: list[str], groups: dict[str, list[TrajectorySu
 
 def _draw_outcomes(
     axes: Any, names: list[str], groups: dict[str, list[TrajectorySummary]]
-) -> Counter[Outcome]:
-    total: Counter[Outcome] = Counter(item.outcome for name in names for item in groups[name])
+) -> Counter[IndentationOutcome]:
+    total: Counter[IndentationOutcome] = Counter(
+        item.outcome for name in names for item in groups[name]
+    )
     left = np.zeros(len(names))
     for outcome, colour in OUTCOME_COLOURS.items():
         if not total[outcome]:

@@ -28,7 +28,7 @@ from palpate_fem.plot.style import (
     new_figure,
     save,
 )
-from palpate_fem.result import Step, Trajectory
+from palpate_fem.result import IndentationResult, IndentationStep
 from palpate_fem.store.content import Outline, StoredFingertip
 
 __all__ = ["plot_curves", "plot_overview", "plot_step", "von_mises"]
@@ -51,7 +51,7 @@ def von_mises(stress: Floats) -> Floats:
 
 def plot_step(
     tip: StoredFingertip,
-    trajectory: Trajectory,
+    trajectory: IndentationResult,
     path: Path,
     *,
     step: int = -1,
@@ -123,7 +123,7 @@ def plot_step(
     save(figure, path)
 
 
-def _chosen(trajectory: Trajectory, step: int, quantity: Quantity) -> Step:
+def _chosen(trajectory: IndentationResult, step: int, quantity: Quantity) -> IndentationStep:
     count = len(trajectory.steps)
     if not -count <= step < count:
         raise ConfigError(
@@ -179,7 +179,7 @@ def _draw_indenter(
 def _draw_below(
     axes: Any,
     tip: StoredFingertip,
-    shown: Step,
+    shown: IndentationStep,
     deformed: Floats,
     colours: Floats,
     paint: dict[str, Any],

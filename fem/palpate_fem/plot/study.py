@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from palpate_fem.plot.style import MM, grid, label, new_figure, save
-from palpate_fem.study import DISPLACEMENT_CHANGE_M, FORCE_CHANGE, Row
+from palpate_fem.study import DISPLACEMENT_CHANGE_M, FORCE_CHANGE, StudyRow
 
 COLOURS = ("#2f6fb5", "#d1495b", "#2e8b57", "#e09f3e")
 LIMIT = "#9aa0a8"
 
 
-def plot_study(rows: Sequence[Row], path: Path) -> None:
+def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
     """Change of force and displacement by each refinement, and seconds, one line an indenter.
 
     Args:
@@ -49,7 +49,7 @@ def plot_study(rows: Sequence[Row], path: Path) -> None:
     save(figure, path)
 
 
-def _name(row: Row, *, meshes: bool) -> str:
+def _name(row: StudyRow, *, meshes: bool) -> str:
     """What stands under a row's points."""
     if not meshes:
         return f"{row.steps} steps"

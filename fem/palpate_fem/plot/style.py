@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.extras import require
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.store.files import disk_error
 
 INK = "#30343b"
@@ -18,11 +18,11 @@ PATCH = "#d1495b"
 AXES = ("x", "y", "z")
 AXIS_COLOURS = ("#d1495b", "#2e8b57", "#2f6fb5")
 OUTCOME_COLOURS = {
-    Outcome.COMPLETE: "#2e8b57",
-    Outcome.FORCE_LIMIT: "#2f6fb5",
-    Outcome.DIVERGED: "#d1495b",
-    Outcome.DEADLINE: "#e09f3e",
-    Outcome.CANCELLED: "#9aa0a8",
+    IndentationOutcome.COMPLETE: "#2e8b57",
+    IndentationOutcome.FORCE_LIMIT: "#2f6fb5",
+    IndentationOutcome.DIVERGED: "#d1495b",
+    IndentationOutcome.DEADLINE: "#e09f3e",
+    IndentationOutcome.CANCELLED: "#9aa0a8",
 }
 
 MM = 1e3

@@ -17,9 +17,9 @@ from palpate.errors import DatasetError
 from palpate_fem.electrodes.gap import Gap
 from palpate_fem.electrodes.sensor import Electrodes
 from palpate_fem.electrodes.unit import UnitParameters
-from palpate_fem.mesh.geometry import Geometry
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.result import Step
+from palpate_fem.mesh.solid import FingertipGeometry
+from palpate_fem.result import IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 Floats = NDArray[np.float64]
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 _NAME = re.compile(r"biotac-(?P<thickness>[0-9.]+)mm-(?P<edge>[0-9.]+)mm-(?P<layers>\d+)")
 
 
-def geometry_of(fingertip: StoredFingertip) -> Geometry:
+def geometry_of(fingertip: StoredFingertip) -> FingertipGeometry:
     """Build the parametric geometry that a stored fingertip was simulated on, for its core.
 
     Raises:
@@ -92,14 +92,14 @@ class Population:
             name: sensor.of_gap(rest[name]).counts for name, sensor in self.sensors.items()
         }
 
-    def gap(self, unit: str, step: Step | None = None) -> Gap:
+    def gap(self, unit: str, step: IndentationStep | None = None) -> Gap:
         """Gap over the film of a unit; untouched without a step."""
         finder = self.sensors[unit].finder
         if step is None:
             return finder.measure(self._nodes)
         return finder.of_step(self._nodes, step)
 
-    def answer(self, steps: Iterable[Step]) -> dict[str, Floats]:
+    def answer(self, steps: Iterable[IndentationStep]) -> dict[str, Floats]:
         """Ideal counts of each unit to the steps of a trajectory, each of shape (S, 19)."""
         found: dict[str, list[Floats]] = {name: [] for name in self.sensors}
         for step in steps:

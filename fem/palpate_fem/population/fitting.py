@@ -12,7 +12,7 @@ from palpate.errors import DatasetError
 from palpate_fem.electrodes.gap import Gap
 from palpate_fem.electrodes.sensor import Electrodes
 from palpate_fem.electrodes.unit import UnitParameters
-from palpate_fem.mesh.geometry import Geometry
+from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.population.fit import fit_unit
 from palpate_fem.population.member import Member, Wanted
 from palpate_fem.population.mount import clear_steps
@@ -132,7 +132,7 @@ FORCE_SHARE = 0.2
 
 
 def fit_member(
-    geometry: Geometry,
+    geometry: FingertipGeometry,
     rest: Gap,
     states: Sequence[Deep],
     wanted: Wanted,

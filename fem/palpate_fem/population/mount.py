@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 
 MOUNT_SHARE = 0.05
 """Share of the nodal forces that what is held may bear."""
 
 
-def clear_steps(trajectory: Trajectory, held: NDArray[np.integer[Any]]) -> int:
+def clear_steps(trajectory: IndentationResult, held: NDArray[np.integer[Any]]) -> int:
     """Steps before the indenter bears on what nail and clamp hold.
 
     Such trajectories collide with the mount: the paper leaves them out ("Experimental testing

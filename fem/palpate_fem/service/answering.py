@@ -12,7 +12,7 @@ from palpate.messages import (
     SimulationReply,
     SimulationRequest,
 )
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.service.jobs import Began, Ended, Event, Failed, Pressurising, Stepped, Waiting
 from palpate_fem.service.reply import OUTCOMES, as_step
 
@@ -82,7 +82,7 @@ class Asked:
                 self.answer.fail(event.error())
 
     def _end(self, event: Ended) -> None:
-        if event.outcome is Outcome.DEADLINE and not self.steps_done:
+        if event.outcome is IndentationOutcome.DEADLINE and not self.steps_done:
             self.answer.fail(
                 RemoteError(
                     f"no step converged within {self.elapsed_s:.1f} s: {event.reason}",
@@ -137,6 +137,6 @@ class Asked:
             return
 
 
-def _reason(outcome: Outcome) -> str:
+def _reason(outcome: IndentationOutcome) -> str:
     """What ``stopped_because`` says where the solver gave no reason."""
-    return "" if outcome is Outcome.COMPLETE else outcome.value
+    return "" if outcome is IndentationOutcome.COMPLETE else outcome.value

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from palpate.errors import RemoteError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import Floats, Outcome, Step, Trajectory
+from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.jobs import Ended, Event, Failed, Job, Setup, Stepped
 from palpate_fem.service.pool import Pool
 from palpate_fem.store.content import StoredFingertip
@@ -101,7 +101,7 @@ class BatchReport:
         return self.outcomes[FAILED]
 
 
-OnTrajectory = Callable[[Plan, Trajectory], None]
+OnTrajectory = Callable[[Plan, IndentationResult], None]
 OnReport = Callable[[BatchReport], None]
 
 
@@ -177,7 +177,7 @@ class Batch:
         pending: Iterator[Plan] = iter(plans)
         ahead = next(pending, None)
         report = BatchReport(total)
-        steps: dict[str, list[Step]] = {}
+        steps: dict[str, list[IndentationStep]] = {}
         while True:
             if stop.is_set() and not report.stopped:
                 report.stopped = True
@@ -209,7 +209,7 @@ class Batch:
         """End the workers."""
         self._pool.close()
 
-    def _submit(self, plan: Plan, steps: dict[str, list[Step]]) -> None:
+    def _submit(self, plan: Plan, steps: dict[str, list[IndentationStep]]) -> None:
         job = Job(plan.name, self._parameters, plan.indenter, plan.path, self._limit_s)
         steps[plan.name] = []
         try:
@@ -226,7 +226,7 @@ def _account(
     report: BatchReport,
     plan: Plan,
     event: Ended | Failed,
-    steps: Sequence[Step],
+    steps: Sequence[IndentationStep],
     on_trajectory: OnTrajectory,
 ) -> None:
     """Count how one ended, and hand it on unless it was stopped by whoever stops the batch."""
@@ -235,15 +235,15 @@ def _account(
         report.outcomes[FAILED] += 1
         report.early.append(Early(plan.name, FAILED, event.problem, len(steps), total))
         return
-    if event.outcome is Outcome.CANCELLED:
+    if event.outcome is IndentationOutcome.CANCELLED:
         return
     report.outcomes[event.outcome.value] += 1
     report.seconds.append(event.seconds)
-    if event.outcome is not Outcome.COMPLETE:
+    if event.outcome is not IndentationOutcome.COMPLETE:
         report.early.append(Early(plan.name, event.outcome.value, event.reason, len(steps), total))
     on_trajectory(
         plan,
-        Trajectory(
+        IndentationResult(
             plan.indenter,
             plan.path,
             tuple(steps),

@@ -9,9 +9,10 @@ from pathlib import Path
 from palpate.errors import ConfigError
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics.solver import Fingertip, Settings
-from palpate_fem.mesh.geometry import Geometry
-from palpate_fem.result import Floats, Outcome, Step, Trajectory
+from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.solid import FingertipGeometry
+from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.fingertips import Build, OnFraction
 from palpate_fem.store.content import Setting, StoredFingertip
 
@@ -46,9 +47,9 @@ class BiotacTip:
         path: Floats,
         *,
         friction_coefficient: float,
-        on_step: Callable[[Step], None] | None = None,
-        should_stop: Callable[[], Outcome | None] | None = None,
-    ) -> Trajectory:
+        on_step: Callable[[IndentationStep], None] | None = None,
+        should_stop: Callable[[], IndentationOutcome | None] | None = None,
+    ) -> IndentationResult:
         """See ``Tip.indent``."""
         tip = self._solved
         # Friction has no part in the pressurised state, so one state serves all coefficients.
@@ -84,7 +85,7 @@ def biotac(
     return build
 
 
-def _geometry(mesh: str, edge_m: float | None, layers: int) -> Callable[[float], Geometry]:
+def _geometry(mesh: str, edge_m: float | None, layers: int) -> Callable[[float], FingertipGeometry]:
     """Makes the geometry for a skin thickness [m]."""
     if mesh == PARAMETRIC:
         from palpate_fem.mesh.parametric import biotac as parametric
@@ -98,13 +99,13 @@ def _geometry(mesh: str, edge_m: float | None, layers: int) -> Callable[[float],
     return lambda thickness: read_nvlabs(Path(mesh), thickness_m=thickness, layers=layers)
 
 
-def _settings(given: Mapping[str, Setting]) -> Settings:
-    known = {field.name for field in fields(Settings)}
+def _settings(given: Mapping[str, Setting]) -> SolverSettings:
+    known = {field.name for field in fields(SolverSettings)}
     if unknown := sorted(set(given) - known):
         raise ConfigError(
             f"the solver has no setting {unknown[0]!r}", remedy=f"known: {', '.join(sorted(known))}"
         )
-    return Settings(**given)  # type: ignore[arg-type]
+    return SolverSettings(**given)  # type: ignore[arg-type]
 
 
 def _named(settings: object, above: str = "") -> list[tuple[str, Setting]]:

@@ -10,7 +10,7 @@ from typing import Protocol, cast
 
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import Floats, Outcome, Step, Trajectory
+from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 OnFraction = Callable[[float], None]
@@ -30,9 +30,9 @@ class Tip(Protocol):
         path: Floats,
         *,
         friction_coefficient: float,
-        on_step: Callable[[Step], None] | None = None,
-        should_stop: Callable[[], Outcome | None] | None = None,
-    ) -> Trajectory:
+        on_step: Callable[[IndentationStep], None] | None = None,
+        should_stop: Callable[[], IndentationOutcome | None] | None = None,
+    ) -> IndentationResult:
         """Follow a path of poses, shape (K, 7); see ``Fingertip.indent``."""
         ...
 

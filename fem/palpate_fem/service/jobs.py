@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from palpate.errors import ErrorCode, PalpateError, RemoteError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import Floats, Outcome, Step
+from palpate_fem.result import Floats, IndentationOutcome, IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 
@@ -79,14 +79,14 @@ class Began:
 class Stepped:
     """A step has converged."""
 
-    step: Step
+    step: IndentationStep
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
     """The last of a job that ran: how it ended, as in ``Trajectory``."""
 
-    outcome: Outcome
+    outcome: IndentationOutcome
     reason: str = ""
     travel_m: float = 0.0
     seconds: float = 0.0

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from palpate.closing import Closing
 from palpate.errors import RemoteError
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.service.fingertips import without_friction
 from palpate_fem.service.jobs import Began, Ended, Event, Failed, Job, Setup, Waiting
 from palpate_fem.service.process import WorkerProcess, WorkerState
@@ -136,7 +136,7 @@ class Pool(Closing):
             else:
                 task.overdue = min(task.overdue, time.monotonic() + self._grace_s)
         if worker is None:
-            self._finish(task, Ended(Outcome.CANCELLED, "cancelled while it waited"))
+            self._finish(task, Ended(IndentationOutcome.CANCELLED, "cancelled while it waited"))
             self._tell_waiting()
         else:
             worker.cancel(job_id)
@@ -239,10 +239,12 @@ class Pool(Closing):
         """What the owner of a job hears whose worker is gone."""
         overdue = time.monotonic() >= task.overdue
         if overdue and task.cancelled:
-            return Ended(Outcome.CANCELLED, "cancelled; the solver was ended as it did not stop")
+            return Ended(
+                IndentationOutcome.CANCELLED, "cancelled; the solver was ended as it did not stop"
+            )
         if overdue:
             return Ended(
-                Outcome.DEADLINE,
+                IndentationOutcome.DEADLINE,
                 f"the solver was ended as it did not stop within {self._grace_s:g} s after the "
                 "deadline",
             )
@@ -264,7 +266,9 @@ class Pool(Closing):
                 for task in broken:
                     self._waiting.remove(task)
             for task in late:
-                self._finish(task, Ended(Outcome.DEADLINE, "the deadline passed while it waited"))
+                self._finish(
+                    task, Ended(IndentationOutcome.DEADLINE, "the deadline passed while it waited")
+                )
             for worker in hung:
                 worker.kill()
             for task in broken:

@@ -12,7 +12,7 @@ from palpate.errors import SimulationError
 from palpate_fem.calibration.runs import Simulated
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.path import check_path
-from palpate_fem.result import Floats, Step, Trajectory
+from palpate_fem.result import Floats, IndentationResult, IndentationStep
 from palpate_fem.service.jobs import Began, Ended, Event, Failed, Job, Setup, Stepped
 from palpate_fem.service.pool import Pool
 
@@ -47,7 +47,7 @@ class PoolSimulator(Closing):
         poses = check_path(path)
         job = Job(str(next(self._numbers)), parameters, indenter, poses, self._limit_s)
         self._pool.submit(job, events.put)
-        steps: list[Step] = []
+        steps: list[IndentationStep] = []
         thickness_m = fluid_m3 = math.nan
         while True:
             event = events.get()
@@ -59,7 +59,7 @@ class PoolSimulator(Closing):
             elif isinstance(event, Failed):
                 raise SimulationError(event.problem, remedy=event.remedy)
             elif isinstance(event, Ended):
-                done = Trajectory(
+                done = IndentationResult(
                     indenter,
                     poses,
                     tuple(steps),

@@ -20,14 +20,20 @@ from palpate.messages import (
     SimulationRequest,
     SimulationStep,
 )
-from palpate_fem.result import Convergence, Floats, Outcome, Step, Trajectory
+from palpate_fem.result import (
+    Convergence,
+    Floats,
+    IndentationOutcome,
+    IndentationResult,
+    IndentationStep,
+)
 
 OUTCOMES = {
-    Outcome.COMPLETE: SimulationOutcome.COMPLETE,
-    Outcome.FORCE_LIMIT: SimulationOutcome.FORCE_LIMIT,
-    Outcome.DIVERGED: SimulationOutcome.DIVERGED,
-    Outcome.DEADLINE: SimulationOutcome.DEADLINE,
-    Outcome.CANCELLED: SimulationOutcome.CANCELLED,
+    IndentationOutcome.COMPLETE: SimulationOutcome.COMPLETE,
+    IndentationOutcome.FORCE_LIMIT: SimulationOutcome.FORCE_LIMIT,
+    IndentationOutcome.DIVERGED: SimulationOutcome.DIVERGED,
+    IndentationOutcome.DEADLINE: SimulationOutcome.DEADLINE,
+    IndentationOutcome.CANCELLED: SimulationOutcome.CANCELLED,
 }
 
 
@@ -42,7 +48,7 @@ def as_pose(pose: Floats) -> Pose:
     return Pose((x, y, z), (qw, qx, qy, qz))
 
 
-def as_step(step: Step, request: SimulationRequest) -> SimulationStep:
+def as_step(step: IndentationStep, request: SimulationRequest) -> SimulationStep:
     """A step with the fields that the request wants."""
     touching = bool(np.isfinite(step.centre_of_pressure).all())
     return SimulationStep(
@@ -59,7 +65,7 @@ def as_step(step: Step, request: SimulationRequest) -> SimulationStep:
 
 
 def as_reply(
-    trajectory: Trajectory, request: SimulationRequest, mesh_sha256: bytes
+    trajectory: IndentationResult, request: SimulationRequest, mesh_sha256: bytes
 ) -> SimulationReply:
     """What ``Client.simulate`` returns for this trajectory; only ``elapsed_s`` differs."""
     return SimulationReply(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.indenter.approach import Surface, check_clear
+from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.result import Floats
 from palpate_fem.store.content import StoredFingertip
 
 
-def skin_of(fingertip: StoredFingertip) -> Surface:
+def skin_of(fingertip: StoredFingertip) -> OuterSurface:
     """The outer surface of the pressurised, untouched skin."""
-    return Surface(fingertip.pressurised_nodes, fingertip.mesh.outer_faces)
+    return OuterSurface(fingertip.pressurised_nodes, fingertip.mesh.outer_faces)
 
 
 def check_start(fingertip: StoredFingertip, indenter: str, pose: Floats) -> None:

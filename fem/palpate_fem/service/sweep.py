@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from palpate_fem.indenter.outline import outline_of
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.service.batch import Batch, BatchReport, OnReport, Plan
 from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.writer import Place, StoreWriter
@@ -61,7 +61,7 @@ def sweep_into_store(
                     places[plan.name] = store.claim(plan.name)
                     yield plan
 
-        def keep(plan: Plan, trajectory: Trajectory) -> None:
+        def keep(plan: Plan, trajectory: IndentationResult) -> None:
             with places.pop(plan.name) as place:
                 place.write(trajectory)
 

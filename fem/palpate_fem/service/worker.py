@@ -17,7 +17,7 @@ import time
 from multiprocessing.connection import Connection
 
 from palpate.errors import PalpateError
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.service.fingertips import Fingertips, load_factory
 from palpate_fem.service.jobs import (
     Began,
@@ -76,10 +76,10 @@ class Worker:
         deadline = time.monotonic() + job.deadline_s
         told = -math.inf
 
-        def should_stop() -> Outcome | None:
+        def should_stop() -> IndentationOutcome | None:
             if job.id in self._cancelled:
-                return Outcome.CANCELLED
-            return Outcome.DEADLINE if time.monotonic() > deadline else None
+                return IndentationOutcome.CANCELLED
+            return IndentationOutcome.DEADLINE if time.monotonic() > deadline else None
 
         def on_fraction(fraction: float) -> None:
             nonlocal told
@@ -102,7 +102,7 @@ class Worker:
                 should_stop=should_stop,
             )
         except _Stopped:
-            outcome = should_stop() or Outcome.CANCELLED
+            outcome = should_stop() or IndentationOutcome.CANCELLED
             return Ended(outcome, "stopped while the fluid was filled in")
         except Exception as error:  # any trouble is this job's, and its owner is told
             if not isinstance(error, PalpateError):

@@ -56,7 +56,7 @@ _ROUTINES = {
 }
 
 
-class Bound:
+class BoundRoutine:
     """A routine with all its arguments, to be called many times.
 
     Args:
@@ -97,7 +97,7 @@ class Cholesky:
     def __init__(self, matrix: Array) -> None:
         self._info = np.zeros(1, np.int32)
         size = max(1, len(matrix))
-        self._call = Bound("potrf", matrix.dtype, "L", len(matrix), matrix, size, self._info)
+        self._call = BoundRoutine("potrf", matrix.dtype, "L", len(matrix), matrix, size, self._info)
 
     def __call__(self) -> bool:
         """Run it; whether the matrix was positive definite."""
@@ -105,38 +105,38 @@ class Cholesky:
         return not self._info[0]
 
 
-def solve_right(lower: Array, block: Array) -> Bound:
+def solve_right(lower: Array, block: Array) -> BoundRoutine:
     """``block <- block L^-T``."""
     rows, size = block.shape
-    return Bound(
+    return BoundRoutine(
         "trsm", block.dtype, "R", "L", "T", "N", rows, size, 1.0, lower, max(1, size), block,
         max(1, rows),
     )  # fmt: skip
 
 
-def subtract_square(block: Array, target: Array) -> Bound:
+def subtract_square(block: Array, target: Array) -> BoundRoutine:
     """``target <- target - block block^T``, its lower triangle."""
     rows, size = block.shape
-    return Bound(
+    return BoundRoutine(
         "syrk", block.dtype, "L", "N", rows, size, -1.0, block, max(1, rows), 1.0, target,
         max(1, rows),
     )  # fmt: skip
 
 
-def solve_left(lower: Array, vector: Array, *, transposed: bool) -> Bound:
+def solve_left(lower: Array, vector: Array, *, transposed: bool) -> BoundRoutine:
     """``vector <- L^-1 vector``, or with its transpose."""
     size = len(lower)
     letter = "T" if transposed else "N"
-    return Bound("trsv", lower.dtype, "L", letter, "N", size, lower, max(1, size), vector, 1)
+    return BoundRoutine("trsv", lower.dtype, "L", letter, "N", size, lower, max(1, size), vector, 1)
 
 
 def multiply(
     block: Array, vector: Array, factor: float, keep: float, target: Array, *, transposed: bool
-) -> Bound:
+) -> BoundRoutine:
     """``target <- keep * target + factor * block vector``, or with its transpose."""
     rows, size = block.shape
     letter = "T" if transposed else "N"
-    return Bound(
+    return BoundRoutine(
         "gemv", block.dtype, letter, rows, size, factor, block, max(1, rows), vector, 1, keep,
         target, 1,
     )  # fmt: skip

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.sparse.front import UnsafePivotError
-from palpate_fem.sparse.fronts import Fronts, Places
+from palpate_fem.sparse.fronts import FrontalFactor, FrontAssembly, UnsafePivotError
 
 logger = logging.getLogger(__name__)
 
@@ -22,7 +21,7 @@ Indices = NDArray[np.integer[Any]]
 SOLVERS = ("auto", "fronts", "fronts-double", "superlu")
 
 
-class Factor(Protocol):
+class SparseFactor(Protocol):
     """A matrix with a fixed pattern (upper triangle in CSR) that is factorised again and again."""
 
     name: str
@@ -40,7 +39,7 @@ class Factor(Protocol):
 
 def make_factor(
     indptr: Indices, indices: Indices, *, groups: Indices | None = None, solver: str = "auto"
-) -> Factor:
+) -> SparseFactor:
     """A solver for one pattern.
 
     Args:
@@ -60,7 +59,7 @@ def make_factor(
         return SuperLu(indptr, indices)
     if groups is None:
         groups = np.arange(len(indptr) - 1)
-    return Multifrontal(Places(indptr, indices, groups), double=solver == "fronts-double")
+    return Multifrontal(FrontAssembly(indptr, indices, groups), double=solver == "fronts-double")
 
 
 class Multifrontal:
@@ -68,14 +67,14 @@ class Multifrontal:
 
     name = "fronts"
 
-    def __init__(self, places: Places, *, double: bool) -> None:
+    def __init__(self, places: FrontAssembly, *, double: bool) -> None:
         self._places = places
-        self._single = None if double else Fronts(places, np.float32)
-        self._double: Fronts | None = None
-        self._current: Fronts | None = None
+        self._single = None if double else FrontalFactor(places, np.float32)
+        self._double: FrontalFactor | None = None
+        self._current: FrontalFactor | None = None
 
     def factorise(self, values: Floats) -> None:
-        """See `Factor`; singular or non-finite matrices raise SimulationError."""
+        """See `SparseFactor`; singular or non-finite matrices raise SimulationError."""
         check_finite(values)
         self._current = None
         if self._single is not None:
@@ -87,7 +86,7 @@ class Multifrontal:
                 self._current = self._single
                 return
         if self._double is None:
-            self._double = Fronts(self._places, np.float64)
+            self._double = FrontalFactor(self._places, np.float64)
         try:
             self._double.factorise(values)
         except UnsafePivotError as error:
@@ -98,7 +97,7 @@ class Multifrontal:
         self._current = self._double
 
     def solve(self, right: Floats) -> Floats:
-        """See `Factor`."""
+        """See `SparseFactor`."""
         if self._current is None:
             raise SimulationError("there is no factor to solve with", remedy="factorise first")
         return self._current.solve(np.asarray(right, np.float64))
@@ -143,7 +142,7 @@ class SuperLu:
         self._factor: Any = None
 
     def factorise(self, values: Floats) -> None:
-        """See `Factor`."""
+        """See `SparseFactor`."""
         check_finite(values)
         self._full.data = values[self._gather]
         try:
@@ -159,14 +158,14 @@ class SuperLu:
             ) from error
 
     def solve(self, right: Floats) -> Floats:
-        """See `Factor`."""
+        """See `SparseFactor`."""
         if self._factor is None:
             raise SimulationError("there is no factor to solve with", remedy="factorise first")
         return np.asarray(self._factor.solve(right))
 
     @property
     def negative(self) -> int:
-        """See `Factor`; exact as long as SuperLU has kept to the diagonal, which it prefers."""
+        """See `SparseFactor`; exact while SuperLU keeps to the diagonal, which it prefers."""
         return 0 if self._factor is None else int((self._factor.U.diagonal() < 0.0).sum())
 
 

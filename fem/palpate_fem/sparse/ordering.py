@@ -47,7 +47,7 @@ class Front:
 
 
 @dataclass(frozen=True, slots=True)
-class Elimination:
+class EliminationTree:
     """Order and fronts; children stand before parents.
 
     Attributes:
@@ -77,7 +77,7 @@ class Elimination:
         return sum(_flop(f.last - f.first, len(f.border)) for f in self.fronts)
 
 
-def plan_elimination(indptr: Ints, indices: Ints, groups: Ints) -> Elimination:
+def plan_elimination(indptr: Ints, indices: Ints, groups: Ints) -> EliminationTree:
     """Order and fronts of a matrix.
 
     Args:
@@ -215,7 +215,7 @@ def _number(
     children: dict[int, list[int]],
     order: Ints,
     groups: Ints,
-) -> Elimination:
+) -> EliminationTree:
     """Number the unknowns front by front, children first."""
     first, second, top = _sequence(own, border, children)
     sequence = first + second + top
@@ -244,4 +244,4 @@ def _number(
         )
         begin = end
     unknowns = np.concatenate([by_node[node] for node in nodes] or [np.zeros(0, np.int64)])
-    return Elimination(unknowns, tuple(fronts), len(first), len(second))
+    return EliminationTree(unknowns, tuple(fronts), len(first), len(second))

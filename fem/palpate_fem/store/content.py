@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -107,7 +107,7 @@ class TrajectorySummary:
     id: str
     indenter: str
     sensor: str
-    outcome: Outcome
+    outcome: IndentationOutcome
     reason: str
     complete: bool
     travel_m: float

@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 
 from palpate.errors import DatasetError, PalpateError
-from palpate_fem.result import Outcome, Trajectory
+from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import (
     Outline,
     StoredFingertip,
@@ -29,7 +29,7 @@ SUFFIX = ".sim"
 FINGERTIP = "fingertip.h5"
 TRAJECTORIES = "trajectories"
 
-UNFINISHED = (Outcome.CANCELLED, Outcome.DEADLINE)
+UNFINISHED = (IndentationOutcome.CANCELLED, IndentationOutcome.DEADLINE)
 """Outcomes that say nothing of the finger: such a trajectory is not done, and run again."""
 
 
@@ -102,7 +102,7 @@ class SimulationStore:
         with self._group(trajectory) as group:
             return read_summary(trajectory, group)
 
-    def trajectory(self, trajectory: str) -> Trajectory:
+    def trajectory(self, trajectory: str) -> IndentationResult:
         """All of a trajectory. Fields come back as float64 but were kept as float32.
 
         Raises:
@@ -147,9 +147,11 @@ class SimulationStore:
         with self._reading(self._head()) as file:
             return text(file["fingertip"].attrs["key"]) if "fingertip" in file else ""
 
-    def _outcome(self, trajectory: str) -> Outcome:
+    def _outcome(self, trajectory: str) -> IndentationOutcome:
         with self._group(trajectory) as group:
-            return Outcome(text(group.attrs.get("outcome", Outcome.COMPLETE.value)))
+            return IndentationOutcome(
+                text(group.attrs.get("outcome", IndentationOutcome.COMPLETE.value))
+            )
 
     def _head(self) -> Path:
         return self.path if self._whole else self.path / FINGERTIP

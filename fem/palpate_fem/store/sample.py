@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.result import Convergence, Outcome, Step, Trajectory
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import Floats, Ints, Outline, StoredFingertip
 
 INNER_M = 5.5e-3
@@ -75,7 +75,7 @@ def sample_trajectory(
     depth_m: float = 2e-3,
     y_m: float = 0.0,
     angle: float = 0.0,
-) -> Trajectory:
+) -> IndentationResult:
     """A sphere of 7 mm pressed into the pad, ``angle`` [rad] about y."""
     skin = tip.pressurised_nodes
     cos, sin = np.cos(angle), np.sin(angle)
@@ -88,8 +88,13 @@ def sample_trajectory(
         _step(tip, skin, pose, inward, depth - START_M)
         for pose, depth in zip(path[1:], travel[1:], strict=True)
     )
-    return Trajectory(
-        "sphere_medium", path, found, Outcome.COMPLETE, travel_m=float(travel[-1]), seconds=7.5
+    return IndentationResult(
+        "sphere_medium",
+        path,
+        found,
+        IndentationOutcome.COMPLETE,
+        travel_m=float(travel[-1]),
+        seconds=7.5,
     )
 
 
@@ -106,7 +111,9 @@ def indenter_outline(indenter: str) -> Outline:
     return vertices - np.array([0.0, 0.0, INDENTER_M]), triangles
 
 
-def _step(tip: StoredFingertip, skin: Floats, pose: Floats, inward: Floats, depth_m: float) -> Step:
+def _step(
+    tip: StoredFingertip, skin: Floats, pose: Floats, inward: Floats, depth_m: float
+) -> IndentationStep:
     centre = pose[:3] - INDENTER_M * inward
     from_centre = skin - centre
     along = from_centre @ inward
@@ -131,7 +138,7 @@ def _step(tip: StoredFingertip, skin: Floats, pose: Floats, inward: Floats, dept
     force = indenter_force.sum(axis=0)
     total = pushed.sum()
     magnitude = np.linalg.norm(displacement[tip.mesh.elements].mean(axis=1), axis=1)
-    return Step(
+    return IndentationStep(
         pose=pose,
         displacement=displacement,
         fluid_pressure_pa=tip.fluid_pressure_pa + 7e3 * max(depth_m / 3e-3, 0.0) ** 2,

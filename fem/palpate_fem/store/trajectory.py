@@ -1,4 +1,4 @@
-"""One trajectory of the store: HDF5 group to `Trajectory` and back."""
+"""One trajectory of the store: HDF5 group to `IndentationResult` and back."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_fem.result import Convergence, Outcome, Step, Trajectory
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import Outline, TrajectorySummary
 from palpate_fem.store.hdf5 import PACKED, create, palpate_version, set_attributes, text
 
@@ -38,7 +38,7 @@ CONVERGENCE = np.dtype(
 
 def write_trajectory(
     group: Any,
-    trajectory: Trajectory,
+    trajectory: IndentationResult,
     *,
     nodes: int,
     fingertip: str,
@@ -64,7 +64,7 @@ def write_trajectory(
         {
             **{name: getattr(trajectory, name) for name in told},
             "outcome": trajectory.outcome.value,
-            "complete": trajectory.outcome is Outcome.COMPLETE,
+            "complete": trajectory.outcome is IndentationOutcome.COMPLETE,
             "sensor": sensor,
             "fingertip": fingertip,
             "palpate": palpate_version(),
@@ -94,14 +94,14 @@ def read_summary(trajectory: str, group: Any) -> TrajectorySummary:
     pose, force = (group[name][()].astype(np.float64) for name in ("pose", "force"))
     pressure = group.get("fluid_pressure_pa")
     attributes = group.attrs
-    outcome = Outcome(text(attributes.get("outcome", Outcome.COMPLETE.value)))
+    outcome = IndentationOutcome(text(attributes.get("outcome", IndentationOutcome.COMPLETE.value)))
     return TrajectorySummary(
         id=trajectory,
         indenter=text(attributes["indenter"]),
         sensor=text(attributes.get("sensor", "")),
         outcome=outcome,
         reason=text(attributes.get("reason", "")),
-        complete=bool(attributes.get("complete", outcome is Outcome.COMPLETE)),
+        complete=bool(attributes.get("complete", outcome is IndentationOutcome.COMPLETE)),
         travel_m=float(attributes.get("travel_m", np.nan)),
         seconds=float(attributes.get("seconds", np.nan)),
         path=group["path"][()] if "path" in group else pose,
@@ -111,7 +111,7 @@ def read_summary(trajectory: str, group: Any) -> TrajectorySummary:
     )
 
 
-def read_trajectory(group: Any) -> Trajectory:
+def read_trajectory(group: Any) -> IndentationResult:
     """Read all of one trajectory; stress has no rows where it was not kept."""
     table = group["convergence"][()]
     columns: dict[str, Any] = {
@@ -126,13 +126,14 @@ def read_trajectory(group: Any) -> Trajectory:
     )
     columns["convergence"] = [Convergence(*row) for row in table.tolist()]
     steps = tuple(
-        Step(**{name: values[at] for name, values in columns.items()}) for at in range(len(table))
+        IndentationStep(**{name: values[at] for name, values in columns.items()})
+        for at in range(len(table))
     )
-    return Trajectory(
+    return IndentationResult(
         indenter=text(group.attrs["indenter"]),
         path=group["path"][()],
         steps=steps,
-        outcome=Outcome(text(group.attrs["outcome"])),
+        outcome=IndentationOutcome(text(group.attrs["outcome"])),
         reason=text(group.attrs["reason"]),
         travel_m=float(group.attrs["travel_m"]),
         seconds=float(group.attrs["seconds"]),

@@ -8,7 +8,7 @@ from typing import Any
 
 from palpate.closing import Closing
 from palpate.errors import ConfigError, DatasetError
-from palpate_fem.result import Trajectory
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import Outline, StoredFingertip, check_id
 from palpate_fem.store.files import (
     PART,
@@ -104,7 +104,7 @@ class StoreWriter(SimulationStore, Closing):
             raise
         return Place(self, trajectory, claim)
 
-    def write(self, trajectory: str, result: Trajectory, *, sensor: str = "") -> None:
+    def write(self, trajectory: str, result: IndentationResult, *, sensor: str = "") -> None:
         """Claim and write in one; when this returns it is on the disk.
 
         Args:
@@ -125,7 +125,7 @@ class StoreWriter(SimulationStore, Closing):
             self._lock.release()
             self._lock = None
 
-    def image(self, trajectory: str, result: Trajectory, sensor: str) -> bytes:
+    def image(self, trajectory: str, result: IndentationResult, sensor: str) -> bytes:
         """Bytes of the file of a trajectory."""
 
         def fill(file: Any) -> None:
@@ -206,7 +206,7 @@ class Place(Closing):
     def __init__(self, store: StoreWriter, trajectory: str, claim: Claim) -> None:
         self._store, self._trajectory, self._claim = store, trajectory, claim
 
-    def write(self, result: Trajectory, *, sensor: str = "") -> None:
+    def write(self, result: IndentationResult, *, sensor: str = "") -> None:
         """Write it, once.
 
         Raises:

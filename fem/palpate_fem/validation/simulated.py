@@ -17,7 +17,7 @@ from palpate_fem.calibration.measured import (
     read_indentations,
 )
 from palpate_fem.calibration.runs import Simulated, from_rest
-from palpate_fem.mechanics.path import path_lengths
+from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.store.content import TrajectorySummary
 from palpate_fem.store.hdf5 import SCHEMA as STORE_SCHEMA
 from palpate_fem.store.read import SimulationStore

@@ -27,7 +27,7 @@ from palpate_fem.calibration.align import (
 from palpate_fem.calibration.cost import axis_rms_n, peak_n, relative_rms, rms_n
 from palpate_fem.calibration.measured import SIMULATED, Indentation
 from palpate_fem.calibration.runs import Simulated
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 
 PAPER_RANGE_N = (0.226, 0.486)
 """Mean RMS force error of the best and the worst indenter (paper, "Finite element model
@@ -69,7 +69,7 @@ class Compared:
     depth_offset_m: float
     displacement_m: float
     coverage: float
-    outcome: Outcome
+    outcome: IndentationOutcome
     pair: Aligned
 
     @property

@@ -14,20 +14,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from palpate_fem.verify import (
-    balance,
     closed_forms,
+    conservation,
     contact,
-    convergence,
-    cycles,
     element,
-    fluid,
     friction,
     public_skin,
     tangents,
 )
-from palpate_fem.verify.check import Case, Check
+from palpate_fem.verify.check import VerificationCase, VerificationCheck
 
-__all__ = ["Case", "Check", "run", "suite"]
+__all__ = ["VerificationCase", "VerificationCheck", "run", "suite"]
 
 # Beside a checkout of the project; an installed palpate has none, and its checks are skipped.
 SHARED_DATA = Path(__file__).resolve().parents[5] / "shared" / "data"
@@ -36,8 +33,8 @@ PUBLIC_SKIN = "nvlabs_biotac_mesh"
 
 def suite(
     *, quick: bool = False, only: str = "", shared_data: Path | None = None
-) -> tuple[Case, ...]:
-    """The checks, not yet run; each is called without arguments and gives its `Check`.
+) -> tuple[VerificationCase, ...]:
+    """The checks, not yet run; each is called without arguments and gives its `VerificationCheck`.
 
     Args:
         quick: Leave out those that take long.
@@ -49,10 +46,7 @@ def suite(
         *tangents.CHECKS,
         *element.CHECKS,
         *closed_forms.CHECKS,
-        *convergence.CHECKS,
-        *fluid.CHECKS,
-        *balance.CHECKS,
-        *cycles.CHECKS,
+        *conservation.CHECKS,
         *contact.CHECKS,
         *friction.CHECKS,
         *public_skin.checks(folder),
@@ -66,8 +60,8 @@ def run(
     only: str = "",
     slow: bool = False,
     shared_data: Path | None = None,
-    on_check: Callable[[Check, int, int], None] | None = None,
-) -> list[Check]:
+    on_check: Callable[[VerificationCheck, int, int], None] | None = None,
+) -> list[VerificationCheck]:
     """Run the suite.
 
     Args:

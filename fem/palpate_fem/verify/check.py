@@ -11,7 +11,7 @@ from palpate.errors import PalpateError
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class VerificationCheck:
     """One line of the suite.
 
     Attributes:
@@ -38,52 +38,52 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """What a check's function returns; see `Check`."""
+class Measurement:
+    """What a check's function returns; see `VerificationCheck`."""
 
     value: float
     reference: float = 0.0
     note: str = ""
 
 
-class Absent(Exception):
+class MissingDataError(Exception):
     """Something that is not part of the program is not there; the message says what."""
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class VerificationCase:
     """A check that has not been run.
 
     Attributes:
         name: ``topic/what``.
         measure: Does the work.
-        tolerance: See `Check`.
+        tolerance: See `VerificationCheck`.
         unit: Of value and reference.
         slow: Takes more than a few seconds.
         at_least: The reference is a lower limit: any larger value passes.
     """
 
     name: str
-    measure: Callable[[], Measured]
+    measure: Callable[[], Measurement]
     tolerance: float
     unit: str = ""
     slow: bool = False
     at_least: bool = False
 
-    def __call__(self) -> Check:
+    def __call__(self) -> VerificationCheck:
         """Run it; a simulation that cannot be run is a check that fails."""
         started = time.perf_counter()
         skipped = False
         try:
             measured = self.measure()
-        except Absent as reason:
-            measured, skipped = Measured(math.nan, math.nan, f"skipped: {reason}"), True
+        except MissingDataError as reason:
+            measured, skipped = Measurement(math.nan, math.nan, f"skipped: {reason}"), True
         except PalpateError as error:
-            measured = Measured(math.nan, math.nan, error.problem)
+            measured = Measurement(math.nan, math.nan, error.problem)
         note = (
             ", ".join(filter(None, ("at least", measured.note))) if self.at_least else measured.note
         )
-        return Check(
+        return VerificationCheck(
             name=self.name,
             value=float(measured.value),
             reference=float(measured.reference),
@@ -95,7 +95,7 @@ class Case:
             skipped=skipped,
         )
 
-    def _holds(self, measured: Measured) -> bool:
+    def _holds(self, measured: Measurement) -> bool:
         allowed = self.tolerance * (abs(measured.reference) or 1.0)
         miss = measured.reference - measured.value
         return bool(miss <= allowed if self.at_least else abs(miss) <= allowed)

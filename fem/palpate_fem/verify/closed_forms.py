@@ -1,4 +1,7 @@
-"""Homogeneous stretches, inflated spheres and tubes against textbook formulas."""
+"""Homogeneous stretches, inflated spheres and tubes against textbook formulas.
+
+Cook's membrane against felupe, and Newton's count against the bulk modulus.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,16 @@ from functools import cache, partial
 
 import numpy as np
 
-from palpate_fem.verify.body import MU, TIGHT, Body
-from palpate_fem.verify.check import Case, Measured
-from palpate_fem.verify.meshes import octant, on_planes, quarter_tube, rectangle, slab
+from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody
+from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.meshes import (
+    cooks_membrane,
+    octant,
+    on_planes,
+    quarter_tube,
+    rectangle,
+    slab,
+)
 
 INNER_M, OUTER_M = 5.5e-3, 7.07e-3  # a ball of the BioTac's size
 FINEST = (6, 3)  # edges of a patch of the octant, layers
@@ -18,7 +28,7 @@ EVER_FINER = ((2, 1), (4, 2), (8, 4))
 FEWER_DIGITS = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-9)
 
 
-def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measured:
+def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measurement:
     """Cauchy stress over mu along x of a cube: l^2 - l^power for J = 1.
 
     Args:
@@ -33,7 +43,7 @@ def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measure
     held[end[:, 0], 0] = True
     held[end[:, 1], 1] = wide or plane
     goal = mesh.nodes * [stretch, stretch if wide else 1.0, 1.0]
-    body = Body(mesh, held=held, bulk_ratio=1e9)
+    body = VerificationBody(mesh, held=held, bulk_ratio=1e9)
     # So small that no point comes to the barrier of a pinch on the way.
     for share in np.linspace(0.1, 1.0, 10):
         at = mesh.nodes + share * (goal - mesh.nodes)
@@ -41,7 +51,7 @@ def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measure
         balance = body.solve()
     across = np.ptp(body.state.position[:, 1]) * np.ptp(body.state.position[:, 2])
     stress = body.reactions(balance)[end[:, 0], 0].sum() / across
-    return Measured(stress / MU, stretch**2 - stretch**power, "sigma / mu")
+    return Measurement(stress / MU, stretch**2 - stretch**power, "sigma / mu")
 
 
 def thick_sphere(stretch: float, ratio: float) -> float:
@@ -65,7 +75,7 @@ def blown(
 ) -> dict[float, float]:
     """Find p / mu of an eighth of a sphere at the volume of each stretch, by volume control."""
     mesh = octant(edges, INNER_M, INNER_M * ratio, layers, wedges=wedges)
-    body = Body(mesh, held=on_planes(mesh), bulk_ratio=1e6, settings=FEWER_DIGITS)
+    body = VerificationBody(mesh, held=on_planes(mesh), bulk_ratio=1e6, settings=FEWER_DIGITS)
     rest = body.system.balance(body.state, None).volume
     found, last = {}, 1.0
     for stretch in stretches:
@@ -78,33 +88,33 @@ def blown(
 STRETCHES = (1.1, 1.25, 1.5, 2.0)
 
 
-def sphere(stretch: float, *, wedges: bool) -> Measured:
+def sphere(stretch: float, *, wedges: bool) -> Measurement:
     """Inflation of a thick sphere, B/A = 1.5, with three layers; through its limit point at 1.6."""
-    return Measured(
+    return Measurement(
         blown(*FINEST, 1.5, STRETCHES, wedges)[stretch], thick_sphere(stretch, 1.5), "p / mu"
     )
 
 
-def sphere_of_biotac(stretch: float) -> Measured:
+def sphere_of_biotac(stretch: float) -> Measurement:
     """The same at the BioTac's size."""
     ratio = OUTER_M / INNER_M
     found = blown(*FINEST, ratio, (1.05, 1.1, 1.2, 1.3))
-    return Measured(MU * found[stretch] * 1e-3, MU * thick_sphere(stretch, ratio) * 1e-3)
+    return Measurement(MU * found[stretch] * 1e-3, MU * thick_sphere(stretch, ratio) * 1e-3)
 
 
-def sphere_order(*, wedges: bool) -> Measured:
+def sphere_order(*, wedges: bool) -> Measurement:
     """Slope of log error over log edge from the two finest of three meshes."""
     exact = thick_sphere(1.1, 1.5)
     error = [abs(blown(e, n, 1.5, (1.1,), wedges)[1.1] - exact) for e, n in EVER_FINER]
     note = "errors " + ", ".join(f"{e / exact:.2%}" for e in error)
-    return Measured(np.log2(error[1] / error[2]), 2.0, note)
+    return Measurement(np.log2(error[1] / error[2]), 2.0, note)
 
 
-def balloon(stretch: float) -> Measured:
+def balloon(stretch: float) -> Measurement:
     """Ideal balloon, thickness over radius t -> 0: p / mu = 2 t (1/l - 1/l^7)."""
     thin = 1e-3
     found = blown(6, 1, 1 + thin, (stretch,))[stretch] / thin
-    return Measured(found, 2 * (1 / stretch - 1 / stretch**7), "p R / (mu t), t / R = 0.001")
+    return Measurement(found, 2 * (1 / stretch - 1 / stretch**7), "p R / (mu t), t / R = 0.001")
 
 
 @cache
@@ -116,7 +126,7 @@ def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[
     held[:, 2] = True
     bore = np.abs(np.hypot(*mesh.nodes[:, :2].T) - INNER_M) < 1e-9
     held[bore, :2] = True
-    body = Body(mesh, held=held, bulk_ratio=bulk_ratio, settings=FEWER_DIGITS)
+    body = VerificationBody(mesh, held=held, bulk_ratio=bulk_ratio, settings=FEWER_DIGITS)
     found, last = {}, 1.0
     for stretch in stretches:
         for between in np.linspace(last, stretch, 2 + int((stretch - last) / 0.1))[1:]:
@@ -131,9 +141,9 @@ def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[
     return found
 
 
-def tube(stretch: float) -> Measured:
+def tube(stretch: float) -> Measurement:
     """Inflation of a thick tube in plane strain, B/A = 1.5, with three layers."""
-    return Measured(_tube((1.1, 1.5, 2.0), 1e6, 3)[stretch], thick_tube(stretch, 1.5), "p / mu")
+    return Measurement(_tube((1.1, 1.5, 2.0), 1e6, 3)[stretch], thick_tube(stretch, 1.5), "p / mu")
 
 
 SMALL = 1e-4  # strain: what is not linear in it is far below the tolerance
@@ -144,49 +154,104 @@ def bulk_ratio(nu: float) -> float:
     return 2 * (1 + nu) / 3 / (1 - 2 * nu)
 
 
-def _lame_sphere(nu: float) -> Measured:
+def _lame_sphere(nu: float) -> Measurement:
     mesh = octant(8, INNER_M, 1.5 * INNER_M, 4)
-    body = Body(mesh, held=on_planes(mesh), bulk_ratio=bulk_ratio(nu), settings=FEWER_DIGITS)
+    body = VerificationBody(
+        mesh, held=on_planes(mesh), bulk_ratio=bulk_ratio(nu), settings=FEWER_DIGITS
+    )
     rest = body.system.balance(body.state, None).volume
     body.solve(volume=rest * (1 + SMALL) ** 3)
     young, cube = 2 * (1 + nu), 1.5**3  # over mu; B^3 / A^3
     per_pressure = ((1 - 2 * nu) + (1 + nu) / 2 * cube) / (cube - 1) / young
-    return Measured(body.state.fluid_pressure / MU / SMALL, 1 / per_pressure, "p A / (mu u)")
+    return Measurement(body.state.fluid_pressure / MU / SMALL, 1 / per_pressure, "p A / (mu u)")
 
 
-def _lame_tube(nu: float) -> Measured:
+def _lame_tube(nu: float) -> Measurement:
     found = _tube((1 + SMALL,), bulk_ratio(nu), 5)[1 + SMALL] / SMALL
     square = 1.5**2
-    return Measured(found, 2 * (square - 1) / ((1 - 2 * nu) + square), "p A / (mu u)")
+    return Measurement(found, 2 * (square - 1) / ((1 - 2 * nu) + square), "p A / (mu u)")
 
 
 @cache
-def lame(shape: str, nu: float) -> Measured:
+def lame(shape: str, nu: float) -> Measurement:
     """Lame's thick sphere or tube in plane strain: pressure per small displacement of the bore."""
     return (_lame_sphere if shape == "sphere" else _lame_tube)(nu)
 
 
-def lame_change(shape: str) -> Measured:
+def lame_change(shape: str) -> Measurement:
     """How much the relative error changes from nu = 0.3 to 0.4999: locking would show here."""
     errors = [m.value / m.reference - 1 for m in (lame(shape, 0.3), lame(shape, 0.4999))]
-    return Measured(errors[1] - errors[0], 0.0, f"errors {errors[0]:.2%}, {errors[1]:.2%}")
+    return Measurement(errors[1] - errors[0], 0.0, f"errors {errors[0]:.2%}, {errors[1]:.2%}")
+
+
+COOK_MU, COOK_BULK, COOK_FORCE = 80.194, 400_890.0, 100.0
+# Vertical way of the free end's upper corner with felupe 11's hexahedra of constant pressure, by
+# edges a side; four digits are published, hence the tolerance.
+COOK = {4: 6.020, 8: 6.619, 16: 6.814, 32: 6.884}
+COOK_LIMIT = 6.92  # of ever finer meshes, Richardson
+
+
+def cooks_corner(edges: int) -> float:
+    """Vertical way of the corner: plane strain, a dead shear force at the free end."""
+    mesh = cooks_membrane(edges)
+    held = np.zeros(mesh.nodes.shape, bool)
+    held[:, 2] = True
+    held[mesh.nodes[:, 0] == 0] = True
+    settings = replace(TIGHT, tolerance=1e-8, largest_move_m=3.0)
+    body = VerificationBody(
+        mesh, held=held, mu=COOK_MU, bulk_ratio=COOK_BULK / COOK_MU, settings=settings
+    )
+    end = np.flatnonzero(np.abs(mesh.nodes[:, 0] - 48.0) < 1e-9)
+    height = mesh.nodes[end, 1]
+    share = np.where((height == height.min()) | (height == height.max()), 0.5, 1.0)
+    for part in np.linspace(0.0, 1.0, 6)[1:]:
+        body.system.load[end, 1] = part * COOK_FORCE * share / share.sum()
+        body.solve()
+    corner = end[height == height.max()]
+    return float((body.state.position - mesh.nodes)[corner, 1].mean())
+
+
+def cook(edges: int) -> Measurement:
+    """The same element by another code gives the same way."""
+    return Measurement(cooks_corner(edges), COOK[edges], "felupe, Q1P0")
+
+
+def cook_limit() -> Measurement:
+    """It does not lock: the finest mesh is near the limit."""
+    return Measurement(cooks_corner(32), COOK_LIMIT, "limit of felupe's series")
+
+
+def newton_count() -> Measurement:
+    """Iterations of an inflation by 10 % at kappa / mu = 1e6, and at 1e2."""
+    counts = []
+    for ratio in (1e6, 1e2):
+        mesh = octant(4, 5.5e-3, 7.07e-3, 2)
+        settings = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-8)
+        body = VerificationBody(mesh, held=on_planes(mesh), bulk_ratio=ratio, settings=settings)
+        body.solve(volume=1.1 * body.system.balance(body.state, None).volume)
+        counts.append(body.report.iterations)
+    return Measurement(counts[0], counts[1])
 
 
 CHECKS = (
-    Case("closed/uniaxial stretch 1.5", partial(stretched, 1.5, -1, wide=False, plane=False), 1e-8),
-    Case(
+    VerificationCase(
+        "closed/uniaxial stretch 1.5", partial(stretched, 1.5, -1, wide=False, plane=False), 1e-8
+    ),
+    VerificationCase(
         "closed/equibiaxial stretch 1.5", partial(stretched, 1.5, -4, wide=True, plane=False), 1e-8
     ),
-    Case(
+    VerificationCase(
         "closed/pure shear stretch 1.5", partial(stretched, 1.5, -2, wide=False, plane=True), 1e-8
     ),
     *(
-        Case(f"closed/thick sphere, {kind}, stretch {s}", partial(sphere, s, wedges=wedges), 1e-2)
+        VerificationCase(
+            f"closed/thick sphere, {kind}, stretch {s}", partial(sphere, s, wedges=wedges), 1e-2
+        )
         for kind, wedges in (("hexahedra", False), ("wedges", True))
         for s in STRETCHES
     ),
     *(
-        Case(
+        VerificationCase(
             f"closed/thick sphere, {kind}, order",
             partial(sphere_order, wedges=wedges),
             0.1,
@@ -195,7 +260,7 @@ CHECKS = (
         for kind, wedges in (("hexahedra", False), ("wedges", True))
     ),
     *(
-        Case(
+        VerificationCase(
             f"closed/sphere of the BioTac's size, stretch {s}",
             partial(sphere_of_biotac, s),
             1e-2,
@@ -203,18 +268,24 @@ CHECKS = (
         )
         for s in (1.05, 1.1, 1.2, 1.3)
     ),
-    Case("closed/ideal balloon, stretch 1.5", partial(balloon, 1.5), 1e-2),
+    VerificationCase("closed/ideal balloon, stretch 1.5", partial(balloon, 1.5), 1e-2),
     *(
-        Case(f"closed/thick tube, plane strain, stretch {s}", partial(tube, s), 1e-2)
+        VerificationCase(f"closed/thick tube, plane strain, stretch {s}", partial(tube, s), 1e-2)
         for s in (1.1, 1.5, 2.0)
     ),
     *(
-        Case(f"closed/Lame {shape}, nu {nu}", partial(lame, shape, nu), 5e-3)
+        VerificationCase(f"closed/Lame {shape}, nu {nu}", partial(lame, shape, nu), 5e-3)
         for shape in ("sphere", "tube")
         for nu in (0.3, 0.4999)
     ),
     *(
-        Case(f"closed/Lame {shape}, change with nu", partial(lame_change, shape), 5e-3)
+        VerificationCase(f"closed/Lame {shape}, change with nu", partial(lame_change, shape), 5e-3)
         for shape in ("sphere", "tube")
     ),
+    *(
+        VerificationCase(f"convergence/Cook's membrane, {edges} edges", partial(cook, edges), 2e-4)
+        for edges in COOK
+    ),
+    VerificationCase("convergence/Cook's membrane, limit", cook_limit, 1e-2),
+    VerificationCase("newton/count does not grow with kappa", newton_count, 1e-12, "iterations"),
 )

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fem.indenter.shape import Indenter
-from palpate_fem.mechanics.balance import Balance
-from palpate_fem.mechanics.laws import Press
+from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.state import ForceBalance
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.verify.body import MU, TIGHT, Body
-from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody, ball, plane, pose, punch, roll
+from palpate_fem.verify.check import Measurement, VerificationCase
 from palpate_fem.verify.meshes import (
     graded,
     hollow_sphere,
@@ -22,7 +22,6 @@ from palpate_fem.verify.meshes import (
     rectangle,
     slab,
 )
-from palpate_fem.verify.rigid import ball, plane, pose, punch, roll
 
 Floats = NDArray[np.float64]
 
@@ -40,12 +39,12 @@ PUNCH_RINGS = (0.3, 0.5, 0.65, 0.775, 0.875, 0.925, 0.975, 1.025, 1.075, 1.125)
 
 def _pressed(
     mesh: SolidMesh, held: NDArray[np.bool_], indenter: Indenter, depth: float
-) -> tuple[Body, Balance]:
+) -> tuple[VerificationBody, ForceBalance]:
     """Pressed to a depth [m], the deep end held."""
     held = held.copy()
     held[mesh.nodes[:, 2] > mesh.nodes[:, 2].max() - 1e-12] = True
-    body = Body(mesh, held=held, settings=SETTINGS)
-    return body, body.solve(Press(indenter, pose((0.0, 0.0, depth)), 0.0))
+    body = VerificationBody(mesh, held=held, settings=SETTINGS)
+    return body, body.solve(PosedIndenter(indenter, pose((0.0, 0.0, depth)), 0.0))
 
 
 def _quarter(mesh: SolidMesh) -> NDArray[np.bool_]:
@@ -55,7 +54,7 @@ def _quarter(mesh: SolidMesh) -> NDArray[np.bool_]:
     return held
 
 
-def _mean_square(balance: Balance, distance: Floats) -> float:
+def _mean_square(balance: ForceBalance, distance: Floats) -> float:
     """Of the distance from the middle, weighted with the nodal forces along z [m^2]."""
     force = -balance.indenter[:, 2]
     return float((force * distance**2).sum() / force.sum())
@@ -79,30 +78,30 @@ def hertz(radius: float, depth: float) -> tuple[float, float, float]:
     return float(force), float(contact), float(body.state.indenter_pressure[middle].max())
 
 
-def hertz_force(radius: float, depth: float) -> Measured:
+def hertz_force(radius: float, depth: float) -> Measurement:
     """Hertz: F = 16/3 mu sqrt(R) d^1.5."""
-    return Measured(hertz(radius, depth)[0], 16 / 3 * MU * np.sqrt(radius) * depth**1.5)
+    return Measurement(hertz(radius, depth)[0], 16 / 3 * MU * np.sqrt(radius) * depth**1.5)
 
 
-def hertz_radius(radius: float, depth: float) -> Measured:
+def hertz_radius(radius: float, depth: float) -> Measurement:
     """Hertz: a = sqrt(R d)."""
-    return Measured(hertz(radius, depth)[1] * 1e3, np.sqrt(radius * depth) * 1e3)
+    return Measurement(hertz(radius, depth)[1] * 1e3, np.sqrt(radius * depth) * 1e3)
 
 
-def hertz_pressure(radius: float, depth: float) -> Measured:
+def hertz_pressure(radius: float, depth: float) -> Measurement:
     """Hertz: p0 = 3 F / (2 pi a^2), F and a by their formulas."""
     force, area = 16 / 3 * MU * np.sqrt(radius) * depth**1.5, np.pi * radius * depth
-    return Measured(hertz(radius, depth)[2] * 1e-3, 1.5e-3 * force / area)
+    return Measurement(hertz(radius, depth)[2] * 1e-3, 1.5e-3 * force / area)
 
 
-def flat_punch() -> Measured:
+def flat_punch() -> Measurement:
     """Sneddon: F = 8 mu a d under a flat-ended cylinder."""
     a, depth = 1e-3, 1e-5
     outside = PUNCH_RINGS[-1] + graded(0.05, 0.05, FAR, GROWTH)[1:]
     radii = a * np.concatenate([PUNCH_RINGS, outside])
     mesh = slab(*quarter_disc(radii, 8), a * graded(0.05, 0.1, FAR, GROWTH), name="punch")
     _, balance = _pressed(mesh, _quarter(mesh), punch(a, 1e-3 * a), depth)
-    return Measured(-4 * balance.indenter[:, 2].sum(), 8 * MU * a * depth)
+    return Measurement(-4 * balance.indenter[:, 2].sum(), 8 * MU * a * depth)
 
 
 @cache
@@ -127,19 +126,21 @@ def line_contact() -> tuple[float, float, float, float]:
     return force, float(contact), float(body.state.indenter_pressure.max()), radius
 
 
-def line_contact_width() -> Measured:
+def line_contact_width() -> Measurement:
     """Johnson: a = sqrt(F R / (pi mu)) at the measured force."""
     force, contact, _, radius = line_contact()
-    return Measured(contact * 1e3, np.sqrt(force * radius / np.pi / MU) * 1e3, f"{force:.2f} N/m")
+    return Measurement(
+        contact * 1e3, np.sqrt(force * radius / np.pi / MU) * 1e3, f"{force:.2f} N/m"
+    )
 
 
-def line_contact_pressure() -> Measured:
+def line_contact_pressure() -> Measurement:
     """Johnson: p0 = 2 F / (pi a), a by its formula."""
     force, _, pressure, radius = line_contact()
-    return Measured(pressure * 1e-3, 2e-3 * force / np.pi / np.sqrt(force * radius / np.pi / MU))
+    return Measurement(pressure * 1e-3, 2e-3 * force / np.pi / np.sqrt(force * radius / np.pi / MU))
 
 
-def contact_patch(shake: float) -> Measured:
+def contact_patch(shake: float) -> Measurement:
     """A block squeezed by a plane: the same pressure everywhere.
 
     Args:
@@ -153,14 +154,14 @@ def contact_patch(shake: float) -> Measured:
     mesh = slab(points, quads, line[:3])
     held = _quarter(mesh)
     held[mesh.nodes[:, 2] == line[2], 2] = True
-    body = Body(mesh, held=held)
-    body.solve(Press(plane(), pose((0.0, 0.0, 0.05 * line[2])), 0.0))
+    body = VerificationBody(mesh, held=held)
+    body.solve(PosedIndenter(plane(), pose((0.0, 0.0, 0.05 * line[2])), 0.0))
     pressure = body.state.indenter_pressure
     spread = float(np.abs(pressure / pressure.mean() - 1).max())
-    return Measured(spread, note=f"mean {pressure.mean() * 1e-3:.3f} kPa")
+    return Measurement(spread, note=f"mean {pressure.mean() * 1e-3:.3f} kPa")
 
 
-def free_slide() -> Measured:
+def free_slide() -> Measurement:
     """A coarse ball dragged over a frictionless plane: tangential over normal force.
 
     Barriers between facets fail this ("No Free Slide"); a plane's normal is the same everywhere.
@@ -168,20 +169,22 @@ def free_slide() -> Measured:
     mesh = hollow_sphere(4, 3e-3, 4e-3, 1)
     held = np.zeros(mesh.nodes.shape, bool)
     held[mesh.inner_nodes] = True
-    body, worst = Body(mesh, held=held), 0.0
-    press = Press(plane(), pose((0.0, 0.0, -4e-3)), 0.0)
+    body, worst = VerificationBody(mesh, held=held), 0.0
+    press = PosedIndenter(plane(), pose((0.0, 0.0, -4e-3)), 0.0)
     for k in range(1, 9):
         balance = body.solve(press.at(pose((1e-4 * k, 0.5e-4 * k, -4e-3 + min(k, 2) * 1e-4))))
         x, y, z = -balance.indenter.sum(axis=0)
         worst = max(worst, float(np.hypot(x, y) / z))
-    return Measured(worst, note=f"{z:.3f} N")
+    return Measurement(worst, note=f"{z:.3f} N")
 
 
 SPHERES = ((3.5e-3, "3.5"), (1.75e-3, "1.75"))
 DEPTH_M = 1e-4
 CHECKS = (
     *(
-        Case(f"contact/Hertz {what}, R {name} mm", partial(law, radius, DEPTH_M), tolerance, unit)
+        VerificationCase(
+            f"contact/Hertz {what}, R {name} mm", partial(law, radius, DEPTH_M), tolerance, unit
+        )
         for radius, name in SPHERES
         for what, law, tolerance, unit in (
             ("force", hertz_force, 3e-2, "N"),
@@ -189,10 +192,10 @@ CHECKS = (
             ("pressure", hertz_pressure, 5e-2, "kPa"),
         )
     ),
-    Case("contact/flat punch, force", flat_punch, 5e-2, "N"),
-    Case("contact/line contact, half width", line_contact_width, 5e-2, "mm"),
-    Case("contact/line contact, pressure", line_contact_pressure, 5e-2, "kPa"),
-    Case("contact/patch test, even quads", partial(contact_patch, 0.0), 1e-6),
-    Case("contact/patch test, distorted quads", partial(contact_patch, 0.2), 1e-6),
-    Case("contact/free slide of facets on a plane", free_slide, 1e-6),
+    VerificationCase("contact/flat punch, force", flat_punch, 5e-2, "N"),
+    VerificationCase("contact/line contact, half width", line_contact_width, 5e-2, "mm"),
+    VerificationCase("contact/line contact, pressure", line_contact_pressure, 5e-2, "kPa"),
+    VerificationCase("contact/patch test, even quads", partial(contact_patch, 0.0), 1e-6),
+    VerificationCase("contact/patch test, distorted quads", partial(contact_patch, 0.2), 1e-6),
+    VerificationCase("contact/free slide of facets on a plane", free_slide, 1e-6),
 )

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fem.indenter.pose import rotation_matrix
-from palpate_fem.mechanics.laws import Press
+from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.verify.body import MU, TIGHT, Body
-from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody, ball, pose
+from palpate_fem.verify.check import Measurement, VerificationCase
 from palpate_fem.verify.closed_forms import INNER_M, OUTER_M
 from palpate_fem.verify.meshes import (
     distorted,
@@ -24,7 +24,6 @@ from palpate_fem.verify.meshes import (
     slab,
     triangles,
 )
-from palpate_fem.verify.rigid import ball, pose
 
 Floats = NDArray[np.float64]
 
@@ -45,52 +44,54 @@ def _on_edge(mesh: SolidMesh) -> NDArray[np.bool_]:
     return np.asarray(~inside.all(axis=1))
 
 
-def patch(strain: Floats, *, wedges: bool) -> Measured:
+def patch(strain: Floats, *, wedges: bool) -> Measurement:
     """Linear motion of the boundary of a distorted cube: the inside follows to the last digits."""
     mesh = _cube(wedges=wedges)
     held = np.zeros(mesh.nodes.shape, bool)
     held[_on_edge(mesh)] = True
-    body = Body(mesh, held=held, bulk_ratio=10.0, settings=replace(TIGHT, tolerance=1e-13))
+    body = VerificationBody(
+        mesh, held=held, bulk_ratio=10.0, settings=replace(TIGHT, tolerance=1e-13)
+    )
     exact = mesh.nodes @ (np.eye(3) + strain).T
     body.state.position[held] = exact[held]
     body.solve()
-    return Measured(np.abs(body.state.position - exact).max() / SIDE_M)
+    return Measurement(np.abs(body.state.position - exact).max() / SIDE_M)
 
 
-def patch_pressure(*, wedges: bool) -> Measured:
+def patch_pressure(*, wedges: bool) -> Measurement:
     """The same under equal swelling: every element finds the same pressure."""
     mesh = _cube(wedges=wedges)
     held = np.zeros(mesh.nodes.shape, bool)
     held[_on_edge(mesh)] = True
-    body = Body(mesh, held=held, bulk_ratio=10.0)
+    body = VerificationBody(mesh, held=held, bulk_ratio=10.0)
     body.state.position[held] = 1.05 * mesh.nodes[held]
     body.solve()
-    return Measured(np.abs(body.state.pressure / (body.bulk * (1.05**3 - 1)) - 1).max())
+    return Measurement(np.abs(body.state.pressure / (body.bulk * (1.05**3 - 1)) - 1).max())
 
 
-def rigid_motion(*, wedges: bool) -> Measured:
+def rigid_motion(*, wedges: bool) -> Measurement:
     """Turned and moved, a body at rest has no energy, force or change of volume."""
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=wedges)
-    body = Body(mesh)
+    body = VerificationBody(mesh)
     rest = body.system.balance(body.state, None)
     body.state.position = mesh.nodes @ rotation_matrix(QUATERNION).T + [3e-3, -5e-3, 2e-3]
     moved = body.system.balance(body.state, None)
     force = np.abs(moved.internal).max() / (MU * OUTER_M**2)
     energy = abs(body.strain_energy()) / (MU * body.system.skin.rest_volume.sum())
-    return Measured(max(force, energy, moved.strain_error), note=f"volume {rest.volume:.3g} m^3")
+    return Measurement(max(force, energy, moved.strain_error), note=f"volume {rest.volume:.3g} m^3")
 
 
-def objectivity() -> Measured:
+def objectivity() -> Measurement:
     """A loaded state turned with its indenter: forces turn, energy and volume stay."""
     mesh = hollow_sphere(4, INNER_M, OUTER_M, 2)
-    body = Body(mesh)
+    body = VerificationBody(mesh)
     random = np.random.default_rng(1)
     body.state.position += random.normal(scale=5e-5, size=mesh.nodes.shape)
     body.state.pressure += random.normal(scale=MU, size=len(mesh.elements))
     body.state.indenter_pressure += 1e5
     body.state.traction += random.normal(scale=1e4, size=body.state.traction.shape)
     at = np.array([1e-4, 2e-4, -OUTER_M + 3e-4])
-    press = Press(ball(3.5e-3), pose(at), 0.2)
+    press = PosedIndenter(ball(3.5e-3), pose(at), 0.2)
     body.settle(press)
     before, energy = body.system.balance(body.state, press), body.strain_energy()
     turn = rotation_matrix(QUATERNION)
@@ -106,7 +107,7 @@ def objectivity() -> Measured:
         )
     ]
     off += [after.volume / before.volume - 1, body.strain_energy() / energy - 1]
-    return Measured(np.abs(off).max())
+    return Measurement(np.abs(off).max())
 
 
 def order_of(residuals: Sequence[float]) -> float:
@@ -115,33 +116,39 @@ def order_of(residuals: Sequence[float]) -> float:
     return float(np.log(c / b) / np.log(b / a))
 
 
-def newton_order(*, wedges: bool) -> Measured:
+def newton_order(*, wedges: bool) -> Measurement:
     """Residuals of an inflation: the last three fall quadratically."""
     mesh = octant(4, INNER_M, 1.5 * INNER_M, 2, wedges=wedges)
-    body = Body(mesh, held=on_planes(mesh))
+    body = VerificationBody(mesh, held=on_planes(mesh))
     rest = body.system.balance(body.state, None).volume
     body.solve(volume=1.1 * rest)
     note = " ".join(f"{r:.0e}" for r in body.report.residuals)
-    return Measured(order_of(body.report.residuals), 2.0, note)
+    return Measurement(order_of(body.report.residuals), 2.0, note)
 
 
 KINDS = (("hexahedra", False), ("wedges", True))
 CHECKS = (
     *(
-        Case(f"element/patch test, {kind}", partial(patch, STRAIN, wedges=wedges), 1e-12)
+        VerificationCase(
+            f"element/patch test, {kind}", partial(patch, STRAIN, wedges=wedges), 1e-12
+        )
         for kind, wedges in KINDS
     ),
     *(
-        Case(f"element/patch test, pressure, {kind}", partial(patch_pressure, wedges=wedges), 1e-12)
+        VerificationCase(
+            f"element/patch test, pressure, {kind}", partial(patch_pressure, wedges=wedges), 1e-12
+        )
         for kind, wedges in KINDS
     ),
     *(
-        Case(f"element/rigid motion, {kind}", partial(rigid_motion, wedges=wedges), 1e-10)
+        VerificationCase(
+            f"element/rigid motion, {kind}", partial(rigid_motion, wedges=wedges), 1e-10
+        )
         for kind, wedges in KINDS
     ),
-    Case("element/objectivity of a loaded state", objectivity, 1e-10),
+    VerificationCase("element/objectivity of a loaded state", objectivity, 1e-10),
     *(
-        Case(
+        VerificationCase(
             f"newton/order, inflation, {kind}",
             partial(newton_order, wedges=wedges),
             0.1,

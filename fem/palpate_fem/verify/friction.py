@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
 from palpate_fem.indenter.pose import rotation_matrix
-from palpate_fem.mechanics.laws import Press
+from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.newton import NewtonSettings
-from palpate_fem.verify.body import BULK_RATIO, TIGHT, Body
-from palpate_fem.verify.check import Case, Measured
+from palpate_fem.verify.bodies import BULK_RATIO, TIGHT, VerificationBody, about_y, plane, pose
+from palpate_fem.verify.check import Measurement, VerificationCase
 from palpate_fem.verify.meshes import rectangle, slab
-from palpate_fem.verify.rigid import about_y, plane, pose
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +26,7 @@ PRESS_M, SLIDE_M = 3e-5, 1e-3  # by the plane
 NEAR_SLIP = replace(TIGHT, tolerance=1e-11, gap_tolerance_m=1e-15, iterations=25)
 
 
-class Block:
+class SlidingBlock:
     """A flat block whose lower side lies on a plane, all of it turned about y by an angle [rad].
 
     Its upper side is clamped, tied along x and y, or free.
@@ -51,8 +50,8 @@ class Block:
         held = np.zeros(mesh.nodes.shape, bool)
         held[self.top] = (clamped or tied, clamped or tied, clamped)
         self.angle = angle
-        self.body = Body(mesh, held=held, bulk_ratio=bulk_ratio, settings=settings)
-        self.press = Press(plane(), self.pose(0.0, 0.0), FRICTION)
+        self.body = VerificationBody(mesh, held=held, bulk_ratio=bulk_ratio, settings=settings)
+        self.press = PosedIndenter(plane(), self.pose(0.0, 0.0), FRICTION)
         self.body.settle(self.press)
 
     def pose(self, along: float, up: float) -> Floats:
@@ -82,7 +81,7 @@ def dragged(angle: float) -> tuple[float, float]:
     Returns:
         Tangential over normal force while it slides forth, and back.
     """
-    block = Block(clamped=True, angle=angle)
+    block = SlidingBlock(clamped=True, angle=angle)
     for along, up in ((0.0, 1e-5), (0.0, PRESS_M), (1e-5, PRESS_M)):
         block.slide(along, up)
     for k in range(1, 8):
@@ -93,12 +92,12 @@ def dragged(angle: float) -> tuple[float, float]:
     return forth, along / across
 
 
-def stick() -> Measured:
+def stick() -> Measurement:
     """Half way to its slip angle a block hangs in the springs of sticking: way = T / (k area).
 
     Of a material that does not bulge under its weight (nu = 0), so that no point slides.
     """
-    block, slope = Block(bulk_ratio=2 / 3), np.arctan(FRICTION) / 2
+    block, slope = SlidingBlock(bulk_ratio=2 / 3), np.arctan(FRICTION) / 2
     block.weigh(0.0)
     block.slide(0.0, 1e-6)
     before = block.body.contact_points()
@@ -107,22 +106,22 @@ def stick() -> Measured:
     moved = (block.body.contact_points() - before)[..., 0]
     way = (block.body.system.outer.area_values * moved).sum() / SIDE_M**2
     expected = -along / block.body.contact.tangential_stiffness / SIDE_M**2
-    return Measured(way * 1e9, expected * 1e9, "mean of the sole")
+    return Measurement(way * 1e9, expected * 1e9, "mean of the sole")
 
 
-def slip_at(angle: float) -> Measured:
+def slip_at(angle: float) -> Measurement:
     """Steady sliding: T = mu N."""
-    return Measured(dragged(angle)[0], FRICTION, "T / N")
+    return Measurement(dragged(angle)[0], FRICTION, "T / N")
 
 
-def reversal(angle: float) -> Measured:
+def reversal(angle: float) -> Measurement:
     """Dragged back the force turns round: T = -mu N."""
-    return Measured(dragged(angle)[1], -FRICTION, "T / N")
+    return Measurement(dragged(angle)[1], -FRICTION, "T / N")
 
 
-def slip_angle() -> Measured:
+def slip_angle() -> Measurement:
     """The steepest ramp on which a free block lies still: atan(mu); at 30 degrees it does not."""
-    block = Block(settings=NEAR_SLIP)
+    block = SlidingBlock(settings=NEAR_SLIP)
     block.weigh(0.0)
     block.slide(0.0, 1e-6)
     still, slides = 0.0, np.radians(30.0)
@@ -135,25 +134,25 @@ def slip_angle() -> Measured:
             still = middle
         except SimulationError:
             block.body.state, slides = kept, middle
-    return Measured(np.degrees(still), np.degrees(np.arctan(FRICTION)))
+    return Measurement(np.degrees(still), np.degrees(np.arctan(FRICTION)))
 
 
-def tether() -> Measured:
+def tether() -> Measurement:
     """What holds a block on a ramp of 30 degrees that slips under it: W (sin - mu cos)."""
     slope = np.radians(30.0)
-    block = Block(tied=True)
+    block = SlidingBlock(tied=True)
     block.weigh(slope)
     for k in range(8):
         block.slide(-1e-4 * k, 1e-6)
     # Weight that lies on tied nodes goes into the tether without being seen by the sole.
     load = block.body.system.load[block.top].sum(axis=0)
     pull = load[0] - block.body.reactions(block.balance)[:, 0].sum()
-    return Measured(pull, WEIGHT_N * (np.sin(slope) - FRICTION * np.cos(slope)))
+    return Measurement(pull, WEIGHT_N * (np.sin(slope) - FRICTION * np.cos(slope)))
 
 
-def no_creep(increments: int) -> Measured:
+def no_creep(increments: int) -> Measurement:
     """A block at 95 % of its slip angle, solved again and again from a disturbed state."""
-    block = Block(edges=2, settings=replace(TIGHT, tolerance=1e-10, gap_tolerance_m=1e-13))
+    block = SlidingBlock(edges=2, settings=replace(TIGHT, tolerance=1e-10, gap_tolerance_m=1e-13))
     for share in (0.0, 0.5, 0.95):
         block.weigh(np.arctan(FRICTION) * share)
         block.slide(0.0, 1e-6)
@@ -162,19 +161,19 @@ def no_creep(increments: int) -> Measured:
         block.body.state.position += random.normal(scale=1e-8, size=start.shape)
         block.slide(0.0, 1e-6)
     way = float(np.abs(block.body.state.position - start).max())
-    return Measured(way * 1e9, 0.0, f"{increments} increments")
+    return Measurement(way * 1e9, 0.0, f"{increments} increments")
 
 
 CHECKS = (
-    Case("friction/stick below the limit", stick, 1e-6, "nm"),
+    VerificationCase("friction/stick below the limit", stick, 1e-6, "nm"),
     *(
-        Case(
+        VerificationCase(
             f"friction/{what}, plane at {degrees} degrees", partial(law, np.radians(degrees)), 1e-6
         )
         for degrees in (0, 30)
         for what, law in (("slip at T = mu N", slip_at), ("reversal", reversal))
     ),
-    Case("friction/slip angle of a ramp", slip_angle, 1e-6, "degrees"),
-    Case("friction/tether on a ramp of 30 degrees", tether, 1e-6, "N"),
-    Case("friction/no creep under load", partial(no_creep, 1000), 1.0, "nm"),
+    VerificationCase("friction/slip angle of a ramp", slip_angle, 1e-6, "degrees"),
+    VerificationCase("friction/tether on a ramp of 30 degrees", tether, 1e-6, "N"),
+    VerificationCase("friction/no creep under load", partial(no_creep, 1000), 1.0, "nm"),
 )

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_fem.mesh.extrude import extrude
-from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.mesh.solid import SolidMesh, extrude
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from palpate_fem.mesh.nvlabs import SKIN, read_nvlabs
-from palpate_fem.verify.body import TIGHT, Body
-from palpate_fem.verify.check import Absent, Case, Measured
+from palpate_fem.verify.bodies import TIGHT, VerificationBody
+from palpate_fem.verify.check import Measurement, MissingDataError, VerificationCase
 
 FILLED_M3 = (60e-9, 150e-9, 250e-9, 350e-9, 430e-9)
 QUADRATIC_KPA = 26.58  # P2-P0 on the public tetrahedra
@@ -38,9 +38,11 @@ def filled(folder: Path, layers: int, bulk_ratio: float) -> tuple[float, float]:
         Absent: The public files are not there.
     """
     if not (folder / SKIN).is_file():
-        raise Absent(f"no public BioTac in {folder.name}; its files are not part of palpate")
+        raise MissingDataError(
+            f"no public BioTac in {folder.name}; its files are not part of palpate"
+        )
     mesh = read_nvlabs(folder, layers=layers).mesh
-    body = Body(mesh, bulk_ratio=bulk_ratio, settings=SETTINGS)
+    body = VerificationBody(mesh, bulk_ratio=bulk_ratio, settings=SETTINGS)
     rest = body.system.balance(body.state, None).volume
     for more in FILLED_M3:
         body.solve(volume=rest + more)
@@ -48,41 +50,45 @@ def filled(folder: Path, layers: int, bulk_ratio: float) -> tuple[float, float]:
     return body.state.fluid_pressure * 1e-3, thickness
 
 
-def pressure(folder: Path, layers: int) -> Measured:
+def pressure(folder: Path, layers: int) -> Measurement:
     """By layers, against wedges of another program."""
     found, thickness = filled(folder, layers, 1e3)
-    return Measured(found, WEDGES_KPA[layers], f"{thickness:.2f} mm thick")
+    return Measurement(found, WEDGES_KPA[layers], f"{thickness:.2f} mm thick")
 
 
-def against_quadratic(folder: Path) -> Measured:
+def against_quadratic(folder: Path) -> Measurement:
     """Against quadratic tetrahedra, which do not lock; on the public tetrahedra themselves."""
-    return Measured(filled(folder, 2, 1e3)[0], QUADRATIC_KPA, "P2-P0")
+    return Measurement(filled(folder, 2, 1e3)[0], QUADRATIC_KPA, "P2-P0")
 
 
-def layers_agree(folder: Path) -> Measured:
+def layers_agree(folder: Path) -> Measurement:
     """Largest deviation of one or two layers from three."""
     found = [filled(folder, layers, 1e3)[0] for layers in WEDGES_KPA]
     note = ", ".join(f"{p:.2f}" for p in found) + " kPa"
-    return Measured(max(abs(p / found[-1] - 1) for p in found), 0.0, note)
+    return Measurement(max(abs(p / found[-1] - 1) for p in found), 0.0, note)
 
 
-def bulk_modulus(folder: Path, ratio: float) -> Measured:
+def bulk_modulus(folder: Path, ratio: float) -> Measurement:
     """Pressure at another kappa over that at 1e3 mu: an element that locks would show more."""
     found = filled(folder, 2, ratio)[0]
-    return Measured(found / filled(folder, 2, 1e3)[0], SOFTER[ratio], f"{found:.2f} kPa")
+    return Measurement(found / filled(folder, 2, 1e3)[0], SOFTER[ratio], f"{found:.2f} kPa")
 
 
-def checks(folder: Path) -> tuple[Case, ...]:
+def checks(folder: Path) -> tuple[VerificationCase, ...]:
     """All of them.
 
     Args:
         folder: Holds ``meshes/biotac``; where it is absent they are skipped.
     """
     return (
-        Case("skin/filled by 430 mm^3, 2 layers", partial(pressure, folder, 2), 1e-2, "kPa"),
-        Case("skin/against quadratic tetrahedra", partial(against_quadratic, folder), 1e-2, "kPa"),
+        VerificationCase(
+            "skin/filled by 430 mm^3, 2 layers", partial(pressure, folder, 2), 1e-2, "kPa"
+        ),
+        VerificationCase(
+            "skin/against quadratic tetrahedra", partial(against_quadratic, folder), 1e-2, "kPa"
+        ),
         *(
-            Case(
+            VerificationCase(
                 f"skin/filled by 430 mm^3, {layers} layers",
                 partial(pressure, folder, layers),
                 1e-2,
@@ -91,9 +97,9 @@ def checks(folder: Path) -> tuple[Case, ...]:
             )
             for layers in (1, 3)
         ),
-        Case("skin/layers agree", partial(layers_agree, folder), 8e-3, slow=True),
+        VerificationCase("skin/layers agree", partial(layers_agree, folder), 8e-3, slow=True),
         *(
-            Case(
+            VerificationCase(
                 f"skin/kappa / mu = {ratio:g} over 1000",
                 partial(bulk_modulus, folder, ratio),
                 1e-3,

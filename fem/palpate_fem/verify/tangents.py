@@ -9,14 +9,12 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from palpate_fem.indenter.distance import distance
-from palpate_fem.mechanics.balance import Balance
-from palpate_fem.mechanics.laws import Press
-from palpate_fem.verify.body import MU, Body
-from palpate_fem.verify.check import Case, Measured
-from palpate_fem.verify.finger import round_core
+from palpate_fem.indenter.shape import distance
+from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.state import ForceBalance
+from palpate_fem.verify.bodies import MU, VerificationBody, ball, pose, round_core
+from palpate_fem.verify.check import Measurement, VerificationCase
 from palpate_fem.verify.meshes import hollow_sphere, octant
-from palpate_fem.verify.rigid import ball, pose
 
 Floats = NDArray[np.float64]
 
@@ -29,19 +27,19 @@ TOLERANCE = 1e-6
 TURN = np.array([1.0, 0.1, 0.2, 0.0]) / np.linalg.norm([1.0, 0.1, 0.2, 0.0])
 
 
-def _shaken(*, wedges: bool = False, core: bool = False) -> tuple[Body, Floats]:
+def _shaken(*, wedges: bool = False, core: bool = False) -> tuple[VerificationBody, Floats]:
     """A body whose nodes are moved at random, none held, and a random direction (V, 3)."""
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=True) if wedges else hollow_sphere(
         8, INNER_M, OUTER_M, 1
     )  # fmt: skip
-    body = Body(mesh, bulk_ratio=1e2, core=round_core(CORE_M, 0.5e-3) if core else None)
+    body = VerificationBody(mesh, bulk_ratio=1e2, core=round_core(CORE_M, 0.5e-3) if core else None)
     random = np.random.default_rng(5)
     body.state.position += random.normal(scale=3e-5, size=mesh.nodes.shape)
     _follow(body, None)
     return body, random.normal(size=mesh.nodes.shape)
 
 
-def _follow(body: Body, press: Press | None) -> None:
+def _follow(body: VerificationBody, press: PosedIndenter | None) -> None:
     """Pressures and tractions that obey their laws exactly where the nodes are.
 
     The solver's tangent is that of the equations with these unknowns eliminated; here they are, by
@@ -62,7 +60,7 @@ def _follow(body: Body, press: Press | None) -> None:
     points = body.contact_points()
     local = press.to_local(points).reshape(-1, 3)
     gap, normal, _ = (part.reshape(*points.shape[:2], -1) for part in distance(
-        press.indenter, local
+        press.shape, local
     ))  # fmt: skip
     state.indenter_pressure = contact.stiffness * np.maximum(-gap[..., 0], 0.0)
     if press.friction == 0.0:
@@ -75,7 +73,7 @@ def _follow(body: Body, press: Press | None) -> None:
     state.traction = (size / np.maximum(length, 1e-300))[..., None] * way @ press.rotation.T
 
 
-def _product(body: Body, press: Press | None, direction: Floats) -> Floats:
+def _product(body: VerificationBody, press: PosedIndenter | None, direction: Floats) -> Floats:
     """The solver's tangent times a direction (V, 3)."""
     system = body.system
     system.balance(body.state, press)
@@ -89,7 +87,10 @@ def _product(body: Body, press: Press | None, direction: Floats) -> Floats:
 
 
 def _difference(
-    body: Body, press: Press | None, direction: Floats, pick: Callable[[Balance], Floats]
+    body: VerificationBody,
+    press: PosedIndenter | None,
+    direction: Floats,
+    pick: Callable[[ForceBalance], Floats],
 ) -> Floats:
     """Central difference of nodal forces along a direction."""
     kept, ends = body.state, []
@@ -102,11 +103,11 @@ def _difference(
     return np.asarray((ends[0] - ends[1]) / (2 * STEP_M))
 
 
-def _off(found: Floats, expected: Floats) -> Measured:
-    return Measured(float(np.abs(found - expected).max() / np.abs(expected).max()))
+def _off(found: Floats, expected: Floats) -> Measurement:
+    return Measurement(float(np.abs(found - expected).max() / np.abs(expected).max()))
 
 
-def element_force(*, wedges: bool) -> Measured:
+def element_force(*, wedges: bool) -> Measurement:
     """Nodal forces are the derivative of the mixed energy by the nodes."""
     body, direction = _shaken(wedges=wedges)
     state = body.state
@@ -116,17 +117,17 @@ def element_force(*, wedges: bool) -> Measured:
         for sign in (1.0, -1.0)
     )
     slope = (up - down) / (2 * STEP_M)
-    return Measured(abs(float((force * direction).sum()) / slope - 1))
+    return Measurement(abs(float((force * direction).sum()) / slope - 1))
 
 
-def element_tangent(*, wedges: bool) -> Measured:
+def element_tangent(*, wedges: bool) -> Measurement:
     """The condensed tangent is the derivative of the nodal forces, element pressures following."""
     body, direction = _shaken(wedges=wedges)
     expected = _difference(body, None, direction, lambda balance: balance.internal)
     return _off(_product(body, None, direction), expected)
 
 
-def fluid_gradient() -> Measured:
+def fluid_gradient() -> Measurement:
     """dV/dx by the differences of the cavity's volume."""
     body, direction = _shaken()
     state, volumes = body.state.copy(), []
@@ -135,10 +136,10 @@ def fluid_gradient() -> Measured:
         volumes.append(body.system.balance(state, None).volume)
     gradient = body.system.balance(body.state, None).volume_gradient
     slope = (volumes[0] - volumes[1]) / 2e-7
-    return Measured(abs(float((gradient * direction).sum()) / slope - 1))
+    return Measurement(abs(float((gradient * direction).sum()) / slope - 1))
 
 
-def fluid_tangent() -> Measured:
+def fluid_tangent() -> Measurement:
     """The follower pressure's tangent -p d2V/dx2 by the differences of dV/dx."""
     body, direction = _shaken()
     without = _product(body, None, direction)
@@ -148,7 +149,7 @@ def fluid_tangent() -> Measured:
     return _off(found, expected)
 
 
-def core_tangent() -> Measured:
+def core_tangent() -> Measurement:
     """Contact with the tabulated core, its curvature included."""
     body, direction = _shaken(core=True)
     expected = _difference(body, None, direction, lambda balance: balance.core)
@@ -157,10 +158,10 @@ def core_tangent() -> Measured:
     return _off(with_core - _product(body, None, direction), expected)
 
 
-def contact_tangent(friction: float, slip_m: float) -> Measured:
+def contact_tangent(friction: float, slip_m: float) -> Measurement:
     """Contact with a ball: gap and curvature, then friction by an arm of anchors ``slip_m``."""
     body, direction = _shaken()
-    press = Press(ball(3.5e-3), pose((1e-4, 2e-4, -OUTER_M + 3e-4), TURN), friction)
+    press = PosedIndenter(ball(3.5e-3), pose((1e-4, 2e-4, -OUTER_M + 3e-4), TURN), friction)
     body.state.anchor[:] = press.to_local(body.contact_points() - slip_m * np.array([1, 0.3, 0.1]))
     _follow(body, press)
     expected = _difference(body, press, direction, lambda balance: balance.indenter)
@@ -171,28 +172,30 @@ def contact_tangent(friction: float, slip_m: float) -> Measured:
     note = f"{touching.sum()} points touch"
     if friction:
         note += f", {slides.sum()} slide"
-    return Measured(_off(found, expected).value, note=note)
+    return Measurement(_off(found, expected).value, note=note)
 
 
 CHECKS = (
     *(
-        Case(f"element/{what}, {kind}", partial(law, wedges=wedges), TOLERANCE)
+        VerificationCase(f"element/{what}, {kind}", partial(law, wedges=wedges), TOLERANCE)
         for kind, wedges in (("hexahedra", False), ("wedges", True))
         for what, law in (
             ("force is the energy's gradient", element_force),
             ("tangent by differences", element_tangent),
         )
     ),
-    Case("fluid/volume gradient by differences", fluid_gradient, TOLERANCE),
-    Case("fluid/tangent by differences", fluid_tangent, TOLERANCE),
-    Case("contact/tangent by differences, core", core_tangent, TOLERANCE),
-    Case("contact/tangent by differences, gap", partial(contact_tangent, 0.0, 0.0), TOLERANCE),
-    Case(
+    VerificationCase("fluid/volume gradient by differences", fluid_gradient, TOLERANCE),
+    VerificationCase("fluid/tangent by differences", fluid_tangent, TOLERANCE),
+    VerificationCase("contact/tangent by differences, core", core_tangent, TOLERANCE),
+    VerificationCase(
+        "contact/tangent by differences, gap", partial(contact_tangent, 0.0, 0.0), TOLERANCE
+    ),
+    VerificationCase(
         "friction/tangent by differences, stick",
         partial(contact_tangent, FRICTION, 1e-7),
         TOLERANCE,
     ),
-    Case(
+    VerificationCase(
         "friction/tangent by differences, slip", partial(contact_tangent, FRICTION, 3e-3), TOLERANCE
     ),
 )

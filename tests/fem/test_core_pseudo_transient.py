@@ -10,15 +10,20 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics.creep import LEAST, MOST, START, Creep
-from palpate_fem.mechanics.indentation import Indentation
-from palpate_fem.mechanics.laws import ContactSettings, Press
-from palpate_fem.mechanics.newton import Newton, NewtonSettings
+from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.newton import (
+    LEAST,
+    MOST,
+    START,
+    NewtonSettings,
+    NewtonSolver,
+    PseudoTransient,
+)
 from palpate_fem.mechanics.solver import Fingertip
-from palpate_fem.mechanics.state import State
-from palpate_fem.mechanics.system import System
+from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.result import Outcome
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.sparse.factor import make_factor
 
 Floats = NDArray[np.float64]
@@ -29,7 +34,7 @@ BALL = make_indenter("sphere_medium")
 
 
 def test_drag_falls_to_none_and_comes_back_where_nothing_is_won() -> None:
-    creep = Creep()
+    creep = PseudoTransient()
     drags = [creep.drag]
     for residual in (1.0, 3.0, 0.5, 2.0, 0.3, 0.1):  # leaving an unstable state, forces may grow
         creep.after(residual)
@@ -42,7 +47,7 @@ def test_drag_falls_to_none_and_comes_back_where_nothing_is_won() -> None:
 
 
 def test_drag_rises_from_none_as_far_as_it_may() -> None:
-    creep = Creep(drag=0.0)
+    creep = PseudoTransient(drag=0.0)
     creep.rise()
     assert creep.drag == LEAST
     while creep.may_rise:
@@ -50,29 +55,31 @@ def test_drag_rises_from_none_as_far_as_it_may() -> None:
     assert creep.drag == MOST
 
 
-def newton_of(mesh: SolidMesh, held: NDArray[np.bool_], solver: str = "fronts-double") -> Newton:
-    system = System(
+def newton_of(
+    mesh: SolidMesh, held: NDArray[np.bool_], solver: str = "fronts-double"
+) -> NewtonSolver:
+    system = EquilibriumSystem(
         mesh, None, shear_modulus_pa=2.8e5, bulk_ratio=1e3, contact=ContactSettings(), held=held
     )
     pattern = system.pattern
     factor = make_factor(pattern.indptr, pattern.indices, groups=pattern.free // 3, solver=solver)
-    return Newton(system, factor, NewtonSettings(creep_iterations=100))
+    return NewtonSolver(system, factor, NewtonSettings(pseudo_transient_iterations=100))
 
 
 @pytest.fixture(scope="module")
-def column(block: Mesh) -> tuple[SolidMesh, NDArray[np.bool_], State]:
+def column(block: Mesh) -> tuple[SolidMesh, NDArray[np.bool_], SolutionState]:
     """A slender column with clamped ends, shortened far beyond Euler's load, and straight."""
     mesh = block((1, 1, 12))
     held = np.zeros(mesh.nodes.shape, bool)
     held[(mesh.nodes[:, 2] < 1e-9) | (mesh.nodes[:, 2] > 12e-3 - 1e-9)] = True
-    state = State.at_rest(mesh)
+    state = SolutionState.at_rest(mesh)
     state.position[:, 2] *= 0.85
     return mesh, held, state
 
 
 @pytest.mark.parametrize("solver", ["fronts", "fronts-double", "superlu"])
 def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
-    column: tuple[SolidMesh, NDArray[np.bool_], State], solver: str
+    column: tuple[SolidMesh, NDArray[np.bool_], SolutionState], solver: str
 ) -> None:
     """Newton finds the unstable straight column; nothing real would stay there."""
     mesh, held, start = column
@@ -87,7 +94,7 @@ def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
 
     bent = start.copy()
     bent.position[middle, 0] += 1e-6  # the least disturbance: creeping follows it, not the column
-    report, balance = newton.solve(bent, None, volume=None, creep=True)
+    report, balance = newton.solve(bent, None, volume=None, pseudo_transient=True)
     assert report.converged, report.residuals
     assert bent.position[middle, 0].mean() - 0.5e-3 > 0.5e-3
     newton.system.balance(bent, None)
@@ -102,11 +109,13 @@ def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
 def test_creeping_arrives_where_plain_steps_do(finger: Fingertip) -> None:
     low = finger.nodes[:, 2].min()
     answers = []
-    for creep in (False, True):
+    for continued in (False, True):
         state = finger.state.copy()
-        press = Press(BALL, np.array([0.0, 0.0, low + 0.4e-3, 1.0, 0.0, 0.0, 0.0]), 0.0)
+        press = PosedIndenter(BALL, np.array([0.0, 0.0, low + 0.4e-3, 1.0, 0.0, 0.0, 0.0]), 0.0)
         finger.newton.forget()
-        report, balance = finger.equilibrium(state, press, finger.cavity, None, creep=creep)
+        report, balance = finger.newton.solve(
+            state, press, volume=finger.cavity_m3, pseudo_transient=continued
+        )
         assert report.converged
         answers.append((state.position, balance.indenter.sum(axis=0)))
     np.testing.assert_allclose(answers[0][0], answers[1][0], atol=1e-8)
@@ -118,15 +127,15 @@ def test_a_point_that_lets_go_does_so_at_once(finger: Fingertip) -> None:
     low = finger.nodes[:, 2].min()
     state = finger.state.copy()
     deep = np.array([0.0, 0.0, low + 0.4e-3, 1.0, 0.0, 0.0, 0.0])
-    press = Press(BALL, deep, 0.3)
-    assert finger.equilibrium(state, press, finger.cavity, None)[0].converged
+    press = PosedIndenter(BALL, deep, 0.3)
+    assert finger.newton.solve(state, press, volume=finger.cavity_m3)[0].converged
     touching = state.indenter_pressure > 0.0
     assert touching.sum() > 4
-    short = Newton(
+    short = NewtonSolver(
         finger.system, finger.newton.factor, NewtonSettings(iterations=1, largest_move_m=1e-6)
     )
     away = press.at(deep - np.array([0.0, 0.0, 0.3e-3, 0.0, 0.0, 0.0, 0.0]))
-    short.solve(state, away, volume=finger.cavity)
+    short.solve(state, away, volume=finger.cavity_m3)
     gone = touching & (state.indenter_pressure <= 0.0)
     assert gone.any()
     assert not state.traction[gone].any()
@@ -139,16 +148,16 @@ def test_a_snap_ends_the_trajectory_before_it(fill: Fill) -> None:
     finger.newton.settings = NewtonSettings(iterations=1)
     low = finger.nodes[:, 2].min()
     path = np.array([[0.0, 0.0, low + depth, 1.0, 0.0, 0.0, 0.0] for depth in (-2e-6, 0.2e-3)])
-    run = Indentation(finger, BALL, path, None, None)
+    run = finger.load_stepping(BALL, path)
     report, balance = run.increment(path[1], 1.0)
     assert report.converged
     force = float(np.linalg.norm(balance.indenter.sum(axis=0)))
-    assert run.force == pytest.approx(force)
+    assert run.at.force == pytest.approx(force)
 
-    run = Indentation(finger, BALL, path, None, None)
-    run.force, before = 2.0 * force, run.state.copy()
+    run = finger.load_stepping(BALL, path)
+    run.at.force, before = 2.0 * force, run.at.state.copy()
     report, _ = run.increment(path[1], 1.0)
     assert not report.converged
-    assert run.outcome is Outcome.DIVERGED
+    assert run.outcome is IndentationOutcome.DIVERGED
     assert run.reason == f"the skin snaps: {2 * force:.1f} N fall to {force:.1f} N"
-    np.testing.assert_array_equal(run.state.position, before.position)
+    np.testing.assert_array_equal(run.at.state.position, before.position)

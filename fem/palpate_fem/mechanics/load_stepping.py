@@ -1,0 +1,342 @@
+"""Load stepping: the increments of one indentation, their cut-backs, and where it ends.
+
+A step is the way from one pose of a path to the next. It is solved in one increment of the load, or
+in several shorter ones where Newton's method needs them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fem.indenter.shape import Indenter
+from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.material import VOLUME_BARRIER
+from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.state import ForceBalance, SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
+
+Floats = NDArray[np.float64]
+
+CONTACT_SHARE = 1e-3
+"""A surface point counts as touching if its pressure exceeds this share of the largest."""
+
+VOIGT = [0, 4, 8, 5, 2, 1]
+"""Places of xx yy zz yz xz xy in a flattened tensor."""
+
+OVERSHOOT = 0.1
+"""By how much the force may exceed the force limit at the end of the last increment."""
+
+SNAP = 0.1
+"""Share of the force that may be lost where only pseudo-transient continuation converges.
+
+A larger loss means that the solution has left its branch: nodes that carried the pinch have slipped
+out of it, which a continuous skin would not do. The indentation ends before the snap."""
+
+EASY_ITERATIONS = 8
+"""After an increment that took no more Newton iterations than this, the next is twice as long."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolverSettings:
+    """How a fingertip is solved.
+
+    Attributes:
+        newton: Tolerances of one increment.
+        contact: Constants of the contact laws for a shear modulus of `solver.REFERENCE_MODULUS_PA`;
+            each fingertip scales them with its own modulus, so that forces scale exactly with it.
+        force_limit_n: An indentation ends where the force on the indenter exceeds this [N]; the
+            paper saw 23-32 N at most.
+        smallest_increment: Fraction of a step below which the indentation is given up.
+        volume_barrier: See `NeoHooke.barrier`.
+        predict: Whether increments start from an extrapolation of the last two.
+        solver: See `make_factor`.
+    """
+
+    newton: NewtonSettings = field(default_factory=NewtonSettings)
+    contact: ContactSettings = field(default_factory=ContactSettings)
+    force_limit_n: float = 32.0
+    smallest_increment: float = 1 / 64
+    volume_barrier: float = VOLUME_BARRIER
+    predict: bool = True
+    solver: str = "auto"
+
+
+def interpolate_pose(a: Floats, b: Floats, fraction: float) -> Floats:
+    """Pose (7,) at a fraction of the way from a to b: straight line, and the shortest turn."""
+    position = a[:3] + fraction * (b[:3] - a[:3])
+    first, second = a[3:], b[3:]
+    cosine = float(first @ second)
+    if cosine < 0.0:
+        second, cosine = -second, -cosine
+    if cosine > 1.0 - 1e-12:
+        turn = first + fraction * (second - first)
+    else:
+        angle = np.arccos(min(cosine, 1.0))
+        turn = np.sin((1 - fraction) * angle) * first + np.sin(fraction * angle) * second
+    return np.concatenate([position, turn / np.linalg.norm(turn)])
+
+
+def path_lengths(path: Floats) -> Floats:
+    """Length of the tip's way up to each pose [m], (K,)."""
+    moves = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(moves)])
+
+
+@dataclass(slots=True)
+class _Progress:
+    """Where the load stepping stands; an increment that is given up restores the last one.
+
+    Attributes:
+        state: Converged solution.
+        indenter: At the pose of that solution.
+        force: On the indenter [N].
+        previous: Solution one increment before, for the predictor; None = no prediction.
+        previous_length: Length of the increment between the two, in steps.
+    """
+
+    state: SolutionState
+    indenter: PosedIndenter
+    force: float = 0.0
+    previous: SolutionState | None = None
+    previous_length: float = 0.0
+
+
+@dataclass(slots=True)
+class _StepCost:
+    """What the increments of one step have cost."""
+
+    started: float = field(default_factory=time.perf_counter)
+    increments: int = 0
+    iterations: int = 0
+    factorisations: int = 0
+
+    def add(self, report: NewtonReport) -> None:
+        """Count an increment."""
+        self.increments += 1
+        self.iterations += report.iterations
+        self.factorisations += report.factorisations
+
+
+class LoadStepping:
+    """One indentation while it is computed."""
+
+    def __init__(
+        self,
+        newton: NewtonSolver,
+        settings: SolverSettings,
+        rest: SolutionState,
+        cavity_m3: float,
+        indenter: Indenter,
+        path: Floats,
+        *,
+        friction: float,
+        on_step: Callable[[IndentationStep], None] | None = None,
+        should_stop: Callable[[], IndentationOutcome | None] | None = None,
+    ) -> None:
+        """Prepare an indentation; see `Fingertip.indent`.
+
+        Args:
+            newton: Solver of the fingertip's equations.
+            settings: Force limit, smallest increment, prediction.
+            rest: Pressurised, untouched state; stays as it is.
+            cavity_m3: Volume inside the skin, which the sealed fluid keeps [m^3].
+            indenter: What presses.
+            path: Poses (K, 7); the first does not touch the skin.
+            friction: Coulomb coefficient between indenter and skin.
+            on_step: Called with each converged step.
+            should_stop: Called at least once in each iteration; an outcome ends the indentation.
+        """
+        self.newton, self.settings, self.rest = newton, settings, rest
+        self.cavity_m3, self.path = cavity_m3, np.asarray(path, np.float64)
+        self.on_step, self.should_stop = on_step, should_stop
+        self.at = _Progress(rest.copy(), PosedIndenter(indenter, self.path[0], friction))
+        self.outcome: IndentationOutcome | None = None
+        self.reason = ""
+        newton.system.settle(self.at.state, self.at.indenter)
+        newton.forget()
+
+    def run(self) -> IndentationResult:
+        """Follow the whole path."""
+        started = time.perf_counter()
+        lengths = path_lengths(self.path)
+        steps: list[IndentationStep] = []
+        travel = 0.0
+        size = 1.0  # of the next increment, as a share of its step
+        for k in range(1, len(self.path)):
+            cost, done = _StepCost(), 0.0
+            while done < 1.0 - 1e-9 and self.outcome is None:
+                if self._stop():
+                    break
+                size = min(size, 1.0 - done)
+                goal = done + size
+                if 1.0 - goal < 1e-6:
+                    goal = 1.0
+                pose = interpolate_pose(self.path[k - 1], self.path[k], goal)
+                before = replace(self.at)
+                report, balance = self.increment(pose, size)
+                cost.add(report)
+                if report.converged and self._overshoots(balance, size):
+                    self.at = before
+                    size *= 0.5
+                    continue
+                if report.converged:
+                    done = goal
+                    travel = lengths[k - 1] + done * (lengths[k] - lengths[k - 1])
+                    if report.iterations <= EASY_ITERATIONS:
+                        size = min(1.0, 2.0 * size)
+                    self._check_force(balance, travel)
+                    continue
+                size *= 0.5
+                if self.outcome is None and size < self.settings.smallest_increment:
+                    self.outcome = IndentationOutcome.DIVERGED
+                    self.reason = f"{report.reason}, {travel * 1e3:.3f} mm along the path"
+            if done < 1.0 - 1e-9:
+                break
+            steps.append(self._step(self.path[k], balance, cost))
+            if self.on_step is not None:
+                self.on_step(steps[-1])
+            if self.outcome is not None:
+                break
+        return IndentationResult(
+            indenter=self.at.indenter.shape.name,
+            path=self.path,
+            steps=tuple(steps),
+            outcome=self.outcome or IndentationOutcome.COMPLETE,
+            reason=self.reason,
+            travel_m=float(travel),
+            seconds=time.perf_counter() - started,
+        )
+
+    def increment(self, pose: Floats, length: float) -> tuple[NewtonReport, ForceBalance]:
+        """Solve for one pose; the solution moves on only if it converged.
+
+        Args:
+            pose: Pose of the indenter (7,).
+            length: Length of the increment, in steps.
+        """
+        start, last_force = self.at.state, self.at.force
+        indenter = self.at.indenter.at(pose)
+        trial = self._predicted(length)
+        report, balance = self._solve(trial, indenter)
+        if not report.converged and self.outcome is None:
+            # The extrapolation may be wrong (e.g. at first touch), or the pinched skin has an
+            # unstable direction: continue without the one and with a remedy for the other.
+            trial = start.copy()
+            second, balance = self._solve(trial, indenter, pseudo_transient=True)
+            second.iterations += report.iterations
+            second.factorisations += report.factorisations
+            report = second
+            if report.converged and _force(balance) < (1.0 - SNAP) * last_force:
+                self.outcome = IndentationOutcome.DIVERGED
+                self.reason = f"the skin snaps: {last_force:.1f} N fall to {_force(balance):.1f} N"
+                report.converged = False
+        if report.converged:
+            self.at = _Progress(trial, indenter, _force(balance), start, length)
+            self.newton.system.settle(trial, indenter)
+        else:
+            self.at.previous = None
+        return report, balance
+
+    def _solve(
+        self, trial: SolutionState, indenter: PosedIndenter, *, pseudo_transient: bool = False
+    ) -> tuple[NewtonReport, ForceBalance]:
+        return self.newton.solve(
+            trial,
+            indenter,
+            volume=self.cavity_m3,
+            should_stop=self._stop,
+            pseudo_transient=pseudo_transient,
+        )
+
+    def _predicted(self, length: float) -> SolutionState:
+        """Linear extrapolation of the last two solutions; a copy of the last if there is one."""
+        at, before = self.at.state, self.at.previous
+        trial = at.copy()
+        if self.settings.predict and before is not None:
+            ratio = length / self.at.previous_length
+            trial.position += ratio * (at.position - before.position)
+            trial.pressure += ratio * (at.pressure - before.pressure)
+            trial.fluid_pressure += ratio * (at.fluid_pressure - before.fluid_pressure)
+            trial.traction += ratio * (at.traction - before.traction)
+            for now, earlier in (
+                (trial.core_pressure, before.core_pressure),
+                (trial.indenter_pressure, before.indenter_pressure),
+            ):
+                now += ratio * (now - earlier)
+                np.maximum(now, 0.0, out=now)  # contact does not pull
+        return trial
+
+    def _overshoots(self, balance: ForceBalance, size: float) -> bool:
+        """Whether an increment ends so far beyond the force limit that it must be shortened."""
+        settings = self.settings
+        return (
+            _force(balance) > (1.0 + OVERSHOOT) * settings.force_limit_n
+            and 0.5 * size >= settings.smallest_increment
+        )
+
+    def _check_force(self, balance: ForceBalance, travel: float) -> None:
+        """End the indentation where the force limit is exceeded."""
+        force = _force(balance)
+        if force > self.settings.force_limit_n:
+            self.outcome = IndentationOutcome.FORCE_LIMIT
+            self.reason = f"{force:.1f} N, {travel * 1e3:.3f} mm along the path"
+
+    def _stop(self) -> bool:
+        """Ask the caller whether to go on."""
+        if self.should_stop is not None and self.outcome is None:
+            self.outcome = self.should_stop()
+            if self.outcome is not None:
+                self.reason = str(self.outcome)
+        return self.outcome is not None
+
+    def _step(self, pose: Floats, balance: ForceBalance, cost: _StepCost) -> IndentationStep:
+        """Quantities of the converged solution."""
+        system, state = self.newton.system, self.at.state
+        surface, on_skin = system.outer, -balance.indenter
+        weight = state.indenter_pressure * surface.area_values
+        points = surface.points_at(state.position)
+        touching = state.indenter_pressure > CONTACT_SHARE * max(
+            float(state.indenter_pressure.max()), 1.0
+        )
+        centre = np.full(3, np.nan)
+        if touching.any():
+            centre = (weight[..., None] * points).sum(axis=(0, 1)) / weight.sum()
+        stress = system.skin.stress(state.position, state.pressure)
+        return IndentationStep(
+            pose=np.array(pose),
+            displacement=state.position - self.rest.position,
+            fluid_pressure_pa=state.fluid_pressure,
+            force=on_skin.sum(axis=0),
+            torque=np.cross(state.position, on_skin).sum(axis=0),
+            indenter_force=on_skin,
+            core_force=-balance.core,
+            contact_area_m2=float(surface.current_area(state.position)[touching].sum()),
+            centre_of_pressure=centre,
+            stress=stress.reshape(-1, 9)[:, VOIGT],
+            convergence=_convergence(system, balance, self.cavity_m3, cost),
+        )
+
+
+def _force(balance: ForceBalance) -> float:
+    """Size of the net force on the indenter [N]."""
+    return float(np.linalg.norm(balance.indenter.sum(axis=0)))
+
+
+def _convergence(
+    system: EquilibriumSystem, balance: ForceBalance, cavity_m3: float, cost: _StepCost
+) -> Convergence:
+    return Convergence(
+        increments=cost.increments,
+        iterations=cost.iterations,
+        factorisations=cost.factorisations,
+        residual=balance.residual,
+        volume_error=abs(balance.volume - cavity_m3) / cavity_m3,
+        penetration_m=max(0.0, -float(system.outer.gap.min()), -float(system.inner.gap.min())),
+        seconds=time.perf_counter() - cost.started,
+    )

@@ -1,0 +1,277 @@
+"""Indenters of the verification: plane, ball, punch and roll, and where they are.
+
+A solid on the test stand: equations, state and tight solution, with energies and reactions.
+
+Fingertips to press: a ball of skin around a ball, and the parametric BioTac, coarse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from palpate.errors import SimulationError
+from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
+from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.material import NeoHooke
+from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mechanics.state import ForceBalance, SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
+from palpate_fem.mesh.core import DistanceGrid
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
+from palpate_fem.sparse.factor import make_factor
+from palpate_fem.verify.meshes import hollow_sphere
+
+Floats = NDArray[np.float64]
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def plane(half_m: float = 0.1) -> Indenter:
+    """A box so large that its top is a plane."""
+    edge = 1e-4
+    inner = half_m - edge
+    box = Primitive(PrimitiveKind.BOX, (0.0, 0.0, -half_m), (inner, inner, inner, 0.0), edge)
+    return Indenter("plane", (box,))
+
+
+def ball(radius_m: float) -> Indenter:
+    """A sphere."""
+    at = (0.0, 0.0, -radius_m)
+    return Indenter(
+        "ball", (Primitive(PrimitiveKind.REVOLVED, at, (0.0, 0.0, 0.0, 0.0), radius_m),)
+    )
+
+
+def roll(radius_m: float, half_length_m: float) -> Indenter:
+    """A cylinder along y."""
+    at, sizes = (0.0, 0.0, -radius_m), (0.0, 0.0, -half_length_m, half_length_m)
+    return Indenter("roll", (Primitive(PrimitiveKind.REVOLVED, at, sizes, radius_m, axis=1),))
+
+
+def punch(radius_m: float, edge_m: float) -> Indenter:
+    """A flat-ended cylinder along z with a rounded rim."""
+    sizes = (0.0, radius_m - edge_m, -4 * radius_m, -edge_m)
+    return Indenter("punch", (Primitive(PrimitiveKind.REVOLVED, (0.0, 0.0, 0.0), sizes, edge_m),))
+
+
+def pose(position: ArrayLike, quaternion: ArrayLike = UPRIGHT) -> Floats:
+    """Position [m] and unit quaternion w x y z as one row, (7,)."""
+    return np.concatenate([np.asarray(position, np.float64), np.asarray(quaternion, np.float64)])
+
+
+def about_y(angle: float) -> Floats:
+    """Quaternion of a turn about y by an angle [rad]."""
+    return np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])
+
+
+MU = 2.8e5  # [Pa], the paper's optimum
+BULK_RATIO = 1e4
+
+# Far tighter than production, so that what is seen is the discretisation.
+TIGHT = NewtonSettings(
+    tolerance=1e-11,
+    volume_tolerance=1e-11,
+    gap_tolerance_m=1e-14,
+    traction_tolerance=1e-7,
+    iterations=40,
+    largest_move_m=1.0,
+    keep_factor=0.0,
+    keep_elastic=0.0,
+)
+
+
+class VerificationBody:
+    """One solid; ``state`` goes on from solution to solution."""
+
+    def __init__(
+        self,
+        mesh: SolidMesh,
+        *,
+        held: NDArray[np.bool_] | None = None,
+        core: DistanceGrid | None = None,
+        mu: float = MU,
+        bulk_ratio: float = BULK_RATIO,
+        contact: ContactSettings | None = None,
+        settings: NewtonSettings = TIGHT,
+    ) -> None:
+        """Put it up.
+
+        Args:
+            mesh: The solid.
+            held: Prescribed components (V, 3); None = the mesh's fixed nodes.
+            core: Inside, or None.
+            mu: Shear modulus [Pa].
+            bulk_ratio: Bulk over shear modulus.
+            contact: Constants of the contact laws.
+            settings: When an increment is solved.
+        """
+        self.mesh, self.mu, self.bulk = mesh, mu, bulk_ratio * mu
+        self.contact = contact or ContactSettings()
+        self.system = EquilibriumSystem(
+            mesh, core, shear_modulus_pa=mu, bulk_ratio=bulk_ratio, contact=self.contact, held=held
+        )
+        self.settings = settings
+        self.held = np.ones(mesh.nodes.shape, bool)
+        self.held.reshape(-1)[self.system.pattern.free] = False
+        self.state = SolutionState.at_rest(mesh)
+        self.report = NewtonReport()
+
+    @cached_property
+    def newton(self) -> NewtonSolver:
+        """Made when first needed: half of the bodies are only looked at."""
+        pattern = self.system.pattern
+        return NewtonSolver(
+            self.system,
+            make_factor(
+                pattern.indptr, pattern.indices, groups=pattern.free // 3, solver="fronts-double"
+            ),
+            self.settings,
+        )
+
+    def solve(
+        self, press: PosedIndenter | None = None, *, volume: float | None = None
+    ) -> ForceBalance:
+        """Equilibrium from where it is; then anchors follow what slid.
+
+        Raises:
+            SimulationError: There is none, or it was not found.
+        """
+        self.report, balance = self.newton.solve(self.state, press, volume=volume)
+        if not self.report.converged:
+            raise SimulationError(
+                f"{self.report.reason}; last error {self.report.residuals[-1]:.1e}",
+                remedy="use smaller increments",
+            )
+        if press is not None:
+            self.settle(press)
+        return balance
+
+    def settle(self, press: PosedIndenter) -> None:
+        """See `EquilibriumSystem.settle`."""
+        self.system.settle(self.state, press)
+
+    def contact_points(self) -> Floats:
+        """See `Surface.points_at`."""
+        return self.system.outer.points_at(self.state.position)
+
+    def reactions(self, balance: ForceBalance) -> Floats:
+        """Forces of the supports on held components [N], 0 elsewhere, (V, 3)."""
+        fluid = self.state.fluid_pressure * balance.volume_gradient
+        total = balance.internal + balance.indenter + balance.core - fluid
+        return np.where(self.held, total, 0.0)
+
+    def strain_energy(self) -> float:
+        """Stored in the skin, to second order in what is left of the residuals [J]."""
+        return self.energy_at(self.state.position, self.state.pressure)
+
+    def energy_at(self, position: Floats, pressure: Floats) -> float:
+        """Mixed energy: sum w W + sum p (v - v0) - v0 p^2 / (2 kappa) [J]."""
+        skin = self.system.skin
+        f = np.einsum("eai,eqaj->eqij", position[self.mesh.elements], skin.gradient_values)
+        isochoric = (skin.weight_values * NeoHooke(self.mu).function(f)).sum()
+        volume = (skin.weight_values * np.linalg.det(f)).sum(axis=1)
+        swelling = pressure * (volume - skin.rest_volume)
+        return float(isochoric + (swelling - skin.rest_volume * pressure**2 / 2 / self.bulk).sum())
+
+    def contact_energy(self) -> float:
+        """Stored in the springs of contact, indenter and core [J]."""
+        state, contact = self.state, self.contact
+        outer, inner = self.system.outer.area_values, self.system.inner.area_values
+        normal = (outer * state.indenter_pressure**2).sum() + (inner * state.core_pressure**2).sum()
+        stick = (outer * (state.traction**2).sum(axis=2)).sum()
+        return float(normal / 2 / contact.stiffness + stick / 2 / contact.tangential_stiffness)
+
+
+INNER_M, OUTER_M, CORE_M, BALL_M = 3.0e-3, 4.5e-3, 2.95e-3, 2.0e-3
+FILLED = 1.06  # cavity over the unpressurised one
+ASIDE_M = (0.31e-3, 0.17e-3)  # of the indenter: no symmetry
+EDGE_M = 1.4e-3  # of the coarse BioTac
+
+
+@dataclass
+class TouchedFingertip:
+    """A pressurised body, the sealed volume [m^3], and an indenter whose z = 0 just touches."""
+
+    body: VerificationBody
+    volume: float
+    press: PosedIndenter
+    start: Floats
+
+    def at(self, move: Floats) -> ForceBalance:
+        """Equilibrium with the indenter moved by so much from where it touches [m]."""
+        return self.body.solve(self.placed(move), volume=self.volume)
+
+    def placed(self, move: Floats) -> PosedIndenter:
+        """The indenter there."""
+        return self.press.at(pose(self.start + move))
+
+
+def round_core(radius: float, spacing: float) -> DistanceGrid:
+    """A ball around the origin, tabulated with a margin of 1 mm or more."""
+    half = int(np.ceil((radius + 1e-3) / spacing)) + 2
+    line = spacing * np.arange(-half, half + 1)
+    at = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
+    return DistanceGrid.sampled(at[0, 0, 0], spacing, np.linalg.norm(at, axis=-1) - radius)
+
+
+def round_finger(
+    *, friction: float, scale: float = 1.0, mu: float = MU, stiffness: float = 1.0
+) -> TouchedFingertip:
+    """A ball of skin, its upper part held, around a ball; filled, and ready to be pressed.
+
+    Args:
+        friction: Of the indenter.
+        scale: Factor on all lengths.
+        mu: Modulus of the skin [Pa].
+        stiffness: Factor on the constants of contact.
+    """
+    mesh = hollow_sphere(6, INNER_M, OUTER_M, 1)
+    fixed = np.flatnonzero(mesh.nodes[:, 2] > 0.2e-3).astype(np.int32)
+    mesh = replace(mesh, nodes=mesh.nodes * scale, fixed=fixed)
+    grid = round_core(CORE_M, 0.25e-3)
+    core = DistanceGrid(grid.origin * scale, grid.spacing * scale, grid.coefficients * scale)
+    usual = ContactSettings()
+    contact = replace(usual.scaled(stiffness), margin_m=usual.margin_m * scale)
+    body = VerificationBody(mesh, core=core, mu=mu, contact=contact)
+    rest = body.system.balance(body.state, None).volume
+    for share in (0.5, 1.0):
+        body.solve(volume=rest * (1 + share * (FILLED - 1)))
+    return _touched(body, rest * FILLED, ball(BALL_M * scale), np.array(ASIDE_M) * scale, friction)
+
+
+@cache
+def _coarse() -> tuple[FingertipGeometry, Fingertip]:
+    geometry = biotac(edge_m=EDGE_M, layers=1)
+    return geometry, Fingertip.pressurised(
+        geometry, settings=SolverSettings(newton=TIGHT, solver="fronts-double")
+    )
+
+
+def biotac_finger(*, friction: float, aside: tuple[float, float]) -> TouchedFingertip:
+    """The parametric BioTac, coarse, and a ball of 3.5 mm under the pad at x, y [m]."""
+    geometry, tip = _coarse()
+    body = VerificationBody(geometry.mesh, core=geometry.core.grid)
+    body.state = tip.state.copy()
+    return _touched(body, tip.cavity_m3, ball(3.5e-3), np.array(aside), friction)
+
+
+def _touched(
+    body: VerificationBody, volume: float, indenter: Indenter, aside: Floats, friction: float
+) -> TouchedFingertip:
+    """Raise the indenter until it touches the highest of the contact points above it."""
+    press = PosedIndenter(indenter, pose((0.0, 0.0, 0.0)), friction)
+    radius = indenter.primitives[0].rounding
+    x, y, z = np.moveaxis(body.contact_points(), -1, 0)
+    off = (x - aside[0]) ** 2 + (y - aside[1]) ** 2
+    below = (off < radius**2) & (z < 0)
+    height = (z[below] + radius - np.sqrt(radius**2 - off[below])).min()
+    finger = TouchedFingertip(body, volume, press, np.array([*aside, height]))
+    body.settle(finger.placed(np.zeros(3)))
+    return finger

@@ -1,0 +1,368 @@
+"""The sealed fluid: its volume stays, and volume control and pressure control are one law.
+
+What holds without a closed form: balance, energy, symmetry and scaling.
+
+Loading and unloading: work equals what is stored plus what friction takes, step by step.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.state import ForceBalance
+from palpate_fem.verify.bodies import (
+    MU,
+    TouchedFingertip,
+    VerificationBody,
+    ball,
+    biotac_finger,
+    pose,
+    round_finger,
+)
+from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.element import order_of
+from palpate_fem.verify.meshes import hollow_sphere
+
+INNER_M, OUTER_M, BALL_M, DENT_M = 3.0e-3, 4.5e-3, 2.0e-3, 0.4e-3
+
+
+def _skin() -> VerificationBody:
+    """A ball of skin whose upper half is held."""
+    mesh = hollow_sphere(6, INNER_M, OUTER_M, 1)
+    held = np.zeros(mesh.nodes.shape, bool)
+    held[mesh.nodes[:, 2] > 0] = True
+    return VerificationBody(mesh, held=held)
+
+
+def sealed() -> Measurement:
+    """Largest deviation from the sealed volume while a finger is pressed, over it."""
+    worst = 0.0
+    for finger in (round_finger(friction=0.186), biotac_finger(friction=0.186, aside=(-6e-3, 0.0))):
+        for k in range(1, 5):
+            balance = finger.at(np.array([0.05e-3 * k, 0.0, 0.15e-3 * k]))
+            worst = max(worst, abs(balance.volume / finger.volume - 1))
+    return Measurement(worst)
+
+
+@cache
+def _dented() -> tuple[float, float, float]:
+    """Empty skin under an indenter: volume lost, and then, sealed there, p / mu and force."""
+    press = PosedIndenter(ball(BALL_M), pose((0.0, 0.0, -OUTER_M + DENT_M)), 0.0)
+    empty = _skin()
+    rest = empty.system.balance(empty.state, None).volume
+    free = empty.solve(press)
+    shut = _skin()
+    again = shut.solve(press, volume=free.volume)
+    same = np.abs(again.indenter - free.indenter).max() / np.abs(free.indenter).max()
+    return 1 - free.volume / rest, shut.state.fluid_pressure / MU, float(same)
+
+
+def unsealed() -> Measurement:
+    """Sealed at the volume that an empty skin takes by itself, a dented skin has no pressure."""
+    lost, pressure, _ = _dented()
+    return Measurement(pressure, note=f"p / mu; the dent takes {lost:.2%} of the volume")
+
+
+def unsealed_force() -> Measurement:
+    """And the same nodal forces."""
+    return Measurement(_dented()[2])
+
+
+def two_controls() -> Measurement:
+    """Filled to a volume it finds a pressure; at that pressure, from rest, the same volume."""
+    by_volume = _skin()
+    volume = 1.1 * by_volume.system.balance(by_volume.state, None).volume
+    by_volume.solve(volume=volume)
+    by_pressure = _skin()
+    by_pressure.state.fluid_pressure = by_volume.state.fluid_pressure
+    note = f"{by_volume.state.fluid_pressure * 1e-3:.3f} kPa"
+    return Measurement(by_pressure.solve().volume / volume, 1.0, note)
+
+
+Floats = NDArray[np.float64]
+
+FRICTION = 0.186
+ASIDE_M = (-6e-3, 1e-3)  # under the BioTac's pad, off its middle
+RUB_M, DEEP_M = 0.6e-3, 3.6e-3
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _forces(finger: TouchedFingertip, balance: ForceBalance) -> dict[str, Floats]:
+    """Nodal forces on the skin by their source [N], (V, 3)."""
+    return {
+        "indenter": -balance.indenter,
+        "core": -balance.core,
+        "fluid": finger.body.state.fluid_pressure * balance.volume_gradient,
+        "supports": finger.body.reactions(balance),
+    }
+
+
+@cache
+def _pressed_biotac() -> tuple[float, float, float, str]:
+    """A finger rubbed and pinched on its core.
+
+    Returns:
+        Imbalance of force and of moment over the indenter's, deepest penetration [m], and the
+        sizes of the forces in words.
+    """
+    finger = biotac_finger(friction=FRICTION, aside=ASIDE_M)
+    for share in np.linspace(0.0, 1.0, 13)[1:]:
+        balance = finger.at(share * np.array([RUB_M, 0.0, DEEP_M]))
+    forces = _forces(finger, balance)
+    position = finger.body.state.position
+    push = {who: float(np.linalg.norm(force.sum(axis=0))) for who, force in forces.items()}
+    force = sum(forces.values(), np.zeros((1, 3)))
+    turn = np.linalg.norm(np.cross(position, forces["indenter"]).sum(axis=0))
+    note = ", ".join(f"{who} {size:.3g} N" for who, size in push.items())
+    system = finger.body.system
+    return (
+        float(np.linalg.norm(force.sum(axis=0))) / push["indenter"],
+        float(np.linalg.norm(np.cross(position, force).sum(axis=0)) / turn),
+        -float(min(system.outer.gap.min(), system.inner.gap.min())),
+        note,
+    )
+
+
+def force_balance() -> Measurement:
+    """Indenter, core, fluid and supports: their forces on the skin add up to nothing."""
+    return Measurement(_pressed_biotac()[0], note=_pressed_biotac()[3])
+
+
+def moment_balance() -> Measurement:
+    """So do their moments about the origin, because the stress is symmetric."""
+    return Measurement(_pressed_biotac()[1])
+
+
+def penetration() -> Measurement:
+    """How deep the worst point is in indenter or core."""
+    return Measurement(_pressed_biotac()[2] * 1e6)
+
+
+def potential(finger: TouchedFingertip, move: Floats) -> float:
+    """Energy whose stationary point is the equilibrium with the indenter there [J].
+
+    Mixed in all pressures, so that what Newton leaves over counts in the second order only:
+    skin, minus p_f (V - V_0), and of each contact point -w (p g + p^2 / (2 e)).
+    """
+    body = finger.body
+    balance, state = finger.at(move), body.state
+    contact = 0.0
+    for surface, pressure in (
+        (body.system.outer, state.indenter_pressure),
+        (body.system.inner, state.core_pressure),
+    ):
+        gap = np.where(pressure > 0, surface.gap, 0.0)
+        point = pressure * gap + pressure**2 / 2 / body.contact.stiffness
+        contact -= float((surface.area_values * point).sum())
+    fluid = state.fluid_pressure * (balance.volume - finger.volume)
+    return body.strain_energy() - fluid + contact
+
+
+def energy_derivative() -> Measurement:
+    """The force is the energy's derivative by the indenter's way (five points, frictionless)."""
+    finger, depth, step = round_finger(friction=0.0), 0.75e-3, 1e-7
+    for share in (0.25, 0.5, 0.75, 1.0):
+        force = -finger.at(share * depth * UP).indenter.sum(axis=0)[2]
+    near = [potential(finger, (depth + k * step) * UP) for k in (-2, -1, 1, 2)]
+    slope = (near[0] - 8 * near[1] + 8 * near[2] - near[3]) / (12 * step)
+    return Measurement(force / slope - 1, note=f"{force:.4g} N")
+
+
+def mirror_mesh() -> Measurement:
+    """Nodes of the parametric mesh against their mirror images, over the finger's size."""
+    mesh = biotac_finger(friction=0.0, aside=ASIDE_M).body.mesh
+    off = mesh.nodes[mesh.mirror] * [1.0, -1.0, 1.0] - mesh.nodes
+    return Measurement(np.abs(off).max() / np.ptp(mesh.nodes))
+
+
+@cache
+def _pressed_in_the_middle() -> tuple[float, float]:
+    finger = biotac_finger(friction=FRICTION, aside=(ASIDE_M[0], 0.0))
+    start = finger.body.state.position.copy()
+    for k in range(1, 5):
+        balance = finger.at(np.array([0.02e-3 * k, 0.0, 0.3e-3 * k]))
+    moved = finger.body.state.position - start
+    off = moved[finger.body.mesh.mirror] * [1.0, -1.0, 1.0] - moved
+    force = balance.indenter.sum(axis=0)
+    return float(np.abs(off).max() / np.abs(moved).max()), abs(force[1] / force[2])
+
+
+def mirror_displacement() -> Measurement:
+    """Pressed and rubbed in the middle plane it moves as its mirror image does."""
+    return Measurement(_pressed_in_the_middle()[0])
+
+
+def mirror_force() -> Measurement:
+    """The force has no component across the plane."""
+    return Measurement(_pressed_in_the_middle()[1])
+
+
+def _answer(scale: float, mu: float, stiffness: float) -> tuple[Floats, Floats]:
+    """Displacements over scale, and forces and pressures: of indenter, core, fluid."""
+    finger = round_finger(friction=FRICTION, scale=scale, mu=mu, stiffness=stiffness)
+    start = finger.body.state.position.copy()
+    for k in range(1, 6):
+        balance = finger.at(scale * np.array([0.05e-3 * k, 0.0, 0.16e-3 * k]))
+    moved = (finger.body.state.position - start) / scale
+    force, core = -balance.indenter.sum(axis=0), -balance.core.sum(axis=0)
+    pressure = finger.body.state.fluid_pressure * scale**2
+    return moved, np.array([*force, *core, pressure]) / scale**2 / (mu / MU)
+
+
+@cache
+def scaling(scale: float, modulus: float, stiffness: float) -> Measurement:
+    """Largest relative deviation of displacements and of forces from those of the original.
+
+    Forces go with modulus and with the square of lengths; contact's constants, which are pressures
+    per length, go along.
+    """
+    moved, force = _answer(1.0, MU, 1.0)
+    other, other_force = _answer(scale, modulus * MU, stiffness)
+    # Each force over the size of its own kind: indenter, core, fluid.
+    sizes = np.repeat([np.linalg.norm(force[:3]), np.linalg.norm(force[3:6]), force[6]], (3, 3, 1))
+    shape = np.abs(other - moved).max() / np.abs(moved).max()
+    off = (np.abs(other_force - force) / sizes).max()
+    return Measurement(np.max([shape, off]), note=f"shape {shape:.1e}, forces {off:.1e}")
+
+
+def newton_in_contact() -> Measurement:
+    """Residuals of an increment without friction, once the set of touching points is found."""
+    finger = round_finger(friction=0.0)
+    for k in range(1, 6):
+        finger.at(0.1e-3 * k * UP)
+    residuals = finger.body.report.residuals
+    return Measurement(order_of(residuals), 2.0, " ".join(f"{r:.0e}" for r in residuals))
+
+
+COARSE, FINE, FINEST = 4, 16, 32  # steps a leg
+# Press, drag, drag back, lift [m]: corners of the indenter's way.
+CORNERS_M = np.array(
+    [
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.5e-3),
+        (0.4e-3, 0.0, 0.5e-3),
+        (0.0, 0.0, 0.5e-3),
+        (0.0, 0.0, 0.0),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LoadCycle:
+    """Energies [J] of one time around.
+
+    Attributes:
+        work: Of the indenter on the finger: force times way, by the trapezoidal rule.
+        stored: At the end less at the start.
+        lost: In friction: traction times the way of the sliding points' anchors, the same rule.
+        most: Largest stored energy.
+        least_lost: Of any increment, with the traction at its end.
+        apart_m: Largest distance of a node from where it started [m].
+    """
+
+    work: float
+    stored: float
+    lost: float
+    most: float
+    least_lost: float
+    apart_m: float
+
+    @property
+    def miss(self) -> float:
+        """Work that is neither stored nor lost, over the largest stored energy."""
+        return (self.work - self.stored - self.lost) / self.most
+
+
+@cache
+def cycle(friction: float, steps: int) -> LoadCycle:
+    """Once around in ``steps`` increments for each leg."""
+    finger = round_finger(friction=friction)
+    body, start = finger.body, finger.body.state.position.copy()
+    rest = body.strain_energy() + body.contact_energy()
+    work = lost = most = stored = 0.0
+    least = np.inf
+    force, before = np.zeros(3), CORNERS_M[0]
+    for a, b in itertools.pairwise(CORNERS_M):
+        for share in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            move = a + share * (b - a)
+            traction, anchor = body.state.traction.copy(), body.state.anchor.copy()
+            last, force = force, -finger.at(move).indenter.sum(axis=0)
+            work += float((force + last) @ (move - before)) / 2
+            # The indenter does not turn, so its frame's axes are the sensor's.
+            slid = body.system.outer.area_values[..., None] * (body.state.anchor - anchor)
+            lost += float(((traction + body.state.traction) / 2 * slid).sum())
+            least = min(least, float((body.state.traction * slid).sum()))
+            stored = body.strain_energy() + body.contact_energy() - rest
+            before, most = move, max(most, stored)
+    apart = float(np.linalg.norm(body.state.position - start, axis=1).max())
+    return LoadCycle(work, stored, lost, most, least, apart)
+
+
+def closed_cycle() -> Measurement:
+    """Without friction all work comes back."""
+    around = cycle(0.0, COARSE)
+    return Measurement(
+        max(abs(around.work), abs(around.stored)) / around.most, note="over the most"
+    )
+
+
+def same_shape() -> Measurement:
+    """Without friction every node comes back."""
+    return Measurement(cycle(0.0, COARSE).apart_m * 1e9)
+
+
+def work_balance(steps: int) -> Measurement:
+    """Work = stored + lost in friction."""
+    around = cycle(FRICTION, steps)
+    note = f"{around.lost * 1e6:.2f} uJ lost of {around.most * 1e6:.2f} uJ, {steps} steps a leg"
+    return Measurement(around.miss, note=note)
+
+
+def work_order() -> Measurement:
+    """Slope of log miss over log step from coarse to fine steps; kinks at stick and slip cost."""
+    misses = [abs(cycle(FRICTION, steps).miss) for steps in (COARSE, FINE)]
+    order = np.log(misses[0] / misses[1]) / np.log(FINE / COARSE)
+    return Measurement(order, 1.0, ", ".join(f"{miss:.1e}" for miss in misses))
+
+
+def dissipation() -> Measurement:
+    """In no increment does friction give energy: least of all over the most stored."""
+    around = cycle(FRICTION, FINE)
+    return Measurement(around.least_lost / around.most)
+
+
+CHECKS = (
+    VerificationCase("fluid/sealed volume while pressed", sealed, 1e-10),
+    VerificationCase("fluid/no pressure at the free volume", unsealed, 1e-10),
+    VerificationCase("fluid/no force of it either", unsealed_force, 1e-8),
+    VerificationCase("fluid/pressure and volume control agree", two_controls, 1e-10),
+    VerificationCase("balance/forces on a pressed BioTac", force_balance, 1e-8),
+    VerificationCase("balance/moments on a pressed BioTac", moment_balance, 1e-8),
+    VerificationCase("contact/penetration on a pressed BioTac", penetration, 5.0, "um"),
+    VerificationCase("balance/force is the energy's derivative", energy_derivative, 1e-8),
+    VerificationCase("symmetry/mesh", mirror_mesh, 1e-10),
+    VerificationCase("symmetry/displacements", mirror_displacement, 1e-10),
+    VerificationCase("symmetry/force across", mirror_force, 1e-10),
+    VerificationCase("scaling/modulus x 3", partial(scaling, 1.0, 3.0, 3.0), 1e-8),
+    VerificationCase("scaling/lengths x 1.7", partial(scaling, 1.7, 1.0, 1 / 1.7), 1e-8),
+    VerificationCase("newton/order in contact", newton_in_contact, 0.1, at_least=True),
+    VerificationCase("work/closed cycle without friction", closed_cycle, 1e-8),
+    VerificationCase("work/shape after it", same_shape, 1.0, "nm"),
+    VerificationCase(
+        f"work/stored and lost, {FINE} steps a leg", partial(work_balance, FINE), 1e-3
+    ),
+    VerificationCase(
+        f"work/stored and lost, {FINEST} steps a leg",
+        partial(work_balance, FINEST),
+        3e-4,
+        slow=True,
+    ),
+    VerificationCase("work/order in the step", work_order, 1e-12, at_least=True),
+    VerificationCase("work/friction gives nothing back", dissipation, 1e-12, at_least=True),
+)
