@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from palpate.rigid import unit
 from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
-from palpate_fem.indenter.pose import unit
 from palpate_fem.indenter.shape import Indenter, distance, signed_distance
 
 PICTURE = Path(__file__).resolve().parent / "pictures" / "indenters.png"

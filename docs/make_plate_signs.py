@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.rigid import rotation_matrices
 from palpate_deploy.generate.spec import ExperimentSpec
-from palpate_fem.indenter.pose import rotation_matrix
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
@@ -85,7 +85,7 @@ def path_at(nodes: Floats, lean: float, side: float) -> Floats:
             -np.sin(half_y) * np.sin(half_x),
         ]
     )
-    normal = rotation_matrix(quaternion)[:, 2]
+    normal = rotation_matrices(quaternion)[:, 2]
     low = float((nodes @ normal).min())
     centre = np.array([-5e-3, 0.0, 0.0])
     centre += normal * (low - 2e-6 - centre @ normal)

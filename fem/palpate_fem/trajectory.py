@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigError
+from palpate.rigid import facing, unit
 from palpate_fem.indenter.approach import OuterSurface, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.pose import facing, unit
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mesh.surface import node_normals
 

@@ -21,6 +21,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from palpate import rigid
 from palpate.errors import DatasetError
 from palpate.messages import ElectrodeFrame, Stamp
 from palpate.sampling import sample_offsets
@@ -31,9 +32,6 @@ Known = npt.NDArray[np.bool_]
 
 GAP_PERIODS = 3.0
 """A stream that is silent for longer has lost readings [periods]."""
-
-_STRAIGHT = 1.0 - 1e-9
-"""Quaternions with a larger product are so near that a line is the arc."""
 
 
 class Stamped(Protocol):
@@ -130,18 +128,8 @@ def slerp(
         DatasetError: Times and quaternions do not belong together.
     """
     around = _Around(at_ns, times_ns, quaternions, period_s)
-    product = np.sum(around.before * around.after, axis=-1, keepdims=True)
-    after = np.where(product < 0.0, -around.after, around.after)
-    product = np.clip(np.abs(product), 0.0, 1.0)
-    angle = np.arccos(product)
-    near = product > _STRAIGHT
-    sine = np.where(near, 1.0, np.sin(angle))
-    share = around.share[..., None]
-    weight_before = np.where(near, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
-    weight_after = np.where(near, share, np.sin(share * angle) / sine)
-    mixed = weight_before * around.before + weight_after * after
-    mixed /= np.linalg.norm(mixed, axis=-1, keepdims=True)
-    return np.where(around.known[..., None], mixed, np.nan), around.known
+    turned = rigid.slerp(around.before, around.after, around.share)
+    return np.where(around.known[..., None], turned, np.nan), around.known
 
 
 class _Around:

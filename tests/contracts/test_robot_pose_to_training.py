@@ -20,6 +20,7 @@ from palpate.client import Client
 from palpate.config import LinkConfig, parse_config
 from palpate.files.record import read_record
 from palpate.messages import Pose
+from palpate.rigid import Transform
 from palpate_gateway import node
 from palpate_gateway.config import GatewayConfig
 from palpate_gateway.drivers import DRIVERS
@@ -147,9 +148,8 @@ def test_a_registration_of_the_testbed_gives_base_sensor(tmp_path: Path) -> None
     """As docs/devices/robot-pose.md says: the pose that is written there, turned round."""
     registrations = pytest.importorskip("palpate_training.experiment.registration")
     testbed = pytest.importorskip("palpate_training.experiment.registration")
-    transforms = pytest.importorskip("palpate_training.experiment.transform")
     turn = np.array([0.1, 0.9, -0.2, 0.3])
-    truth = transforms.Transform.from_pose([0.41, -0.2, 0.13, *(turn / np.linalg.norm(turn))])
+    truth = Transform.from_pose([0.41, -0.2, 0.13, *(turn / np.linalg.norm(turn))])
     places = [(0.0, 0.0, -0.05), (0.04, 0.0, -0.05), (0.0, 0.05, -0.05), (0.03, 0.06, -0.05)]
     holes = np.array(places)
     found = testbed.register(truth.apply(holes), holes)  # truth: of the sensor in the base
@@ -165,6 +165,6 @@ def test_a_registration_of_the_testbed_gives_base_sensor(tmp_path: Path) -> None
         "flange_indenter": tool,
     }
     placed = Placement(parse_config(PlacementOptions, options, where="test"))
-    in_base = transforms.Transform.from_pose([*flange.position, *flange.orientation])
+    in_base = Transform.from_pose([*flange.position, *flange.orientation])
     tip = read.apply(in_base.apply(np.array([0.0, 0.0, 0.12])))
     np.testing.assert_allclose(placed.tip(flange).position, tip, atol=1e-9)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate_fem.indenter.pose import rotation_matrix
-from palpate_fem.mechanics.load_stepping import interpolate_pose, path_lengths
+from palpate.rigid import interpolate_pose, rotation_matrices
+from palpate_fem.mechanics.load_stepping import path_lengths
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def test_interpolation_begins_ends_reverses_and_knows_both_signs(
         np.testing.assert_allclose(there[:3], back[:3], atol=1e-16)
         assert angle(there, back) < 1e-6
         other = np.concatenate([b[:3], -b[3:]])
-        turned = [rotation_matrix(interpolate_pose(a, end, share)[3:]) for end in (b, other)]
+        turned = [rotation_matrices(interpolate_pose(a, end, share)[3:]) for end in (b, other)]
         np.testing.assert_allclose(turned[0], turned[1], atol=1e-9)
 
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
+from palpate.rigid import facing, rotation_matrices, to_local, unit
 from palpate_fem.indenter.approach import OuterSurface, check_clear, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.pose import facing, rotation_matrix, to_indenter, unit
 from palpate_fem.indenter.shape import signed_distance
 
 Floats = NDArray[np.float64]
@@ -93,7 +93,7 @@ def test_at_first_contact_the_gap_is_nothing_and_before_it_is_not(
     points = skin.samples(9).reshape(-1, 3)
     for further, low, high in ((0.0, -2e-6, 3e-6), (-1e-4, 1e-9, 1.01e-4)):
         pose = np.concatenate([aim + (travel + further) * unit(direction), quaternion])
-        assert low < signed_distance(indenter, to_indenter(pose, points)).min() < high
+        assert low < signed_distance(indenter, to_local(pose, points)).min() < high
 
 
 def test_an_indenter_that_misses_is_told() -> None:
@@ -130,7 +130,7 @@ def test_inside_a_large_finger_is_not_clear_although_no_skin_is_near() -> None:
 def test_facing_turns_z_there_by_the_shortest_way(direction: Direction) -> None:
     quaternion, there = facing(direction), unit(direction)
     assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-15)
-    np.testing.assert_allclose(rotation_matrix(quaternion)[:, 2], there, atol=1e-14)
+    np.testing.assert_allclose(rotation_matrices(quaternion)[:, 2], there, atol=1e-14)
     turn = 2 * math.atan2(float(np.linalg.norm(quaternion[1:])), quaternion[0])
     angle = math.atan2(float(np.linalg.norm(np.cross(UP, there))), there[2])
     assert turn == pytest.approx(angle, abs=1e-7)
@@ -140,7 +140,7 @@ def test_facing_turns_z_there_by_the_shortest_way(direction: Direction) -> None:
 @pytest.mark.parametrize("tilt", [0.0, 1e-3, 1e-7, 1e-9, 1e-13, 1e-200])
 def test_facing_backwards_is_exact_and_exactly_backwards_turns_about_x(tilt: float) -> None:
     direction = np.array([0.6 * tilt, 0.8 * tilt, -1.0])
-    matrix = rotation_matrix(facing(direction))
+    matrix = rotation_matrices(facing(direction))
     np.testing.assert_allclose(matrix[:, 2], unit(direction), atol=1e-15)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
 

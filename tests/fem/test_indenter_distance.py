@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from palpate.rigid import rotation_matrices, to_local
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.kernels import distances
-from palpate_fem.indenter.pose import rotation_matrix, to_indenter
 from palpate_fem.indenter.shape import (
     Indenter,
     Primitive,
@@ -166,9 +166,9 @@ def test_moving_indenter_and_points_together_changes_nothing(
 ) -> None:
     pose = np.array([*position, *(np.array(turn) / np.linalg.norm(turn))])
     points = cloud(40, seed)
-    rotation = rotation_matrix(pose[3:])
+    rotation = rotation_matrices(pose[3:])
     moved = points @ rotation.T + pose[:3]
-    back = to_indenter(pose, moved)
+    back = to_local(pose, moved)
     indenter = make_indenter(name)
     np.testing.assert_allclose(back, points, atol=1e-16 * 100)
     np.testing.assert_allclose(

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
+from palpate.rigid import rotation_matrices
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import check_path
-from palpate_fem.indenter.pose import rotation_matrix
 from palpate_fem.trajectory import (
     ANGLE_RAD,
     CLEARANCE_M,
@@ -76,7 +76,7 @@ def test_an_angled_path_moves_at_30_degrees_and_faces_there(azimuth: int) -> Non
     assert np.linalg.norm(path[-1, :3] - path[0, :3]) == pytest.approx(1.5e-3 + CLEARANCE_M)
     way /= np.linalg.norm(way)
     assert math.acos(-PAD @ way) == pytest.approx(ANGLE_RAD, abs=1e-9)
-    np.testing.assert_allclose(rotation_matrix(path[0, 3:])[:, 2], way, atol=1e-12)
+    np.testing.assert_allclose(rotation_matrices(path[0, 3:])[:, 2], way, atol=1e-12)
     aside = [(1, 0), (0, 1), (-1, 0), (0, -1)][azimuth]  # distal, +y, proximal, -y
     np.testing.assert_allclose(way[:2], math.sin(ANGLE_RAD) * np.array(aside), atol=1e-12)
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from palpate.errors import DeviceTimeout, RecordingError
 from palpate.messages import Pose, RobotPoseFrame
+from palpate.rigid import compose, inverse, normalised
 from palpate_gateway.device import Device
-from palpate_gateway.pose.rigid import compose, inverse, normalised
 from palpate_gateway.readings import PoseReading, Reading
 
 PATIENCE_S = 20.0

@@ -12,12 +12,12 @@ import pytest
 
 from palpate.bus.topics import POSE
 from palpate.errors import ConfigError, DatasetError
+from palpate.rigid import Transform
 from palpate_training.datasets.trials import RawTrial
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.executed_plan import JointLog, ingest_experiment, read_joint_log
 from palpate_training.experiment.kinematics import Arm
 from palpate_training.experiment.plan import Plan, commanded_travel
-from palpate_training.experiment.transform import Transform
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

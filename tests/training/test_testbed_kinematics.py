@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, MissingExtraError
+from palpate.rigid import Transform, rotation_matrices
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.kinematics import ACCURACY_M, Arm
-from palpate_training.experiment.transform import Transform, facing, rotation_matrices
+from palpate_training.experiment.plan import facing
 
 PLANAR = """<robot name="planar">
 <link name="base"/><link name="upper"/><link name="fore"/><link name="hand"/>

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import ConfigError
+from palpate.rigid import rotation_matrices
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.kinematics import ACCURACY_M
 from palpate_training.experiment.plan import (
@@ -24,7 +25,6 @@ from palpate_training.experiment.plan import (
     increments_of,
     make_plan,
 )
-from palpate_training.experiment.transform import rotation_matrices
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -9,14 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import ConfigError
+from palpate.rigid import Transform, quaternions_of, rotation_matrices
 from palpate_training.experiment.clearance import plate_holes
+from palpate_training.experiment.plan import facing
 from palpate_training.experiment.registration import average, frame_of, register
-from palpate_training.experiment.transform import (
-    Transform,
-    facing,
-    quaternions,
-    rotation_matrices,
-)
 
 Floats = npt.NDArray[np.float64]
 
@@ -43,7 +39,7 @@ def test_quaternions_and_matrices_are_the_same_turns(quaternion: Floats) -> None
     matrix = rotation_matrices(quaternion)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix) > 0
-    back = quaternions(matrix)
+    back = quaternions_of(matrix)
     assert back[0] >= 0
     np.testing.assert_allclose(rotation_matrices(back), matrix, atol=1e-12)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import SimulationError
-from palpate_fem.indenter.pose import rotation_matrix, to_indenter, unit
+from palpate.rigid import rotation_matrices, to_local, unit
 from palpate_fem.indenter.shape import Indenter, PrimitiveKind, signed_distance
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ def first_contact(
     Raises:
         SimulationError: It passes the surface.
     """
-    turn = rotation_matrix(quaternion)
+    turn = rotation_matrices(quaternion)
     target = np.asarray(target, np.float64)
     move = turn.T @ unit(direction)  # per metre, indenter frame
     corner = surface.nodes[surface.faces]
@@ -122,7 +122,7 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
         SimulationError: It does; says by how much.
     """
     points = surface.samples(_LEVELS[0]).reshape(-1, 3)
-    gap = float(signed_distance(indenter, to_indenter(pose, points)).min())
+    gap = float(signed_distance(indenter, to_local(pose, points)).min())
     if gap <= 0.0:
         raise SimulationError(
             f"at the first pose indenter {indenter.name!r} is {-gap * 1e3:.3f} mm inside the skin"
@@ -131,7 +131,7 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
             remedy=f"begin the path at least {-gap * 1e3 + 0.05:.2f} mm further out",
         )
     # Clear of all skin: then all of it is on the same side of the skin as any point of it.
-    inner = rotation_matrix(pose[3:]) @ _point_of(indenter) + pose[:3]
+    inner = rotation_matrices(pose[3:]) @ _point_of(indenter) + pose[:3]
     corner = surface.nodes[surface.faces]
     away = inner - corner.mean(axis=1)
     nearest = int(np.einsum("fi,fi->f", away, away).argmin())

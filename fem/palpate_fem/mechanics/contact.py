@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from palpate.rigid import rotation_matrices
 from palpate_fem.device import DEVICE, scalars, vec3s
-from palpate_fem.indenter.pose import rotation_matrix
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels
 from palpate_fem.mechanics.contact_kernels import ContactLaw
@@ -69,7 +69,7 @@ class PosedIndenter:
         self.shape, self.friction = indenter, friction
         self.primitives = scalars(indenter.packed())
         self.tip = np.asarray(pose[:3], np.float64)
-        self.rotation = rotation_matrix(pose[3:])
+        self.rotation = rotation_matrices(pose[3:])
 
     def at(self, pose: Floats) -> PosedIndenter:
         """The same at another pose."""
@@ -79,7 +79,7 @@ class PosedIndenter:
             self.friction,
             self.primitives,
         )
-        other.tip, other.rotation = np.asarray(pose[:3], np.float64), rotation_matrix(pose[3:])
+        other.tip, other.rotation = np.asarray(pose[:3], np.float64), rotation_matrices(pose[3:])
         return other
 
     def to_local(self, points: Floats) -> Floats:

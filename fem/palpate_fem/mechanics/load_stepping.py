@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.rigid import interpolate_pose
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.material import VOLUME_BARRIER
@@ -65,21 +66,6 @@ class SolverSettings:
     volume_barrier: float = VOLUME_BARRIER
     predict: bool = True
     solver: str = "auto"
-
-
-def interpolate_pose(a: Floats, b: Floats, fraction: float) -> Floats:
-    """Pose (7,) at a fraction of the way from a to b: straight line, and the shortest turn."""
-    position = a[:3] + fraction * (b[:3] - a[:3])
-    first, second = a[3:], b[3:]
-    cosine = float(first @ second)
-    if cosine < 0.0:
-        second, cosine = -second, -cosine
-    if cosine > 1.0 - 1e-12:
-        turn = first + fraction * (second - first)
-    else:
-        angle = np.arccos(min(cosine, 1.0))
-        turn = np.sin((1 - fraction) * angle) * first + np.sin(fraction * angle) * second
-    return np.concatenate([position, turn / np.linalg.norm(turn)])
 
 
 def path_lengths(path: Floats) -> Floats:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_fem.indenter.pose import rotation_matrix
+from palpate.rigid import rotation_matrices
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody, ball, pose
@@ -74,7 +74,7 @@ def rigid_motion(*, wedges: bool) -> Measurement:
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=wedges)
     body = VerificationBody(mesh)
     rest = body.system.balance(body.state, None)
-    body.state.position = mesh.nodes @ rotation_matrix(QUATERNION).T + [3e-3, -5e-3, 2e-3]
+    body.state.position = mesh.nodes @ rotation_matrices(QUATERNION).T + [3e-3, -5e-3, 2e-3]
     moved = body.system.balance(body.state, None)
     force = np.abs(moved.internal).max() / (MU * OUTER_M**2)
     energy = abs(body.strain_energy()) / (MU * body.system.skin.rest_volume.sum())
@@ -94,7 +94,7 @@ def objectivity() -> Measurement:
     press = PosedIndenter(ball(3.5e-3), pose(at), 0.2)
     body.settle(press)
     before, energy = body.system.balance(body.state, press), body.strain_energy()
-    turn = rotation_matrix(QUATERNION)
+    turn = rotation_matrices(QUATERNION)
     body.state.position = body.state.position @ turn.T
     body.state.traction = body.state.traction @ turn.T
     after = body.system.balance(body.state, press.at(pose(turn @ at, QUATERNION)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
-from palpate_fem.indenter.pose import rotation_matrix
+from palpate.rigid import rotation_matrices
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.verify.bodies import BULK_RATIO, TIGHT, VerificationBody, about_y, plane, pose
@@ -45,7 +45,7 @@ class SlidingBlock:
         line = np.linspace(-SIDE_M / 2, SIDE_M / 2, edges + 1)
         mesh = slab(*rectangle(line, line), np.linspace(0.0, HEIGHT_M, 3), name="block")
         self.top = mesh.nodes[:, 2] == HEIGHT_M
-        self.turn = rotation_matrix(about_y(angle))
+        self.turn = rotation_matrices(about_y(angle))
         mesh = replace(mesh, nodes=mesh.nodes @ self.turn.T)
         held = np.zeros(mesh.nodes.shape, bool)
         held[self.top] = (clamped or tied, clamped or tied, clamped)

@@ -19,8 +19,8 @@ from palpate.bus.topics import ROBOT_POSE
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import Pose, RobotPoseFrame
+from palpate.rigid import compose, inverse
 from palpate_gateway.emulators.emulator import Emulator, Pace, tell_lead
-from palpate_gateway.pose.rigid import compose, inverse
 
 TipSource = Callable[[float], Pose]
 """Pose of the tip in the sensor frame at a time of the emulator's own [s]."""

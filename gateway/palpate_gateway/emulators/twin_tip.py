@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from palpate.errors import ConfigError
 from palpate.messages import Pose
+from palpate.rigid import Quaternion, Vector, normalised
 from palpate_gateway.emulators.emulator import HostTimed
 from palpate_gateway.emulators.twin import RATE_HZ, Told, loop_options
-from palpate_gateway.pose.rigid import Quaternion, Vector, normalised
 from palpate_gateway.readings import PoseReading
 from palpate_gateway.virtual.options import VirtualOptions
 from palpate_gateway.virtual.tape import Twin, find_tape

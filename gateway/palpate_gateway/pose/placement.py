@@ -19,7 +19,7 @@ from pydantic import AfterValidator, model_validator
 
 from palpate.config import StrictConfig
 from palpate.messages import Pose
-from palpate_gateway.pose.rigid import compose, inverse, is_unit, length_of, normalised
+from palpate.rigid import compose, inverse, is_rotation, normalised, quaternion_length
 from palpate_gateway.readings import PoseReading
 from palpate_gateway.timing.clock_map import Heard
 
@@ -44,10 +44,11 @@ class PoseOptions(StrictConfig):
     def _is_pose(self) -> PoseOptions:
         if not all(map(math.isfinite, self.position_m)):
             raise ValueError(f"position_m {self.position_m} is not finite")
-        if not is_unit(self.orientation_wxyz):
+        if not is_rotation(self.orientation_wxyz):
             raise ValueError(
                 f"orientation_wxyz {self.orientation_wxyz} has length "
-                f"{length_of(self.orientation_wxyz):.4g}, not 1: give a unit quaternion w x y z"
+                f"{quaternion_length(self.orientation_wxyz):.4g}, not 1: "
+                "give a unit quaternion w x y z"
             )
         return self
 

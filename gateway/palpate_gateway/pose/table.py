@@ -14,7 +14,7 @@ from typing import IO
 
 from palpate.errors import RecordingError
 from palpate.messages import Pose
-from palpate_gateway.pose.rigid import is_unit, length_of
+from palpate.rigid import is_rotation, quaternion_length
 from palpate_gateway.pose.rows import Row
 
 _LINE_LIMIT = 1 << 16
@@ -129,10 +129,10 @@ class PoseTable:
         time_s = self._value(cells, self._time, _TIME)
         x, y, z = (self._scale * self._length(cells, *column) for column in self._position)
         w, qx, qy, qz = (self._value(cells, *column) for column in self._quaternion)
-        if not is_unit((w, qx, qy, qz)):
+        if not is_rotation((w, qx, qy, qz)):
             raise self._wrong(
-                f"columns qw qx qy qz: the quaternion has length {length_of((w, qx, qy, qz)):.4g}, "
-                "not 1"
+                "columns qw qx qy qz: the quaternion has length "
+                f"{quaternion_length((w, qx, qy, qz)):.4g}, not 1"
             )
         if self._wall is not None and self.start_wall_ns is None:
             text = cells[self._wall]

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from palpate.errors import ConfigError
+from palpate.rigid import shortest_turn
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading, PoseReading, WrenchReading
-from palpate_gateway.virtual.geometry import pressing
 from palpate_gateway.virtual.options import BLOCK_FRAMES, UNTOUCHED_FRAMES, Group, VirtualOptions
 from palpate_gateway.virtual.physics import (
     INDENTER_RADII_M,
@@ -118,7 +118,7 @@ class Formula:
         torque = np.cross(state.tip, state.force).astype(np.float32)
         force = state.force.astype(np.float32)
         in_contact = (state.depth > 0.0).tolist()
-        orientation = pressing(episode.place.normal)
+        orientation = shortest_turn(-episode.place.normal)
         ticks, times = range(tick, tick + count), times_s.tolist()
         return [
             (

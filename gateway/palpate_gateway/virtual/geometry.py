@@ -77,12 +77,3 @@ def skin_point(arc_m: float, angle_rad: float) -> SkinPoint:
     along = np.cos(bend) * forward - np.sin(bend) * radial
     centre = np.array([TIP_X_M + min(arc_m, 0.0), 0.0, AXIS_Z_M])
     return SkinPoint(centre + normal * OUTER_RADIUS_M, normal, along, np.cross(normal, along))
-
-
-def pressing(normal: Array) -> Array:
-    """Unit quaternion w x y z that turns the indenter's +z into the pressing direction."""
-    target = -normal
-    # Half-way rotation from +z; no normal of the felt region points there, so it is defined.
-    quaternion = np.array([1.0 + target[2], -target[1], target[0], 0.0])
-    unit: Array = quaternion / np.linalg.norm(quaternion)
-    return unit

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate.files.tape import TapeTrajectory
+from palpate.rigid import rotation_matrices
 from palpate_gateway.virtual.geometry import Array
 from palpate_gateway.virtual.trajectory import CLEARANCE_M, ease
 
@@ -102,6 +103,5 @@ def poses(values: Array, step: Array, distance: Array) -> tuple[Array, Array]:
     turns = values[:, 3:] * np.concatenate([[1.0], sign])[:, None]
     quaternion = between(turns, step)
     quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-    w, x, y, z = quaternion.T
-    towards = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    towards = rotation_matrices(quaternion)[:, :, 2]
     return between(values[:, :3], step) - distance[:, None] * towards, quaternion

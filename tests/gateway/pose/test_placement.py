@@ -13,8 +13,8 @@ from hypothesis import given
 from palpate.config import parse_config
 from palpate.errors import ConfigError
 from palpate.messages import Pose
+from palpate.rigid import compose, inverse
 from palpate_gateway.pose.placement import Placement, PlacementOptions
-from palpate_gateway.pose.rigid import compose, inverse
 
 fakes: Any = importlib.import_module("pose_fakes")
 matrix, poses, NEAR = fakes.matrix, fakes.poses, fakes.NEAR

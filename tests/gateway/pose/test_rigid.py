@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 
 from palpate.messages import Pose
-from palpate_gateway.pose.rigid import compose, inverse, is_unit
+from palpate.rigid import compose, inverse, is_rotation
 
 fakes: Any = importlib.import_module("pose_fakes")
 matrix, poses = fakes.matrix, fakes.poses
@@ -42,4 +42,4 @@ def test_inverse_undoes(pose: Pose) -> None:
     ],
 )
 def test_unit_quaternions(quaternion: tuple[float, float, float, float], unit: bool) -> None:
-    assert is_unit(quaternion) is unit
+    assert is_rotation(quaternion) is unit

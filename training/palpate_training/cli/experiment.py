@@ -18,12 +18,12 @@ from rich.table import Table
 
 from palpate.command import typed_command
 from palpate.errors import ConfigError
+from palpate.rigid import Transform
 from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.features_file import palpate_version
 from palpate_training.datasets.trials import TrialsContents, read_contents, write_trials
 from palpate_training.experiment.kinematics import Arm
 from palpate_training.experiment.plan import ARMS
-from palpate_training.experiment.transform import Transform
 
 console = Console()
 

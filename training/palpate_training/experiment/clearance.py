@@ -19,9 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import ConfigError
+from palpate.rigid import Floats, Transform
 from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.plan import facing
 from palpate_training.experiment.registration import register
-from palpate_training.experiment.transform import Floats, Transform, facing
 
 PLATE_CENTRE_M = np.array([-0.005, 0.0, 0.055])
 """Centre of the plate's upper face [m], sensor frame: 55 mm below the finger, which lies with its

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from palpate.alignment import linear
 from palpate.errors import ConfigError, DatasetError
+from palpate.rigid import Floats, Transform
 from palpate_training.datasets.ingest import (
     Streams,
     middles,
@@ -34,7 +35,6 @@ from palpate_training.datasets.trials import RawTrial, TrialHeader
 from palpate_training.experiment.kinematics import Arm
 from palpate_training.experiment.plan import DWELL_S, Motion, commanded_travel
 from palpate_training.experiment.trajectory_file import read_trajectories
-from palpate_training.experiment.transform import Floats, Transform
 
 GAP_S = 0.05
 """How old the last sample of an increment may be at its end [s]: five frames at 100 Hz."""

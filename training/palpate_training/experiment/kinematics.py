@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.extras import require
-from palpate_training.experiment.transform import Floats, Transform, quaternions
+from palpate.rigid import Floats, Transform, quaternions_of
 
 ACCURACY_M = 0.01e-3
 """Paper, "Experimental testing procedure": a trajectory is kept at 0.01 mm or better."""
@@ -132,7 +132,7 @@ class Arm:
         for i, row in enumerate(rows):
             tip = self._tip(row)
             positions[i], rotations[i] = tip.translation, tip.rotation
-        return positions, quaternions(rotations)
+        return positions, quaternions_of(rotations)
 
     def link_frames(self, joints: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Frames that move with each joint, robot frame.

@@ -8,6 +8,7 @@ than 0.01 mm are eliminated. Collisions with the mount are not looked for here.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -15,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import ConfigError
+from palpate.rigid import Floats, Transform
 from palpate_training.experiment.kinematics import ACCURACY_M, ANGLE_ACCURACY_RAD, Arm
-from palpate_training.experiment.transform import Floats, Transform, facing, unit
 
 APPROACH_M = 3.0e-3
 """Travel from the start to first contact as planned [m]; paper."""
@@ -248,3 +249,42 @@ def make_plan(
         start_s += item.duration_s + TRANSIT_S
     used = {motion.trajectory.arm for motion in motions}
     return Plan(tuple(motions), {k: v for k, v in stations.items() if k in used}), eliminated
+
+
+# `unit` and `facing` of `palpate.rigid` differ from these in the last bit. Stored plans and their
+# simulations are reproduced bit for bit, so the formulas of the first plans stay.
+
+
+def unit(vector: npt.ArrayLike, what: str = "direction") -> Floats:
+    """A direction of length 1, shape (3,).
+
+    Raises:
+        ConfigError: Not three finite numbers, or all of them zero.
+    """
+    values = np.asarray(vector, np.float64)
+    if values.shape == (3,) and np.isfinite(values).all():
+        length = float(np.linalg.norm(values))
+        if length > 0.0:
+            return values / length
+    raise ConfigError(
+        f"{what} {vector!r} is not a direction", remedy="give three finite numbers, not all zero"
+    )
+
+
+def facing(direction: npt.ArrayLike) -> Floats:
+    """Quaternion w x y z of an indenter that presses along a direction, shape (4,).
+
+    The indenter presses along its own +z; of all turns that bring +z there it is the shortest, so
+    that on the pad, which is pressed along about +z of the sensor frame, its x stays along the
+    finger. Straight down (-z) it is the half turn about x.
+    """
+    x, y, z = map(float, unit(direction))
+    aside = math.hypot(x, y)
+    if z < 0.0 and aside < 1e-12:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    # cos and sin of half the angle to +z, by the half-angle formula that keeps its digits
+    angle = math.atan2(aside, z)
+    half_sin, half_cos = math.sin(angle / 2), math.cos(angle / 2)
+    if aside == 0.0:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    return np.array([half_cos, -half_sin * y / aside, half_sin * x / aside, 0.0])

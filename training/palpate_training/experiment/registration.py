@@ -28,8 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from palpate.errors import ConfigError
 from palpate.extras import require
+from palpate.rigid import Floats, Transform
 from palpate_training.experiment.plan import ARMS
-from palpate_training.experiment.transform import Floats, Transform
 
 CONGRUENCE_M = 2.0e-3
 """How much the distance of two holes may differ between robot and drawing [m]: twice the worst

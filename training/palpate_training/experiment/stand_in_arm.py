@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate_training.experiment.transform import Floats, Transform
+from palpate.rigid import Floats, Transform
 
 SIDES = ("left", "right")
 FLANGE = "flange"

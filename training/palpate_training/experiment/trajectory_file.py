@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.atomic import written_whole
+from palpate.rigid import Floats, Transform
 from palpate_training.experiment.plan import (
     DWELL_S,
     INCREMENT_M,
@@ -31,7 +32,6 @@ from palpate_training.experiment.plan import (
     Station,
     Trajectory,
 )
-from palpate_training.experiment.transform import Floats, Transform
 
 SCHEMA = "palpate.testbed.trajectories"
 VERSION = 1

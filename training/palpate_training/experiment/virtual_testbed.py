@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import ConfigError
+from palpate.rigid import Floats
 from palpate_training.datasets.trials import Counts, RawTrial, TrialHeader
 from palpate_training.experiment.plan import (
     APPROACH_M,
@@ -25,8 +26,8 @@ from palpate_training.experiment.plan import (
     INCREMENT_M,
     commanded_travel,
     increments_of,
+    unit,
 )
-from palpate_training.experiment.transform import Floats, unit
 
 RATE_HZ = 100
 """Of all streams; paper: at least 100 Hz."""
