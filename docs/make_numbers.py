@@ -1,0 +1,159 @@
+"""Compare the figures of the documents with the files that the commands wrote (``make docs``).
+
+``python docs/make_numbers.py``          writes the figures into the pages
+``python docs/make_numbers.py --check``  exits 1 if a page says something else
+
+A claim is a piece of a page with fields for its figures. The piece is found by its words, whatever
+figures it has now; it must occur exactly once in the page.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+FIELD = re.compile(r"\{(\w+)\}")
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A piece of a page, with ``{name}`` where figures stand, and the figures as printed."""
+
+    page: str
+    text: str
+    figures: dict[str, str] = field(default_factory=dict)
+
+    def pattern(self) -> re.Pattern[str]:
+        """The piece with any figures; line breaks may stand where it has blanks."""
+        parts = FIELD.split(self.text)
+        words = [re.escape(part).replace(r"\ ", r"\s+") for part in parts[::2]]
+        return re.compile(r"(-?\d[\d.,]*\d|\d)".join(words))
+
+    def fresh(self, page: str) -> str:
+        """The page with this claim's figures.
+
+        Raises:
+            SystemExit: The piece is not in the page, or more than once.
+        """
+        found = list(self.pattern().finditer(page))
+        if len(found) != 1:
+            raise SystemExit(f"{self.page}: {self.text!r} is there {len(found)} times, not once")
+        names = FIELD.findall(self.text)
+        for number in range(len(names), 0, -1):
+            start, end = found[0].span(number)
+            page = page[:start] + self.figures[names[number - 1]] + page[end:]
+        return page
+
+
+def _read(name: str) -> Any:
+    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
+
+
+def _fem() -> Iterator[Claim]:
+    """Speed and robustness of the finite elements."""
+    bench, runs = _read("fem/bench.json"), _read("fem/campaign.json")
+    # The long cylinder, tilted towards the tip, meets the rim that the clamp holds: not counted.
+    counted = [
+        run
+        for run in runs
+        if not (run["name"].startswith("cylinder_long") and run["name"].endswith("angled-0"))
+    ]
+    good = [run for run in counted if run["outcome"] in {"complete", "force limit"}]
+    figures = {
+        "seconds": f"{bench['normal.seconds']:.1f}",
+        "unknowns": f"{bench['system.unknowns']:,.0f}",
+        "good": str(len(good)),
+        "all": str(len(counted)),
+        "mib": f"{bench['memory.peak_mib']:.0f}",
+        "rounded": f"{bench['normal.seconds']:.0f}",
+    }
+    yield Claim("README.md", "{good} of {all} reach full depth or 32 N", figures)
+    yield Claim("docs/results/fem.md", "**{good} of {all} (98.9%) reach full depth", figures)
+    yield Claim("README.md", "finite elements: {unknowns} unknowns", figures)
+    yield Claim("README.md", "| {seconds} s (goal 8; the paper's model", figures)
+    yield Claim("README.md", "on six processors), {mib} MiB", figures)
+    yield Claim("README.md", "an indentation of 3 mm in {rounded} s", figures)
+
+
+def _rows(name: str) -> dict[tuple[str, str], dict[str, float]]:
+    """(held out, model) -> metrics of a result file of training."""
+    return {(row["held_out"], row["model"]): row["metrics"] for row in _read(name)["results"]}
+
+
+def _real_force() -> Iterator[Claim]:
+    rows = _rows("force-real.json")
+    for label, model, bold in (
+        ("constant", "constant (training mean)", ""),
+        ("linear fit", "linear fit", ""),
+        ("network (medians; mean of five seeds)", "MLP", "**"),
+        ("network trained on the *other* finger", "MLP", ""),
+    ):
+        held_out = "unseen" if "other" in label else "20 blocks"
+        figures = {}
+        for finger in "12":
+            metrics = rows[f"lasa-finger{finger}, {held_out}", model]
+            figures[f"force{finger}"] = f"{metrics['force_magnitude_median_n']:.3f}"
+            figures[f"angle{finger}"] = f"{metrics['force_angle_median_rad']:.3f}"
+        cells = (f"{bold}{{force{finger}}} N, {{angle{finger}}} rad{bold}" for finger in "12")
+        yield Claim("README.md", f"| {label} | {' | '.join(cells)} |", figures)
+
+
+def _twin() -> Iterator[Claim]:
+    field_rows = _rows("twin/learning/twin-field.json")
+    network = field_rows["all units", "network"]["nodal_subset_m"]
+    zero = field_rows["all units", "zero"]["nodal_subset_m"]
+    location = _rows("twin/learning/twin-location.json")["all units", "network"]
+    force = _rows("twin/learning/twin-force.json")["all units", "network"]
+    electrodes = [
+        metrics["electrode_rmse_counts"]
+        for (_, model), metrics in _rows("twin/learning/twin-synthesis.json").items()
+        if model == "network"
+    ]
+    figures = {
+        "field": f"{network * 1e3:.2f}",
+        "zero": f"{zero * 1e3:.2f}",
+        "location": f"{location['location_distance_median_m'] * 1e3:.1f}",
+        "force": f"{force['force_magnitude_median_n']:.2f}",
+        "low": f"{min(electrodes):.0f}",
+        "high": f"{max(electrodes):.0f}",
+    }
+    yield Claim(
+        "README.md",
+        "displacement of the skin {field} mm a node (0.22; predicting no displacement {zero}),"
+        " contact location {location} mm (2.0), force {force} N (0.64), electrodes from the field"
+        " {low} to {high} counts",
+        figures,
+    )
+
+
+def claims() -> list[Claim]:
+    """Every figure of the documents that a result file holds."""
+    return [*_fem(), *_real_force(), *_twin()]
+
+
+def main() -> None:
+    """Write or check the pages."""
+    pages: dict[str, str] = {}
+    for claim in claims():
+        page = pages.get(claim.page) or (ROOT / claim.page).read_text(encoding="utf-8")
+        pages[claim.page] = claim.fresh(page)
+    stale = [name for name, page in pages.items() if page != (ROOT / name).read_text("utf-8")]
+    if sys.argv[1:] == ["--check"]:
+        if stale:
+            raise SystemExit(
+                f"{', '.join(stale)}: figures differ from docs/results; run: make docs"
+            )
+        return
+    for name in stale:
+        (ROOT / name).write_text(pages[name], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
