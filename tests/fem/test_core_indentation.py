@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 Fill = Callable[..., Fingertip]
 
 BALL = make_indenter("sphere_medium")
+HELD_M = 1e-8  # what the criterion of Newton leaves of 0.6 mm; it differs by the kind of processor
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 FRICTION = FingertipParameters().friction_coefficient
 
@@ -119,7 +120,7 @@ def test_the_skin_is_dragged_held_and_dragged_back(finger: Fingertip, sense: flo
     friction = [(s.force[0] - still.force[0]) * sense for s in (along, held, back)]
     assert friction[0] > 0.05 * along.force[2]
     assert friction[1] == pytest.approx(friction[0], rel=5e-5)
-    np.testing.assert_allclose(held.displacement, along.displacement, atol=1e-9)
+    np.testing.assert_allclose(held.displacement, along.displacement, atol=HELD_M)
     assert friction[2] < -0.02 * back.force[2]
 
 

