@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from palpate.errors import DeviceError
 from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp
-from palpate_gateway.condition.condition import Condition
+from palpate_gateway.clock.stamps import DueMessage, FileClock
+from palpate_gateway.condition.condition import Condition, WarmUp, is_drift
 from palpate_gateway.condition.stillness import StillLimits, evidence_of
-from palpate_gateway.condition.untouched import is_drift
-from palpate_gateway.condition.warm_up import WarmUp
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.tare import TARE_FRAMES, TareCollector
-from palpate_gateway.timing.clock_map import FileClock
 
 Floats = NDArray[np.float64]
 
@@ -92,7 +90,7 @@ def capture(folder: Path) -> list[ElectrodeFrame]:
     with make_device("text_log", {"path": folder / "syntouch_btd_raw" / "data.btd.gz"}) as device:
         pipeline = Pipeline(device.info, tare="query")
         pipeline.begin(device.identity, FileClock(device.identity.serial, None))
-        out: list[Outgoing] = []
+        out: list[DueMessage] = []
         while readings := device.read(1.0):
             out += pipeline.push(readings, 0)
     return [one.message for one in out if isinstance(one.message, ElectrodeFrame)]

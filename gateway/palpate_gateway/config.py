@@ -11,8 +11,7 @@ from palpate.names import Name
 from palpate_gateway.condition.condition import DRIFT_COUNTS
 from palpate_gateway.condition.stillness import MAX_PAC_SD_COUNTS, MAX_SD_COUNTS
 from palpate_gateway.one_core import CoreChoice
-from palpate_gateway.pipeline import TareMode
-from palpate_gateway.tare import TARE_FRAMES
+from palpate_gateway.tare import TARE_FRAMES, TareMode
 
 
 class SensorConfig(StrictConfig):

@@ -1,18 +1,32 @@
-"""What a device yields: readings in the device's own time, before the gateway adds its facts.
+"""What a device yields: readings with the device's own count and time.
 
-A device knows its tick and its time; sequence numbers, host clocks and tares are the gateway's.
-What a driver knows of when things arrived it tells by ``heard``; see ``timing.clock_map``.
+Sequence numbers, the host's clocks and tares are added later, by the gateway.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.messages import CountArray, FloatArray
-from palpate_gateway.timing.clock_map import Heard
+
+
+class ClockObservation(NamedTuple):
+    """One observation of a device's clock: what it showed when something of the device arrived.
+
+    A reading may be older than what arrived with it: a BioTac's frame begins 10 ms before its last
+    slot arrives, so the driver hands over the newest observation beside the reading.
+
+    Attributes:
+        device_s: Time that the device's clock showed [s].
+        arrival_ns: Host monotonic clock when it arrived [ns].
+    """
+
+    device_s: float
+    arrival_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,16 +35,17 @@ class ElectrodeReading:
 
     Attributes:
         tick: The device's own unwrapped frame counter.
-        time_s: The device's time at the first slot [s], from an origin of its own.
-        missed_before: Frames the device is known to have lost directly before this one.
+        time_s: The device's time at the first slot [s]; the origin is the device's own.
+        missed_before: Frames that the device lost directly before this one, as far as is known.
         electrodes: Raw counts E1..E19, uint16, shape ``(19,)`` (SP: 24).
         pdc: Raw static pressure [counts].
         pac: Raw dynamic pressure in order of sampling [counts], uint16, shape ``(22,)`` (SP: 27);
-            a sample that was lost leaves its place, invalid.
+            the place of a lost sample stays, with its validity bit clear.
         tac: Raw dynamic temperature [counts].
         tdc: Raw static temperature [counts].
         validity: Bit set = channel good; the order is that of ``ElectrodeFrame.validity``.
-        heard: What arrived last of the device; None = this reading.
+        observed: The newest observation of the device's clock; None = this reading's own time and
+            arrival.
     """
 
     tick: int
@@ -42,7 +57,7 @@ class ElectrodeReading:
     tac: int
     tdc: int
     validity: int
-    heard: Heard | None = None
+    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +70,9 @@ class WrenchReading:
         force: Force on the BioTac [N], sensor frame, float32, shape ``(3,)``.
         torque: Torque on the BioTac about the sensor frame's origin [N m], shape ``(3,)``.
         serial: Serial number of the force/torque sensor.
-        overload: The device says its range is exceeded.
-        heard: What arrived last of the device; None = this reading.
+        overload: The device reports that its range is exceeded.
+        observed: The newest observation of the device's clock; None = this reading's own time and
+            arrival.
     """
 
     tick: int
@@ -65,12 +81,12 @@ class WrenchReading:
     torque: FloatArray
     serial: str
     overload: bool = False
-    heard: Heard | None = None
+    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class PoseReading:
-    """Where the indenter is.
+    """Position and orientation of the indenter.
 
     Attributes:
         tick: The device's own unwrapped counter.
@@ -78,9 +94,10 @@ class PoseReading:
         indenter: Standard name, e.g. ``"sphere_14mm"``.
         position: Tip of the indenter [m], sensor frame, float64, shape ``(3,)``.
         orientation: Unit quaternion w x y z of the indenter in the sensor frame, shape ``(4,)``.
-        in_contact: Whether it touches the skin; None = the source cannot know.
-        missed_before: Poses known to have been lost directly before this one.
-        heard: What arrived last of the device; None = this reading.
+        in_contact: Whether it touches the skin; None = the source does not measure that.
+        missed_before: Poses lost directly before this one, as far as is known.
+        observed: The newest observation of the device's clock; None = this reading's own time and
+            arrival.
     """
 
     tick: int
@@ -90,12 +107,12 @@ class PoseReading:
     orientation: npt.NDArray[np.float64]
     in_contact: bool | None
     missed_before: int = 0
-    heard: Heard | None = None
+    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class FieldReading:
-    """The displacement of the skin, where the source knows it.
+    """The displacement of the skin, from a source that computes it.
 
     Attributes:
         tick: The device's own unwrapped counter.
@@ -103,14 +120,15 @@ class FieldReading:
         mesh_sha256: Content hash of the mesh, 32 bytes.
         displacement: Nodal displacement from the pressurised state [m], sensor frame, float32,
             shape ``(V, 3)``.
-        heard: What arrived last of the device; None = this reading.
+        observed: The newest observation of the device's clock; None = this reading's own time and
+            arrival.
     """
 
     tick: int
     time_s: float
     mesh_sha256: bytes
     displacement: FloatArray
-    heard: Heard | None = None
+    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)

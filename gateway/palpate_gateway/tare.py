@@ -1,18 +1,21 @@
-"""Taring: averaging untouched frames to a baseline, and keeping every baseline of a run."""
+"""Tares: averaging untouched frames to a baseline, and keeping every baseline of a run."""
 
 from __future__ import annotations
 
 import hashlib
 import threading
 from collections import deque
+from concurrent.futures import Future
+from typing import Literal
 
 import numpy as np
 
 from palpate.errors import DeviceError, ErrorCode, RemoteError
-from palpate.messages import NO_TARE, ElectrodeFrame, Tare
-from palpate_gateway.condition.stillness import MAX_SD_COUNTS, StillLimits, evidence_of
+from palpate.messages import NO_TARE, CountArray, ElectrodeFrame, Tare
+from palpate_gateway.condition.stillness import StillLimits, evidence_of
 
-__all__ = ["MAX_SD_COUNTS", "TARE_FRAMES", "TareCollector", "TareLedger"]
+TareMode = Literal["still", "first", "query"]
+"""When a sensor is tared first: when it is still, when its electrodes are, or only on request."""
 
 TARE_FRAMES = 50
 """Frames averaged by default: half a second at 100 Hz."""
@@ -22,11 +25,11 @@ _STILL = StillLimits()
 
 
 class TareCollector:
-    """Averages consecutive good frames: those with every channel, and PAC as far as it is sampled.
+    """Averages consecutive good frames: every channel is valid, of PAC at least one sample.
 
     Args:
         frames: How many.
-        limits: What a sensor that nothing touches does not exceed.
+        limits: Noise up to which a sensor counts as still.
     """
 
     def __init__(self, frames: int, limits: StillLimits = _STILL) -> None:
@@ -40,12 +43,13 @@ class TareCollector:
 
         Raises:
             DeviceError: A channel stays invalid, or something moves; names it. The next frame
-                begins anew.
+                starts a new average.
         """
-        if _missing(frame):
+        missing = _missing(frame)
+        if missing:
             self._refused += 1
             if self._refused >= self._wanted:
-                raise self._invalid(frame)
+                raise self._invalid(frame, missing)
             return None
         if self._window and self._window[-1].sensor_type is not frame.sensor_type:
             self._window.clear()  # the finger was exchanged
@@ -82,19 +86,18 @@ class TareCollector:
             frames_averaged=len(window),
         )
 
-    def _invalid(self, frame: ElectrodeFrame) -> DeviceError:
-        bad = _missing(frame)
+    def _invalid(self, frame: ElectrodeFrame, channels: list[str]) -> DeviceError:
         refused, self._refused = self._refused, 0
         self._window.clear()
         return DeviceError(
-            f"cannot tare {frame.sensor_serial}: {', '.join(bad[:4])} invalid "
+            f"cannot tare {frame.sensor_serial}: {', '.join(channels[:4])} invalid "
             f"({refused} frames refused)",
             remedy="check the cable and connector of this finger; see the parity_errors counters",
         )
 
 
 def _missing(frame: ElectrodeFrame) -> list[str]:
-    """Channels that a tare needs and that this frame does not have."""
+    """Channels that a tare needs and that are invalid in this frame."""
     layout = frame.sensor_type.layout
     slow = (1 << layout.first_pac_bit) - 1
     bad = ~frame.validity & slow
@@ -103,8 +106,8 @@ def _missing(frame: ElectrodeFrame) -> list[str]:
     return [layout.bit_name(bit) for bit in range(layout.first_pac_bit) if bad >> bit & 1]
 
 
-def _valid_pac(frame: ElectrodeFrame) -> np.ndarray:
-    """Samples of PAC that are good."""
+def _valid_pac(frame: ElectrodeFrame) -> CountArray:
+    """Valid samples of PAC."""
     layout = frame.sensor_type.layout
     if frame.validity == layout.all_valid:
         return frame.pac
@@ -114,7 +117,7 @@ def _valid_pac(frame: ElectrodeFrame) -> np.ndarray:
 
 
 def _tare_id(last: ElectrodeFrame, baseline: bytes) -> int:
-    """An id that is the same for the same replay and another one for every live tare."""
+    """An id that every replay of a recording repeats, and no live tare shares with another."""
     stamp = last.stamp
     facts = f"{last.sensor_serial}/{stamp.sequence}/{stamp.monotonic_ns}/{stamp.wall_ns}/"
     digest = hashlib.blake2b(facts.encode() + baseline, digest_size=8).digest()
@@ -122,7 +125,7 @@ def _tare_id(last: ElectrodeFrame, baseline: bytes) -> int:
 
 
 class TareLedger:
-    """Every tare of one sensor in this run, by id. Safe to use from several threads."""
+    """Every tare of one sensor in this run, by id. May be used from several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -162,3 +165,117 @@ class TareLedger:
                 code=ErrorCode.NOT_FOUND,
             )
         return tare
+
+
+class TareAttempts:
+    """The attempts to tare one sensor: the gateway's own, and those that were requested.
+
+    ``offer`` and ``finish`` belong to one thread; the rest may be called from any.
+
+    Args:
+        frames: Frames in a tare, unless a request says otherwise.
+        limits: Noise up to which a sensor counts as still.
+        at_start: Whether to tare without a request, as soon as the sensor is still.
+    """
+
+    def __init__(self, frames: int, limits: StillLimits, *, at_start: bool) -> None:
+        self.ledger = TareLedger()
+        self.counters: dict[str, int] = {"tares": 0, "tares_refused": 0}
+        self.error: DeviceError | None = None
+        """Why the last attempt failed; None after a success."""
+        self.frames = frames
+        self._limits = limits
+        self._own = TareCollector(frames, limits) if at_start else None
+        self._lock = threading.Lock()
+        self._requested: list[tuple[TareCollector, Future[Tare]]] = []
+        self._over = ""
+
+    @property
+    def attempting(self) -> bool:
+        """Whether an attempt without a request is under way."""
+        return self._own is not None
+
+    def attempt(self) -> None:
+        """Tare as soon as the sensor is still; does nothing if such an attempt is under way."""
+        if self._own is None:
+            self._own = TareCollector(self.frames, self._limits)
+
+    def ask(self, frames: int, *, sensor: str, never: str = "") -> Future[Tare]:
+        """Tare with the next frames (0 = the usual number).
+
+        Args:
+            frames: How many.
+            sensor: Name of the sensor for errors.
+            never: Why it can never be tared; empty = it can.
+
+        Raises:
+            DeviceError: No further frames will come to be averaged.
+        """
+        future: Future[Tare] = Future()
+        collector = TareCollector(frames or self.frames, self._limits)
+        with self._lock:
+            if self._over or never:
+                raise DeviceError(
+                    f"{sensor} cannot be tared: {self._over or never}",
+                    remedy="tare a live sensor, or ask for a known tare by its id",
+                )
+            self._requested.append((collector, future))
+        return future
+
+    def offer(self, frame: ElectrodeFrame) -> list[Tare]:
+        """Take a frame; the tares that it has completed, which are in force now."""
+        if self._own is None and not self._requested:
+            return []
+        tares = []
+        if self._own is not None:
+            tare = self._try(self._own, frame)
+            if isinstance(tare, Tare):
+                tares.append(tare)
+        with self._lock:
+            requested = list(self._requested)
+        for collector, future in requested:
+            result = self._try(collector, frame)
+            if result is None:
+                continue
+            if isinstance(result, Tare):
+                tares.append(result)
+            with self._lock:
+                self._requested = [one for one in self._requested if one[0] is not collector]
+            _answer(future, result)
+        return tares
+
+    def finish(self, why: str) -> None:
+        """No further frame will come."""
+        with self._lock:
+            self._over = why
+            requested, self._requested = self._requested, []
+        error = DeviceError(f"not tared: {why}", remedy="tare while the sensor delivers")
+        for _, future in requested:
+            _answer(future, error)
+
+    def recorded(self, tare: Tare) -> None:
+        """A tare of a record is put in force."""
+        self.ledger.enter(tare)
+        self.counters["tares"] += 1
+
+    def _try(self, collector: TareCollector, frame: ElectrodeFrame) -> Tare | DeviceError | None:
+        try:
+            tare = collector.add(frame)
+        except DeviceError as error:
+            self.error = error
+            self.counters["tares_refused"] += 1
+            return error
+        if tare is not None:
+            self._own = None
+            self.error = None
+            self.recorded(tare)
+        return tare
+
+
+def _answer(future: Future[Tare], result: Tare | DeviceError) -> None:
+    if not future.set_running_or_notify_cancel():
+        return  # the request timed out and was cancelled
+    if isinstance(result, Tare):
+        future.set_result(result)
+    else:
+        future.set_exception(result)

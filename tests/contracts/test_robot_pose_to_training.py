@@ -21,11 +21,11 @@ from palpate.config import LinkConfig, parse_config
 from palpate.files.record import read_record
 from palpate.messages import Pose
 from palpate.rigid import Transform
-from palpate_gateway import node
 from palpate_gateway.config import GatewayConfig
 from palpate_gateway.drivers import DRIVERS
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.readings import PoseReading, Reading
+from palpate_gateway.service import node
 from palpate_gateway.virtual.finger import Virtual
 from palpate_services.config import RecorderConfig
 from palpate_services.recorder.service import run_recorder

@@ -19,9 +19,9 @@ from palpate.messages import (
     Tare,
     WrenchFrame,
 )
+from palpate_gateway.clock.stamps import FileClock
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Pipeline
-from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.service.pipeline import Pipeline
 from palpate_services.inference.estimates import estimate, estimate_field, synthesise
 from palpate_services.inference.model import Runtime, load
 from palpate_services.inference.repository import resolve

@@ -6,8 +6,8 @@ import pytest
 
 from palpate.messages import ServiceState, Status
 from palpate_deploy.station.status import clock_lines, duration_words, wall_words
-from palpate_gateway.timing.clock_map import ClockQuality
-from palpate_gateway.timing.discipline import Discipline
+from palpate_gateway.clock.stamps import ClockQuality
+from palpate_gateway.clock.wall_clock import WallDiscipline
 
 
 def status(gauges: dict[str, float], counters: dict[str, int] | None = None) -> Status:
@@ -62,7 +62,7 @@ def test_one_sensor_has_no_prefix_and_a_service_no_clock() -> None:
 
 def test_nobody_is_told_more_than_is_known() -> None:
     assert "not known" in wall_words(None)
-    assert "nothing keeps it right" in wall_words(Discipline(False, 16.0))
+    assert "nothing keeps it right" in wall_words(WallDiscipline(False, 16.0))
 
 
 @pytest.mark.parametrize(

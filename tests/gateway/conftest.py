@@ -22,11 +22,11 @@ from palpate.errors import PalpateError
 from palpate.files.record import RecordWriter
 from palpate.files.tape import write_tape
 from palpate.messages import ServiceRequest, ServiceState, Status, Tare, TareRequest
-from palpate_gateway import node
+from palpate_gateway.clock.stamps import FileClock
 from palpate_gateway.config import GatewayConfig
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Pipeline
-from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.service import node
+from palpate_gateway.service.pipeline import Pipeline
 
 sys.path.append(str(Path(__file__).parent))  # tests import the fakes by name
 

@@ -21,8 +21,8 @@ from tests.gateway.scenes import was_approached, was_felt, was_measured
 from palpate.errors import PalpateError
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
-from palpate_gateway.pipeline import Pipeline
-from palpate_gateway.worker import SensorWorker
+from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.worker import SensorWorker
 
 PATIENCE_S = 90.0
 SOUND = 15

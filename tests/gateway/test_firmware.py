@@ -12,8 +12,14 @@ from typing import Any
 
 import pytest
 
-from palpate_gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
-from palpate_gateway.protocols.can_slots import SEQUENCES
+from palpate_gateway.protocols.bridge import (
+    BridgeDecoder,
+    BridgeHello,
+    BridgeRecord,
+    BridgeSlots,
+    BridgeStatus,
+)
+from palpate_gateway.protocols.channels import SEQUENCES
 from palpate_gateway.protocols.spi import channel_of_command, encode_word
 
 FIRMWARE = Path(__file__).parents[2] / "deploy" / "firmware" / "bridge"
@@ -161,7 +167,7 @@ def board(library: ctypes.CDLL, request: pytest.FixtureRequest) -> Board:
 
 
 def slots_of(records: list[BridgeRecord]) -> list[bytes]:
-    groups = [one.body for one in records if isinstance(one.body, SlotGroup)]
+    groups = [one.body for one in records if isinstance(one.body, BridgeSlots)]
     return [payload for group in groups for payload in group.payloads]
 
 
@@ -174,7 +180,7 @@ def test_every_packet_is_read_without_loss(board: Board) -> None:
     assert flaws == {"junk_bytes": 1}  # the zero at the start
     assert [one.header.sequence for one in records] == list(range(len(records)))
     assert {one.header.source for one in records} == {7}
-    hellos = [one.body for one in records if isinstance(one.body, Hello)]
+    hellos = [one.body for one in records if isinstance(one.body, BridgeHello)]
     assert len(hellos) == 2
     assert (hellos[0].slot_rate_hz, hellos[0].slots_per_frame) == (4400, 44)
     told = [(finger.serial, finger.firmware) for finger in hellos[0].fingers]
@@ -186,7 +192,7 @@ def test_every_packet_is_read_without_loss(board: Board) -> None:
         assert payload == bytes([command]) + words
     channels = [channel_of_command(payload[0]) for payload in payloads[:88]]
     assert channels == list(SEQUENCES["biotac_e1_first"]) * 2
-    times = [one.time_us for one in records if isinstance(one.body, SlotGroup)]
+    times = [one.time_us for one in records if isinstance(one.body, BridgeSlots)]
     assert all(abs(b - a - 5000) <= 1 for a, b in itertools.pairwise(times))
 
 
@@ -204,7 +210,7 @@ def test_errors_are_sent_as_they_came_and_counted(board: Board) -> None:
     assert ends[:44] == [b"\xa5\x2d"] * 44
     assert ends[44:88] == [b"\x00\x00"] * 44
     assert ends[88:176] == [b"\x7f\xc0"] * 88
-    status = next(one.body for one in records if isinstance(one.body, Status))
+    status = next(one.body for one in records if isinstance(one.body, BridgeStatus))
     assert status.parity_errors == (0,) * last + (88,)
     assert (status.error_words, status.overruns) == (44, 0)
 
@@ -220,7 +226,7 @@ def test_what_the_line_did_not_take_is_a_gap(library: ctypes.CDLL) -> None:
     records, counters = decoded(board)
     assert counters["lost_packets"] == 2
     assert counters["crc_errors"] == counters["cobs_errors"] == 0
-    status = next(one.body for one in records if isinstance(one.body, Status))
+    status = next(one.body for one in records if isinstance(one.body, BridgeStatus))
     assert status.overruns == 88
 
 
@@ -232,18 +238,18 @@ def test_a_stall_drops_slots_and_keeps_the_grid(library: ctypes.CDLL) -> None:
     board.run(4400)
     records, counters = decoded(board)
     assert counters["lost_packets"] == 1
-    groups = [one for one in records if isinstance(one.body, SlotGroup)]
+    groups = [one for one in records if isinstance(one.body, BridgeSlots)]
     for before, after in itertools.pairwise(groups):
         slots = (after.time_us - before.time_us) * 4400 / 1e6
         assert slots == pytest.approx(round(slots), abs=0.01)
         # The frame went on meanwhile: the place in it follows from the time.
-        assert isinstance(before.body, SlotGroup)
-        assert isinstance(after.body, SlotGroup)
+        assert isinstance(before.body, BridgeSlots)
+        assert isinstance(after.body, BridgeSlots)
         first, place = (channel_of_command(one.body.payloads[0][0]) for one in (before, after))  # type: ignore[union-attr]
         order = SEQUENCES["biotac_e1_first"]
         if first in order[::2]:
             assert order[(order.index(first) + round(slots)) % 44] == place
-    status = next(one.body for one in records if isinstance(one.body, Status))
+    status = next(one.body for one in records if isinstance(one.body, BridgeStatus))
     assert 7 + 85 <= status.overruns <= 7 + 90
 
 

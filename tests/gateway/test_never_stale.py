@@ -37,7 +37,7 @@ that takes the time of reading for that of the sample would be wrong by up to ``
 
 GATEWAY = """
 import json, signal, sys, threading
-from palpate_gateway import node
+from palpate_gateway.service import node
 from palpate_gateway.config import GatewayConfig
 from palpate.config import LinkConfig, parse_config
 stop = threading.Event()

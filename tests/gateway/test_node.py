@@ -18,10 +18,10 @@ from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, DeviceLost, ErrorCode, LinkError, RemoteError
 from palpate.messages import Origin, ServiceState
-from palpate_gateway import node
 from palpate_gateway.config import GatewayConfig
 from palpate_gateway.drivers import DRIVERS
 from palpate_gateway.readings import Reading
+from palpate_gateway.service import node
 from palpate_gateway.virtual import finger as virtual
 
 PATIENCE_S = 10.0

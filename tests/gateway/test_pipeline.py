@@ -11,11 +11,11 @@ from palpate.bus.topics import TOPICS
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import DeviceError
 from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate_gateway.clock.stamps import DueMessage, FileClock, LiveClock, PacedClock
 from palpate_gateway.device import DeviceIdentity, DeviceInfo
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Outgoing, Pipeline
 from palpate_gateway.readings import ElectrodeReading, FieldReading, Reading, RecordedMessage
-from palpate_gateway.timing.clock_map import FileClock, LiveClock, PacedClock
+from palpate_gateway.service.pipeline import Pipeline
 
 IDENTITY = DeviceIdentity("BT1", 1 / 4400)
 
@@ -47,11 +47,11 @@ def pipeline(*, live: bool, tare_frames: int = 10) -> Pipeline:
     return made
 
 
-def frames(out: list[Outgoing]) -> list[ElectrodeFrame]:
+def frames(out: list[DueMessage]) -> list[ElectrodeFrame]:
     return [item.message for item in out if isinstance(item.message, ElectrodeFrame)]
 
 
-def tares(out: list[Outgoing]) -> list[Tare]:
+def tares(out: list[DueMessage]) -> list[Tare]:
     return [item.message for item in out if isinstance(item.message, Tare)]
 
 
@@ -160,7 +160,7 @@ def test_replaying_twice_gives_the_same_bytes() -> None:
         with make_device("virtual", options) as device:
             made = Pipeline(device.info)
             made.begin(device.identity, FileClock(device.identity.serial, None))
-            out: list[Outgoing] = []
+            out: list[DueMessage] = []
             while got := device.read(1.0):
                 out += made.push(got, 0)
             runs.append([TOPICS[item.topic].codec.encode(item.message) for item in out])
@@ -207,7 +207,7 @@ def test_real_capture_is_tared_from_its_first_frames(shared_data: Path) -> None:
         made = Pipeline(device.info)
         identity = device.identity
         made.begin(identity, FileClock(identity.serial, identity.start_wall_ns))
-        out: list[Outgoing] = []
+        out: list[DueMessage] = []
         while got := device.read(1.0):
             out += made.push(got, 0)
         out += made.finish()

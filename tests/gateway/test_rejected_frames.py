@@ -16,9 +16,9 @@ from palpate.errors import PalpateError
 from palpate.health import Health
 from palpate.messages import Origin, ServiceState
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate_gateway.pipeline import Pipeline
 from palpate_gateway.readings import Reading, WrenchReading
-from palpate_gateway.worker import SensorWorker
+from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.worker import SensorWorker
 
 
 class Babbler(Device):

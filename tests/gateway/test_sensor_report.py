@@ -8,7 +8,7 @@ import pytest
 
 from palpate.errors import DeviceLost
 from palpate.health import Health
-from palpate_gateway.sensor_report import SensorReport
+from palpate_gateway.service.sensor_report import SensorReport
 
 
 def test_a_sensor_that_stays_away_is_logged_once_for_each_reason(

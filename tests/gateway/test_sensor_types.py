@@ -9,10 +9,10 @@ import numpy as np
 from palpate.codec import ELECTRODE_FRAME, TARE
 from palpate.config import StrictConfig
 from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
+from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate_gateway.pipeline import Outgoing, Pipeline
 from palpate_gateway.readings import ElectrodeReading, Reading
-from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.service.pipeline import Pipeline
 
 FRAMES = 30
 INFO = DeviceInfo("test", SensorType.BIOTAC, "test", 100.0, True, False, Origin.LIVE)
@@ -41,7 +41,7 @@ def identity(kind: SensorType) -> DeviceIdentity:
     return DeviceIdentity(f"BT-{kind.name}", 1 / 4400, sensor_type=kind)
 
 
-def sent(items: list[Outgoing]) -> tuple[list[ElectrodeFrame], list[Tare]]:
+def sent(items: list[DueMessage]) -> tuple[list[ElectrodeFrame], list[Tare]]:
     messages = [item.message for item in items]
     for message in messages:
         if isinstance(message, ElectrodeFrame):

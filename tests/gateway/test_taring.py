@@ -10,12 +10,12 @@ import pytest
 
 from palpate.errors import DeviceError
 from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
-from palpate_gateway.condition.condition import Retare
+from palpate_gateway.clock.stamps import DueMessage, FileClock, LiveClock
+from palpate_gateway.condition.condition import RetareRules
 from palpate_gateway.device import DeviceIdentity, DeviceInfo
-from palpate_gateway.pipeline import Outgoing, Pipeline
 from palpate_gateway.readings import ElectrodeReading
+from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.tare import TareCollector
-from palpate_gateway.timing.clock_map import FileClock, LiveClock
 
 fakes: Any = importlib.import_module("condition_fakes")
 IDENTITY = DeviceIdentity("BT1", 1 / 4400)
@@ -28,9 +28,9 @@ def pipeline(*, live: bool = True, **options: Any) -> Pipeline:
     return made
 
 
-def push(made: Pipeline, frames: Iterable[ElectrodeFrame]) -> list[Outgoing]:
+def push(made: Pipeline, frames: Iterable[ElectrodeFrame]) -> list[DueMessage]:
     """Readings that hold what the frames do."""
-    out: list[Outgoing] = []
+    out: list[DueMessage] = []
     for frame in frames:
         reading = ElectrodeReading(
             tick=frame.stamp.device_tick,
@@ -47,7 +47,7 @@ def push(made: Pipeline, frames: Iterable[ElectrodeFrame]) -> list[Outgoing]:
     return out
 
 
-def tares(out: list[Outgoing]) -> list[Tare]:
+def tares(out: list[DueMessage]) -> list[Tare]:
     return [item.message for item in out if isinstance(item.message, Tare)]
 
 
@@ -105,7 +105,7 @@ def test_a_request_is_refused_while_a_hand_holds_it() -> None:
 
 
 def test_drift_is_tared_away_if_that_is_allowed() -> None:
-    made = pipeline(retare=Retare(after_s=2.0, drift_counts=10.0))
+    made = pipeline(retare=RetareRules(after_s=2.0, drift_counts=10.0))
     finger = fakes.Finger()
     (first,) = tares(push(made, finger.frames(1.0)))
     finger.offset[:] = 15.0
@@ -127,7 +127,7 @@ def test_drift_is_not_tared_away_unless_that_is_allowed() -> None:
 
 
 def test_a_press_that_stays_is_never_tared_away() -> None:
-    made, finger = pipeline(retare=Retare(after_s=1.0)), fakes.Finger()
+    made, finger = pipeline(retare=RetareRules(after_s=1.0)), fakes.Finger()
     push(made, finger.frames(1.0))
     finger.press(120.0)
     assert tares(push(made, finger.frames(15.0))) == []

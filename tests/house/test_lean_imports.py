@@ -40,7 +40,7 @@ def test_protos_load_nothing_heavy() -> None:
     [
         ("palpate.client", ()),
         ("palpate_deploy.cli.app", ()),
-        ("palpate_gateway.node", ()),
+        ("palpate_gateway.service.node", ()),
         ("palpate_services.inference.services", ("onnxruntime",)),
         ("palpate_services.recorder.service", ("rerun", "pyarrow")),
     ],

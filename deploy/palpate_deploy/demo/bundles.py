@@ -19,9 +19,9 @@ from palpate.extras import require
 from palpate.files.bundle import read_bundle
 from palpate.files.record import RecordWriter
 from palpate_deploy.training import EXTRA_MODULES
+from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Outgoing, Pipeline
-from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.service.pipeline import Pipeline
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import PACKAGED, available, resolve
 
@@ -138,7 +138,7 @@ def write_virtual_record(
         clock = FileClock(device.identity.serial, None)
         pipeline.begin(device.identity, clock)
 
-        def write(items: list[Outgoing]) -> None:
+        def write(items: list[DueMessage]) -> None:
             nonlocal written
             for item in items:
                 topic = TOPICS[item.topic]

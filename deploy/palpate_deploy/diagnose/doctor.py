@@ -259,7 +259,7 @@ def _clock() -> Finding:
 
 def _wall(profile: Profile) -> Finding:
     from palpate_deploy.station.status import wall_words
-    from palpate_gateway.timing.discipline import wall_discipline
+    from palpate_gateway.clock.wall_clock import wall_discipline
 
     kept = wall_discipline()
     found = wall_words(kept)

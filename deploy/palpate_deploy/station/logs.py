@@ -32,7 +32,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """``12:34:56.789 warning palpate_gateway.node: message``, local time."""
+    """``12:34:56.789 warning palpate_gateway.service.node: message``, local time."""
 
     default_time_format = "%H:%M:%S"
     default_msec_format = "%s.%03d"

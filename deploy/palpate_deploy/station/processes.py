@@ -70,8 +70,8 @@ def _run_router(profile: Profile, stop: threading.Event) -> None:
 
 
 def _run_gateway(profile: Profile, stop: threading.Event) -> None:
-    from palpate_gateway import node
     from palpate_gateway.one_core import stay_on_one_core
+    from palpate_gateway.service import node
 
     if profile.gateway.pace != "fast":
         stay_on_one_core(profile.gateway.core)

@@ -21,8 +21,8 @@ from palpate.messages import (
     Status,
 )
 from palpate_deploy.station.logs import FAILED
-from palpate_gateway.timing.clock_map import ClockQuality
-from palpate_gateway.timing.discipline import Discipline
+from palpate_gateway.clock.stamps import ClockQuality
+from palpate_gateway.clock.wall_clock import WallDiscipline
 
 _QUALITY = "clock_quality"
 _SMALL_PPM = 0.5
@@ -39,7 +39,7 @@ def clock_lines(status: Status) -> list[str]:
         sensor = head or " ".join(status.sensors) or status.service
         lines.append(f"clock of {sensor}: {_sensor_clock(gauges, head + dot)}")
     if "wall_synchronised" in gauges:
-        kept = Discipline(gauges["wall_synchronised"] > 0.5, gauges.get("wall_error_s", 0.0))
+        kept = WallDiscipline(gauges["wall_synchronised"] > 0.5, gauges.get("wall_error_s", 0.0))
         lines.append(f"wall clock: {wall_words(kept)}")
     if steps := status.counters.get("wall_steps", 0):
         times = "once" if steps == 1 else f"{steps} times"
@@ -47,7 +47,7 @@ def clock_lines(status: Status) -> list[str]:
     return lines
 
 
-def wall_words(kept: Discipline | None) -> str:
+def wall_words(kept: WallDiscipline | None) -> str:
     """How the wall clock is kept, for people."""
     if kept is None:
         return "whether anything keeps it right is not known here"

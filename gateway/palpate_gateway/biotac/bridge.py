@@ -14,15 +14,21 @@ import numpy as np
 from pydantic import Field
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
-from palpate_gateway.biotac.device import FingerDevice, FingerOptions
-from palpate_gateway.biotac.line_slots import LineSlots
-from palpate_gateway.biotac.slot_link import Finger, SlotSource
+from palpate_gateway.biotac.finger import FingerDevice, FingerOptions
+from palpate_gateway.biotac.slot_link import FingerQueue, SlotSource
+from palpate_gateway.biotac.slots import LineSlots
 from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import channels as ch
-from palpate_gateway.protocols.bridge import BridgeDecoder, BridgeRecord, Hello, SlotGroup, Status
-from palpate_gateway.protocols.can_slots import FINGERS_MAX, SEQUENCES, SlotDecoder, payload_rows
+from palpate_gateway.protocols.bridge import (
+    BridgeDecoder,
+    BridgeHello,
+    BridgeRecord,
+    BridgeSlots,
+    BridgeStatus,
+)
+from palpate_gateway.protocols.can_slots import FINGERS_MAX, SlotDecoder, payload_rows
 from palpate_gateway.protocols.slot_clock import SlotClock
-from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.readings import ClockObservation
 
 _FIRST_S = 1.0
 """How long the first packet may take [s]: they come every 5 to 10 ms."""
@@ -67,8 +73,8 @@ class BridgeSource(SlotSource):
         self._clock = self._new_clock()
         self._source: int | None = None
         self._epoch: int | None = None
-        self._hello: Hello | None = None
-        self._status: tuple[Status, Status] | None = None
+        self._hello: BridgeHello | None = None
+        self._status: tuple[BridgeStatus, BridgeStatus] | None = None
         self._foreign = 0
         self._end: DeviceError | None = None
         self._arrival_ns = 0
@@ -78,7 +84,7 @@ class BridgeSource(SlotSource):
     def _new_clock(self) -> SlotClock:
         return SlotClock(
             slot_rate_hz=1.0 / self.slot_period_s,
-            sequence=None if self._sequence == "learn" else SEQUENCES[self._sequence],
+            sequence=None if self._sequence == "learn" else ch.SEQUENCES[self._sequence],
             exact=True,
         )
 
@@ -146,9 +152,9 @@ class BridgeSource(SlotSource):
     def _take(self, record: BridgeRecord) -> LineSlots | None:
         if not self._is_ours(record):
             return None
-        if isinstance(record.body, SlotGroup):
+        if isinstance(record.body, BridgeSlots):
             return self._place(record.body, record.time_us)
-        if isinstance(record.body, Hello):
+        if isinstance(record.body, BridgeHello):
             self._meet(record.body)
         else:
             self._status = (self._status[0] if self._status else record.body, record.body)
@@ -174,7 +180,7 @@ class BridgeSource(SlotSource):
             )
         return True
 
-    def _meet(self, hello: Hello) -> None:
+    def _meet(self, hello: BridgeHello) -> None:
         if hello.slot_rate_hz == 0:
             raise DeviceError(
                 f"{self._port.name}: the bridge tells a rate of 0 slots per second",
@@ -190,7 +196,7 @@ class BridgeSource(SlotSource):
         if known is None:
             self.slot_period_s = 1.0 / hello.slot_rate_hz
 
-    def _place(self, group: SlotGroup, time_us: int) -> LineSlots | None:
+    def _place(self, group: BridgeSlots, time_us: int) -> LineSlots | None:
         if self._hello is None:
             self.fingers = group.fingers
         rest = _ABSENT * (FINGERS_MAX - group.fingers)
@@ -198,7 +204,7 @@ class BridgeSource(SlotSource):
         stamps_s = 1e-6 * time_us + words.index.astype(np.float64) * self.slot_period_s
         if len(stamps_s):
             # A packet leaves when its last slot has been sampled.
-            self.heard = Heard(float(stamps_s[-1]), self._arrival_ns)
+            self.observed = ClockObservation(float(stamps_s[-1]), self._arrival_ns)
         places = self._clock.place_all(words.channel, stamps_s)
         return LineSlots.placed(words, places, len(self._clock.sequence))
 
@@ -241,7 +247,7 @@ class BiotacBridge(FingerDevice):
         settings = options.model_dump(exclude={"port", "serial"})
         return (options.line,), settings, BridgeSource(options), FINGERS_MAX
 
-    def _check_there(self, finger: Finger) -> None:
+    def _check_there(self, finger: FingerQueue) -> None:
         assert isinstance(finger.source, BridgeSource)
         fingers = finger.source.fingers
         if finger.index >= fingers > 0:

@@ -13,15 +13,14 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from palpate_gateway.biotac.device import FingerDevice, FingerOptions
-from palpate_gateway.biotac.line_slots import LineSlots
+from palpate_gateway.biotac.finger import FingerDevice, FingerOptions
 from palpate_gateway.biotac.slot_link import SlotSource
+from palpate_gateway.biotac.slots import LineSlots
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.protocols import channels as ch
-from palpate_gateway.protocols.can_slots import CAN_FINGERS_MAX, SEQUENCES, CanSlotDecoder
-from palpate_gateway.protocols.places import Floats
-from palpate_gateway.protocols.slot_clock import SlotClock
-from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.protocols.can_slots import CAN_FINGERS_MAX, CanSlotDecoder
+from palpate_gateway.protocols.slot_clock import Floats, SlotClock
+from palpate_gateway.readings import ClockObservation
 
 _LATE_S = 2e-4
 """Whoever waits for the end of a round wakes by so much after it [s]."""
@@ -78,7 +77,7 @@ class CanSource(SlotSource):
         self._decoder = CanSlotDecoder(fingers=options.fingers, can_id=options.can_id)
         self._clock = SlotClock(
             slot_rate_hz=options.slot_rate_hz,
-            sequence=None if options.sequence == "learn" else SEQUENCES[options.sequence],
+            sequence=None if options.sequence == "learn" else ch.SEQUENCES[options.sequence],
         )
 
     def open(self) -> None:
@@ -107,7 +106,9 @@ class CanSource(SlotSource):
     def _note_times(self, slots: LineSlots, stamps_s: Floats) -> None:
         late_s = stamps_s - slots.time_s
         soonest = int(np.argmin(late_s))
-        self.heard = Heard(float(slots.time_s[soonest]), round(1e9 * float(stamps_s[soonest])))
+        self.observed = ClockObservation(
+            float(slots.time_s[soonest]), round(1e9 * float(stamps_s[soonest]))
+        )
         left = slots.size - 1 - int(slots.position[-1]) or slots.size
         scatter_s = min(float(late_s.max() - late_s[soonest]), _SCATTER_S)
         ends_s = float(slots.time_s[-1]) + left * self.slot_period_s

@@ -18,15 +18,14 @@ from pydantic import Field
 from palpate.config import StrictConfig
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from palpate.messages import COUNTS_MAX, PAC_SAMPLES, Origin, SensorType
-from palpate_gateway.biotac.sensor_type import TypeOption
+from palpate_gateway.biotac.finger import TypeOption
+from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.ports.serial_port import SerialPort, settle
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.protocols import pic32 as ask
-from palpate_gateway.protocols.pic32 import Layout, Pic32Decoder, Pic32Record, Pic32Sample
-from palpate_gateway.readings import ElectrodeReading, Reading
-from palpate_gateway.timing.clock_map import Heard
-from palpate_gateway.timing.sample_clock import SampleClock, Verdict
+from palpate_gateway.protocols.pic32 import Pic32Decoder, Pic32Layout, Pic32Record, Pic32Sample
+from palpate_gateway.readings import ClockObservation, ElectrodeReading, Reading
 
 VALIDITY = (1 << (ch.FIRST_PAC_BIT + 1)) - 1
 """Electrodes, PDC, TAC, TDC and the one PAC sample of a record."""
@@ -56,7 +55,7 @@ class Pic32Options(StrictConfig):
     port: str = Field(min_length=1)
     baud: int = Field(default=ask.BAUD, gt=0)
     rts_cts: bool = True
-    layout: Layout = Layout.PAC_FIRST
+    layout: Pic32Layout = Pic32Layout.PAC_FIRST
     serial: str = ""
     sensor_type: TypeOption = "auto"
 
@@ -210,11 +209,11 @@ class BiotacPic32(Device):
         """Hold a record and release the one before it; False if the stream is out of step."""
         now_s = time.monotonic()
         verdict = self._clock.take(record.tick // _TICKS_PER_US % _WRAP_US, now_s)
-        if verdict in (Verdict.DOUBTFUL, Verdict.RESTARTED):
+        if verdict in (SampleVerdict.DOUBTFUL, SampleVerdict.RESTARTED):
             return False
-        if verdict is Verdict.NEW:
+        if verdict is SampleVerdict.NEW:
             # The reading waited for this record, whose arrival tells the clock.
-            self._release(readings, Heard(self._clock.time_s, time.monotonic_ns()))
+            self._release(readings, ClockObservation(self._clock.time_s, time.monotonic_ns()))
             self._absent = _is_absent(record.sample)
             self._counts["absent"] += self._absent
             if not self._absent:
@@ -224,7 +223,7 @@ class BiotacPic32(Device):
             self._heard_s = now_s
         return True
 
-    def _release(self, readings: list[Reading], heard: Heard | None = None) -> None:
+    def _release(self, readings: list[Reading], observed: ClockObservation | None = None) -> None:
         if self._held is None:
             return
         (sample, tick, time_s), self._held = self._held, None
@@ -244,7 +243,7 @@ class BiotacPic32(Device):
                 tac=sample.tac,
                 tdc=sample.tdc,
                 validity=VALIDITY,
-                heard=heard,
+                observed=observed,
             )
         )
 

@@ -17,10 +17,9 @@ from typing import ClassVar
 import numpy as np
 
 from palpate.errors import ConfigError, DeviceError, DeviceTimeout
-from palpate_gateway.biotac.line_slots import LineSlots
-from palpate_gateway.biotac.slots import SlotBlock
+from palpate_gateway.biotac.slots import LineSlots, SlotBlock
 from palpate_gateway.protocols.spi import WordKind
-from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.readings import ClockObservation
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ class SlotSource(ABC):
 
     slot_period_s: float
     """Time between two slots [s]."""
-    heard: Heard | None = None
+    observed: ClockObservation | None = None
     """The slot of the last ones that was least under way: its time, and when it arrived."""
 
     @abstractmethod
@@ -59,7 +58,7 @@ class SlotSource(ABC):
         """What went wrong on the line, and with the words of this finger."""
 
 
-class Finger:
+class FingerQueue:
     """One finger's end of a shared line."""
 
     def __init__(self, link: SlotLink, index: int) -> None:
@@ -135,14 +134,14 @@ class SlotLink:
     def __init__(self, key: Hashable, settings: object, source: SlotSource) -> None:
         self._key, self._settings, self.source = key, settings, source
         self.news = threading.Condition()
-        self._fingers: dict[int, Finger] = {}
+        self._fingers: dict[int, FingerQueue] = {}
         self._stop = threading.Event()
         self._failed = False
         self._begun: list[LineSlots] = []  # of the frame that is not over
         self._thread = threading.Thread(target=self._run, name=f"line {key}", daemon=True)
 
     @classmethod
-    def join(cls, key: Hashable, settings: object, source: SlotSource, index: int) -> Finger:
+    def join(cls, key: Hashable, settings: object, source: SlotSource, index: int) -> FingerQueue:
         """Listen to one finger of a line, which is opened if nobody listens yet.
 
         Args:
@@ -175,12 +174,12 @@ class SlotLink:
                     f"port {index + 1} of {key} is configured twice",
                     remedy="give each sensor a port of its own",
                 )
-            finger = Finger(link, index)
+            finger = FingerQueue(link, index)
             with link.news:
                 link._fingers[index] = finger
             return finger
 
-    def leave(self, finger: Finger) -> None:
+    def leave(self, finger: FingerQueue) -> None:
         """A finger stops listening."""
         with self._guard:
             with self.news:

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.messages import COUNTS_MAX, ChannelFault, FaultKind
-from palpate_gateway.condition.blocks import Block
+from palpate_gateway.condition.stillness import FrameBlock
 
 SATURATED_BLOCKS = 1
 WINDOW_BLOCKS = 5
@@ -88,11 +88,11 @@ class ChannelHealth:
         self._at_rail = np.zeros(self._electrodes, np.int64)
         self._standing = np.zeros(self._electrodes, np.int64)
         self._pac_standing = 0
-        self._last: Block | None = None
-        self._recent: deque[Block] = deque(maxlen=WINDOW_BLOCKS)
+        self._last: FrameBlock | None = None
+        self._recent: deque[FrameBlock] = deque(maxlen=WINDOW_BLOCKS)
         self._varied: deque[bool] = deque(maxlen=STUCK_BLOCKS)
 
-    def add(self, block: Block, *, untouched: bool) -> None:
+    def add(self, block: FrameBlock, *, untouched: bool) -> None:
         """Take a block.
 
         Args:
@@ -120,7 +120,7 @@ class ChannelHealth:
                 names[FaultKind.ODD] = odd
         self._tell({kind: tuple(found) for kind, found in names.items()})
 
-    def _follow(self, block: Block) -> None:
+    def _follow(self, block: FrameBlock) -> None:
         last, self._last = self._last, block
         self._recent.append(block)
         at_end = ((block.high == 0) | (block.low == COUNTS_MAX)) & (block.seen > 0)
@@ -151,7 +151,7 @@ class ChannelHealth:
             names[FaultKind.DEAD] = silent
         return dead
 
-    def _find_stuck(self, block: Block) -> _Flags:
+    def _find_stuck(self, block: FrameBlock) -> _Flags:
         stuck: _Flags = np.zeros(self._electrodes, np.bool_)
         if self._stuck:
             same = block.low == block.high
@@ -170,7 +170,7 @@ class ChannelHealth:
         stuck[list(self._stuck)] = True
         return stuck
 
-    def _judge_pac(self, block: Block, names: dict[FaultKind, list[str]]) -> None:
+    def _judge_pac(self, block: FrameBlock, names: dict[FaultKind, list[str]]) -> None:
         kind = None
         if block.pac_seen and block.pac_low == block.pac_high and block.pac_low in (0, COUNTS_MAX):
             kind = FaultKind.SATURATED
@@ -207,7 +207,7 @@ def _electrode_names(flags: _Flags) -> list[str]:
     return [f"E{at + 1}" for at in np.flatnonzero(flags)]
 
 
-def _odd(block: Block, usable: _Flags) -> list[str]:
+def _odd(block: FrameBlock, usable: _Flags) -> list[str]:
     levels = sorted(block.mean[usable].tolist())
     median = levels[len(levels) // 2]
     if median < THIN_COUNTS:

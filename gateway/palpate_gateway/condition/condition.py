@@ -1,22 +1,195 @@
-"""The condition of one sensor, from its frames: what its gateway says of it beside them."""
+"""The level of the untouched sensor, and how far it has drifted from the tare.
+
+Stillness alone does not tell: a constant press is still too. What tells is how the sensor got to
+where it rests. As long as nothing moves it stays untouched, and what its level does is drift. After
+a movement it is untouched again only if it rests where it rested before, give or take what heat and
+a relaxing skin do: they move all electrodes alike and the pressure little, a press moves some
+electrodes and the pressure much.
+
+
+Whether the core is still warming up: the slope of TDC while nothing touches the sensor.
+
+The core is heated; until it has settled the electrodes drift (hardware reference 4.3). What a count
+of TDC is in degrees differs from source to source (1.9), so that slopes are told in counts.
+
+
+The condition of one sensor, from its frames: what its gateway says of it beside them.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
+import numpy.typing as npt
 
 from palpate.messages import ChannelFault, ElectrodeFrame, FaultKind, FrameLayout, Tare
-from palpate_gateway.condition.blocks import Block, Blocks
 from palpate_gateway.condition.channel_health import ChannelHealth, describe
 from palpate_gateway.condition.stillness import (
     WINDOW_BLOCKS,
+    Floats,
+    FrameBlock,
+    FrameBlocks,
     StillLimits,
     evidence_of_blocks,
 )
-from palpate_gateway.condition.untouched import Touch, UntouchedLevel
-from palpate_gateway.condition.warm_up import WarmUp
+
+EVEN_COUNTS, EVEN_SHARE = 25.0, 0.2
+"""Drift moves no electrode by more than this beside the median of all [counts], and this share of
+it: of real sensors that drifted by 169 counts in three minutes untouched none moved by more than 31
+beside it; a hand that held a finger lightly moved some by 230, and the median by 3."""
+
+PDC_BAND_COUNTS = 40.0
+"""Drift moves PDC by less [counts]; a hand that held the finger lightly moved it by 330."""
+
+_Usable = npt.NDArray[np.bool_]
+
+
+class TouchState(Enum):
+    """What is known of touches."""
+
+    UNKNOWN = "not tared yet"
+    UNTOUCHED = "untouched"
+    MOVING = "touched or moving"
+    HELD = "still, but not where it rested untouched"
+
+
+class UntouchedLevel:
+    """Follows one sensor from block to block.
+
+    Args:
+        electrodes: Number of electrodes.
+    """
+
+    def __init__(self, electrodes: int) -> None:
+        self.touch = TouchState.UNKNOWN
+        self._electrodes = electrodes
+        self._level: tuple[Floats, float] | None = None
+        self._tare: tuple[Floats, float] | None = None
+        self.drift_counts = 0.0
+        """Greatest distance of an electrode from the tare, when it was last untouched [counts]."""
+        self.drift_electrode = 0
+        """Which one, from 0."""
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a tare to compare with."""
+        return self._tare is not None
+
+    def tared(self, tare: Tare) -> None:
+        """Somebody, or the gateway, took the present level for untouched."""
+        self._tare = self._level = tare.electrodes.astype(np.float64), tare.pdc
+        self.drift_counts = 0.0
+
+    def moved(self) -> None:
+        """The sensor is not still."""
+        if self.touch is not TouchState.UNKNOWN or self.known:
+            self.touch = TouchState.MOVING
+
+    def rests_at(self, electrodes: Floats, pdc: float, usable: _Usable) -> None:
+        """The sensor is still.
+
+        Args:
+            electrodes: Mean raw counts, shape ``(E,)``.
+            pdc: Mean raw PDC [counts].
+            usable: Electrodes that are looked at, bool, shape ``(E,)``; at least one.
+        """
+        if self._level is None or self._tare is None:
+            return
+        if not (
+            is_drift(electrodes - self._level[0], pdc - self._level[1], usable)
+            and is_drift(electrodes - self._tare[0], pdc - self._tare[1], usable)
+        ):
+            self.touch = TouchState.HELD
+            return
+        self.touch = TouchState.UNTOUCHED
+        self._level = np.where(usable, electrodes, self._level[0]), pdc
+        distance = np.where(usable, np.abs(electrodes - self._tare[0]), 0.0)
+        self.drift_electrode = int(np.argmax(distance))
+        self.drift_counts = float(distance[self.drift_electrode])
+
+
+def is_drift(change: Floats, pdc_change: float, usable: _Usable) -> bool:
+    """Whether a change of level is one that an untouched sensor makes.
+
+    Args:
+        change: Of the electrodes [counts], shape ``(E,)``.
+        pdc_change: Of PDC [counts].
+        usable: Electrodes that are looked at, bool, shape ``(E,)``.
+    """
+    # In plain Python, which is faster for so few.
+    looked_at = sorted(change[usable].tolist())
+    common = looked_at[len(looked_at) // 2]
+    uneven = max(looked_at[-1] - common, common - looked_at[0])
+    even: bool = uneven <= EVEN_COUNTS + EVEN_SHARE * abs(common)
+    return even and abs(pdc_change) <= PDC_BAND_COUNTS
+
+
+WARMING_COUNTS_PER_MIN = 30.0
+"""Steeper is warming up: the settled sensor of the public capture rises by 7 untouched, and a
+sensor that warms by 10 degrees in half an hour begins with twice this."""
+
+SETTLED_COUNTS_PER_MIN = 15.0
+"""Flatter is settled; between both it stays what it was."""
+
+WINDOW_S = 30.0
+"""TDC is followed over this time [s]."""
+
+_SPAN_MIN_S = 10.0
+_POINT_S = 1.0
+
+
+class WarmUp:
+    """Follows TDC of one sensor."""
+
+    def __init__(self) -> None:
+        self.warming = False
+        """Whether it is warming up, as far as is known."""
+        self.slope_counts_per_min: float | None = None
+        """Slope of TDC; None = not known yet."""
+        self._points: deque[tuple[float, float]] = deque()
+        self._sum = 0.0
+        self._count = 0
+        self._since_s: float | None = None
+
+    def begin(self) -> None:
+        """Begin anew: the sensor was touched, or was away. What is known stays."""
+        self._points.clear()
+        self._sum, self._count, self._since_s = 0.0, 0, None
+
+    def add(self, time_s: float, tdc: float) -> None:
+        """Take the mean of a block.
+
+        Args:
+            time_s: When [s].
+            tdc: Mean raw TDC [counts].
+        """
+        if self._since_s is None or not 0.0 <= time_s - self._since_s < WINDOW_S:
+            self.begin()
+            self._since_s = time_s
+        self._sum += tdc
+        self._count += 1
+        if time_s - self._since_s < _POINT_S:
+            return
+        self._points.append((0.5 * (time_s + self._since_s), self._sum / self._count))
+        self._sum, self._count, self._since_s = 0.0, 0, time_s
+        while self._points[-1][0] - self._points[0][0] > WINDOW_S:
+            self._points.popleft()
+        if self._points[-1][0] - self._points[0][0] >= _SPAN_MIN_S:
+            self._judge()
+
+    def _judge(self) -> None:
+        times, values = np.array(self._points).T
+        times = times - times.mean()
+        slope = 60.0 * float(times @ (values - values.mean()) / (times @ times))
+        self.slope_counts_per_min = slope
+        if abs(slope) > WARMING_COUNTS_PER_MIN:
+            self.warming = True
+        elif abs(slope) < SETTLED_COUNTS_PER_MIN:
+            self.warming = False
+
 
 DRIFT_COUNTS = 10.0
 """A baseline that is further off is old [counts]: twice the noise of one frame."""
@@ -26,7 +199,7 @@ _UNTRUE = (FaultKind.DEAD, FaultKind.STUCK)
 
 
 @dataclass(frozen=True, slots=True)
-class Retare:
+class RetareRules:
     """When a gateway tares again by itself.
 
     Attributes:
@@ -53,11 +226,11 @@ class Condition:
         layout: FrameLayout,
         rate_hz: float,
         limits: StillLimits,
-        retare: Retare | None = None,
+        retare: RetareRules | None = None,
     ) -> None:
         self._limits, self._retare = limits, retare
-        self._blocks = Blocks(layout, rate_hz)
-        self._recent: deque[Block] = deque(maxlen=WINDOW_BLOCKS)
+        self._blocks = FrameBlocks(layout, rate_hz)
+        self._recent: deque[FrameBlock] = deque(maxlen=WINDOW_BLOCKS)
         self._level = UntouchedLevel(layout.electrodes)
         self._channels = ChannelHealth(layout.electrodes)
         self._warm_up = WarmUp()
@@ -69,7 +242,7 @@ class Condition:
         """What speaks against a sensor that is still; empty = it is."""
 
     @property
-    def touch(self) -> Touch:
+    def touch(self) -> TouchState:
         """What is known of touches."""
         return self._level.touch
 
@@ -112,9 +285,9 @@ class Condition:
         if self.warming and self._warm_up.slope_counts_per_min is not None:
             told.append("warming up, so the baseline drifts: tare before you measure")
         level = self._level
-        if level.touch is Touch.UNTOUCHED and level.drift_counts > DRIFT_COUNTS:
+        if level.touch is TouchState.UNTOUCHED and level.drift_counts > DRIFT_COUNTS:
             told.append(f"E{level.drift_electrode + 1} has drifted from the tare: tare again")
-        elif level.touch is Touch.HELD:
+        elif level.touch is TouchState.HELD:
             told.append("still, but not where it rested: it is held, or has to be tared again")
         return "; ".join(told)
 
@@ -145,9 +318,9 @@ class Condition:
         self._now_s = block.time_s
         self._recent.append(block)
         self._judge_rest(block)
-        untouched = self._level.touch is Touch.UNTOUCHED
+        untouched = self._level.touch is TouchState.UNTOUCHED
         self._channels.add(block, untouched=untouched)
-        if untouched or (self._level.touch is Touch.UNKNOWN and not self.motion):
+        if untouched or (self._level.touch is TouchState.UNKNOWN and not self.motion):
             if block.slow_seen[2]:
                 self._warm_up.add(block.time_s, block.tdc_mean)
         else:
@@ -155,7 +328,7 @@ class Condition:
         self._tell()
         return True
 
-    def _judge_rest(self, block: Block) -> None:
+    def _judge_rest(self, block: FrameBlock) -> None:
         usable = self._channels.usable
         if len(self._recent) < WINDOW_BLOCKS or not usable.any():
             self._moved(self.motion)
@@ -168,7 +341,7 @@ class Condition:
         count = len(self._recent)
         mean = np.add.reduce([one.mean for one in self._recent]) / count
         self._level.rests_at(mean, sum(one.pdc_mean for one in self._recent) / count, usable)
-        if self._level.touch is not Touch.UNTOUCHED:
+        if self._level.touch is not TouchState.UNTOUCHED:
             self._untouched_since_s = None
         elif self._untouched_since_s is None:
             self._untouched_since_s = block.time_s

@@ -1,4 +1,10 @@
-"""Whether a sensor is still: what moves is touched, or was just now.
+"""Frames in blocks of a fifth of a second, so that watching them costs little.
+
+A frame is copied into a row; everything else is computed once a block. Invalid samples are left
+out.
+
+
+Whether a sensor is still: what moves is touched, or was just now.
 
 PAC is the dynamic part of the fluid's pressure: whoever touches the skin shakes it, even a hand
 that holds on. PDC creeps while skin and fluid relax. Electrodes vary and shift. What is still need
@@ -16,7 +22,144 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from palpate_gateway.condition.blocks import Block, Floats
+from palpate.messages import CountArray, ElectrodeFrame, FrameLayout
+
+BLOCK_S = 0.2
+"""Duration of a block [s], but never fewer frames than ``FRAMES_MIN``."""
+
+FRAMES_MIN = 10
+
+Floats = npt.NDArray[np.float64]
+Counts = npt.NDArray[np.int64]
+_NONE = np.uint16(0xFFFF)
+_Valid = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameBlock:
+    """Statistics of consecutive frames; of E electrodes, arrays have shape ``(E,)``.
+
+    Attributes:
+        time_s: Time of the last frame [s], by the frames' monotonic clock.
+        frames: How many.
+        seen: Valid samples of each electrode; 0 = its other numbers say nothing.
+        mean: Mean [counts].
+        variance: Variance [counts^2].
+        low: Least, uint16 [counts].
+        high: Greatest, uint16 [counts].
+        pac_seen: Valid samples of PAC.
+        pac_mean: Mean [counts].
+        pac_variance: Variance [counts^2].
+        pac_low: Least [counts].
+        pac_high: Greatest [counts].
+        slow_seen: Valid samples of PDC, TAC and TDC.
+        pdc_mean: Mean [counts].
+        pdc_variance: Variance [counts^2].
+        tdc_mean: Mean [counts].
+    """
+
+    time_s: float
+    frames: int
+    seen: Counts
+    mean: Floats
+    variance: Floats
+    low: CountArray
+    high: CountArray
+    pac_seen: int
+    pac_mean: float
+    pac_variance: float
+    pac_low: int
+    pac_high: int
+    slow_seen: tuple[int, ...]
+    pdc_mean: float
+    pdc_variance: float
+    tdc_mean: float
+
+
+class FrameBlocks:
+    """Collects frames of one sensor.
+
+    Args:
+        layout: Of its frames.
+        rate_hz: Frames per second [Hz].
+    """
+
+    def __init__(self, layout: FrameLayout, rate_hz: float) -> None:
+        self._layout = layout
+        self._frames = frames = max(FRAMES_MIN, round(BLOCK_S * rate_hz))
+        # One row a frame: electrodes, PDC, TAC, TDC, PAC; the columns are the validity bits.
+        self._rows = np.zeros((frames, layout.slots), np.uint16)
+        self._validity = [0] * frames
+        self._count = 0
+        self._whole = np.full(layout.slots, frames, np.int64)
+        self._bits = np.arange(layout.slots, dtype=np.uint64)
+
+    def begin(self) -> None:
+        """Forget the block that has begun."""
+        self._count = 0
+
+    def add(self, frame: ElectrodeFrame) -> FrameBlock | None:
+        """Take a frame; the block when it is full."""
+        layout, at = self._layout, self._count
+        row = self._rows[at]
+        row[: layout.electrodes] = frame.electrodes
+        row[layout.electrodes : layout.first_pac_bit] = (frame.pdc, frame.tac, frame.tdc)
+        row[layout.first_pac_bit :] = frame.pac
+        self._validity[at] = frame.validity
+        self._count = at + 1
+        if self._count < self._frames:
+            return None
+        self._count = 0
+        return self._block(frame.stamp.monotonic_ns * 1e-9)
+
+    def _block(self, time_s: float) -> FrameBlock:
+        layout, frames = self._layout, self._frames
+        if all(one == layout.all_valid for one in self._validity):
+            seen = self._whole
+            rows = self._rows.astype(np.float64)
+            mean = np.add.reduce(rows, axis=0) / frames
+            rows -= mean
+            rows *= rows
+            variance = np.add.reduce(rows, axis=0) / frames
+            low, high = np.minimum.reduce(self._rows), np.maximum.reduce(self._rows)
+        else:
+            valid = self._valid()
+            seen = np.count_nonzero(valid, axis=0)
+            some = np.maximum(seen, 1)
+            mean = np.where(valid, self._rows, 0.0).sum(axis=0) / some
+            variance = np.where(valid, np.square(self._rows - mean), 0.0).sum(axis=0) / some
+            low = np.where(valid, self._rows, _NONE).min(axis=0)
+            high = np.where(valid, self._rows, 0).max(axis=0)
+        e, p = layout.electrodes, layout.first_pac_bit
+        parts = (part[p:].tolist() for part in (seen, mean, variance))
+        pac = [(n, m, v) for n, m, v in zip(*parts, strict=True) if n]
+        pac_seen = sum(n for n, _, _ in pac)
+        pac_mean = sum(n * m for n, m, _ in pac) / max(pac_seen, 1)
+        pac_square = sum(n * (v + (m - pac_mean) ** 2) for n, m, v in pac)
+        return FrameBlock(
+            time_s=time_s,
+            frames=frames,
+            seen=seen[:e],
+            mean=mean[:e],
+            variance=variance[:e],
+            low=low[:e],
+            high=high[:e],
+            pac_seen=pac_seen,
+            pac_mean=pac_mean,
+            pac_variance=pac_square / max(pac_seen, 1),
+            pac_low=min(low[p:].tolist()),
+            pac_high=max(high[p:].tolist()),
+            slow_seen=tuple(seen[e:p].tolist()),
+            pdc_mean=float(mean[e]),
+            pdc_variance=float(variance[e]),
+            tdc_mean=float(mean[p - 1]),
+        )
+
+    def _valid(self) -> _Valid:
+        words = np.array(self._validity, np.uint64)
+        valid: _Valid = (words[:, None] >> self._bits & np.uint64(1)).astype(np.bool_)
+        return valid
+
 
 MAX_SD_COUNTS = 25.0
 """An electrode that varies more than this is being touched [counts]. A settled sensor has 0.5; the
@@ -54,7 +197,7 @@ class StillLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class MotionEvidence:
     """What speaks for a touch in a window of frames.
 
     Attributes:
@@ -101,7 +244,7 @@ class Evidence:
         return ""
 
 
-def evidence_of(electrodes: Floats, pac: Floats, pdc: Floats) -> Evidence:
+def evidence_of(electrodes: Floats, pac: Floats, pdc: Floats) -> MotionEvidence:
     """Evidence of whole frames.
 
     Args:
@@ -115,7 +258,9 @@ def evidence_of(electrodes: Floats, pac: Floats, pdc: Floats) -> Evidence:
     return _evidence(frames, half, electrodes.var(axis=0), step, pac_sd, float(pdc.std()))
 
 
-def evidence_of_blocks(blocks: Sequence[Block], usable: npt.NDArray[np.bool_]) -> Evidence:
+def evidence_of_blocks(
+    blocks: Sequence[FrameBlock], usable: npt.NDArray[np.bool_]
+) -> MotionEvidence:
     """Evidence of consecutive blocks.
 
     Args:
@@ -137,12 +282,14 @@ def evidence_of_blocks(blocks: Sequence[Block], usable: npt.NDArray[np.bool_]) -
 
 def _evidence(
     frames: int, half: int, variance: Floats, step: Floats, pac_sd: float, pdc_sd: float
-) -> Evidence:
+) -> MotionEvidence:
     worst = int(variance.argmax())
     # Of two means of as many frames; what is left out has neither noise nor shift.
     noise = math.sqrt(2.0 * float(np.add.reduce(variance)) / len(variance) / half)
     shift = math.sqrt(float(step @ step) / len(step))
-    return Evidence(frames, worst, math.sqrt(float(variance[worst])), shift, noise, pac_sd, pdc_sd)
+    return MotionEvidence(
+        frames, worst, math.sqrt(float(variance[worst])), shift, noise, pac_sd, pdc_sd
+    )
 
 
 def _pooled_sd(parts: Sequence[tuple[float, float]]) -> float:

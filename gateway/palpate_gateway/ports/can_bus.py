@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError, DeviceError, DeviceLost
 from palpate.extras import require
+from palpate_gateway.clock.wall_clock import KernelStamps
 from palpate_gateway.ports.can_frames import (
     BUS_OFF,
     CanFrame,
@@ -33,7 +34,6 @@ from palpate_gateway.ports.can_frames import (
 )
 from palpate_gateway.ports.datagrams import BATCH, Datagrams, available
 from palpate_gateway.ports.port import silent
-from palpate_gateway.timing.kernel_stamps import KernelStamps
 
 _BUFFER = 4 << 20
 """What the system shall keep while this process does not read [bytes]: its usual 0.2 MB are full

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.extras import require
-from palpate_gateway.ports.datagrams import Waiting
+from palpate_gateway.ports.datagrams import DatagramBatch
 
 BUS_OFF = 0x40
 """Class of an error frame that says that the interface has left the bus (linux/can/error.h)."""
@@ -78,10 +78,10 @@ class CanFrames:
         return CanFrames(self.kind[kept], self.can_id[kept], self.size[kept], self.data[kept])
 
 
-Reader = Callable[[Waiting], CanFrames]
+Reader = Callable[[DatagramBatch], CanFrames]
 
 
-def from_socketcan(waiting: Waiting) -> CanFrames:
+def from_socketcan(waiting: DatagramBatch) -> CanFrames:
     """Frames of Linux' CAN sockets."""
     told = np.ascontiguousarray(waiting.data[:, : _FRAME.itemsize]).view(_FRAME)[:, 0]
     word = told["word"]
@@ -113,7 +113,7 @@ class MulticastReader:
         self._same = np.zeros(0, np.bool_)  # of each byte, whether it must be the same
         self._at = 0  # where data begin
 
-    def __call__(self, waiting: Waiting) -> CanFrames:
+    def __call__(self, waiting: DatagramBatch) -> CanFrames:
         """Frames of datagrams."""
         alike = self._alike(waiting)
         if not alike.all():
@@ -135,7 +135,7 @@ class MulticastReader:
         rows = zip(waiting.data, sizes, strict=True)
         return CanFrames.of([self._one(row[:size].tobytes()) for row, size in rows])
 
-    def _alike(self, waiting: Waiting) -> npt.NDArray[np.bool_]:
+    def _alike(self, waiting: DatagramBatch) -> npt.NDArray[np.bool_]:
         """Which are like the one that was learnt."""
         length = len(self._raw)
         if not length:

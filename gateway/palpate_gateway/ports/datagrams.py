@@ -54,7 +54,7 @@ def available() -> bool:
     )
 
 
-class Waiting(NamedTuple):
+class DatagramBatch(NamedTuple):
     """Datagrams in order of their coming.
 
     Attributes:
@@ -102,7 +102,7 @@ class Datagrams:
         """For ``select``."""
         return self._socket.fileno()
 
-    def take(self) -> Waiting:
+    def take(self) -> DatagramBatch:
         """What waits, at most ``BATCH``.
 
         Raises:
@@ -120,7 +120,7 @@ class Datagrams:
         told = (taken["control_size"] >= _STAMP_SIZE) & (control[:, 1] == _STAMP_KIND)
         stamps_ns = np.where(told, control[:, 2] * 1_000_000_000 + control[:, 3], NO_STAMP)
         whole = (taken["flags"] & _MSG_TRUNC) == 0
-        return Waiting(self._data[:count], taken["size"] * whole, stamps_ns)
+        return DatagramBatch(self._data[:count], taken["size"] * whole, stamps_ns)
 
     def close(self) -> None:
         """Let go of the socket; never raises."""

@@ -20,8 +20,7 @@ from pydantic import AfterValidator, model_validator
 from palpate.config import StrictConfig
 from palpate.messages import Pose
 from palpate.rigid import compose, inverse, is_rotation, normalised, quaternion_length
-from palpate_gateway.readings import PoseReading
-from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.readings import ClockObservation, PoseReading
 
 _NEEDED = {
     "indenter": ("base_sensor", "flange_indenter"),
@@ -123,7 +122,7 @@ class Placement:
         tick: int,
         time_s: float,
         missed_before: int = 0,
-        heard: Heard | None = None,
+        observed: ClockObservation | None = None,
     ) -> PoseReading:
         """A reading of the tip; whether it touches is not known."""
         tip = self.tip(base_flange)
@@ -135,5 +134,5 @@ class Placement:
             orientation=np.array(tip.orientation),
             in_contact=None,
             missed_before=missed_before,
-            heard=heard,
+            observed=observed,
         )

@@ -16,8 +16,7 @@ from palpate.names import Name
 from palpate_gateway.device import BusDevice, DeviceIdentity, DeviceInfo
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.pose.track import PoseTrack, Verdict
-from palpate_gateway.readings import PoseReading, Reading
-from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.readings import ClockObservation, PoseReading, Reading
 
 _BATCH = 64
 """Most readings in one answer of ``read``."""
@@ -172,5 +171,5 @@ class PoseZenoh(BusDevice):
             tick=frame.sequence,
             time_s=time_s,
             missed_before=self._track.missed_before,
-            heard=Heard(time_s, received.received_monotonic_ns),
+            observed=ClockObservation(time_s, received.received_monotonic_ns),
         )

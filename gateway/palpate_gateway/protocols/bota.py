@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from palpate_gateway.protocols.checksums import crc16_x25
-from palpate_gateway.protocols.resync import FrameFinder
+from palpate_gateway.protocols.framing import FrameFinder, crc16_x25
 
 FRAME_BYTES = 37
 
@@ -87,14 +86,14 @@ class BotaDecoder:
         return BotaFrame(status, tuple(wrench), time_us, temperature_c)
 
 
-class Format(IntEnum):
+class BotaFormat(IntEnum):
     """What the sensor sends while it runs; ``BotaDecoder`` reads the binary one."""
 
     BINARY = 0
     CSV = 1
 
 
-class BareCommand(StrEnum):
+class BotaCommand(StrEnum):
     """Commands without parameters."""
 
     CONFIG = "C"
@@ -130,7 +129,7 @@ def period_s(sinc: int) -> float:
     return SINC_STEP_S * _one_of(SINC_LENGTHS, sinc, "sinc length")
 
 
-def bare_request(command: BareCommand) -> bytes:
+def bare_request(command: BotaCommand) -> bytes:
     """A command without parameters."""
     return command.value.encode("ascii")
 
@@ -140,7 +139,7 @@ def communication_request(
     baud: int,
     temperature_compensation: bool = False,
     calibrated: bool = True,
-    data_format: Format = Format.BINARY,
+    data_format: BotaFormat = BotaFormat.BINARY,
 ) -> bytes:
     """Set what is sent and how fast.
 
@@ -181,7 +180,7 @@ def expected_reply(request: bytes) -> bytes | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Ack:
+class BotaAck:
     """A reply ``r,<number>,<command>,<code>``.
 
     Attributes:
@@ -193,13 +192,13 @@ class Ack:
     code: int
 
 
-def find_ack(text: bytes) -> Ack | None:
+def find_ack(text: bytes) -> BotaAck | None:
     """First reply in the text, so that a refusal can be told from silence."""
     found = _ACK.search(text)
-    return Ack(found[2].decode("ascii"), int(found[3])) if found else None
+    return BotaAck(found[2].decode("ascii"), int(found[3])) if found else None
 
 
-class TextWait:
+class BotaTextWait:
     """Waits for a text, and gives what follows it untouched: after ``R`` that is frames.
 
     Args:

@@ -8,6 +8,9 @@ visible to the host. ``encode`` is what the reference firmware does; it should s
     HELLO    u8 fingers n, u16 slots per second, u8 slots per frame, n x (16 B serial, 4 B firmware)
     SLOTS    u8 count k, u8 fingers n, k x (command byte, n x 2 bytes)
     STATUS   u8 fingers n, n x u32 parity errors, u32 error words, u32 overruns
+
+
+Gaps, repetitions and starts of a bridge, from the numbers and times of its packets.
 """
 
 from __future__ import annotations
@@ -16,10 +19,8 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-from palpate_gateway.protocols.bridge_track import PacketTrack
 from palpate_gateway.protocols.can_slots import FINGERS_MAX
-from palpate_gateway.protocols.checksums import crc16_x25
-from palpate_gateway.protocols.cobs import Packet, PacketSplitter, encode_packet
+from palpate_gateway.protocols.framing import CobsPacket, PacketSplitter, crc16_x25, encode_packet
 from palpate_gateway.protocols.spi import printable_prefix
 
 VERSION = 1
@@ -35,7 +36,7 @@ _CRC = struct.Struct("<H")
 _LONGEST = _HEADER.size + _SLOTS.size + SLOTS_MAX * (1 + 2 * FINGERS_MAX) + _CRC.size
 
 
-class PacketType(IntEnum):
+class BridgePacketType(IntEnum):
     """What the body of a packet is."""
 
     HELLO = 1
@@ -44,7 +45,7 @@ class PacketType(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class BridgeHeader:
     """Head of every packet.
 
     Attributes:
@@ -61,7 +62,7 @@ class Header:
 
 
 @dataclass(frozen=True, slots=True)
-class Finger:
+class BridgeFinger:
     """Who a finger is: serial (up to 16 ASCII) and firmware (up to 4); empty if unknown."""
 
     serial: str
@@ -69,7 +70,7 @@ class Finger:
 
 
 @dataclass(frozen=True, slots=True)
-class Hello:
+class BridgeHello:
     """What the bridge says of itself at start and every few seconds.
 
     Attributes:
@@ -80,11 +81,11 @@ class Hello:
 
     slot_rate_hz: int
     slots_per_frame: int
-    fingers: tuple[Finger, ...]
+    fingers: tuple[BridgeFinger, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class SlotGroup:
+class BridgeSlots:
     """Consecutive slots.
 
     Attributes:
@@ -97,7 +98,7 @@ class SlotGroup:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class BridgeStatus:
     """Counters of the bridge since its start, each modulo 2**32.
 
     Attributes:
@@ -111,7 +112,7 @@ class Status:
     overruns: int
 
 
-Body = Hello | SlotGroup | Status
+BridgeBody = BridgeHello | BridgeSlots | BridgeStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +127,14 @@ class BridgeRecord:
         time_us: Unwrapped device time of this epoch [us].
     """
 
-    header: Header
-    body: Body
+    header: BridgeHeader
+    body: BridgeBody
     lost_before: int
     epoch: int
     time_us: int
 
 
-def encode(header: Header, body: Body) -> bytes:
+def encode(header: BridgeHeader, body: BridgeBody) -> bytes:
     """A packet as it goes over the wire, with its delimiter.
 
     Raises:
@@ -152,8 +153,8 @@ def encode(header: Header, body: Body) -> bytes:
     return encode_packet(data + _CRC.pack(crc16_x25(data)))
 
 
-def _encode_body(body: Body) -> tuple[PacketType, bytes]:
-    if isinstance(body, Hello):
+def _encode_body(body: BridgeBody) -> tuple[BridgePacketType, bytes]:
+    if isinstance(body, BridgeHello):
         count = _within("fingers", len(body.fingers), FINGERS_MAX, least=1)
         rate_hz = _within("slot_rate_hz", body.slot_rate_hz, 0xFFFF)
         slots = _within("slots_per_frame", body.slots_per_frame, 0xFF)
@@ -161,18 +162,18 @@ def _encode_body(body: Body) -> tuple[PacketType, bytes]:
             _FINGER.pack(_text("serial", one.serial, 16), _text("firmware", one.firmware, 4))
             for one in body.fingers
         ]
-        return PacketType.HELLO, _HELLO.pack(count, rate_hz, slots) + b"".join(fingers)
-    if isinstance(body, SlotGroup):
+        return BridgePacketType.HELLO, _HELLO.pack(count, rate_hz, slots) + b"".join(fingers)
+    if isinstance(body, BridgeSlots):
         count = _within("fingers", body.fingers, FINGERS_MAX, least=1)
         slots = _within("number of payloads", len(body.payloads), SLOTS_MAX)
         for payload in body.payloads:
             _within("length of a payload", len(payload), 1 + 2 * count, least=1 + 2 * count)
-        return PacketType.SLOTS, _SLOTS.pack(slots, count) + b"".join(body.payloads)
+        return BridgePacketType.SLOTS, _SLOTS.pack(slots, count) + b"".join(body.payloads)
     count = _within("fingers", len(body.parity_errors), FINGERS_MAX, least=1)
     counters = (*body.parity_errors, body.error_words, body.overruns)
     for counter in counters:
         _within("counter", counter, 0xFFFFFFFF)
-    return PacketType.STATUS, struct.pack(f"<B{count + 2}I", count, *counters)
+    return BridgePacketType.STATUS, struct.pack(f"<B{count + 2}I", count, *counters)
 
 
 def _within(name: str, value: int, most: int, *, least: int = 0) -> int:
@@ -187,28 +188,28 @@ def _text(name: str, text: str, size: int) -> bytes:
     return text.encode("ascii")
 
 
-def decode_body(kind: int, data: bytes) -> Body | None:
+def decode_body(kind: int, data: bytes) -> BridgeBody | None:
     """The body of a packet; None if its type is unknown or its length or count of fingers wrong."""
-    if kind == PacketType.SLOTS and len(data) >= _SLOTS.size:
+    if kind == BridgePacketType.SLOTS and len(data) >= _SLOTS.size:
         slots, count = _SLOTS.unpack_from(data)
         size = 1 + 2 * count
         if not 1 <= count <= FINGERS_MAX or len(data) != _SLOTS.size + slots * size:
             return None
         starts = range(_SLOTS.size, len(data), size)
-        return SlotGroup(count, tuple(data[at : at + size] for at in starts))
-    if kind == PacketType.HELLO and len(data) >= _HELLO.size:
+        return BridgeSlots(count, tuple(data[at : at + size] for at in starts))
+    if kind == BridgePacketType.HELLO and len(data) >= _HELLO.size:
         count, rate_hz, slots = _HELLO.unpack_from(data)
         if not 1 <= count <= FINGERS_MAX or len(data) != _HELLO.size + count * _FINGER.size:
             return None
         names = _FINGER.iter_unpack(data[_HELLO.size :])
-        fingers = tuple(Finger(printable_prefix(a), printable_prefix(b)) for a, b in names)
-        return Hello(rate_hz, slots, fingers)
-    if kind == PacketType.STATUS and data:
+        fingers = tuple(BridgeFinger(printable_prefix(a), printable_prefix(b)) for a, b in names)
+        return BridgeHello(rate_hz, slots, fingers)
+    if kind == BridgePacketType.STATUS and data:
         count = data[0]
         if not 1 <= count <= FINGERS_MAX or len(data) != 1 + 4 * (count + 2):
             return None
         *parity_errors, error_words, overruns = struct.unpack_from(f"<{count + 2}I", data, 1)
-        return Status(tuple(parity_errors), error_words, overruns)
+        return BridgeStatus(tuple(parity_errors), error_words, overruns)
     return None
 
 
@@ -221,7 +222,7 @@ class BridgeDecoder:
 
     def __init__(self) -> None:
         self._splitter = PacketSplitter(_LONGEST)
-        self._tracks: dict[int, PacketTrack] = {}
+        self._tracks: dict[int, BridgePacketTrack] = {}
         self._epochs: dict[int, int] = {}
         self.counters = self._splitter.counters
         self.counters |= dict.fromkeys(
@@ -253,7 +254,7 @@ class BridgeDecoder:
         self.counters["packets"] += len(records)
         return records
 
-    def _record(self, packet: Packet) -> BridgeRecord | None:
+    def _record(self, packet: CobsPacket) -> BridgeRecord | None:
         data = packet.data[: -_CRC.size]
         flaw = ""
         if len(data) < _HEADER.size:
@@ -267,27 +268,83 @@ class BridgeDecoder:
         if version != VERSION:
             self.counters["unknown_versions"] += 1
             return None
-        header = Header(source, flags, sequence, time_us)
+        header = BridgeHeader(source, flags, sequence, time_us)
         body = decode_body(kind, data[_HEADER.size :])
-        lost = self._follow(header, hello=kind == PacketType.HELLO)
+        lost = self._follow(header, hello=kind == BridgePacketType.HELLO)
         if lost is None:
             self.counters["repeated_packets"] += 1
             return None
         self.counters["lost_packets"] += lost
         if body is None:
-            known = kind in PacketType.__members__.values()
+            known = kind in BridgePacketType.__members__.values()
             self.counters["bad_bodies" if known else "unknown_types"] += 1
             return None
         time_us = self._tracks[source].time_us
         return BridgeRecord(header, body, lost, self._epochs[source], time_us)
 
-    def _follow(self, header: Header, *, hello: bool) -> int | None:
+    def _follow(self, header: BridgeHeader, *, hello: bool) -> int | None:
         """How many packets are missing before this one; None if it is a repetition."""
         sequence, time_us = header.sequence, header.device_time_us
         track = self._tracks.get(header.source)
         if track is not None and not track.has_restarted(sequence, time_us, hello=hello):
             return track.follow(sequence, time_us)
         self.counters["restarts"] += track is not None
-        self._tracks[header.source] = PacketTrack(sequence, time_us)
+        self._tracks[header.source] = BridgePacketTrack(sequence, time_us)
         self._epochs[header.source] = self._epochs.get(header.source, -1) + 1
         return 0
+
+
+_SEQUENCES = 1 << 16
+_TIMES = 1 << 32
+
+_LATE_US = 1_000_000
+"""A HELLO has the time it is sent, the slots behind it that of the first, which is earlier [us]."""
+
+
+@dataclass(slots=True)
+class BridgePacketTrack:
+    """Where the packets of a bridge have got to since it started.
+
+    Attributes:
+        sequence: Number of its last packet, modulo 65536.
+        time_us: Device time of that packet, unwrapped [us].
+    """
+
+    sequence: int
+    time_us: int
+
+    def has_restarted(self, sequence: int, time_us: int, *, hello: bool) -> bool:
+        """Whether the next packet is of another start.
+
+        Its time goes back in a HELLO, or together with its number, or by more than slots are late.
+        """
+        step = _signed(sequence - self.sequence, _SEQUENCES)
+        elapsed_us = _signed(time_us - self.time_us, _TIMES)
+        if elapsed_us < 0 and (hello or step < 0 or elapsed_us < -_LATE_US):
+            return True
+        # After more than 36 minutes a start looks like time that goes on over its wrap; but the
+        # first HELLO of all has number 0, out of its turn.
+        return hello and sequence == 0 and step != 1 and time_us < self.time_us % _TIMES
+
+    def follow(self, sequence: int, time_us: int) -> int | None:
+        """Go on to the next packet.
+
+        Args:
+            sequence: Its number, modulo 65536.
+            time_us: Its device time, modulo 2**32 [us].
+
+        Returns:
+            How many packets are missing before it; None if it repeats the last.
+        """
+        lost = (sequence - self.sequence - 1) % _SEQUENCES
+        if lost == _SEQUENCES - 1:
+            return None
+        self.sequence = sequence
+        self.time_us += _signed(time_us - self.time_us, _TIMES)
+        return lost
+
+
+def _signed(difference: int, modulus: int) -> int:
+    """The shorter way around."""
+    half = modulus // 2
+    return (difference + half) % modulus - half

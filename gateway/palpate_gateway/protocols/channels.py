@@ -67,3 +67,14 @@ def interleaved(layout: FrameLayout, *, pac_first: bool) -> tuple[int, ...]:
 def frame_rate_hz(layout: FrameLayout, slot_rate_hz: float = SLOT_RATE_HZ) -> float:
     """Frames per second at a slot rate."""
     return slot_rate_hz / layout.slots
+
+
+SEQUENCES: dict[str, tuple[int, ...]] = {
+    "biotac_e1_first": interleaved(BIOTAC_LAYOUT, pac_first=False),
+    "biotac_pac_first": interleaved(BIOTAC_LAYOUT, pac_first=True),
+    "biotac_sp_e1_first": interleaved(BIOTAC_SP_LAYOUT, pac_first=False),
+    "biotac_sp_pac_first": interleaved(BIOTAC_SP_LAYOUT, pac_first=True),
+    "numatac": (PAC, PDC),
+}
+"""Sequences of sampling by name (hardware reference 1.7). A stream cannot tell whether its frames
+begin with E1 or with PAC: as a cycle both are the same."""

@@ -5,12 +5,19 @@ The device answers over TCP (or RS-232, same text) in ASCII lines that end with 
 ``ERROR(code)``. Replies and data lines may come in any order, also between ``L0()`` and its echo.
 There is no checksum: a line is taken only if all of it has one of these shapes. What is sent to the
 device is in ``kms40_requests``.
+
+
+Commands to the Weiss KMS 40 (hardware reference 3.1).
+
+The order seen in the field: mask, filter, divider, ``VL(0)``, start. Stop the stream before a tare,
+and read on until the echo ``L0``: samples may still come before it.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 
@@ -42,7 +49,7 @@ _SAMPLE = re.compile(
 _FLAGS = re.compile(r"\d{1,10}|0[xX][0-9a-fA-F]{1,8}")
 
 
-class SystemFlags(IntFlag):
+class KmsFlags(IntFlag):
     """Bits of the status word that ``FLAGS()`` asks for."""
 
     CALIBRATION_VALID = 1 << 0
@@ -66,11 +73,11 @@ class SystemFlags(IntFlag):
     SCRIPT_FAILURE = 1 << 30
 
 
-FAULTS = SystemFlags.CALIBRATION_FAULT | SystemFlags.TEMPERATURE_FAULT | SystemFlags.POWER_FAULT
+FAULTS = KmsFlags.CALIBRATION_FAULT | KmsFlags.TEMPERATURE_FAULT | KmsFlags.POWER_FAULT
 """Flags that say the forces cannot be trusted."""
 
 
-class LineFault(StrEnum):
+class KmsLineFault(StrEnum):
     """Why a line is dropped; the values are names of counters."""
 
     OVERLONG = "overlong_lines"
@@ -83,7 +90,7 @@ class LineFault(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class ForceLine:
+class KmsForceLine:
     """One sample.
 
     Attributes:
@@ -99,7 +106,7 @@ class ForceLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class KmsReply:
     """The answer to a command.
 
     Attributes:
@@ -112,7 +119,7 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class KmsRefusal:
     """The device refuses a command; it does not say which.
 
     Attributes:
@@ -124,9 +131,9 @@ class Refusal:
     meaning: str
 
 
-KmsRecord = ForceLine | Reply | Refusal
+KmsRecord = KmsForceLine | KmsReply | KmsRefusal
 
-_COUNTER_OF = {ForceLine: "data_lines", Reply: "replies", Refusal: "refusals"}
+_COUNTER_OF = {KmsForceLine: "data_lines", KmsReply: "replies", KmsRefusal: "refusals"}
 
 
 class KmsDecoder:
@@ -139,7 +146,7 @@ class KmsDecoder:
         self._line = bytearray()
         self._skipping = False
         self.counters: dict[str, int] = dict.fromkeys(
-            (*_COUNTER_OF.values(), "untimed_lines", *LineFault, "record_bytes", "junk_bytes"), 0
+            (*_COUNTER_OF.values(), "untimed_lines", *KmsLineFault, "record_bytes", "junk_bytes"), 0
         )
 
     @property
@@ -171,7 +178,7 @@ class KmsDecoder:
             return
         if not self._skipping:
             self._skipping = True
-            self.counters[LineFault.OVERLONG] += 1
+            self.counters[KmsLineFault.OVERLONG] += 1
             self.counters["junk_bytes"] += len(self._line)
             self._line.clear()
         self.counters["junk_bytes"] += len(piece)
@@ -184,98 +191,230 @@ class KmsDecoder:
         line = bytes(self._line)
         self._line.clear()
         record = parse_line(line)
-        if isinstance(record, LineFault):
+        if isinstance(record, KmsLineFault):
             self.counters[record] += 1
             self.counters["junk_bytes"] += len(line) + 1
             return None
         self.counters[_COUNTER_OF[type(record)]] += 1
         self.counters["record_bytes"] += len(line) + 1
-        if isinstance(record, ForceLine) and record.timestamp is None:
+        if isinstance(record, KmsForceLine) and record.timestamp is None:
             self.counters["untimed_lines"] += 1
         return record
 
 
-def parse_line(line: bytes) -> KmsRecord | LineFault:
+def parse_line(line: bytes) -> KmsRecord | KmsLineFault:
     """Read one line; blanks and a CR around it do not matter.
 
     Args:
         line: The line without its LF.
     """
     if len(line) > LINE_MAX:
-        return LineFault.OVERLONG
+        return KmsLineFault.OVERLONG
     line = line.strip()
     if not line:
-        return LineFault.BLANK
+        return KmsLineFault.BLANK
     text = line.decode("latin-1")
     if not (text.isascii() and text.isprintable()):
-        return LineFault.NON_ASCII
+        return KmsLineFault.NON_ASCII
     if text.startswith("F="):
         return _parse_data(text)
     if text.startswith("ERROR"):
         refusal = _REFUSAL.fullmatch(text)
         if refusal is None:
-            return LineFault.MALFORMED
+            return KmsLineFault.MALFORMED
         code = int(refusal[1])
-        return Refusal(code, REFUSALS.get(code, f"unknown error {code}"))
+        return KmsRefusal(code, REFUSALS.get(code, f"unknown error {code}"))
     if text in ("L1", "L0"):
-        return Reply(text, "")
+        return KmsReply(text, "")
     reply = _REPLY.fullmatch(text)
     if reply is None:
-        return LineFault.UNKNOWN
+        return KmsLineFault.UNKNOWN
     value = reply[2].strip()
     quoted = len(value) >= 2 and value[0] == value[-1] == '"'
-    return Reply(reply[1], value[1:-1] if quoted else value)
+    return KmsReply(reply[1], value[1:-1] if quoted else value)
 
 
-def _parse_data(text: str) -> ForceLine | LineFault:
+def _parse_data(text: str) -> KmsForceLine | KmsLineFault:
     sample = _SAMPLE.fullmatch(text)
     if sample is not None:
         fx, fy, fz, mx, my, mz = map(float, sample.groups()[:6])
         ticks = sample[7]
         # Each of them is finite if their sum is; if not, see below.
         if math.isfinite(fx + fy + fz + mx + my + mz):
-            return ForceLine((fx, fy, fz), (mx, my, mz), None if ticks is None else int(ticks))
+            return KmsForceLine((fx, fy, fz), (mx, my, mz), None if ticks is None else int(ticks))
     data = _DATA.fullmatch(text)
     if data is None:
-        return LineFault.MALFORMED
+        return KmsLineFault.MALFORMED
     fields = [field.strip() for field in data[1].split(",")]
     if len(fields) != len(AXES):
-        return LineFault.WRONG_COUNT
+        return KmsLineFault.WRONG_COUNT
     # The device's "nan" and "inf", and numbers too large for a float, are all bad.
     if not all(_NUMBER.fullmatch(field) for field in fields):
-        return LineFault.BAD_NUMBER
+        return KmsLineFault.BAD_NUMBER
     fx, fy, fz, mx, my, mz = (float(field) for field in fields)
     if not all(map(math.isfinite, (fx, fy, fz, mx, my, mz))):
-        return LineFault.BAD_NUMBER
+        return KmsLineFault.BAD_NUMBER
     timestamp = None
     if data[2] is not None:
         ticks = data[2].strip()
         if _TICKS.fullmatch(ticks):
             timestamp = int(ticks)
         elif not _NUMBER.fullmatch(ticks):
-            return LineFault.MALFORMED
-    return ForceLine((fx, fy, fz), (mx, my, mz), timestamp)
+            return KmsLineFault.MALFORMED
+    return KmsForceLine((fx, fy, fz), (mx, my, mz), timestamp)
 
 
-def parse_flags(value: str) -> SystemFlags | None:
+def parse_flags(value: str) -> KmsFlags | None:
     """Status word in the value of a ``FLAGS`` reply; None if it is no 32-bit number."""
     if not _FLAGS.fullmatch(value):
         return None
     # Not int(value, 0), which refuses leading zeros.
     word = int(value, 16 if value[:2] in ("0x", "0X") else 10)
-    return SystemFlags(word) if word < 1 << 32 else None
+    return KmsFlags(word) if word < 1 << 32 else None
 
 
-def flag_names(flags: SystemFlags) -> tuple[str, ...]:
+def flag_names(flags: KmsFlags) -> tuple[str, ...]:
     """Names of the flags that are set, lowest first; ``bit 7`` where the reference has no name."""
     return tuple(
-        (SystemFlags(1 << bit).name or f"bit {bit}").lower().replace("_", " ")
+        (KmsFlags(1 << bit).name or f"bit {bit}").lower().replace("_", " ")
         for bit in range(flags.bit_length())
         if flags >> bit & 1
     )
 
 
-def over_range_axes(flags: SystemFlags) -> tuple[str, ...]:
+def over_range_axes(flags: KmsFlags) -> tuple[str, ...]:
     """Axes whose range is exceeded, as named in ``AXES``."""
-    first = SystemFlags.OVER_RANGE_FX.bit_length() - 1
+    first = KmsFlags.OVER_RANGE_FX.bit_length() - 1
     return tuple(axis for k, axis in enumerate(AXES) if flags >> first + k & 1)
+
+
+PORT = 1000
+"""TCP port; the device's address is a setting, two defaults are known (hardware reference 6)."""
+
+BASE_RATE_HZ = 500.0
+"""Rate at divider 1: one sample each 2 ms [Hz]."""
+
+DIVIDER_MAX = 500
+"""Largest divider we ask for, one line a second; the device's own limit is not public."""
+
+FILTER_MAX = 255
+"""Largest filter number we ask for; the device's table of filters is not public."""
+
+
+class KmsQuery(StrEnum):
+    """Commands without arguments that only ask; the value is also the name of the reply."""
+
+    IDENTITY = "ID"
+    SERIAL_NUMBER = "SN"
+    VERSION = "V"
+    CALIBRATION_DATE = "CALDATE"
+    TEMPERATURE = "T"
+    FLAGS = "FLAGS"
+    SAMPLE = "F"
+    """One sample; the answer is a data line."""
+
+
+def query_request(query: KmsQuery) -> bytes:
+    """Ask for one fact."""
+    return f"{query}()\n".encode("ascii")
+
+
+def identify_requests() -> tuple[bytes, ...]:
+    """Ask who the device is: identity, serial number and version, one request each."""
+    return tuple(map(query_request, (KmsQuery.IDENTITY, KmsQuery.SERIAL_NUMBER, KmsQuery.VERSION)))
+
+
+def start_request() -> bytes:
+    """Start the stream; the device echoes ``L1``."""
+    return b"L1()\n"
+
+
+def stop_request() -> bytes:
+    """Stop the stream; the device echoes ``L0``, perhaps after more samples."""
+    return b"L0()\n"
+
+
+def tare_request() -> bytes:
+    """Take the present load as zero; the reply is ``TARE=1``."""
+    return b"TARE(1)\n"
+
+
+def clear_tare_request() -> bytes:
+    """Forget the tare; the reply is ``TARE=0``."""
+    return b"TARE(0)\n"
+
+
+def quiet_request() -> bytes:
+    """Ask for the shortest replies."""
+    return b"VL(0)\n"
+
+
+def mask_request(axes: Sequence[bool] = (True,) * 6) -> bytes:
+    """Choose the axes to be sent; ``kms40.parse_line`` takes only samples of all six.
+
+    Args:
+        axes: Whether to send fx fy fz mx my mz.
+
+    Raises:
+        ValueError: There are not six, or none is chosen.
+    """
+    if len(axes) != 6 or not any(axes):
+        raise ValueError(f"mask {list(axes)} is not six truth values with one true at least")
+    return f"LMASK({{{','.join('1' if axis else '0' for axis in axes)}}})\n".encode("ascii")
+
+
+def divider_request(divider: int) -> bytes:
+    """Send only every n-th sample.
+
+    Args:
+        divider: The n, 1..500.
+
+    Raises:
+        ValueError: The divider is out of range.
+    """
+    _check("divider", divider, 1, DIVIDER_MAX)
+    return f"LDIV({divider})\n".encode("ascii")
+
+
+def filter_request(number: int) -> bytes:
+    """Choose a filter.
+
+    Args:
+        number: Number in the device's table of filters, 0..255.
+
+    Raises:
+        ValueError: The number is out of range.
+    """
+    _check("filter number", number, 0, FILTER_MAX)
+    return f"FLT({number})\n".encode("ascii")
+
+
+def rate_of_divider(divider: int) -> float:
+    """Lines per second at a divider [Hz].
+
+    Raises:
+        ValueError: The divider is out of range.
+    """
+    _check("divider", divider, 1, DIVIDER_MAX)
+    return BASE_RATE_HZ / divider
+
+
+def divider_of_rate(rate_hz: float) -> int:
+    """Largest divider whose rate is not below the one asked for.
+
+    Args:
+        rate_hz: Lines per second, 1..500 [Hz].
+
+    Raises:
+        ValueError: The device cannot deliver at this rate.
+    """
+    slowest = BASE_RATE_HZ / DIVIDER_MAX
+    if not slowest <= rate_hz <= BASE_RATE_HZ:
+        raise ValueError(f"rate {rate_hz} Hz is not in {slowest:g}..{BASE_RATE_HZ:g} Hz")
+    # Rounding can make 500 / (500 / n) a little less than n.
+    return int(BASE_RATE_HZ / rate_hz * (1 + 1e-9))
+
+
+def _check(name: str, value: int, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise ValueError(f"{name} {value} is not in {least}..{most}")

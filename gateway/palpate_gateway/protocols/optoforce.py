@@ -11,8 +11,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from palpate_gateway.protocols.checksums import sum16
-from palpate_gateway.protocols.resync import FrameFinder
+from palpate_gateway.protocols.framing import FrameFinder, sum16
 
 BAUD = 1_000_000
 

@@ -34,7 +34,7 @@ SAMPLE_BYTES = _COUNTS.size
 RECORD_BYTES = _RECORD.size
 
 
-class Layout(StrEnum):
+class Pic32Layout(StrEnum):
     """Order of the 23 values, which changed between commits of the firmware."""
 
     PAC_FIRST = "pac_first"
@@ -107,7 +107,7 @@ def newtons(grams: int) -> float:
     return grams * _NEWTON_PER_GRAM
 
 
-def decode_sample(reply: bytes, layout: Layout = Layout.PAC_FIRST) -> Pic32Sample | None:
+def decode_sample(reply: bytes, layout: Pic32Layout = Pic32Layout.PAC_FIRST) -> Pic32Sample | None:
     """The reply to ``sample_request``; None if it has another length or is misaligned."""
     return _sample(_COUNTS.unpack(reply), layout) if len(reply) == SAMPLE_BYTES else None
 
@@ -120,10 +120,10 @@ def decode_load(reply: bytes) -> int | None:
     return int(load_g) if abs(load_g) <= LARGEST_LOAD_G else None
 
 
-def _sample(values: tuple[int, ...], layout: Layout) -> Pic32Sample | None:
+def _sample(values: tuple[int, ...], layout: Pic32Layout) -> Pic32Sample | None:
     if max(values) > COUNTS_MAX:
         return None
-    if layout is Layout.PAC_FIRST:
+    if layout is Pic32Layout.PAC_FIRST:
         others, electrodes = values[:4], values[4:]
     else:
         electrodes, others = values[:ELECTRODES], values[ELECTRODES:]
@@ -142,8 +142,8 @@ class Pic32Decoder:
         layout: Order of the values; the firmware's, which nothing in the stream tells.
     """
 
-    def __init__(self, layout: Layout = Layout.PAC_FIRST) -> None:
-        self._layout = Layout(layout)
+    def __init__(self, layout: Pic32Layout = Pic32Layout.PAC_FIRST) -> None:
+        self._layout = Pic32Layout(layout)
         self._pending = bytearray()
         self._tick: int | None = None
         self.misaligned = False

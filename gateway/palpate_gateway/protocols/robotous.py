@@ -4,6 +4,12 @@ A request has 8 data bytes, an answer 16 (D1..D16, D1 names the command); ``robo
 them off the serial line and the CAN bus. The sensor sends neither a counter nor a time (hardware
 reference 3.5). Where the page leaves the place of a setting inside a reply open, it is that of the
 maker's own packet class ``RFT_IF_PACKET`` (one source).
+
+
+Lines that carry the data bytes of Robotous RFT sensors (hardware reference 3.5).
+
+Serial: ``55``, data, sum of the data mod 256, ``AA``. CAN: an answer comes in two messages, the
+halves of D1..D16, with an id each; a request is one message.
 """
 
 from __future__ import annotations
@@ -13,6 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
+from palpate_gateway.protocols.framing import FrameFinder, sum8
+
 REQUEST_BYTES = 8
 REPLY_BYTES = 16
 
@@ -21,7 +29,7 @@ AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 _COUNTS = struct.Struct(">6h")
 
 
-class Command(IntEnum):
+class RobotousCommand(IntEnum):
     """First data byte of requests and replies."""
 
     MODEL = 1
@@ -42,7 +50,7 @@ class Command(IntEnum):
     OVERLOADS = 18
 
 
-class FilterOrder(Enum):
+class RobotousFilterOrder(Enum):
     """How cutoffs are numbered; the sources conflict (hardware reference 6).
 
     Both manuals count down from 500 Hz, the maker's sample header up from 1 Hz.
@@ -67,15 +75,20 @@ CUTOFFS_HZ = (500, 300, 200, 150, 100, 50, 40, 30, 20, 10, 5, 3, 2, 1)
 ERRORS = {1: "unsupported", 2: "out of range", 3: "failed"}
 """Meaning of the error code of a refused setting."""
 
-_COMMANDS = {int(command): command for command in Command}
-_TEXTS = (Command.MODEL, Command.SERIAL, Command.FIRMWARE)
-_SETTINGS = (Command.SET_CAN_IDS, Command.SET_BAUD, Command.SET_FILTER, Command.SET_RATE)
+_COMMANDS = {int(command): command for command in RobotousCommand}
+_TEXTS = (RobotousCommand.MODEL, RobotousCommand.SERIAL, RobotousCommand.FIRMWARE)
+_SETTINGS = (
+    RobotousCommand.SET_CAN_IDS,
+    RobotousCommand.SET_BAUD,
+    RobotousCommand.SET_FILTER,
+    RobotousCommand.SET_RATE,
+)
 _VALUES = {
-    Command.GET_CAN_IDS: 6,
-    Command.GET_BAUD: 2,
-    Command.GET_FILTER: 2,
-    Command.GET_RATE: 1,
-    Command.OVERLOADS: 6,
+    RobotousCommand.GET_CAN_IDS: 6,
+    RobotousCommand.GET_BAUD: 2,
+    RobotousCommand.GET_FILTER: 2,
+    RobotousCommand.GET_RATE: 1,
+    RobotousCommand.OVERLOADS: 6,
 }
 
 
@@ -89,7 +102,7 @@ class RobotousData:
         overload: Status byte; bit 5 Fx ... bit 0 Tz set where a load passes 120 % of its rating.
     """
 
-    command: Command
+    command: RobotousCommand
     counts: tuple[int, ...]
     overload: int
 
@@ -98,7 +111,7 @@ class RobotousData:
 class RobotousText:
     """Model, serial number or firmware version."""
 
-    command: Command
+    command: RobotousCommand
     text: str
 
 
@@ -112,7 +125,7 @@ class RobotousResult:
         error: Error code, see ``ERRORS``; 0 if none.
     """
 
-    command: Command
+    command: RobotousCommand
     ok: bool
     error: int
 
@@ -127,7 +140,7 @@ class RobotousValues:
             now, code after restart. Filter: type, code. Rate: code. Overloads: count of each axis.
     """
 
-    command: Command
+    command: RobotousCommand
     values: tuple[int, ...]
 
 
@@ -146,7 +159,7 @@ def decode(payload: bytes) -> RobotousRecord:
     command = _COMMANDS.get(payload[0]) if len(payload) == REPLY_BYTES else None
     if command is None:
         return RobotousUnknown(payload)
-    if command in (Command.SAMPLE, Command.START):
+    if command in (RobotousCommand.SAMPLE, RobotousCommand.START):
         return RobotousData(command, _COUNTS.unpack_from(payload, 1), payload[13])
     if command in _TEXTS:
         text = payload[1:].split(b"\0")[0].decode("ascii", "replace")
@@ -219,34 +232,34 @@ def scale_of(model: str, *, torque_divisor: float | None = None) -> RobotousScal
     return RobotousScale(FORCE_DIVISOR, torque_divisor)
 
 
-def cutoff_hz_of(code: int, order: FilterOrder = FilterOrder.MANUALS) -> int | None:
+def cutoff_hz_of(code: int, order: RobotousFilterOrder = RobotousFilterOrder.MANUALS) -> int | None:
     """Cutoff [Hz] of a filter code; None if the code names none."""
     if not 1 <= code <= len(CUTOFFS_HZ):
         return None
-    return CUTOFFS_HZ[code - 1 if order is FilterOrder.MANUALS else -code]
+    return CUTOFFS_HZ[code - 1 if order is RobotousFilterOrder.MANUALS else -code]
 
 
 def start_request() -> bytes:
     """Stream data; while it streams, the sensor takes only stop and bias."""
-    return _request(Command.START)
+    return _request(RobotousCommand.START)
 
 
 def stop_request() -> bytes:
     """Stop the stream; there is no answer."""
-    return _request(Command.STOP)
+    return _request(RobotousCommand.STOP)
 
 
 def sample_request() -> bytes:
     """Send one wrench."""
-    return _request(Command.SAMPLE)
+    return _request(RobotousCommand.SAMPLE)
 
 
 def bias_request(on: bool = True) -> bytes:
     """Take the present load as zero, or forget that zero; there is no answer."""
-    return _request(Command.BIAS, int(on))
+    return _request(RobotousCommand.BIAS, int(on))
 
 
-def get_request(command: Command) -> bytes:
+def get_request(command: RobotousCommand) -> bytes:
     """Ask for an identity, a setting or the overload counts."""
     if command not in _TEXTS and command not in _VALUES:
         asks = ", ".join(one.name for one in (*_TEXTS, *_VALUES))
@@ -256,15 +269,17 @@ def get_request(command: Command) -> bytes:
 
 def rate_request(rate_hz: int) -> bytes:
     """Set the stream's rate [Hz], one of ``RATE_CODES``; serial lines: ``HIGHEST_RATE_HZ``."""
-    return _request(Command.SET_RATE, _code(RATE_CODES, rate_hz, "rate [Hz]"))
+    return _request(RobotousCommand.SET_RATE, _code(RATE_CODES, rate_hz, "rate [Hz]"))
 
 
 def baud_request(baud: int) -> bytes:
     """Set the baud of the serial line, one of ``BAUD_CODES``."""
-    return _request(Command.SET_BAUD, _code(BAUD_CODES, baud, "baud"))
+    return _request(RobotousCommand.SET_BAUD, _code(BAUD_CODES, baud, "baud"))
 
 
-def filter_request(cutoff_hz: int | None, *, order: FilterOrder = FilterOrder.MANUALS) -> bytes:
+def filter_request(
+    cutoff_hz: int | None, *, order: RobotousFilterOrder = RobotousFilterOrder.MANUALS
+) -> bytes:
     """Set the low-pass.
 
     Args:
@@ -272,9 +287,9 @@ def filter_request(cutoff_hz: int | None, *, order: FilterOrder = FilterOrder.MA
         order: How the sensor numbers cutoffs. Confirm it by the noise level.
     """
     if cutoff_hz is None:
-        return _request(Command.SET_FILTER, 0, 0)
+        return _request(RobotousCommand.SET_FILTER, 0, 0)
     codes = {cutoff_hz_of(code, order) or 0: code for code in range(1, len(CUTOFFS_HZ) + 1)}
-    return _request(Command.SET_FILTER, 1, _code(codes, cutoff_hz, "cutoff [Hz]"))
+    return _request(RobotousCommand.SET_FILTER, 1, _code(codes, cutoff_hz, "cutoff [Hz]"))
 
 
 def can_ids_request(request_id: int, first_id: int, second_id: int) -> bytes:
@@ -282,10 +297,10 @@ def can_ids_request(request_id: int, first_id: int, second_id: int) -> bytes:
     ids = (request_id, first_id, second_id)
     if any(not 1 <= one <= 255 for one in ids) or len(set(ids)) < 3:
         raise ValueError(f"CAN ids {ids} are not three different ones in 1..255")
-    return _request(Command.SET_CAN_IDS, *ids)
+    return _request(RobotousCommand.SET_CAN_IDS, *ids)
 
 
-def _request(command: Command, *parameters: int) -> bytes:
+def _request(command: RobotousCommand, *parameters: int) -> bytes:
     return bytes((command, *parameters)).ljust(REQUEST_BYTES, b"\0")
 
 
@@ -293,3 +308,137 @@ def _code(codes: dict[int, int], value: int, name: str) -> int:
     if value not in codes:
         raise ValueError(f"{name} {value} is not one of {', '.join(map(str, sorted(codes)))}")
     return codes[value]
+
+
+REQUEST_ID = 0x64
+FIRST_ID = 0x01
+SECOND_ID = 0x02
+"""CAN ids as delivered; each can be set to 1..255."""
+
+_HEAD = b"\x55"
+_END = 0xAA
+_EXTRA_BYTES = 3
+_HALF_BYTES = REPLY_BYTES // 2
+
+
+def serial_frame(data: bytes) -> bytes:
+    """Frame of a request (8 data bytes: 11 bytes) or of an answer (16: 19 bytes).
+
+    Raises:
+        ValueError: There are neither 8 nor 16 data bytes.
+    """
+    if len(data) not in (REQUEST_BYTES, REPLY_BYTES):
+        raise ValueError(f"{len(data)} data bytes are neither {REQUEST_BYTES} nor {REPLY_BYTES}")
+    return _HEAD + data + bytes((sum8(data), _END))
+
+
+def _is_good(frame: bytes) -> bool:
+    return frame[-1] == _END and frame[-2] == sum8(frame[1:-2])
+
+
+class RobotousSerialDecoder:
+    """Data bytes out of a serial line.
+
+    Args:
+        data_bytes: Data bytes of a frame: 16 from the sensor, 8 on the way to it.
+    """
+
+    def __init__(self, data_bytes: int = REPLY_BYTES) -> None:
+        self._finder = FrameFinder({_HEAD: data_bytes + _EXTRA_BYTES}, _is_good)
+        self.counters = self._finder.counters
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that has begun."""
+        return self._finder.pending
+
+    def reset(self) -> None:
+        """A new connection: partial bytes are counted as junk, counters are kept."""
+        self._finder.reset()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take bytes as they come; return the data bytes of each good frame."""
+        return [frame[1:-2] for frame in self._finder.feed(data)]
+
+
+def can_messages(
+    payload: bytes, first_id: int = FIRST_ID, second_id: int = SECOND_ID
+) -> tuple[tuple[int, bytes], tuple[int, bytes]]:
+    """Id and data of the two messages that carry one answer.
+
+    Raises:
+        ValueError: There are not 16 data bytes.
+    """
+    if len(payload) != REPLY_BYTES:
+        raise ValueError(f"{len(payload)} data bytes are not {REPLY_BYTES}")
+    return (first_id, payload[:_HALF_BYTES]), (second_id, payload[_HALF_BYTES:])
+
+
+class RobotousCanDecoder:
+    """Data bytes out of CAN messages.
+
+    A half whose other half did not follow is dropped: ``lonely_first``, ``lonely_second``.
+    ``swapped_pairs`` counts those among them that came as a pair in the wrong order. The sensor
+    numbers nothing: where a second half and the next first half are lost together, the halves of
+    two samples make one answer. Only the times of the messages show that; the caller who sees
+    such a gap calls ``reset()`` before it feeds on.
+
+    Args:
+        first_id: CAN id of D1..D8.
+        second_id: CAN id of D9..D16.
+
+    Raises:
+        ValueError: The ids are the same or not in 1..255.
+    """
+
+    def __init__(self, first_id: int = FIRST_ID, second_id: int = SECOND_ID) -> None:
+        if first_id == second_id or not (1 <= first_id <= 255 and 1 <= second_id <= 255):
+            raise ValueError(f"CAN ids {first_id}, {second_id} are not two different in 1..255")
+        self._first_id = first_id
+        self._second_id = second_id
+        self._first: bytes | None = None
+        self._after_lonely_second = False
+        self._first_after_lonely_second = False
+        self.counters: dict[str, int] = dict.fromkeys(
+            ("other_ids", "wrong_lengths", "lonely_first", "lonely_second", "swapped_pairs"), 0
+        )
+
+    @property
+    def pending(self) -> int:
+        """Messages that wait for their second half: 0 or 1."""
+        return int(self._first is not None)
+
+    def reset(self) -> None:
+        """A new connection: a half that waits is counted as lonely, counters are kept."""
+        self._drop_first()
+        self._after_lonely_second = False
+
+    def feed(self, can_id: int, data: bytes) -> list[bytes]:
+        """Take one message; return the 16 data bytes of the answer that is now whole, if any."""
+        if can_id not in (self._first_id, self._second_id):
+            self.counters["other_ids"] += 1
+            return []
+        if len(data) != _HALF_BYTES:
+            self.counters["wrong_lengths"] += 1
+            self.reset()
+            return []
+        if can_id == self._first_id:
+            self._drop_first()
+            self._first = bytes(data)
+            self._first_after_lonely_second = self._after_lonely_second
+            self._after_lonely_second = False
+            return []
+        if self._first is None:
+            self.counters["lonely_second"] += 1
+            self._after_lonely_second = True
+            return []
+        payload = self._first + data
+        self._first = None
+        return [payload]
+
+    def _drop_first(self) -> None:
+        if self._first is None:
+            return
+        self.counters["lonely_first"] += 1
+        self.counters["swapped_pairs"] += self._first_after_lonely_second
+        self._first = None

@@ -12,7 +12,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from palpate_gateway.protocols.places import Floats
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
 
 _GAP_S = 5e-3
 """Silence that is worth a thought; stamps of a bus scatter by 1 ms (hardware reference 5.1) [s]."""
@@ -36,7 +39,7 @@ _PATIENCE_S = 2.0
 """Nobody falls behind and makes up in turns for longer [s]."""
 
 
-class Loss(NamedTuple):
+class FrameLoss(NamedTuple):
     """What a slot shows to be gone before it.
 
     Attributes:
@@ -49,7 +52,7 @@ class Loss(NamedTuple):
     shift_s: float
 
 
-NO_LOSS = Loss(0, 0.0)
+NO_LOSS = FrameLoss(0, 0.0)
 
 
 @dataclass(slots=True)
@@ -109,7 +112,7 @@ class Silences:
         """Least delay of late [s]."""
         return min(self._lows)
 
-    def judge(self, stamp_s: float, delay_s: float, *, broken: bool, edge: bool) -> Loss:
+    def judge(self, stamp_s: float, delay_s: float, *, broken: bool, edge: bool) -> FrameLoss:
         """Take a slot; return what is now known to be gone before it.
 
         Args:
@@ -145,7 +148,7 @@ class Silences:
         late_s = delay_s if at_once else gap.low_s if stamp_s >= gap.until_s else gap.least_s
         frames = math.floor((late_s - usual_s) / self._frame_s + 0.5)
         self._begin(stamp_s, usual_s)
-        return Loss(frames, late_s - usual_s - frames * self._frame_s)
+        return FrameLoss(frames, late_s - usual_s - frames * self._frame_s)
 
     def pass_over(self, stamps_s: Floats, delays_s: Floats) -> bool:
         """Take slots of an unbroken order at once, if none of them is worth a thought.

@@ -1,4 +1,6 @@
-"""The place of slots that carry no number, from the order of their channels and their stamps.
+"""The place of a slot in its stream, of one and of many.
+
+The place of slots that carry no number, from the order of their channels and their stamps.
 
 A slot is known by its channel, PAC by standing between the others. A frame ends where the cycle of
 channels begins again (hardware reference 2.1).
@@ -9,19 +11,119 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from palpate_gateway.protocols import channels as ch
-from palpate_gateway.protocols.can_slots import SlotOrder, learn_order
-from palpate_gateway.protocols.places import Floats, Ints, Place, Places
-from palpate_gateway.protocols.silences import Silences
+from palpate_gateway.protocols.silences import Floats, Silences
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class SlotPlace:
+    """Where a slot belongs.
+
+    Attributes:
+        run: Counts connections and changes of the sequence, from 0.
+        frame: Frame number from 0, with those that were lost.
+        position: Place in the sequence.
+        time_s: When it was sampled [s], by the clock of the stamps: on the grid of slots, which
+            begins anew where frames were lost; the stamp itself if stamps are exact.
+    """
+
+    run: int
+    frame: int
+    position: int
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SlotPlaces:
+    """Where slots belong; see ``SlotPlace``.
+
+    Attributes:
+        kept: Which of the slots have a place, int64, shape ``(N,)``.
+        run: int64, shape ``(N,)``, as are frame and position.
+        frame: Frame numbers.
+        position: Places in the sequence.
+        time_s: When they were sampled [s], float64, shape ``(N,)``.
+    """
+
+    kept: Ints
+    run: Ints
+    frame: Ints
+    position: Ints
+    time_s: Floats
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
 
 _LEARNT_FROM = 128
 """Slots in a row that must repeat before their order is believed: two cycles of up to 64."""
 
 _SCATTER_S = 2e-3
 """No stamp is too early by more than this [s]."""
+
+
+class SlotOrder:
+    """A cycle of channels, and the way from slot to slot in it.
+
+    Args:
+        channels: Channel indices in order of sampling; one at least occurs just once.
+    """
+
+    def __init__(self, channels: Sequence[int]) -> None:
+        self.channels = tuple(channels)
+        self.size = size = len(self.channels)
+        """Slots of a cycle."""
+        self.anchors = {c: p for p, c in enumerate(channels) if self.channels.count(c) == 1}
+        """Positions of the channels that tell theirs."""
+        if not self.anchors:
+            raise ValueError("no channel of the sequence occurs exactly once")
+        self.cycle = np.array(self.channels, np.int64)
+        """The channels as an array."""
+        self.is_anchor = np.array([c in self.anchors for c in self.channels])
+        """Of each position, whether its channel tells it, bool."""
+        # From the last position back, so that the nearest place of a channel stays.
+        self._steps = [
+            {self.channels[(p + steps) % size]: steps for steps in range(size, 0, -1)}
+            for p in range(size)
+        ]
+
+    def steps(self, position: int, channel: int) -> int:
+        """Slots from a position forward to the next one of a channel of the sequence."""
+        return self._steps[position][channel]
+
+    def steps_near(self, position: int, channel: int, expected: float) -> int:
+        """Slots forward to that place of a channel of the sequence which is nearest to a number."""
+        least, size = self.steps(position, channel), self.size
+        if abs(least - expected) < 1:
+            return least
+        places = [p for p, one in enumerate(self.channels) if one == channel]
+        least_of = [(place - position - 1) % size + 1 for place in places]
+        steps = [one + size * max(round((expected - one) / size), 0) for one in least_of]
+        return min(steps, key=lambda one: abs(one - expected))
+
+
+def learn_order(seen: Sequence[int]) -> SlotOrder | None:
+    """The shortest cycle that all these channels repeat, from E1 on; None if they do not.
+
+    Args:
+        seen: Channel indices of consecutive slots; cycles up to half as long are found.
+    """
+    for size in range(1, len(seen) // 2 + 1):
+        if all(a == b for a, b in zip(seen, seen[size:], strict=False)):
+            cycle = tuple(seen[:size])
+            once = [c for c in cycle if cycle.count(c) == 1]
+            if not once:
+                return None
+            start = cycle.index(min(once, key=lambda c: (c < ch.FIRST_ELECTRODE, c == ch.PAC, c)))
+            return SlotOrder(cycle[start:] + cycle[:start])
+    return None
 
 
 class SlotClock:
@@ -85,7 +187,7 @@ class SlotClock:
             return None
         return (self._index - index) / (self._last_s - stamp_s)
 
-    def place(self, channel: int, stamp_s: float) -> Place | None:
+    def place(self, channel: int, stamp_s: float) -> SlotPlace | None:
         """Place the next slot; None if it has no place.
 
         Args:
@@ -117,9 +219,9 @@ class SlotClock:
         self._frame = frame
         self.counters["placed"] += 1
         time_s = stamp_s if self._exact else self._time_s(self._index)
-        return Place(self._run, self._base + frame, position, time_s)
+        return SlotPlace(self._run, self._base + frame, position, time_s)
 
-    def place_all(self, channels: Ints, stamps_s: Floats) -> Places:
+    def place_all(self, channels: Ints, stamps_s: Floats) -> SlotPlaces:
         """Place slots, leaving out what has no place: the same as one by one, and faster.
 
         Args:
@@ -134,9 +236,9 @@ class SlotClock:
         told = [(p.run, p.frame, p.position) for p in places if p is not None]
         run, frame, position = np.array(told, np.int64).reshape(-1, 3).T
         times = np.array([p.time_s for p in places if p is not None], np.float64)
-        return Places(np.array(kept, np.int64), run, frame, position, times)
+        return SlotPlaces(np.array(kept, np.int64), run, frame, position, times)
 
-    def _steady(self, channels: Ints, stamps_s: Floats) -> Places | None:
+    def _steady(self, channels: Ints, stamps_s: Floats) -> SlotPlaces | None:
         """Places of slots that are just the next ones, in order and in time; None if they are not.
 
         One by one a slot costs 10 us; a hand brings 8800 a second.
@@ -178,7 +280,7 @@ class SlotClock:
         self._frame = int(frame[-1])
         self.counters["placed"] += number
         run = np.full(number, self._run)
-        return Places(np.arange(number), run, self._base + frame, position, times_s)
+        return SlotPlaces(np.arange(number), run, self._base + frame, position, times_s)
 
     def reset(self) -> None:
         """The connection is new: a new run begins, and a learnt sequence is learnt again."""

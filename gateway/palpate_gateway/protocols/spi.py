@@ -48,7 +48,7 @@ class WordKind(IntEnum):
     BIT_ERROR = 3
 
 
-class Property(IntEnum):
+class SpiProperty(IntEnum):
     """Property byte that follows ``READ_PROPERTY``."""
 
     FLEX_VERSION = 0x10
@@ -60,7 +60,7 @@ class Property(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
+class SpiWord:
     """One decoded word.
 
     Attributes:
@@ -77,7 +77,7 @@ class Word:
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class SpiWords:
     """Many decoded words.
 
     Attributes:
@@ -132,20 +132,20 @@ def encode_word(value: int) -> bytes:
     return bytes((with_odd_parity(value >> 5 << 1), with_odd_parity((value & 0x1F) << 3)))
 
 
-def decode_word(word: bytes) -> Word:
+def decode_word(word: bytes) -> SpiWord:
     """Decode one word of two bytes."""
     first, second = word
     suspicious = bool(second & _SUSPICIOUS_BITS)
     if first.bit_count() % 2 and second.bit_count() % 2:
-        return Word(WordKind.GOOD, (first >> 1) * 32 + (second >> 3), suspicious, "")
+        return SpiWord(WordKind.GOOD, (first >> 1) * 32 + (second >> 3), suspicious, "")
     if first == second and first in (0x00, 0xFF):
-        return Word(WordKind.ABSENT, 0, False, "")
+        return SpiWord(WordKind.ABSENT, 0, False, "")
     if first == ERROR_BYTE and second in ERROR_WORDS:
-        return Word(WordKind.DEVICE_ERROR, 0, False, ERROR_WORDS[second])
-    return Word(WordKind.BIT_ERROR, 0, suspicious, "")
+        return SpiWord(WordKind.DEVICE_ERROR, 0, False, ERROR_WORDS[second])
+    return SpiWord(WordKind.BIT_ERROR, 0, suspicious, "")
 
 
-def decode_words(words: npt.NDArray[np.uint8]) -> Words:
+def decode_words(words: npt.NDArray[np.uint8]) -> SpiWords:
     """Decode many words at once; the same answers as ``decode_word``.
 
     Args:
@@ -161,7 +161,7 @@ def decode_words(words: npt.NDArray[np.uint8]) -> Words:
     kind[absent] = WordKind.ABSENT
     kind[good] = WordKind.GOOD
     value = (first >> 1).astype(np.uint16) * np.uint16(32) + (second >> 3)
-    return Words(
+    return SpiWords(
         kind=kind,
         value=np.where(good, value, 0).astype(np.uint16),
         suspicious=((second & _SUSPICIOUS_BITS) != 0) & ~absent & ~error,

@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
 from palpate_gateway.ports.serial_port import SerialPort, settle
 from palpate_gateway.protocols import bota as ask
-from palpate_gateway.protocols.bota import BareCommand, BotaDecoder, BotaFrame
+from palpate_gateway.protocols.bota import BotaCommand, BotaDecoder, BotaFrame
 from palpate_gateway.readings import WrenchReading
-from palpate_gateway.timing.sample_clock import SampleClock, Verdict
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
 _ANSWER_S = 1.0
@@ -102,7 +102,7 @@ class WrenchBota(WrenchDevice):
     def _begin(self) -> None:
         """Forget what an earlier connection told."""
         self._decoder = BotaDecoder()
-        self._boot = ask.TextWait(ask.BOOT_TEXT)
+        self._boot = ask.BotaTextWait(ask.BOOT_TEXT)
         self._early = b""
         self._clock = SampleClock(self._period_us, _WRAP_US)
 
@@ -170,14 +170,14 @@ class WrenchBota(WrenchDevice):
                 )
 
     def _configure(self, within_s: float = _ANSWER_S) -> None:
-        self._ask(ask.bare_request(BareCommand.CONFIG), within_s)
+        self._ask(ask.bare_request(BotaCommand.CONFIG), within_s)
         # Answers to earlier calls, and what was on its way of the stream.
         settle(self._port, _QUIET_S, _ANSWER_S)
 
     def _run(self) -> None:
-        self._early = self._ask(ask.bare_request(BareCommand.RUN))
+        self._early = self._ask(ask.bare_request(BotaCommand.RUN))
         self._decoder.reset()
-        self._boot = ask.TextWait(ask.BOOT_TEXT)
+        self._boot = ask.BotaTextWait(ask.BOOT_TEXT)
         self._clock.pause()
         self._silent_since = None
 
@@ -199,9 +199,9 @@ class WrenchBota(WrenchDevice):
     def _take(self, frame: BotaFrame) -> WrenchReading | None:
         """The reading of a frame, if it is a new one that can be trusted."""
         verdict = self._clock.take(frame.device_time_us, time.monotonic())
-        if verdict is Verdict.RESTARTED:
+        if verdict is SampleVerdict.RESTARTED:
             raise self._restarted("its clock began anew")
-        if verdict is not Verdict.NEW:
+        if verdict is not SampleVerdict.NEW:
             return None
         if told := frame.status & ~ask.OVERRANGE:
             for name in ask.status_names(told):
@@ -251,7 +251,7 @@ class WrenchBota(WrenchDevice):
         """
         self._port.write(request)
         what = f"{self.info.model}: command {request.decode('ascii')!r}"
-        wait = ask.TextWait(ask.expected_reply(request) or b"\n")
+        wait = ask.BotaTextWait(ask.expected_reply(request) or b"\n")
         until = time.monotonic() + within_s
         while (left_s := until - time.monotonic()) > 0.0:
             with contextlib.suppress(DeviceTimeout):

@@ -16,8 +16,7 @@ from palpate.config import StrictConfig
 from palpate.errors import DeviceLost, DeviceTimeout
 from palpate.messages import Origin
 from palpate_gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
-from palpate_gateway.readings import Reading, WrenchReading
-from palpate_gateway.timing.clock_map import Heard
+from palpate_gateway.readings import ClockObservation, Reading, WrenchReading
 from palpate_gateway.wrench.mount import Mount, MountOptions
 
 Sample = TypeVar("Sample")
@@ -233,5 +232,5 @@ class WrenchDevice(Device):
             torque=torque,
             serial=self.identity.serial if self.is_open else self._serial,
             overload=overload,
-            heard=Heard(stamp_s, arrival_ns),
+            observed=ClockObservation(stamp_s, arrival_ns),
         )

@@ -14,22 +14,22 @@ from collections.abc import Mapping, Sequence
 from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceTimeout
+from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.port import silent
-from palpate_gateway.ports.sockets import Received, TcpPort
-from palpate_gateway.protocols import kms40_requests as ask
+from palpate_gateway.ports.sockets import ReceivedBytes, TcpPort
+from palpate_gateway.protocols import kms40 as ask
 from palpate_gateway.protocols.kms40 import (
     FAULTS,
-    ForceLine,
     KmsDecoder,
-    Refusal,
-    Reply,
-    SystemFlags,
+    KmsFlags,
+    KmsForceLine,
+    KmsRefusal,
+    KmsReply,
     flag_names,
     over_range_axes,
     parse_flags,
 )
 from palpate_gateway.readings import WrenchReading
-from palpate_gateway.timing.arrivals import Arrivals
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
 _ANSWER_S = 2.0
@@ -39,12 +39,12 @@ _PATIENCE_S = 0.25
 """Silence after which the stream is started again, unless it is that slow by itself [s]."""
 
 _EXPECTED = (
-    SystemFlags.CALIBRATION_VALID
-    | SystemFlags.STABLE
-    | SystemFlags.TARE_ON
-    | SystemFlags.FILTER_ON
-    | SystemFlags.ACQUISITION_RUNNING
-    | SystemFlags.SCRIPT_RUNNING
+    KmsFlags.CALIBRATION_VALID
+    | KmsFlags.STABLE
+    | KmsFlags.TARE_ON
+    | KmsFlags.FILTER_ON
+    | KmsFlags.ACQUISITION_RUNNING
+    | KmsFlags.SCRIPT_RUNNING
 )
 """Flags of a healthy device."""
 
@@ -94,13 +94,13 @@ class WrenchKms40(WrenchDevice):
         self._tells_time = False
         self._port = TcpPort(options.host, options.port)
         self._patience_s = max(_PATIENCE_S, 5.0 / rate_hz)
-        self._arrivals = Arrivals(1.0 / rate_hz)
+        self._arrivals = ArrivalTimes(1.0 / rate_hz)
         self._begin()
 
     def _begin(self) -> None:
         """Forget what an earlier connection told."""
         self._decoder = KmsDecoder()
-        self._flags = SystemFlags(0)
+        self._flags = KmsFlags(0)
         # What the flags mean for a sample: asked 500 times a second, told once.
         self._faulty = self._over_range = False
         self._flags_due_s = 0.0
@@ -118,14 +118,14 @@ class WrenchKms40(WrenchDevice):
             self._arrivals.begin()
 
     def _keeps_zero(self) -> bool:
-        return bool(self._flags & SystemFlags.TARE_ON)
+        return bool(self._flags & KmsFlags.TARE_ON)
 
     def _connect(self) -> str:
         self._begin()
         self._port.open()
         self._greet()
-        self._ask(ask.query_request(ask.Query.IDENTITY), "ID")
-        serial = self._ask(ask.query_request(ask.Query.SERIAL_NUMBER), "SN")
+        self._ask(ask.query_request(ask.KmsQuery.IDENTITY), "ID")
+        serial = self._ask(ask.query_request(ask.KmsQuery.SERIAL_NUMBER), "SN")
         if not serial:
             raise DeviceError(
                 f"{self.info.model}: it tells no serial number",
@@ -154,7 +154,7 @@ class WrenchKms40(WrenchDevice):
                     raise
 
     def _check_flags(self) -> None:
-        self._ask(ask.query_request(ask.Query.FLAGS), "FLAGS")
+        self._ask(ask.query_request(ask.KmsQuery.FLAGS), "FLAGS")
         faults = self._flags & FAULTS
         if faults:
             raise DeviceError(
@@ -184,15 +184,15 @@ class WrenchKms40(WrenchDevice):
             if time.monotonic() >= until:
                 raise silent(self.info.model, round(timeout_s, 3))
 
-    def _readings(self, received: Received) -> list[WrenchReading]:
+    def _readings(self, received: ReceivedBytes) -> list[WrenchReading]:
         records = self._decoder.feed(received.data)
-        count = sum(isinstance(record, ForceLine) for record in records)
+        count = sum(isinstance(record, KmsForceLine) for record in records)
         times_ns = iter(self._arrivals.times_ns(count, received.arrival_ns) if count else ())
         readings = []
         for record in records:
-            if isinstance(record, Reply):
+            if isinstance(record, KmsReply):
                 self._note(record)
-            if not isinstance(record, ForceLine):
+            if not isinstance(record, KmsForceLine):
                 continue
             self._heard_s = time.monotonic()
             arrival_ns = next(times_ns)
@@ -219,10 +219,10 @@ class WrenchKms40(WrenchDevice):
             self._flags_due_s = now_s + self._flags_every_s
             self._counts["flags_unanswered"] += self._flags_asked
             self._flags_asked = True
-            self._port.write(ask.query_request(ask.Query.FLAGS))
+            self._port.write(ask.query_request(ask.KmsQuery.FLAGS))
 
-    def _note(self, reply: Reply) -> None:
-        if reply.name != ask.Query.FLAGS:
+    def _note(self, reply: KmsReply) -> None:
+        if reply.name != ask.KmsQuery.FLAGS:
             return
         self._flags_asked = False
         flags = parse_flags(reply.value)
@@ -233,7 +233,7 @@ class WrenchKms40(WrenchDevice):
         self._faulty, self._over_range = bool(flags & FAULTS), bool(over_range_axes(flags))
         for name in flag_names(flags & ~_EXPECTED):
             self._counts["status_" + name.replace(" ", "_")] += 1
-        if not flags & SystemFlags.CALIBRATION_VALID:
+        if not flags & KmsFlags.CALIBRATION_VALID:
             self._counts["status_calibration_not_valid"] += 1
 
     def _ask(
@@ -254,12 +254,12 @@ class WrenchKms40(WrenchDevice):
             except DeviceTimeout:
                 break
             for record in self._decoder.feed(data):
-                if isinstance(record, Refusal):
+                if isinstance(record, KmsRefusal):
                     raise DeviceError(
                         f"{asked} was refused: {record.meaning} (error {record.code})",
                         remedy="check that this is a KMS 40 whose firmware knows the command",
                     )
-                if not isinstance(record, Reply):
+                if not isinstance(record, KmsReply):
                     continue
                 self._note(record)
                 if record.name == name:

@@ -18,13 +18,15 @@ import numpy.typing as npt
 
 from palpate.errors import DeviceError, DeviceTimeout
 from palpate_gateway.ports.port import silent
-from palpate_gateway.ports.sockets import Received, UdpPort
-from palpate_gateway.ports.web_page import read_page
+from palpate_gateway.ports.sockets import ReceivedBytes, UdpPort, read_page
 from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
-from palpate_gateway.protocols.rdt import RdtDecoder, RdtRecord, RdtScale, RdtSequence
-from palpate_gateway.protocols.rdt_profiles import (
+from palpate_gateway.protocols.rdt import (
     HEX,
     PROFILES,
+    RdtDecoder,
+    RdtRecord,
+    RdtScale,
+    RdtSequence,
     hex_filter_request,
     hex_period_request,
     hex_sensor_number,
@@ -226,7 +228,7 @@ class WrenchRdt(WrenchDevice):
             self._counts["starts_repeated"] += 1
             self._port.write(self._profile.start_request())
 
-    def _fresh(self, datagram: Received) -> list[_Record]:
+    def _fresh(self, datagram: ReceivedBytes) -> list[_Record]:
         """Records of a datagram that are neither repeated nor late."""
         records = []
         for raw in self._decoder.feed(datagram.data):

@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from palpate_gateway.protocols.rdt import PORT, RdtScale
-from palpate_gateway.protocols.rdt_profiles import HEX_FILTERS_HZ, HEX_PERIOD_MAX_MS
+from palpate_gateway.protocols.rdt import HEX_FILTERS_HZ, HEX_PERIOD_MAX_MS, PORT, RdtScale
 from palpate_gateway.wrench.device import WrenchOptions
 
 PRODUCTS = {

@@ -13,17 +13,19 @@ from collections.abc import Mapping, Sequence
 from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceTimeout
+from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.protocols import robotous as ask
-from palpate_gateway.protocols.robotous import Command, RobotousData, RobotousRecord
-from palpate_gateway.protocols.robotous_framing import (
+from palpate_gateway.protocols.robotous import (
     FIRST_ID,
     REQUEST_ID,
     SECOND_ID,
     RobotousCanDecoder,
+    RobotousCommand,
+    RobotousData,
+    RobotousRecord,
 )
 from palpate_gateway.readings import WrenchReading
-from palpate_gateway.timing.arrivals import Arrivals
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 from palpate_gateway.wrench.robotous_line import RobotousCanLine, RobotousLine, RobotousSerialLine
 
@@ -68,7 +70,7 @@ class RobotousOptions(WrenchOptions):
     second_id: int = Field(default=SECOND_ID, ge=1, le=255)
     rate_hz: int = 200
     cutoff_hz: int = 0
-    filter_order: ask.FilterOrder = ask.FilterOrder.MANUALS
+    filter_order: ask.RobotousFilterOrder = ask.RobotousFilterOrder.MANUALS
     model: str = ""
     torque_divisor: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
 
@@ -115,7 +117,7 @@ class WrenchRobotous(WrenchDevice):
         self._tells_time = False
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
         self._scale = ask.RobotousScale(1.0, 1.0)
-        self._arrivals = Arrivals(1.0 / options.rate_hz)
+        self._arrivals = ArrivalTimes(1.0 / options.rate_hz)
 
     def zero(self) -> None:
         """See ``WrenchDevice``; what comes meanwhile is thrown away.
@@ -142,13 +144,13 @@ class WrenchRobotous(WrenchDevice):
         with contextlib.suppress(DeviceTimeout):
             while time.monotonic() < until:
                 self._line.read(_QUIET_S)
-        told = self._text(Command.MODEL)
-        serial = self._text(Command.SERIAL)
+        told = self._text(RobotousCommand.MODEL)
+        serial = self._text(RobotousCommand.SERIAL)
         self._scale = self._scale_of(told)
         cutoff_hz = self._options.cutoff_hz or None
         self._set(ask.filter_request(cutoff_hz, order=self._options.filter_order))
         self._set(ask.rate_request(self._options.rate_hz))
-        self._answer(ask.start_request(), Command.START)
+        self._answer(ask.start_request(), RobotousCommand.START)
         self._arrivals.begin()
         return serial or self._line.name
 
@@ -191,7 +193,9 @@ class WrenchRobotous(WrenchDevice):
 
     def _samples(self, timeout_s: float) -> list[RobotousData]:
         records = [ask.decode(payload) for payload in self._line.read(timeout_s)]
-        samples = [r for r in records if isinstance(r, RobotousData) and r.command == Command.START]
+        samples = [
+            r for r in records if isinstance(r, RobotousData) and r.command == RobotousCommand.START
+        ]
         self._counts["other_answers"] += len(records) - len(samples)
         return samples
 
@@ -206,12 +210,12 @@ class WrenchRobotous(WrenchDevice):
             raise DeviceError(f"{self.info.model}: it is overloaded", remedy="take the load off")
         return [sum(axis) / len(samples) for axis in zip(*(s.counts for s in samples), strict=True)]
 
-    def _text(self, command: Command) -> str:
+    def _text(self, command: RobotousCommand) -> str:
         record = self._answer(ask.get_request(command), command)
         return record.text if isinstance(record, ask.RobotousText) else ""
 
     def _set(self, request: bytes) -> None:
-        record = self._answer(request, Command(request[0]))
+        record = self._answer(request, RobotousCommand(request[0]))
         if not (isinstance(record, ask.RobotousResult) and record.ok):
             why = ask.ERRORS.get(getattr(record, "error", 0), "no reason given")
             raise DeviceError(
@@ -219,7 +223,7 @@ class WrenchRobotous(WrenchDevice):
                 remedy="choose another rate or filter, or raise the sensor's baud",
             )
 
-    def _answer(self, request: bytes, command: Command) -> RobotousRecord:
+    def _answer(self, request: bytes, command: RobotousCommand) -> RobotousRecord:
         """The first answer to a request, which is sent again if none comes.
 
         Raises:
@@ -247,4 +251,4 @@ class WrenchRobotous(WrenchDevice):
 
 
 def _name(request: bytes) -> str:
-    return f"request {request[0]} ({Command(request[0]).name.lower()})"
+    return f"request {request[0]} ({RobotousCommand(request[0]).name.lower()})"

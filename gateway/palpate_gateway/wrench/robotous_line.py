@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.ports.serial_port import SerialPort
-from palpate_gateway.protocols.robotous_framing import (
+from palpate_gateway.protocols.robotous import (
     RobotousCanDecoder,
     RobotousSerialDecoder,
     serial_frame,

@@ -10,11 +10,11 @@ from tests.fuzz.streams import all_counted, pieces, plain_search, same_in_pieces
 from palpate_gateway.protocols.bota import (
     FRAME_BYTES,
     BotaDecoder,
-    TextWait,
+    BotaTextWait,
     find_ack,
     status_names,
 )
-from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.framing import crc16_x25
 
 _GOOD = bytes.fromhex(
     "AA 0000 0000803F 00000040 00004040 CDCCCC3D CDCC4C3E 9A99993E 40E20100 0000CC41 7235"
@@ -70,7 +70,7 @@ def _check_texts(stream: bytes, how: int) -> None:
     """The first of the bytes tells the length of the text that is waited for."""
     size = 1 + (stream[0] if stream else 0) % 64
     text, stream = stream[1 : 1 + size] or b"r", stream[1 + size :]
-    whole, cut = TextWait(text), TextWait(text)
+    whole, cut = BotaTextWait(text), BotaTextWait(text)
     after = whole.feed(stream)
     heard = [cut.feed(piece) for piece in pieces(stream, how)]
     before, found, rest = stream.partition(text)

@@ -9,22 +9,21 @@ from tests.fuzz.streams import all_counted, same_in_pieces, sealed
 
 from palpate_gateway.protocols.bridge import (
     SLOTS_MAX,
-    Body,
+    BridgeBody,
     BridgeDecoder,
+    BridgeFinger,
+    BridgeHeader,
+    BridgeHello,
     BridgeRecord,
-    Finger,
-    Header,
-    Hello,
-    SlotGroup,
-    Status,
+    BridgeSlots,
+    BridgeStatus,
     decode_body,
     encode,
 )
-from palpate_gateway.protocols.checksums import crc16_x25
-from palpate_gateway.protocols.cobs import PacketSplitter, decode, encode_packet
+from palpate_gateway.protocols.framing import PacketSplitter, crc16_x25, decode, encode_packet
 
 _LONGEST = 12 + 2 + SLOTS_MAX * 11
-_HELLO = Hello(4400, 44, (Finger("BT1", "0602"),))
+_HELLO = BridgeHello(4400, 44, (BridgeFinger("BT1", "0602"),))
 
 
 def _seal(_: int, part: bytes) -> bytes:
@@ -53,7 +52,7 @@ def check(data: bytes) -> None:
     for record in records:
         _check_body(record)
     all_counted(decoder, taken, stream)
-    assert len(decoder.feed(encode(Header(3, 0, 0, 0), _HELLO))) == 1
+    assert len(decoder.feed(encode(BridgeHeader(3, 0, 0, 0), _HELLO))) == 1
 
 
 def _check_order(records: list[BridgeRecord], counters: dict[str, int]) -> None:
@@ -75,9 +74,9 @@ def _check_body(record: BridgeRecord) -> None:
     packet = decode(encode(record.header, body)[:-1])
     assert packet is not None
     assert decode_body(packet[1], packet[10:-2]) == body
-    if isinstance(body, SlotGroup):
+    if isinstance(body, BridgeSlots):
         assert {len(payload) for payload in body.payloads} <= {1 + 2 * body.fingers}
-    elif isinstance(body, Status):
+    elif isinstance(body, BridgeStatus):
         assert 1 <= len(body.parity_errors) <= 5
     else:
         assert 1 <= len(body.fingers) <= 5
@@ -85,11 +84,11 @@ def _check_body(record: BridgeRecord) -> None:
 
 def seeds() -> list[bytes]:
     """Packets of all kinds, in order and not, and the contents of packets to be sealed."""
-    slots = SlotGroup(3, (bytes.fromhex("80 7FC1 0000 7FC1"), bytes.fromhex("A2 0101 FEF8 A540")))
-    bodies: list[Body] = [_HELLO, slots, slots, Status((1, 0, 2**32 - 1), 5, 0), slots]
-    wire = [encode(Header(7, 0, n, 1000 * n), body) for n, body in enumerate(bodies)]
-    late = encode(Header(7, 0, 1, 10), _HELLO)
-    wrap = [encode(Header(8, 0, 65535 + n & 0xFFFF, 2**32 - 9 + 8 * n & 2**32 - 1), slots)
+    slots = BridgeSlots(3, (bytes.fromhex("80 7FC1 0000 7FC1"), bytes.fromhex("A2 0101 FEF8 A540")))
+    bodies: list[BridgeBody] = [_HELLO, slots, slots, BridgeStatus((1, 0, 2**32 - 1), 5, 0), slots]
+    wire = [encode(BridgeHeader(7, 0, n, 1000 * n), body) for n, body in enumerate(bodies)]
+    late = encode(BridgeHeader(7, 0, 1, 10), _HELLO)
+    wrap = [encode(BridgeHeader(8, 0, 65535 + n & 0xFFFF, 2**32 - 9 + 8 * n & 2**32 - 1), slots)
             for n in range(3)]  # fmt: skip
     plain = [decode(one[:-1]) for one in (*wire, late, *wrap)]
     contents = b"".join(bytes([len(p) - 1, 1]) + p[:-2] for p in plain if p is not None)

@@ -7,13 +7,12 @@ from tests.fuzz.streams import parts
 
 from palpate_gateway.protocols.can_slots import (
     FINGERS_MAX,
-    SEQUENCES,
     CanSlotDecoder,
     SlotDecoder,
-    learn_order,
     payload_rows,
 )
-from palpate_gateway.protocols.channels import CHANNEL_NAMES
+from palpate_gateway.protocols.channels import CHANNEL_NAMES, SEQUENCES
+from palpate_gateway.protocols.slot_clock import learn_order
 from palpate_gateway.protocols.spi import channel_of_command, decode_word
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.fuzz.streams import all_counted, same_in_pieces
 
-from palpate_gateway.protocols.cobs import (
+from palpate_gateway.protocols.framing import (
     DELIMITER,
     PacketSplitter,
     decode,

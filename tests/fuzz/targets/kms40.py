@@ -9,18 +9,18 @@ from tests.fuzz.streams import all_counted, same_in_pieces
 
 from palpate_gateway.protocols.kms40 import (
     LINE_MAX,
-    ForceLine,
     KmsDecoder,
-    LineFault,
-    Refusal,
-    Reply,
+    KmsForceLine,
+    KmsLineFault,
+    KmsRefusal,
+    KmsReply,
     flag_names,
     over_range_axes,
     parse_flags,
 )
 
 _GOOD = b"F={1.5,-0.25,1.0,0.02,-0.01,0.005},4711\n"
-_SAMPLE = ForceLine((1.5, -0.25, 1.0), (0.02, -0.01, 0.005), 4711)
+_SAMPLE = KmsForceLine((1.5, -0.25, 1.0), (0.02, -0.01, 0.005), 4711)
 
 
 def check(data: bytes) -> None:
@@ -29,7 +29,7 @@ def check(data: bytes) -> None:
     decoder, records = same_in_pieces(KmsDecoder, stream, data[0] if data else 0)
     counters = decoder.counters
     assert decoder.pending <= LINE_MAX
-    lines = len(records) + sum(counters[fault] for fault in LineFault)
+    lines = len(records) + sum(counters[fault] for fault in KmsLineFault)
     assert lines - stream.count(b"\n") in (0, 1)  # an overlong line counts before it ends
     for record in records:
         _check_record(record)
@@ -41,14 +41,14 @@ def check(data: bytes) -> None:
 
 
 def _check_record(record: object) -> None:
-    if isinstance(record, ForceLine):
+    if isinstance(record, KmsForceLine):
         values = (*record.force, *record.torque)
         assert all(map(math.isfinite, values))
         assert record.timestamp is None or record.timestamp >= 0
         line = f"F={{{','.join(map(repr, values))}}}"
         line += "" if record.timestamp is None else f",{record.timestamp}"
         assert KmsDecoder().feed(line.encode("ascii") + b"\n") == [record]
-    elif isinstance(record, Reply):
+    elif isinstance(record, KmsReply):
         assert record.name
         assert record.value.isascii()
         flags = parse_flags(record.value)
@@ -57,7 +57,7 @@ def _check_record(record: object) -> None:
             assert len(flag_names(flags)) == flags.bit_count()
             assert len(over_range_axes(flags)) <= 6
     else:
-        assert isinstance(record, Refusal)
+        assert isinstance(record, KmsRefusal)
         assert record.code >= 0
         assert record.meaning
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.fuzz.streams import all_counted, plain_search, same_in_pieces, sealed
 
-from palpate_gateway.protocols.checksums import sum16
+from palpate_gateway.protocols.framing import sum16
 from palpate_gateway.protocols.optoforce import (
     OptoForceData,
     OptoForceDecoder,

@@ -11,8 +11,8 @@ from palpate_gateway.protocols.pic32 import (
     LARGEST_LOAD_G,
     RECORD_BYTES,
     SAMPLE_BYTES,
-    Layout,
     Pic32Decoder,
+    Pic32Layout,
     Pic32Sample,
     decode_load,
     decode_sample,
@@ -25,7 +25,7 @@ def check(data: bytes) -> None:
     """Two bytes choose cuts and layout; then comes the stream."""
     how, mode = (*data[:2], 0, 0)[:2]
     stream = data[2:]
-    layout = Layout.ELECTRODES_FIRST if mode & 1 else Layout.PAC_FIRST
+    layout = Pic32Layout.ELECTRODES_FIRST if mode & 1 else Pic32Layout.PAC_FIRST
     decoder = Pic32Decoder(layout)
 
     def make() -> Pic32Decoder:
@@ -64,7 +64,7 @@ def _values(sample: Pic32Sample) -> tuple[int, ...]:
     return values
 
 
-def _check_replies(reply: bytes, layout: Layout) -> None:
+def _check_replies(reply: bytes, layout: Pic32Layout) -> None:
     sample = decode_sample(reply, layout)
     assert sample is None or len(reply) == SAMPLE_BYTES == 2 * len(_values(sample))
     load_g = decode_load(reply)

@@ -9,15 +9,16 @@ from tests.fuzz.streams import parts
 
 from palpate_gateway.protocols.rdt import (
     BELIEVABLE_LOSS,
+    PROFILES,
     RECORD_BYTES,
     U32,
     RdtDecoder,
     RdtRecord,
     RdtScale,
     RdtSequence,
+    hex_sensor_number,
     unwrap,
 )
-from palpate_gateway.protocols.rdt_profiles import PROFILES, hex_sensor_number
 
 _RECORD = struct.Struct(">3I6i")
 _SCALE = RdtScale(1e6, 1e6)

@@ -13,11 +13,11 @@ from palpate.bus.topics import TOPICS, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ConfigError, RecordingError
 from palpate.files.record import descriptor_set, summarise
+from palpate_gateway.clock.stamps import FileClock
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Pipeline
 from palpate_gateway.readings import RecordedMessage
 from palpate_gateway.recordings.record import Record, RecordOptions
-from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.service.pipeline import Pipeline
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-record-")
 _PATH = Path(_FOLDER.name, "a.mcap")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.fuzz.streams import parts
 from tests.fuzz.targets.robotous_serial import check_answer
 
-from palpate_gateway.protocols.robotous_framing import (
+from palpate_gateway.protocols.robotous import (
     FIRST_ID,
     SECOND_ID,
     RobotousCanDecoder,

@@ -9,13 +9,14 @@ from palpate_gateway.protocols.robotous import (
     REQUEST_BYTES,
     RobotousData,
     RobotousResult,
+    RobotousSerialDecoder,
     RobotousText,
     RobotousUnknown,
     RobotousValues,
     decode,
     overloaded_axes,
+    serial_frame,
 )
-from palpate_gateway.protocols.robotous_framing import RobotousSerialDecoder, serial_frame
 
 
 def _is_good(frame: bytes) -> bool:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from tests.fuzz.streams import pieces
 
-from palpate_gateway.protocols.can_slots import SEQUENCES
+from palpate_gateway.protocols.channels import SEQUENCES
 from palpate_gateway.protocols.slot_clock import SlotClock
 
 RATE_HZ = 4400.0

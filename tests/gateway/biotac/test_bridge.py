@@ -21,7 +21,7 @@ from palpate_gateway.readings import ElectrodeReading
 pytest.importorskip("serial")
 
 Emulate = Callable[..., BiotacBridgeEmulator]
-Finger = Callable[..., BiotacBridge]
+FingerQueue = Callable[..., BiotacBridge]
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def emulate() -> Iterator[Emulate]:
 
 
 @pytest.fixture
-def finger() -> Iterator[Finger]:
+def finger() -> Iterator[FingerQueue]:
     made: list[BiotacBridge] = []
 
     def make(line: str, **options: Any) -> BiotacBridge:
@@ -71,7 +71,7 @@ def test_the_sums_of_the_emulator() -> None:
 
 @pytest.mark.parametrize(("pac_first", "slots"), [(False, 44), (True, 22)])
 def test_three_fingers_of_one_line(
-    emulate: Emulate, finger: Finger, pac_first: bool, slots: int
+    emulate: Emulate, finger: FingerQueue, pac_first: bool, slots: int
 ) -> None:
     emulator = emulate(
         pac_first=pac_first, slots_per_packet=slots, sequence=65530, clock_us=2**32 - 300_000
@@ -91,7 +91,7 @@ def test_three_fingers_of_one_line(
         assert times.min() > 0.0
 
 
-def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: Finger) -> None:
+def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: FingerQueue) -> None:
     device = finger(emulate(slot_rate_hz=2200.0, fingers=1).address)
     device.open()
     assert device.identity.slot_period_s == pytest.approx(1 / 2200)
@@ -116,7 +116,7 @@ def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: Finger) -> Non
     ],
 )
 def test_a_fault_is_counted_and_nothing_wrong_comes_out(
-    emulate: Emulate, finger: Finger, fault: str, counter: str
+    emulate: Emulate, finger: FingerQueue, fault: str, counter: str
 ) -> None:
     emulator = emulate()
     device = finger(emulator.address)
@@ -132,7 +132,7 @@ def test_a_fault_is_counted_and_nothing_wrong_comes_out(
         assert_right(readings, 0)
 
 
-def test_stuck_fingers_come_out_stuck(emulate: Emulate, finger: Finger) -> None:
+def test_stuck_fingers_come_out_stuck(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     device = finger(emulator.address)
     device.open()
@@ -140,7 +140,7 @@ def test_stuck_fingers_come_out_stuck(emulate: Emulate, finger: Finger) -> None:
     read_frames(device, lambda got: got and len(set(got[-1].pac)) == 1)
 
 
-def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: Finger) -> None:
+def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     emulator.inject("clock_drift", 30.0)
     device = finger(emulator.address)
@@ -150,7 +150,7 @@ def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: Finger
     assert device.counters["lost_slots"] == device.counters["restarts"] == 0
 
 
-def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Finger) -> None:
+def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     device = finger(emulator.address)
     device.open()
@@ -171,7 +171,7 @@ def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Fi
 
 @pytest.mark.parametrize(("fault", "message"), [("restart", "restarted"), ("unplug", "is gone")])
 def test_a_bridge_that_begins_anew_is_lost_and_found(
-    emulate: Emulate, finger: Finger, fault: str, message: str
+    emulate: Emulate, finger: FingerQueue, fault: str, message: str
 ) -> None:
     emulator = emulate()
     device = finger(emulator.address)
@@ -184,7 +184,7 @@ def test_a_bridge_that_begins_anew_is_lost_and_found(
     assert_right(read_frames(device, lambda got: len(got) > 5), 0)
 
 
-def test_an_empty_port_is_no_sensor(emulate: Emulate, finger: Finger) -> None:
+def test_an_empty_port_is_no_sensor(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate(fingers=2)
     emulator.inject("absent", 30.0)
     with pytest.raises(DeviceLost, match="no finger answers"):
@@ -196,7 +196,7 @@ def test_an_empty_port_is_no_sensor(emulate: Emulate, finger: Finger) -> None:
     assert_right(read_frames(there, lambda got: len(got) > 5), 0)
 
 
-def test_the_source_must_be_the_one_that_was_named(emulate: Emulate, finger: Finger) -> None:
+def test_the_source_must_be_the_one_that_was_named(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate(source=9)
     with pytest.raises(DeviceError, match=r"no packet of source 8 .* correct source"):
         finger(emulator.address, source=8).open()
@@ -205,12 +205,12 @@ def test_the_source_must_be_the_one_that_was_named(emulate: Emulate, finger: Fin
     assert_right(read_frames(device, lambda got: len(got) > 3), 0)
 
 
-def test_the_wrong_speed_is_told(emulate: Emulate, finger: Finger) -> None:
+def test_the_wrong_speed_is_told(emulate: Emulate, finger: FingerQueue) -> None:
     with pytest.raises(DeviceError, match="check baud"):
         finger(emulate().address, baud=115200).open()
 
 
-def test_without_hello_the_line_names_the_finger(emulate: Emulate, finger: Finger) -> None:
+def test_without_hello_the_line_names_the_finger(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate(hello_s=3600.0)
     time.sleep(0.1)  # the first one goes to nobody
     device = finger(emulator.address, hello_s=0.0)
@@ -219,7 +219,7 @@ def test_without_hello_the_line_names_the_finger(emulate: Emulate, finger: Finge
     assert_right(read_frames(device, lambda got: len(got) > 3), 0)
 
 
-def test_each_port_once(emulate: Emulate, finger: Finger) -> None:
+def test_each_port_once(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     finger(emulator.address).open()
     with pytest.raises(ConfigError, match="is configured twice"):

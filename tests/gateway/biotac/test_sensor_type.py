@@ -11,7 +11,7 @@ from tests.gateway.reading_devices import read_frames
 
 from palpate.errors import ConfigError, DeviceError
 from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout, SensorType
-from palpate_gateway.biotac.sensor_type import LEARNT_FROM, agreed_type, answering_type
+from palpate_gateway.biotac.finger import LEARNT_FROM, agreed_type, answering_type
 from palpate_gateway.biotac.slots import Slot, SlotBlock, slot_block
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import make_device

@@ -11,9 +11,9 @@ from palpate.errors import DeviceTimeout
 from palpate.messages import BIOTAC_LAYOUT
 from palpate_gateway.biotac.can_fingers import CanOptions, CanSource
 from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.clock.stamps import LiveClock
 from palpate_gateway.emulators.biotac_slots import SlotBlocks, idle_counts, round_of
 from palpate_gateway.ports.can_bus import CanBatch
-from palpate_gateway.timing.clock_map import LiveClock
 
 SLOT_S = 1.0 / 4400.0
 START_S = 100.0
@@ -67,11 +67,11 @@ def stamps_of(bus: LateBus, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray
         if slots is None:
             continue
         for reading in assembler.push(slots.of(0)):
-            heard = source.heard
-            assert heard is not None
-            reading = replace(reading, heard=heard)
-            times = clock.map(reading.time_s, heard.arrival_ns, reading.heard)
-            assert times.monotonic_ns <= heard.arrival_ns
+            observed = source.observed
+            assert observed is not None
+            reading = replace(reading, observed=observed)
+            times = clock.map(reading.time_s, observed.arrival_ns, reading.observed)
+            assert times.monotonic_ns <= observed.arrival_ns
             out.append(1e-9 * times.monotonic_ns)
 
 

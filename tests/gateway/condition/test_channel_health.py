@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from palpate.messages import FaultKind
-from palpate_gateway.condition.blocks import Blocks
 from palpate_gateway.condition.channel_health import REMEDIES, ChannelHealth, describe
+from palpate_gateway.condition.stillness import FrameBlocks
 
 fakes: Any = importlib.import_module("condition_fakes")
 LAYOUT = fakes.LAYOUT
@@ -19,7 +19,7 @@ class Watch:
     def __init__(self) -> None:
         self.finger = fakes.Finger(11)
         self.health = ChannelHealth(19)
-        self._blocks = Blocks(LAYOUT, fakes.RATE_HZ)
+        self._blocks = FrameBlocks(LAYOUT, fakes.RATE_HZ)
 
     def go(self, seconds: float, *, untouched: bool = False) -> dict[FaultKind, tuple[str, ...]]:
         """Let time pass; the faults at its end."""

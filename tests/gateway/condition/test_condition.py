@@ -10,27 +10,26 @@ import pytest
 
 from palpate.errors import DeviceError
 from palpate.messages import ElectrodeFrame, FaultKind
-from palpate_gateway.condition.condition import Condition, Retare
+from palpate_gateway.clock.stamps import DueMessage, FileClock
+from palpate_gateway.condition.condition import Condition, RetareRules, TouchState
 from palpate_gateway.condition.stillness import StillLimits
-from palpate_gateway.condition.untouched import Touch
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Outgoing, Pipeline
+from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.tare import TareCollector
-from palpate_gateway.timing.clock_map import FileClock
 
 fakes: Any = importlib.import_module("condition_fakes")
 
 
-def condition(retare: Retare | None = None) -> Condition:
+def condition(retare: RetareRules | None = None) -> Condition:
     return Condition(fakes.LAYOUT, fakes.RATE_HZ, StillLimits(), retare)
 
 
-def touch(made: Condition) -> Touch:
+def touch(made: Condition) -> TouchState:
     """What is known now; it changes, which a type checker does not see."""
     return made.touch
 
 
-def feed(made: Condition, frames: Iterable[ElectrodeFrame]) -> set[Touch]:
+def feed(made: Condition, frames: Iterable[ElectrodeFrame]) -> set[TouchState]:
     """What it says of touches on the way."""
     return {made.touch for frame in frames if made.add(frame)}
 
@@ -38,19 +37,19 @@ def feed(made: Condition, frames: Iterable[ElectrodeFrame]) -> set[Touch]:
 def test_a_press_and_its_release() -> None:
     made, finger = condition(), fakes.Finger()
     feed(made, finger.frames(1.0))
-    assert touch(made) is Touch.UNKNOWN
+    assert touch(made) is TouchState.UNKNOWN
     assert made.motion == ""
     made.tared(finger.tare())
     feed(made, finger.frames(1.0))
-    assert touch(made) is Touch.UNTOUCHED
+    assert touch(made) is TouchState.UNTOUCHED
     finger.press(300.0)
     seen = feed(made, finger.frames(3.0))
-    assert Touch.MOVING in seen
-    assert touch(made) is Touch.HELD
+    assert TouchState.MOVING in seen
+    assert touch(made) is TouchState.HELD
     assert "it is held, or has to be tared again" in made.message
     finger.press(0.0)
     feed(made, finger.frames(1.0))
-    assert touch(made) is Touch.UNTOUCHED
+    assert touch(made) is TouchState.UNTOUCHED
     assert made.message == ""
 
 
@@ -68,7 +67,7 @@ def test_drift_is_measured_and_the_worst_electrode_named() -> None:
 
 
 def test_it_tares_again_when_untouched_for_long_enough() -> None:
-    made, finger = condition(Retare(after_s=3.0)), fakes.Finger()
+    made, finger = condition(RetareRules(after_s=3.0)), fakes.Finger()
     made.tared(finger.tare())
     finger.offset[:] = 20.0
     feed(made, finger.frames(2.0))
@@ -83,25 +82,25 @@ def test_it_tares_again_when_untouched_for_long_enough() -> None:
 
 def test_it_does_not_tare_again_while_it_is_held() -> None:
     """The trap: a stand that presses is as still as nothing."""
-    made, finger = condition(Retare(after_s=1.0)), fakes.Finger()
+    made, finger = condition(RetareRules(after_s=1.0)), fakes.Finger()
     made.tared(finger.tare())
     feed(made, finger.frames(1.0))
     finger.press(80.0)
     for _ in range(1000):
         made.add(finger.frame())
         assert not made.wants_tare
-    assert touch(made) is Touch.HELD
+    assert touch(made) is TouchState.HELD
     assert made.motion == ""
 
 
 def test_it_does_not_tare_again_with_a_broken_channel() -> None:
-    made, finger = condition(Retare(after_s=1.0)), fakes.Finger()
+    made, finger = condition(RetareRules(after_s=1.0)), fakes.Finger()
     made.tared(finger.tare())
     finger.offset[:] = 20.0
     finger.fixed = {6: 3000}
     feed(made, finger.frames(4.0))
     assert [fault.kind for fault in made.faults] == [FaultKind.STUCK]
-    assert touch(made) is Touch.UNTOUCHED
+    assert touch(made) is TouchState.UNTOUCHED
     assert not made.wants_tare
 
 
@@ -137,11 +136,11 @@ def test_opened_again_it_waits_for_new_frames() -> None:
     made.tared(finger.tare())
     feed(made, finger.frames(1.0))
     made.begin()
-    assert touch(made) is Touch.MOVING
+    assert touch(made) is TouchState.MOVING
     feed(made, finger.frames(0.4))
-    assert touch(made) is Touch.MOVING
+    assert touch(made) is TouchState.MOVING
     feed(made, finger.frames(0.4))
-    assert touch(made) is Touch.UNTOUCHED
+    assert touch(made) is TouchState.UNTOUCHED
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +152,7 @@ def capture(shared_data: Path) -> list[ElectrodeFrame]:
     with make_device("text_log", {"path": path}) as device:
         made = Pipeline(device.info, tare="query")
         made.begin(device.identity, FileClock(device.identity.serial, None))
-        out: list[Outgoing] = []
+        out: list[DueMessage] = []
         while got := device.read(1.0):
             out += made.push(got, 0)
     return [item.message for item in out if isinstance(item.message, ElectrodeFrame)]
@@ -170,9 +169,9 @@ def test_a_hand_that_holds_a_real_sensor_is_seen(capture: list[ElectrodeFrame]) 
             made.tared(tare)
             collector = None
         states.append(made.touch)
-    assert set(states[120:640]) == {Touch.UNTOUCHED}
-    assert Touch.UNTOUCHED not in states[720:1990]
-    assert states[-1] is Touch.UNTOUCHED
+    assert set(states[120:640]) == {TouchState.UNTOUCHED}
+    assert TouchState.UNTOUCHED not in states[720:1990]
+    assert states[-1] is TouchState.UNTOUCHED
     assert made.counters == dict.fromkeys(made.counters, 0)
     assert made.gauges()["tare_drift_counts"] < 40.0
 
@@ -204,15 +203,17 @@ def test_real_sensors_idle_and_pressed(shared_data: Path, idle: str, pressed: st
     untouched, held = data[idle], data[pressed]
     finger = fakes.Finger(3)
     finger.levels = untouched[:50].mean(axis=0)
-    made = condition(Retare(after_s=10.0))
+    made = condition(RetareRules(after_s=10.0))
     made.tared(finger.tare())
-    assert feed(made, _play(finger, untouched[50:6000])) - {Touch.MOVING} == {Touch.UNTOUCHED}
-    assert touch(made) is Touch.UNTOUCHED
+    assert feed(made, _play(finger, untouched[50:6000])) - {TouchState.MOVING} == {
+        TouchState.UNTOUCHED
+    }
+    assert touch(made) is TouchState.UNTOUCHED
     assert made.wants_tare
     finger.levels = data[pressed.split("_")[0] + "_baseline_mean"].astype(np.float64)
-    made = condition(Retare(after_s=1.0))
+    made = condition(RetareRules(after_s=1.0))
     made.tared(finger.tare())
-    assert Touch.UNTOUCHED not in feed(made, _play(finger, held[:6000]))
+    assert TouchState.UNTOUCHED not in feed(made, _play(finger, held[:6000]))
     assert not any(made.counters.values())
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from palpate.messages import ElectrodeFrame, SensorType
-from palpate_gateway.condition.blocks import Block, Blocks
 from palpate_gateway.condition.stillness import (
+    FrameBlock,
+    FrameBlocks,
     StillLimits,
     evidence_of,
     evidence_of_blocks,
@@ -20,8 +21,8 @@ ALL = np.ones(19, np.bool_)
 STILL = StillLimits()
 
 
-def blocks(frames: list[ElectrodeFrame]) -> list[Block]:
-    made = Blocks(frames[0].sensor_type.layout, fakes.RATE_HZ)
+def blocks(frames: list[ElectrodeFrame]) -> list[FrameBlock]:
+    made = FrameBlocks(frames[0].sensor_type.layout, fakes.RATE_HZ)
     return [block for frame in frames if (block := made.add(frame)) is not None]
 
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from palpate_gateway.condition.untouched import Touch, UntouchedLevel, is_drift
+from palpate_gateway.condition.condition import TouchState, UntouchedLevel, is_drift
 
 fakes: Any = importlib.import_module("condition_fakes")
 ALL = np.ones(19, np.bool_)
 
 
-def touch(level: UntouchedLevel) -> Touch:
+def touch(level: UntouchedLevel) -> TouchState:
     """What is known now; it changes, which a type checker does not see."""
     return level.touch
 
@@ -26,7 +26,7 @@ def test_before_the_first_tare_nothing_is_known() -> None:
     level = UntouchedLevel(19)
     level.moved()
     level.rests_at(fakes.LEVELS, 2400.0, ALL)
-    assert touch(level) is Touch.UNKNOWN
+    assert touch(level) is TouchState.UNKNOWN
     assert not level.known
 
 
@@ -34,7 +34,7 @@ def test_drift_is_followed_however_far_it_goes() -> None:
     level = tared()
     for drift in range(0, 300, 2):
         level.rests_at(fakes.LEVELS + drift, 2400.0, ALL)
-        assert touch(level) is Touch.UNTOUCHED
+        assert touch(level) is TouchState.UNTOUCHED
         assert level.drift_counts == drift
 
 
@@ -52,25 +52,25 @@ def test_a_constant_press_is_not_untouched() -> None:
     for counts in (60.0, 300.0):
         finger.press(counts)
         level.moved()
-        assert touch(level) is Touch.MOVING
+        assert touch(level) is TouchState.MOVING
         level.rests_at(fakes.LEVELS + finger.offset, finger.pdc, ALL)
-        assert touch(level) is Touch.HELD
+        assert touch(level) is TouchState.HELD
 
 
 def test_the_pressure_alone_gives_a_press_away() -> None:
     level = tared()
     level.rests_at(fakes.LEVELS, 2400.0 + 45.0, ALL)
-    assert touch(level) is Touch.HELD
+    assert touch(level) is TouchState.HELD
 
 
 def test_released_it_rests_where_it_did_give_or_take_a_little() -> None:
     level = tared()
     level.moved()
     level.rests_at(fakes.LEVELS + 300.0, 2900.0, ALL)
-    assert touch(level) is Touch.HELD
+    assert touch(level) is TouchState.HELD
     level.moved()
     level.rests_at(fakes.LEVELS + 15.0 * np.cos(np.arange(19)), 2425.0, ALL)
-    assert touch(level) is Touch.UNTOUCHED
+    assert touch(level) is TouchState.UNTOUCHED
 
 
 def test_many_small_steps_of_a_press_do_not_add_up_to_drift() -> None:
@@ -81,8 +81,8 @@ def test_many_small_steps_of_a_press_do_not_add_up_to_drift() -> None:
         finger.press(float(counts))
         level.rests_at(fakes.LEVELS + finger.offset, finger.pdc, ALL)
         states.append(level.touch)
-    assert states[5] is Touch.UNTOUCHED
-    assert states[-1] is Touch.HELD
+    assert states[5] is TouchState.UNTOUCHED
+    assert states[-1] is TouchState.HELD
 
 
 def test_a_dead_electrode_does_not_hide_that_it_is_untouched() -> None:
@@ -92,7 +92,7 @@ def test_a_dead_electrode_does_not_hide_that_it_is_untouched() -> None:
     levels = fakes.LEVELS.copy()
     levels[3] = 0.0
     level.rests_at(levels, 2400.0, usable)
-    assert touch(level) is Touch.UNTOUCHED
+    assert touch(level) is TouchState.UNTOUCHED
     assert level.drift_counts == 0.0
 
 

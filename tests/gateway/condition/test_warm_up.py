@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from palpate_gateway.condition.warm_up import WINDOW_S, WarmUp
+from palpate_gateway.condition.condition import WINDOW_S, WarmUp
 
 
 def follow(

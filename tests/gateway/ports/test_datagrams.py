@@ -27,8 +27,8 @@ from palpate_gateway.ports.datagrams import (
     BATCH,
     LARGEST,
     NO_STAMP,
+    DatagramBatch,
     Datagrams,
-    Waiting,
     available,
 )
 
@@ -45,17 +45,17 @@ def pair() -> Iterator[tuple[socket.socket, Datagrams]]:
     near.close()
 
 
-def told(waiting: Waiting) -> list[bytes]:
+def told(waiting: DatagramBatch) -> list[bytes]:
     rows = zip(waiting.data, waiting.size.tolist(), strict=True)
     return [row[:size].tobytes() for row, size in rows]
 
 
-def waiting_of(*datagrams: bytes) -> Waiting:
+def waiting_of(*datagrams: bytes) -> DatagramBatch:
     data = np.zeros((len(datagrams), LARGEST), np.uint8)
     for row, one in zip(data, datagrams, strict=True):
         row[: len(one)] = np.frombuffer(one, np.uint8)
     sizes = np.array([len(one) for one in datagrams], np.uint32)
-    return Waiting(data, sizes, np.full(len(datagrams), NO_STAMP))
+    return DatagramBatch(data, sizes, np.full(len(datagrams), NO_STAMP))
 
 
 def rows(frames: CanFrames) -> list[CanFrame]:

@@ -12,7 +12,7 @@ import pytest
 
 from palpate.errors import DeviceError
 from palpate_gateway.emulators.web_page import WebPage
-from palpate_gateway.ports.web_page import read_page
+from palpate_gateway.ports.sockets import read_page
 
 
 @contextmanager

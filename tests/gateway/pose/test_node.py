@@ -21,8 +21,8 @@ from palpate.client.robot_poses import RobotPosePublisher
 from palpate.config import parse_config
 from palpate.errors import ConfigError
 from palpate.messages import Origin, ServiceState
-from palpate_gateway import node
 from palpate_gateway.config import GatewayConfig
+from palpate_gateway.service import node
 
 fakes: Any = importlib.import_module("pose_fakes")
 PATIENCE_S: float = fakes.PATIENCE_S

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from palpate_gateway.protocols import bota
-from palpate_gateway.protocols.checksums import crc16_x25
+from palpate_gateway.protocols.framing import crc16_x25
 
 # The vector of the hardware reference, section 3.6.
 VECTOR = bytes.fromhex(
@@ -128,16 +128,19 @@ def test_any_bytes_are_accepted(chunks: list[bytes]) -> None:
 
 
 def test_requests() -> None:
-    assert bota.bare_request(bota.BareCommand.CONFIG) == b"C"
-    assert bota.bare_request(bota.BareCommand.RUN) == b"R"
-    letters = {command.name: bota.bare_request(command) for command in bota.BareCommand}
+    assert bota.bare_request(bota.BotaCommand.CONFIG) == b"C"
+    assert bota.bare_request(bota.BotaCommand.RUN) == b"R"
+    letters = {command.name: bota.bare_request(command) for command in bota.BotaCommand}
     assert letters == {
         "CONFIG": b"C", "RUN": b"R", "SAVE": b"s", "LOAD": b"l", "PRINT": b"w",
         "SOFT_RESET": b"I", "HARD_RESET": b"#",
     }  # fmt: skip
     assert bota.communication_request(baud=460800) == b"c,0,1,0,4"
     assert bota.communication_request(
-        baud=230400, temperature_compensation=True, calibrated=False, data_format=bota.Format.CSV
+        baud=230400,
+        temperature_compensation=True,
+        calibrated=False,
+        data_format=bota.BotaFormat.CSV,
     ) == b"c,1,0,1,3"  # fmt: skip
     assert bota.filter_request(512) == b"f,512,0,0,1"
     assert bota.filter_request(51, chop=True, fast=True, fir=True) == b"f,51,1,1,0"
@@ -188,14 +191,14 @@ def test_expected_replies() -> None:
 
 
 def test_refusal_is_told() -> None:
-    assert bota.find_ack(b"\r\nr,0,f,0\r\n") == bota.Ack("f", 0)
-    assert bota.find_ack(b"xr,0,c,17") == bota.Ack("c", 17)
+    assert bota.find_ack(b"\r\nr,0,f,0\r\n") == bota.BotaAck("f", 0)
+    assert bota.find_ack(b"xr,0,c,17") == bota.BotaAck("c", 17)
     assert bota.find_ack(b"App Init") is None
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 100])
 def test_wait_hands_on_what_follows(size: int) -> None:
-    wait, decoder = bota.TextWait(b"r,0,R,0"), bota.BotaDecoder()
+    wait, decoder = bota.BotaTextWait(b"r,0,R,0"), bota.BotaDecoder()
     stream = b"noise r,0,R" + b"r,0,R,0" + VECTOR * 2
     frames = []
     for at in range(0, len(stream), size):
@@ -207,7 +210,7 @@ def test_wait_hands_on_what_follows(size: int) -> None:
 
 
 def test_boot_text() -> None:
-    wait = bota.TextWait(bota.BOOT_TEXT)
+    wait = bota.BotaTextWait(bota.BOOT_TEXT)
     assert wait.feed(b"\x00garbage App In") is None
     assert wait.feed(b"it\r\n") == b"\r\n"
 
@@ -215,7 +218,7 @@ def test_boot_text() -> None:
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.binary(max_size=400)))
 def test_wait_is_bounded(chunks: list[bytes]) -> None:
-    wait = bota.TextWait(b"App Init")
+    wait = bota.BotaTextWait(b"App Init")
     for chunk in chunks:
         wait.feed(chunk)
         assert len(wait.heard) <= 256
@@ -225,4 +228,4 @@ def test_wait_is_bounded(chunks: list[bytes]) -> None:
 @pytest.mark.parametrize("text", [b"", bytes(65)])
 def test_wait_wants_a_short_text(text: bytes) -> None:
     with pytest.raises(ValueError, match=r"1\.\.64"):
-        bota.TextWait(text)
+        bota.BotaTextWait(text)

@@ -10,33 +10,33 @@ from hypothesis import strategies as st
 
 from palpate_gateway.protocols import spi
 from palpate_gateway.protocols.bridge import (
-    Body,
+    BridgeBody,
     BridgeDecoder,
+    BridgeFinger,
+    BridgeHeader,
+    BridgeHello,
     BridgeRecord,
-    Finger,
-    Header,
-    Hello,
-    SlotGroup,
-    Status,
+    BridgeSlots,
+    BridgeStatus,
     decode_body,
     encode,
 )
-from palpate_gateway.protocols.can_slots import SEQUENCES, SlotDecoder, payload_rows
-from palpate_gateway.protocols.checksums import crc16_x25
-from palpate_gateway.protocols.cobs import decode, encode_packet
+from palpate_gateway.protocols.can_slots import SlotDecoder, payload_rows
+from palpate_gateway.protocols.channels import SEQUENCES
+from palpate_gateway.protocols.framing import crc16_x25, decode, encode_packet
 from palpate_gateway.protocols.slot_clock import SlotClock
 
-HELLO = Hello(4400, 44, (Finger("BT00000000000123", "0205"), Finger("", "")))
-STATUS = Status((1, 2, 3), 4, 5)
+HELLO = BridgeHello(4400, 44, (BridgeFinger("BT00000000000123", "0205"), BridgeFinger("", "")))
+STATUS = BridgeStatus((1, 2, 3), 4, 5)
 # The payload is the vector of format A, hardware reference 2.1.
 PAC_2040 = bytes.fromhex("80 7F C1 7F C1 7F C1")
-SLOTS = SlotGroup(3, (PAC_2040, bytes.fromhex("A2 7FC1 0000 7FC1")))
+SLOTS = BridgeSlots(3, (PAC_2040, bytes.fromhex("A2 7FC1 0000 7FC1")))
 
 
 def packet(
-    sequence: int, time_us: int, body: Body = STATUS, *, source: int = 0, flags: int = 0
+    sequence: int, time_us: int, body: BridgeBody = STATUS, *, source: int = 0, flags: int = 0
 ) -> bytes:
-    return encode(Header(source, flags, sequence % 65536, time_us % 2**32), body)
+    return encode(BridgeHeader(source, flags, sequence % 65536, time_us % 2**32), body)
 
 
 def raw_packet(data: bytes) -> bytes:
@@ -63,18 +63,20 @@ def test_checksum_of_the_reference() -> None:
         (STATUS, "03", "03 01000000 02000000 03000000 04000000 05000000"),
     ],
 )
-def test_bytes_of_every_message(body: Body, kind: str, body_hex: str) -> None:
+def test_bytes_of_every_message(body: BridgeBody, kind: str, body_hex: str) -> None:
     data = bytes.fromhex("01" + kind + "07 80 FEFF 40E20100" + body_hex)
     wire = packet(0xFFFE, 123456, body, source=7, flags=0x80)
     assert wire[-1] == 0
     assert decode(wire[:-1]) == data + crc16_x25(data).to_bytes(2, "little")
     decoder = BridgeDecoder()
-    assert decoder.feed(wire) == [BridgeRecord(Header(7, 0x80, 0xFFFE, 123456), body, 0, 0, 123456)]
+    assert decoder.feed(wire) == [
+        BridgeRecord(BridgeHeader(7, 0x80, 0xFFFE, 123456), body, 0, 0, 123456)
+    ]
     assert counted(decoder) == {}
 
 
 def test_a_status_packet_to_the_byte() -> None:
-    wire = packet(1, 2, Status((0,), 0, 0))
+    wire = packet(1, 2, BridgeStatus((0,), 0, 0))
     assert wire.hex(" ").upper() == (
         "03 01 03 01 02 01 02 02 01 01 02 01 01 01 01 01 01 01 01 01 01 01 01 03 59 59 00"
     )
@@ -82,7 +84,7 @@ def test_a_status_packet_to_the_byte() -> None:
 
 def test_slots_are_read_as_those_of_a_bus() -> None:
     (record,) = BridgeDecoder().feed(packet(0, 0, SLOTS))
-    assert isinstance(record.body, SlotGroup)
+    assert isinstance(record.body, BridgeSlots)
     slots = SlotDecoder(fingers=record.body.fingers)
     assert slots.decode(*payload_rows(record.body.payloads)).channel.tolist() == [0, 17]
     assert slots.finger_counters[1]["absent"] == 1
@@ -92,14 +94,14 @@ def test_slots_are_read_as_those_of_a_bus() -> None:
 def test_bridge_times_place_slots_without_doubt(name: str) -> None:
     decoder, clock = BridgeDecoder(), SlotClock(sequence=SEQUENCES[name], exact=True)
     words = spi.encode_word(2040)
-    group = SlotGroup(
+    group = BridgeSlots(
         1,
         tuple(bytes((spi.command_byte(c),)) + words for c in SEQUENCES[name]),
     )
     places = []
     for number in [0, 1, 2, 5, 6]:
         for record in decoder.feed(packet(number, number * 10_000, group)):
-            assert isinstance(record.body, SlotGroup)
+            assert isinstance(record.body, BridgeSlots)
             decoded = SlotDecoder(fingers=1).decode(*payload_rows(record.body.payloads))
             stamps_s = record.time_us * 1e-6 + np.arange(len(decoded)) / 4400
             places.append(clock.place_all(decoded.channel, stamps_s))
@@ -158,11 +160,11 @@ def test_bodies_that_do_not_fit(kind: int, body: str) -> None:
 
 
 def test_an_empty_group_of_slots_is_good() -> None:
-    assert decode_body(2, bytes((0, 3))) == SlotGroup(3, ())
+    assert decode_body(2, bytes((0, 3))) == BridgeSlots(3, ())
 
 
 def test_the_largest_packet_passes() -> None:
-    group = SlotGroup(5, (b"\x80" + b"\x7f\xc1" * 5,) * 255)
+    group = BridgeSlots(5, (b"\x80" + b"\x7f\xc1" * 5,) * 255)
     (record,) = BridgeDecoder().feed(packet(0, 0, group))
     assert record.body == group
 
@@ -170,39 +172,47 @@ def test_the_largest_packet_passes() -> None:
 @pytest.mark.parametrize(
     ("header", "body", "message"),
     [
-        (Header(256, 0, 0, 0), STATUS, r"source 256 is not in 0\.\.255"),
-        (Header(0, -1, 0, 0), STATUS, r"flags -1 is not in 0\.\.255"),
-        (Header(0, 0, 65536, 0), STATUS, r"sequence 65536 is not in 0\.\.65535"),
-        (Header(0, 0, 0, 2**32), STATUS, "device_time_us"),
-        (Header(0, 0, 0, 0), replace(HELLO, fingers=()), r"fingers 0 is not in 1\.\.5"),
-        (Header(0, 0, 0, 0), replace(HELLO, slot_rate_hz=65536), "slot_rate_hz"),
-        (Header(0, 0, 0, 0), replace(HELLO, slots_per_frame=256), "slots_per_frame"),
-        (Header(0, 0, 0, 0), replace(HELLO, fingers=(Finger("x" * 17, ""),)), "serial"),
-        (Header(0, 0, 0, 0), replace(HELLO, fingers=(Finger("", "µ"),)), "firmware"),
-        (Header(0, 0, 0, 0), SlotGroup(6, ()), r"fingers 6 is not in 1\.\.5"),
-        (Header(0, 0, 0, 0), SlotGroup(1, (b"\x80\x01\x01",) * 256), "number of payloads 256"),
-        (Header(0, 0, 0, 0), SlotGroup(2, (PAC_2040,)), r"length of a payload 7 is not in 5\.\.5"),
-        (Header(0, 0, 0, 0), Status((), 0, 0), "fingers"),
-        (Header(0, 0, 0, 0), Status((1,), -1, 0), "counter -1"),
+        (BridgeHeader(256, 0, 0, 0), STATUS, r"source 256 is not in 0\.\.255"),
+        (BridgeHeader(0, -1, 0, 0), STATUS, r"flags -1 is not in 0\.\.255"),
+        (BridgeHeader(0, 0, 65536, 0), STATUS, r"sequence 65536 is not in 0\.\.65535"),
+        (BridgeHeader(0, 0, 0, 2**32), STATUS, "device_time_us"),
+        (BridgeHeader(0, 0, 0, 0), replace(HELLO, fingers=()), r"fingers 0 is not in 1\.\.5"),
+        (BridgeHeader(0, 0, 0, 0), replace(HELLO, slot_rate_hz=65536), "slot_rate_hz"),
+        (BridgeHeader(0, 0, 0, 0), replace(HELLO, slots_per_frame=256), "slots_per_frame"),
+        (BridgeHeader(0, 0, 0, 0), replace(HELLO, fingers=(BridgeFinger("x" * 17, ""),)), "serial"),
+        (BridgeHeader(0, 0, 0, 0), replace(HELLO, fingers=(BridgeFinger("", "µ"),)), "firmware"),
+        (BridgeHeader(0, 0, 0, 0), BridgeSlots(6, ()), r"fingers 6 is not in 1\.\.5"),
+        (
+            BridgeHeader(0, 0, 0, 0),
+            BridgeSlots(1, (b"\x80\x01\x01",) * 256),
+            "number of payloads 256",
+        ),
+        (
+            BridgeHeader(0, 0, 0, 0),
+            BridgeSlots(2, (PAC_2040,)),
+            r"length of a payload 7 is not in 5\.\.5",
+        ),
+        (BridgeHeader(0, 0, 0, 0), BridgeStatus((), 0, 0), "fingers"),
+        (BridgeHeader(0, 0, 0, 0), BridgeStatus((1,), -1, 0), "counter -1"),
     ],
 )
-def test_fields_out_of_range(header: Header, body: Body, message: str) -> None:
+def test_fields_out_of_range(header: BridgeHeader, body: BridgeBody, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         encode(header, body)
 
 
 text = st.text(st.characters(min_codepoint=0x21, max_codepoint=0x7E), max_size=4)
 payload = st.binary(min_size=5, max_size=5)
-bodies: st.SearchStrategy[Body] = st.one_of(
+bodies: st.SearchStrategy[BridgeBody] = st.one_of(
     st.builds(
-        Hello,
+        BridgeHello,
         st.integers(0, 65535),
         st.integers(0, 255),
-        st.lists(st.builds(Finger, text, text), min_size=1, max_size=5).map(tuple),
+        st.lists(st.builds(BridgeFinger, text, text), min_size=1, max_size=5).map(tuple),
     ),
-    st.builds(SlotGroup, st.just(2), st.lists(payload, max_size=60).map(tuple)),
+    st.builds(BridgeSlots, st.just(2), st.lists(payload, max_size=60).map(tuple)),
     st.builds(
-        Status,
+        BridgeStatus,
         st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=5).map(tuple),
         st.integers(0, 2**32 - 1),
         st.integers(0, 2**32 - 1),
@@ -212,7 +222,7 @@ bodies: st.SearchStrategy[Body] = st.one_of(
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(bodies, max_size=5), st.lists(st.binary(max_size=40), min_size=5, max_size=5))
-def test_every_packet_survives_junk_between(sent: list[Body], junk: list[bytes]) -> None:
+def test_every_packet_survives_junk_between(sent: list[BridgeBody], junk: list[bytes]) -> None:
     decoder = BridgeDecoder()
     wire = b""
     good = 0
@@ -249,7 +259,7 @@ def test_chunks_do_not_matter(data: bytes, cuts: list[int]) -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(bodies, st.integers(0, 10_000), st.integers(0, 7))
-def test_a_flipped_bit_never_passes(body: Body, at: int, bit: int) -> None:
+def test_a_flipped_bit_never_passes(body: BridgeBody, at: int, bit: int) -> None:
     wire = bytearray(packet(1, 1, body))
     wire[at % len(wire)] ^= 1 << bit
     records = BridgeDecoder().feed(bytes(wire) + b"\x00")

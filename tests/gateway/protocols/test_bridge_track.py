@@ -3,23 +3,23 @@ from __future__ import annotations
 import pytest
 
 from palpate_gateway.protocols.bridge import (
-    Body,
+    BridgeBody,
     BridgeDecoder,
-    Finger,
-    Header,
-    Hello,
-    SlotGroup,
-    Status,
+    BridgeFinger,
+    BridgeHeader,
+    BridgeHello,
+    BridgeSlots,
+    BridgeStatus,
     encode,
 )
 
-HELLO = Hello(4400, 44, (Finger("BT00000000000123", "0205"),))
-SLOTS = SlotGroup(3, (bytes.fromhex("80 7F C1 7F C1 7F C1"),))
-STATUS = Status((1, 2, 3), 4, 5)
+HELLO = BridgeHello(4400, 44, (BridgeFinger("BT00000000000123", "0205"),))
+SLOTS = BridgeSlots(3, (bytes.fromhex("80 7F C1 7F C1 7F C1"),))
+STATUS = BridgeStatus((1, 2, 3), 4, 5)
 
 
-def packet(sequence: int, time_us: int, body: Body = STATUS, *, source: int = 0) -> bytes:
-    return encode(Header(source, 0, sequence, time_us), body)
+def packet(sequence: int, time_us: int, body: BridgeBody = STATUS, *, source: int = 0) -> bytes:
+    return encode(BridgeHeader(source, 0, sequence, time_us), body)
 
 
 def counted(decoder: BridgeDecoder) -> dict[str, int]:

@@ -10,9 +10,9 @@ from palpate_gateway.protocols import spi
 from palpate_gateway.protocols.can_slots import (
     CanSlotDecoder,
     SlotDecoder,
-    learn_order,
     payload_rows,
 )
+from palpate_gateway.protocols.slot_clock import learn_order
 from palpate_gateway.protocols.spi import WordKind
 
 # Vectors of the hardware reference, 2.1.

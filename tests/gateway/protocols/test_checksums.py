@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_gateway.protocols.checksums import crc16_x25, sum8, sum16
-from palpate_gateway.protocols.resync import FrameFinder
+from palpate_gateway.protocols.framing import FrameFinder, crc16_x25, sum8, sum16
 
 
 def bitwise_crc(data: bytes) -> int:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_gateway.protocols.cobs import PacketSplitter, decode, encode, encode_packet
+from palpate_gateway.protocols.framing import PacketSplitter, decode, encode, encode_packet
 
 RISING = bytes(range(1, 256))
 

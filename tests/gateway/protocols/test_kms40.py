@@ -6,18 +6,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_gateway.protocols import kms40_requests as ask
+from palpate_gateway.protocols import kms40 as ask
 from palpate_gateway.protocols.kms40 import (
     AXES,
     FAULTS,
     LINE_MAX,
     REFUSALS,
-    ForceLine,
     KmsDecoder,
-    LineFault,
-    Refusal,
-    Reply,
-    SystemFlags,
+    KmsFlags,
+    KmsForceLine,
+    KmsLineFault,
+    KmsRefusal,
+    KmsReply,
     flag_names,
     over_range_axes,
     parse_flags,
@@ -25,7 +25,7 @@ from palpate_gateway.protocols.kms40 import (
 )
 
 GOOD = b"F={1.5,-0.25,1.0,0.02,-0.01,0.005},4711"
-SAMPLE = ForceLine((1.5, -0.25, 1.0), (0.02, -0.01, 0.005), 4711)
+SAMPLE = KmsForceLine((1.5, -0.25, 1.0), (0.02, -0.01, 0.005), 4711)
 
 number = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -55,7 +55,7 @@ def test_data_line(end: bytes) -> None:
 )
 def test_data_lines_with_and_without_time_stamp(line: bytes, timestamp: int | None) -> None:
     decoder = KmsDecoder()
-    expected = ForceLine((1.0, -2.0, 0.5), (0.0, 0.004, -50.0), timestamp)
+    expected = KmsForceLine((1.0, -2.0, 0.5), (0.0, 0.004, -50.0), timestamp)
     assert decoder.feed(line + b"\n") == [expected]
     assert decoder.counters["untimed_lines"] == (timestamp is None)
 
@@ -63,30 +63,30 @@ def test_data_lines_with_and_without_time_stamp(line: bytes, timestamp: int | No
 @pytest.mark.parametrize(
     ("line", "reply"),
     [
-        (b"L1", Reply("L1", "")),
-        (b"L0\r", Reply("L0", "")),
-        (b"TARE=1", Reply("TARE", "1")),
-        (b"T=25.7", Reply("T", "25.7")),
-        (b'ID="KMS 40"', Reply("ID", "KMS 40")),
-        (b'SN="', Reply("SN", '"')),
-        (b"LMASK={1,1,1,1,1,1}", Reply("LMASK", "{1,1,1,1,1,1}")),
-        (b"D=", Reply("D", "")),
+        (b"L1", KmsReply("L1", "")),
+        (b"L0\r", KmsReply("L0", "")),
+        (b"TARE=1", KmsReply("TARE", "1")),
+        (b"T=25.7", KmsReply("T", "25.7")),
+        (b'ID="KMS 40"', KmsReply("ID", "KMS 40")),
+        (b'SN="', KmsReply("SN", '"')),
+        (b"LMASK={1,1,1,1,1,1}", KmsReply("LMASK", "{1,1,1,1,1,1}")),
+        (b"D=", KmsReply("D", "")),
     ],
 )
-def test_replies(line: bytes, reply: Reply) -> None:
+def test_replies(line: bytes, reply: KmsReply) -> None:
     assert parse_line(line) == reply
 
 
 @pytest.mark.parametrize(
     ("line", "refusal"),
     [
-        (b"ERROR(14)", Refusal(14, "unknown command")),
-        (b'ERROR(24,"LDIV")', Refusal(24, "invalid parameter")),
-        (b"ERROR(0)", Refusal(0, "success")),
-        (b"ERROR(77)", Refusal(77, "unknown error 77")),
+        (b"ERROR(14)", KmsRefusal(14, "unknown command")),
+        (b'ERROR(24,"LDIV")', KmsRefusal(24, "invalid parameter")),
+        (b"ERROR(0)", KmsRefusal(0, "success")),
+        (b"ERROR(77)", KmsRefusal(77, "unknown error 77")),
     ],
 )
-def test_refusals(line: bytes, refusal: Refusal) -> None:
+def test_refusals(line: bytes, refusal: KmsRefusal) -> None:
     assert parse_line(line) == refusal
 
 
@@ -99,41 +99,41 @@ def test_every_refusal_of_the_reference_has_a_name() -> None:
 @pytest.mark.parametrize(
     ("line", "fault"),
     [
-        (b"", LineFault.BLANK),
-        (b"\r", LineFault.BLANK),
-        (b"F={nan,0,0,0,0,0},1", LineFault.BAD_NUMBER),
-        (b"F={0,inf,0,0,0,0}", LineFault.BAD_NUMBER),
-        (b"F={0,0,-Infinity,0,0,0}", LineFault.BAD_NUMBER),
-        (b"F={0,0,0,1e999,0,0}", LineFault.BAD_NUMBER),
-        (b"F={0,0,0,0,1_0,0}", LineFault.BAD_NUMBER),
-        (b"F={0,0,0,0,,0}", LineFault.BAD_NUMBER),
-        (b"F={0,0,0,0,0}", LineFault.WRONG_COUNT),
-        (b"F={0,0,0,0,0,0,0}", LineFault.WRONG_COUNT),
-        (b"F={}", LineFault.WRONG_COUNT),
-        (b"F={0,0,0,0,0,0", LineFault.MALFORMED),
-        (b"F=0,0,0,0,0,0", LineFault.MALFORMED),
-        (b"F={0,0,0,0,0,0}7", LineFault.MALFORMED),
-        (b"F={0,0,0,0,0,0},", LineFault.MALFORMED),
-        (b"F={0,0,0,0,0,0},later", LineFault.MALFORMED),
-        (b"F={0,0,0F={0,0,0,0,0,0},7", LineFault.MALFORMED),
-        (b"ERROR", LineFault.MALFORMED),
-        (b"ERROR(1234567890)", LineFault.MALFORMED),
-        (b",0.5,0.25},12", LineFault.UNKNOWN),
-        (b"L2", LineFault.UNKNOWN),
-        (b"tare=1", LineFault.UNKNOWN),
-        (b"F={0,0,0,0,0,\xb2}", LineFault.NON_ASCII),
-        (b"TARE=\x001", LineFault.NON_ASCII),
-        (b"X" * (LINE_MAX + 1), LineFault.OVERLONG),
+        (b"", KmsLineFault.BLANK),
+        (b"\r", KmsLineFault.BLANK),
+        (b"F={nan,0,0,0,0,0},1", KmsLineFault.BAD_NUMBER),
+        (b"F={0,inf,0,0,0,0}", KmsLineFault.BAD_NUMBER),
+        (b"F={0,0,-Infinity,0,0,0}", KmsLineFault.BAD_NUMBER),
+        (b"F={0,0,0,1e999,0,0}", KmsLineFault.BAD_NUMBER),
+        (b"F={0,0,0,0,1_0,0}", KmsLineFault.BAD_NUMBER),
+        (b"F={0,0,0,0,,0}", KmsLineFault.BAD_NUMBER),
+        (b"F={0,0,0,0,0}", KmsLineFault.WRONG_COUNT),
+        (b"F={0,0,0,0,0,0,0}", KmsLineFault.WRONG_COUNT),
+        (b"F={}", KmsLineFault.WRONG_COUNT),
+        (b"F={0,0,0,0,0,0", KmsLineFault.MALFORMED),
+        (b"F=0,0,0,0,0,0", KmsLineFault.MALFORMED),
+        (b"F={0,0,0,0,0,0}7", KmsLineFault.MALFORMED),
+        (b"F={0,0,0,0,0,0},", KmsLineFault.MALFORMED),
+        (b"F={0,0,0,0,0,0},later", KmsLineFault.MALFORMED),
+        (b"F={0,0,0F={0,0,0,0,0,0},7", KmsLineFault.MALFORMED),
+        (b"ERROR", KmsLineFault.MALFORMED),
+        (b"ERROR(1234567890)", KmsLineFault.MALFORMED),
+        (b",0.5,0.25},12", KmsLineFault.UNKNOWN),
+        (b"L2", KmsLineFault.UNKNOWN),
+        (b"tare=1", KmsLineFault.UNKNOWN),
+        (b"F={0,0,0,0,0,\xb2}", KmsLineFault.NON_ASCII),
+        (b"TARE=\x001", KmsLineFault.NON_ASCII),
+        (b"X" * (LINE_MAX + 1), KmsLineFault.OVERLONG),
     ],
 )
 def test_faults_are_counted_by_kind_and_do_not_touch_neighbours(
-    line: bytes, fault: LineFault
+    line: bytes, fault: KmsLineFault
 ) -> None:
     assert parse_line(line) is fault
     decoder = KmsDecoder()
     assert decoder.feed(GOOD + b"\n" + line + b"\n" + GOOD + b"\n") == [SAMPLE, SAMPLE]
     assert decoder.counters[fault] == 1
-    assert sum(decoder.counters[kind] for kind in LineFault) == 1
+    assert sum(decoder.counters[kind] for kind in KmsLineFault) == 1
     assert decoder.counters["junk_bytes"] == len(line) + 1
 
 
@@ -149,7 +149,7 @@ def test_endless_line_takes_no_memory_and_is_one_fault() -> None:
 
 def test_longest_line() -> None:
     line = b"PRINT=" + b"7" * (LINE_MAX - 6)
-    assert KmsDecoder().feed(line + b"\n") == [Reply("PRINT", "7" * (LINE_MAX - 6))]
+    assert KmsDecoder().feed(line + b"\n") == [KmsReply("PRINT", "7" * (LINE_MAX - 6))]
 
 
 def test_reset_forgets_the_line_that_has_begun() -> None:
@@ -166,7 +166,7 @@ def test_reset_forgets_the_line_that_has_begun() -> None:
 def test_stopping_drains_samples_before_the_echo() -> None:
     decoder = KmsDecoder()
     records = decoder.feed(GOOD + b"\n" + GOOD + b"\nL0\nTARE=1\n")
-    assert records == [SAMPLE, SAMPLE, Reply("L0", ""), Reply("TARE", "1")]
+    assert records == [SAMPLE, SAMPLE, KmsReply("L0", ""), KmsReply("TARE", "1")]
 
 
 def in_pieces(data: bytes, cuts: list[int]) -> list[bytes]:
@@ -215,16 +215,16 @@ def test_good_lines_are_found_among_junk(parts: list[tuple[bytes, list[float]]])
         data += b"@" + junk.replace(b"\n", b"@") + b"\nF={"
         data += ",".join(map(repr, values)).encode() + b"},1\n"
     found = decoder.feed(data)
-    assert found == [ForceLine((a, b, c), (d, e, f), 1) for _, (a, b, c, d, e, f) in parts]
+    assert found == [KmsForceLine((a, b, c), (d, e, f), 1) for _, (a, b, c, d, e, f) in parts]
 
 
 @pytest.mark.parametrize(
     ("value", "flags"),
     [
         ("0", 0),
-        ("19", SystemFlags.CALIBRATION_VALID | SystemFlags.STABLE | 16),
+        ("19", KmsFlags.CALIBRATION_VALID | KmsFlags.STABLE | 16),
         ("007", 7),
-        ("0x00100000", SystemFlags.OVER_RANGE_FX),
+        ("0x00100000", KmsFlags.OVER_RANGE_FX),
         ("4294967295", 0xFFFFFFFF),
         ("4294967296", None),
         ("-1", None),
@@ -248,14 +248,14 @@ def test_status_word(value: str, flags: int | None) -> None:
     ],
 )  # fmt: skip
 def test_flags_are_named(bit: int, name: str) -> None:
-    assert flag_names(SystemFlags(1 << bit)) == (name,)
+    assert flag_names(KmsFlags(1 << bit)) == (name,)
 
 
 def test_over_range_is_told_per_axis() -> None:
-    every = SystemFlags(0x3F << 20)
+    every = KmsFlags(0x3F << 20)
     assert over_range_axes(every) == AXES
-    assert over_range_axes(SystemFlags.OVER_RANGE_FZ | SystemFlags.OVER_RANGE_MX) == ("fz", "mx")
-    assert over_range_axes(SystemFlags(~(0x3F << 20) & 0xFFFFFFFF)) == ()
+    assert over_range_axes(KmsFlags.OVER_RANGE_FZ | KmsFlags.OVER_RANGE_MX) == ("fz", "mx")
+    assert over_range_axes(KmsFlags(~(0x3F << 20) & 0xFFFFFFFF)) == ()
     assert flag_names(FAULTS) == ("calibration fault", "temperature fault", "power fault")
 
 
@@ -269,7 +269,7 @@ def test_requests() -> None:
     assert ask.mask_request([False, False, True, False, False, False]) == b"LMASK({0,0,1,0,0,0})\n"
     assert ask.divider_request(5) == b"LDIV(5)\n"
     assert ask.filter_request(0) == b"FLT(0)\n"
-    assert ask.query_request(ask.Query.FLAGS) == b"FLAGS()\n"
+    assert ask.query_request(ask.KmsQuery.FLAGS) == b"FLAGS()\n"
     assert ask.identify_requests() == (b"ID()\n", b"SN()\n", b"V()\n")
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate_gateway.protocols import optoforce
-from palpate_gateway.protocols.checksums import sum16
+from palpate_gateway.protocols.framing import sum16
 from palpate_gateway.protocols.optoforce import OptoForceData, OptoForceDecoder, OptoForceReply
 
 # Every vector of the hardware reference, section 3.4.

@@ -14,25 +14,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_gateway.protocols import bota, kms40, kms40_requests, optoforce, pic32, robotous
-from palpate_gateway.protocols.checksums import crc16_x25
-from palpate_gateway.protocols.rdt import RdtDecoder, RdtScale
-from palpate_gateway.protocols.rdt_profiles import HEX, NET_FT, hex_filter_request
-from palpate_gateway.protocols.robotous_framing import RobotousSerialDecoder, serial_frame
+from palpate_gateway.protocols import bota, kms40, optoforce, pic32, robotous
+from palpate_gateway.protocols.framing import crc16_x25
+from palpate_gateway.protocols.rdt import HEX, NET_FT, RdtDecoder, RdtScale, hex_filter_request
+from palpate_gateway.protocols.robotous import RobotousSerialDecoder, serial_frame
 from palpate_gateway.protocols.spi import WordKind, channel_of_command, decode_word
 
 SENT: dict[str, tuple[Callable[[], bytes], str]] = {
     "3.1 identity": (
-        lambda: kms40_requests.query_request(kms40_requests.Query.IDENTITY),
+        lambda: kms40.query_request(kms40.KmsQuery.IDENTITY),
         b"ID()\n".hex(),
     ),
-    "3.1 start": (kms40_requests.start_request, b"L1()\n".hex()),
-    "3.1 stop": (kms40_requests.stop_request, b"L0()\n".hex()),
-    "3.1 all axes": (kms40_requests.mask_request, b"LMASK({1,1,1,1,1,1})\n".hex()),
-    "3.1 every sample": (lambda: kms40_requests.divider_request(1), b"LDIV(1)\n".hex()),
-    "3.1 tare": (kms40_requests.tare_request, b"TARE(1)\n".hex()),
-    "3.1 clear tare": (kms40_requests.clear_tare_request, b"TARE(0)\n".hex()),
-    "3.1 quiet": (kms40_requests.quiet_request, b"VL(0)\n".hex()),
+    "3.1 start": (kms40.start_request, b"L1()\n".hex()),
+    "3.1 stop": (kms40.stop_request, b"L0()\n".hex()),
+    "3.1 all axes": (kms40.mask_request, b"LMASK({1,1,1,1,1,1})\n".hex()),
+    "3.1 every sample": (lambda: kms40.divider_request(1), b"LDIV(1)\n".hex()),
+    "3.1 tare": (kms40.tare_request, b"TARE(1)\n".hex()),
+    "3.1 clear tare": (kms40.clear_tare_request, b"TARE(0)\n".hex()),
+    "3.1 quiet": (kms40.quiet_request, b"VL(0)\n".hex()),
     "3.2 start": (NET_FT.start_request, "12 34 00 02 00 00 00 00"),
     "3.2 bias": (NET_FT.bias_request, "12 34 00 42 00 00 00 00"),
     "3.2 stop": (NET_FT.stop_request, "12 34 00 00 00 00 00 00"),
@@ -59,13 +58,13 @@ SENT: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: serial_frame(robotous.rate_request(200)),
         "55 0F 05 00 00 00 00 00 00 14 AA",
     ),
-    "3.6 configuration": (lambda: bota.bare_request(bota.BareCommand.CONFIG), b"C".hex()),
+    "3.6 configuration": (lambda: bota.bare_request(bota.BotaCommand.CONFIG), b"C".hex()),
     "3.6 communication": (
         lambda: bota.communication_request(baud=460800),
         b"c,0,1,0,4".hex(),
     ),
     "3.6 filter": (lambda: bota.filter_request(512), b"f,512,0,0,1".hex()),
-    "3.6 run": (lambda: bota.bare_request(bota.BareCommand.RUN), b"R".hex()),
+    "3.6 run": (lambda: bota.bare_request(bota.BotaCommand.RUN), b"R".hex()),
     "2.2 stream": (pic32.start_request, b"r\n".hex()),
     "2.2 sample": (pic32.sample_request, b"b\n".hex()),
     "2.2 load": (pic32.load_request, b"l\n".hex()),
@@ -125,9 +124,9 @@ RECEIVED: dict[str, tuple[Callable[[str], Any], str, Any]] = {
     "3.1 data": (
         kms,
         "F={1.5,-0.25,1.0,0.02,-0.01,0.005},4711",
-        kms40.ForceLine((1.5, -0.25, 1.0), (0.02, -0.01, 0.005), 4711),
+        kms40.KmsForceLine((1.5, -0.25, 1.0), (0.02, -0.01, 0.005), 4711),
     ),
-    "3.1 refusal": (kms, "ERROR(14)", kms40.Refusal(14, "unknown command")),
+    "3.1 refusal": (kms, "ERROR(14)", kms40.KmsRefusal(14, "unknown command")),
     "3.2 record": (
         rdt,
         "00000001 00001B58 00000000 0016E360 FFFC2F70 000F4240 00004E20 FFFFD8F0 00001388",

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate_gateway.protocols import pic32
-from palpate_gateway.protocols.pic32 import Layout, Pic32Decoder, Pic32Record, Pic32Sample
+from palpate_gateway.protocols.pic32 import Pic32Decoder, Pic32Layout, Pic32Record, Pic32Sample
 
 SAMPLE = Pic32Sample(2040, 2650, 2050, 1100, tuple(range(3001, 3020)))
 END = bytes(58)
@@ -21,11 +21,11 @@ def record_bytes(
     *,
     load_g: int = 120,
     reference_g: int = -5,
-    layout: Layout = Layout.PAC_FIRST,
+    layout: Pic32Layout = Pic32Layout.PAC_FIRST,
 ) -> bytes:
     others = [sample.pac, sample.pdc, sample.tac, sample.tdc]
     electrodes = list(sample.electrodes)
-    values = others + electrodes if layout is Layout.PAC_FIRST else electrodes + others
+    values = others + electrodes if layout is Pic32Layout.PAC_FIRST else electrodes + others
     return struct.pack("<I23Hii", stamp, *values, load_g, reference_g)
 
 
@@ -47,12 +47,12 @@ def test_bytes_of_a_record() -> None:
     assert record.time_s == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("layout", Layout)
-def test_layouts(layout: Layout) -> None:
+@pytest.mark.parametrize("layout", Pic32Layout)
+def test_layouts(layout: Pic32Layout) -> None:
     raw = record_bytes(7, layout=layout)
     assert Pic32Decoder(layout).feed(raw) == [Pic32Record(7, SAMPLE, 120, -5)]
     assert pic32.decode_sample(raw[4:50], layout) == SAMPLE
-    assert Pic32Decoder(Layout(str(layout))).feed(raw)[0].sample == SAMPLE
+    assert Pic32Decoder(Pic32Layout(str(layout))).feed(raw)[0].sample == SAMPLE
 
 
 def test_the_stamp_is_unwrapped() -> None:

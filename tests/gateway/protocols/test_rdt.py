@@ -6,28 +6,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate_gateway.protocols.rdt import (
-    BELIEVABLE_LOSS,
-    LATE_WINDOW,
-    U32,
-    RdtDecoder,
-    RdtRecord,
-    RdtScale,
-    RdtSequence,
-    Step,
-    decode_records,
-    encode_request,
-    unwrap,
-)
-from palpate_gateway.protocols.rdt_profiles import (
     AXIA,
+    BELIEVABLE_LOSS,
     HEX,
+    LATE_WINDOW,
     NET_FT,
     PROFILES,
     SCHUNK_FTN,
+    U32,
+    RdtDecoder,
     RdtProfile,
+    RdtRecord,
+    RdtScale,
+    RdtSequence,
+    RdtStep,
+    decode_records,
+    encode_request,
     hex_filter_request,
     hex_period_request,
     hex_sensor_number,
+    unwrap,
 )
 
 # The vector of the hardware reference, section 3.2.
@@ -106,15 +104,15 @@ def test_what_does_not_fit() -> None:
         RdtScale(float("nan"), 1.0)
 
 
-def follow(*numbers: tuple[int, int]) -> tuple[list[Step], RdtSequence]:
+def follow(*numbers: tuple[int, int]) -> tuple[list[RdtStep], RdtSequence]:
     sequence = RdtSequence()
     return [sequence.step(rdt, ft) for rdt, ft in numbers], sequence
 
 
 def test_sequence_in_order_and_with_a_gap() -> None:
     steps, sequence = follow((1, 700), (2, 701), (6, 705), (7, 706))
-    assert steps[:2] == [Step(True, True, 0, 0), Step(True, False, 0, 1)]
-    assert steps[2:] == [Step(True, False, 3, 5), Step(True, False, 0, 6)]
+    assert steps[:2] == [RdtStep(True, True, 0, 0), RdtStep(True, False, 0, 1)]
+    assert steps[2:] == [RdtStep(True, False, 3, 5), RdtStep(True, False, 0, 6)]
     assert sequence.counters == RdtSequence().counters | {"lost_records": 3}
 
 
@@ -135,15 +133,15 @@ def test_late_first_record_is_no_restart() -> None:
 @pytest.mark.parametrize("before", [1, 2, LATE_WINDOW, 100_000, 3_000_000_000])
 def test_restart_is_a_new_epoch(before: int) -> None:
     steps, sequence = follow((before, 7000), (1, 7050), (2, 7051))
-    assert steps[1] == Step(True, True, 0, 1)
-    assert steps[2] == Step(True, False, 0, 2)
+    assert steps[1] == RdtStep(True, True, 0, 1)
+    assert steps[2] == RdtStep(True, False, 0, 2)
     assert sequence.counters["restarts"] == 1
     assert sequence.counters["lost_records"] == 0
 
 
 def test_restart_whose_first_records_are_lost() -> None:
     steps, _ = follow((50, 7000), (4, 7050))
-    assert steps[1] == Step(True, True, 3, 4)
+    assert steps[1] == RdtStep(True, True, 3, 4)
 
 
 def test_restart_after_a_loss_of_power() -> None:
@@ -155,7 +153,7 @@ def test_restart_after_a_loss_of_power() -> None:
 def test_late_record_of_the_numbers_before_a_restart() -> None:
     steps, sequence = follow((64, 6400), (1, 6420), (65, 6410), (2, 6430))
     assert [step.keep for step in steps] == [True, True, False, True]
-    assert steps[3] == Step(True, False, 0, 2)
+    assert steps[3] == RdtStep(True, False, 0, 2)
     assert sequence.counters["late_records"] == 1
     assert sequence.counters["lost_records"] == 0
 
@@ -181,7 +179,7 @@ def test_long_loss_is_counted_and_unbelievable_one_is_not() -> None:
     steps, _ = follow((10, 1), (5_000_010, 5_000_001))
     assert steps[1].lost == 4_999_999
     steps, _ = follow((4_000_000_000, 1), (2 * BELIEVABLE_LOSS, 2))
-    assert steps[1] == Step(True, True, 0, 1)
+    assert steps[1] == RdtStep(True, True, 0, 1)
 
 
 def test_device_that_sends_faster_than_it_samples() -> None:
@@ -193,7 +191,7 @@ def test_device_that_sends_faster_than_it_samples() -> None:
 def test_reset_forgets_the_place_and_keeps_ticks_and_counters() -> None:
     _, sequence = follow((1, 1), (3, 3))
     sequence.reset()
-    assert sequence.step(900, 900) == Step(True, True, 0, 3)
+    assert sequence.step(900, 900) == RdtStep(True, True, 0, 3)
     assert sequence.counters["lost_records"] == 1
     assert sequence.counters["restarts"] == 0
 

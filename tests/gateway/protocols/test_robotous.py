@@ -6,8 +6,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from palpate_gateway.protocols import robotous as framing
 from palpate_gateway.protocols import robotous as rft
-from palpate_gateway.protocols import robotous_framing as framing
 
 # Every vector of the hardware reference, section 3.5.
 REQUESTS = {
@@ -41,7 +41,9 @@ def test_data_vector() -> None:
     decoder = framing.RobotousSerialDecoder()
     assert decoder.feed(DATA_FRAME) == [DATA]
     record = rft.decode(DATA)
-    assert record == rft.RobotousData(rft.Command.START, (500, -250, 1000, 200, -100, 50), 0)
+    assert record == rft.RobotousData(
+        rft.RobotousCommand.START, (500, -250, 1000, 200, -100, 50), 0
+    )
     wrench = rft.scale_of("RFT40-SA01").wrench(record.counts)
     assert wrench == pytest.approx((10, -5, 20, 0.1, -0.05, 0.025))
     assert framing.serial_frame(DATA) == DATA_FRAME
@@ -51,7 +53,7 @@ def test_data_vector() -> None:
 def test_one_sample_is_told_from_the_stream() -> None:
     record = rft.decode(b"\x0a" + DATA[1:])
     assert isinstance(record, rft.RobotousData)
-    assert record.command is rft.Command.SAMPLE
+    assert record.command is rft.RobotousCommand.SAMPLE
 
 
 @pytest.mark.parametrize(
@@ -74,17 +76,19 @@ def test_overloads(status: int, axes: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("command", [1, 2, 3])
 def test_identity_is_text_up_to_its_end(command: int) -> None:
     record = rft.decode(reply(command, *b"RFT40-SA01"))
-    assert record == rft.RobotousText(rft.Command(command), "RFT40-SA01")
+    assert record == rft.RobotousText(rft.RobotousCommand(command), "RFT40-SA01")
     full = rft.decode(bytes((command,)) + b"ABCDEFGHIJKLMNO")
-    assert full == rft.RobotousText(rft.Command(command), "ABCDEFGHIJKLMNO")
+    assert full == rft.RobotousText(rft.RobotousCommand(command), "ABCDEFGHIJKLMNO")
 
 
 @pytest.mark.parametrize("command", [4, 6, 8, 15])
 def test_set_replies(command: int) -> None:
-    assert rft.decode(reply(command, 1)) == rft.RobotousResult(rft.Command(command), True, 0)
+    assert rft.decode(reply(command, 1)) == rft.RobotousResult(
+        rft.RobotousCommand(command), True, 0
+    )
     for error, name in ((1, "unsupported"), (2, "out of range"), (3, "failed")):
         refused = rft.decode(reply(command, 0, error))
-        assert refused == rft.RobotousResult(rft.Command(command), False, error)
+        assert refused == rft.RobotousResult(rft.RobotousCommand(command), False, error)
         assert rft.ERRORS[error] == name
 
 
@@ -92,7 +96,7 @@ def test_set_replies(command: int) -> None:
 def test_get_replies(command: int, values: int) -> None:
     record = rft.decode(bytes(range(command, command + 16)))
     wanted = tuple(range(command + 1, command + 1 + values))
-    assert record == rft.RobotousValues(rft.Command(command), wanted)
+    assert record == rft.RobotousValues(rft.RobotousCommand(command), wanted)
 
 
 @pytest.mark.parametrize("payload", [b"", DATA[:15], DATA + b"\0", reply(12), reply(17), reply(99)])
@@ -124,7 +128,7 @@ def test_scale_is_a_setting() -> None:
 def test_filter_codes_follow_the_manuals_unless_told() -> None:
     manuals = [rft.filter_request(cutoff)[:3] for cutoff in rft.CUTOFFS_HZ]
     assert manuals == [bytes((8, 1, code)) for code in range(1, 15)]
-    header = rft.FilterOrder.SAMPLE_HEADER
+    header = rft.RobotousFilterOrder.SAMPLE_HEADER
     assert rft.filter_request(500, order=header)[:3] == bytes((8, 1, 14))
     assert rft.filter_request(1, order=header)[:3] == bytes((8, 1, 1))
     assert rft.filter_request(None) == reply(8)[:8]
@@ -137,8 +141,8 @@ def test_filter_codes_follow_the_manuals_unless_told() -> None:
 def test_requests() -> None:
     assert rft.sample_request() == reply(10)[:8]
     assert rft.bias_request(on=False) == reply(17)[:8]
-    assert rft.get_request(rft.Command.MODEL) == reply(1)[:8]
-    assert rft.get_request(rft.Command.OVERLOADS) == reply(18)[:8]
+    assert rft.get_request(rft.RobotousCommand.MODEL) == reply(1)[:8]
+    assert rft.get_request(rft.RobotousCommand.OVERLOADS) == reply(18)[:8]
     assert rft.baud_request(921600) == reply(6, 1)[:8]
     assert rft.can_ids_request(0x64, 1, 2) == reply(4, 0x64, 1, 2)[:8]
     rates = {rate: rft.rate_request(rate)[1] for rate in (10, 20, 50, 100, 200, 333, 500, 1000)}
@@ -153,7 +157,7 @@ def test_requests_out_of_range() -> None:
     for ids in ((0, 1, 2), (1, 2, 256), (5, 5, 6)):
         with pytest.raises(ValueError, match=r"1\.\.255"):
             rft.can_ids_request(*ids)
-    for command in (rft.Command.START, rft.Command.SET_RATE):
+    for command in (rft.RobotousCommand.START, rft.RobotousCommand.SET_RATE):
         with pytest.raises(ValueError, match="none of MODEL"):
             rft.get_request(command)
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate_gateway.protocols.can_slots import SEQUENCES
-from palpate_gateway.protocols.places import Place
-from palpate_gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.protocols.channels import SEQUENCES
+from palpate_gateway.protocols.slot_clock import SlotClock, SlotPlace
 from palpate_gateway.recordings.text_log import TextLogReader
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]
@@ -27,7 +26,7 @@ def stream(
     return [(channel, START_S + k * PERIOD_S) for k, channel in enumerate(slots, first)]
 
 
-def place_all(clock: SlotClock, slots: Iterable[Stamped]) -> list[Place]:
+def place_all(clock: SlotClock, slots: Iterable[Stamped]) -> list[SlotPlace]:
     places = (clock.place(channel, stamp_s) for channel, stamp_s in slots)
     return [place for place in places if place is not None]
 

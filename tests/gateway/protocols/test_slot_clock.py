@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from palpate_gateway.biotac.frames import FrameAssembler
 from palpate_gateway.biotac.slots import Slot, slot_block
 from palpate_gateway.protocols import channels as ch
-from palpate_gateway.protocols.can_slots import SEQUENCES, SlotOrder
-from palpate_gateway.protocols.places import Place
-from palpate_gateway.protocols.slot_clock import SlotClock
+from palpate_gateway.protocols.channels import SEQUENCES
+from palpate_gateway.protocols.slot_clock import SlotClock, SlotOrder, SlotPlace
 
 E1_FIRST = SEQUENCES["biotac_e1_first"]
 PERIOD_S = 1 / 4400
@@ -30,7 +29,7 @@ def stream(
     return [(channel, START_S + k * PERIOD_S) for k, channel in enumerate(slots, first)]
 
 
-def place_all(clock: SlotClock, slots: Iterable[Stamped]) -> list[Place]:
+def place_all(clock: SlotClock, slots: Iterable[Stamped]) -> list[SlotPlace]:
     places = (clock.place(channel, stamp_s) for channel, stamp_s in slots)
     return [place for place in places if place is not None]
 
@@ -323,7 +322,7 @@ def test_many_slots_find_the_places_that_each_finds_alone(
         (k, place) for k, slot in enumerate(slots) if (place := alone.place(*slot)) is not None
     ]
     clock = SlotClock(sequence=None if learns else sequence, exact=exact)
-    told: list[tuple[int, Place]] = []
+    told: list[tuple[int, SlotPlace]] = []
     begin = 0
     for size in itertools.cycle(sizes):
         batch = slots[begin : begin + size]
@@ -334,7 +333,7 @@ def test_many_slots_find_the_places_that_each_finds_alone(
         columns = (places.run, places.frame, places.position, places.time_s)
         rows = zip(*(column.tolist() for column in columns), strict=True)
         kept = (begin + places.kept).tolist()
-        told += [(k, Place(*row)) for k, row in zip(kept, rows, strict=True)]
+        told += [(k, SlotPlace(*row)) for k, row in zip(kept, rows, strict=True)]
         begin += size
     assert told == expected
     assert clock.counters == alone.counters

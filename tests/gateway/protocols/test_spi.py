@@ -33,7 +33,7 @@ def test_command_vectors(channel: int, command: int) -> None:
 def test_word_vectors(value: int, word: str) -> None:
     assert spi.encode_word(value) == bytes.fromhex(word)
     decoded = spi.decode_word(bytes.fromhex(word))
-    assert decoded == spi.Word(spi.WordKind.GOOD, value, False, "")
+    assert decoded == spi.SpiWord(spi.WordKind.GOOD, value, False, "")
 
 
 @pytest.mark.parametrize("word", ["0000", "FFFF"])

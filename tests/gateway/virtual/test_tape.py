@@ -13,8 +13,8 @@ import pytest
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.tape import Tape, read_tape
 from palpate.messages import Tare
+from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
-from palpate_gateway.pipeline import Outgoing, Pipeline
 from palpate_gateway.readings import (
     ElectrodeReading,
     FieldReading,
@@ -22,7 +22,7 @@ from palpate_gateway.readings import (
     Reading,
     WrenchReading,
 )
-from palpate_gateway.timing.clock_map import FileClock
+from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.virtual import tape as virtual_tape
 from palpate_gateway.virtual.press import between, order, poses
 
@@ -160,7 +160,7 @@ def test_starts_untouched_so_that_a_tare_succeeds(tape_path: Write) -> None:
         ) as device:
             pipeline = Pipeline(device.info)
             pipeline.begin(device.identity, FileClock("x", None))
-            out: list[Outgoing] = []
+            out: list[DueMessage] = []
             while got := device.read(1.0):
                 out += pipeline.push(got, 0)
         (tare,) = [item.message for item in out if isinstance(item.message, Tare)]

@@ -1,0 +1,145 @@
+"""The line under the arrivals: offset and drift of a clock that is only seen late.
+
+Delay only ever adds (hardware reference 5.2), so the clock is the highest line that has no reading
+above it early: the edge of the lower convex hull at the middle of the window. Bursts of late
+readings, clumps of an adapter and stalls of the host lie above it and change nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+
+EnvelopePoint = tuple[float, float]
+"""Device time [s] and by how much later it arrived [ns], both since the first reading."""
+
+PART_S = 0.25
+"""Of each part of the window only the reading that came soonest is kept [s]."""
+
+WINDOW_S = 16.0
+"""What is older than this is forgotten [s]: quartzes warm up by some ppm a minute."""
+
+SETTLED_S = 4.0
+"""From this span on the drift is believed whatever it is [s]."""
+
+_SLOPE_S = 1.0
+"""Over a shorter span delays that differ by a millisecond would look like any drift [s]."""
+
+_PPM = 1e3
+"""A part in a million [ns/s]."""
+
+QUARTZ_PPM = 600.0
+"""Drift that is believed at once: quartzes differ by less than 100 ppm each, cheap resonators by
+500."""
+
+_STEP_NS = 1e6
+"""A single reading that lowers the line by more is of a clock that has stepped [ns]: some devices'
+time is counted by us, and where we have miscounted there is no slope to be seen in it."""
+
+_WILD_PPM = 50_000.0
+"""Beyond this, device time is not time [ppm]."""
+
+
+class ClockEnvelope:
+    """Follows one clock: a few comparisons for each reading, a small fit each 0.25 s."""
+
+    def __init__(self) -> None:
+        self._parts: deque[EnvelopePoint] = deque(maxlen=math.ceil(WINDOW_S / PART_S))
+        self._lowest: EnvelopePoint = (0.0, 0.0)
+        self._low_ns = math.inf  # of this part, above the line
+        self._part_ends_s = self._last_s = 0.0
+        # The line: delay(x) = base + slope * (x - at).
+        self._base_ns, self._slope, self._at_s = math.inf, 0.0, 0.0
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster than the host's the device's clock runs [ppm]; 0 while unknown."""
+        return -self._slope / _PPM
+
+    @property
+    def span_s(self) -> float:
+        """Device time that the line rests on [s]."""
+        return self._parts[-1][0] - self._parts[0][0] if self._parts else 0.0
+
+    def add(self, x_s: float, late_ns: float) -> None:
+        """Take a reading.
+
+        Args:
+            x_s: Device time [s].
+            late_ns: Arrival less device time [ns]; any origin, the same for all.
+        """
+        above_ns = late_ns - self.at(x_s)
+        if above_ns < self._low_ns:
+            self._low_ns, self._lowest = above_ns, (x_s, late_ns)
+        if above_ns < 0.0:  # nothing comes before it was sent
+            if above_ns < -_STEP_NS - _WILD_PPM * _PPM * (x_s - self._last_s):
+                self._parts.clear()
+                self._base_ns, self._at_s, self._part_ends_s = late_ns, x_s, x_s + PART_S
+            else:
+                self._base_ns += above_ns
+            self._low_ns = 0.0
+        self._last_s = x_s
+        if x_s >= self._part_ends_s:
+            self._end_part(x_s)
+
+    def at(self, x_s: float) -> float:
+        """Least delay at a device time [ns]."""
+        return self._base_ns + self._slope * (x_s - self._at_s)
+
+    def _end_part(self, x_s: float) -> None:
+        parts = self._parts
+        if not parts or self._lowest[0] > parts[-1][0]:
+            parts.append(self._lowest)
+        while parts[0][0] < x_s - WINDOW_S and len(parts) > 1:
+            parts.popleft()
+        self._low_ns, self._part_ends_s = math.inf, x_s + PART_S
+        points = tuple(parts)
+        span_s = points[-1][0] - points[0][0]
+        if span_s < _SLOPE_S:
+            self._lie_under(points, self._slope)  # after a long silence it is that of before
+            return
+        believed = _PPM * (_WILD_PPM if span_s >= SETTLED_S else QUARTZ_PPM)
+        slope = middle_slope(points)
+        if abs(slope) <= believed:
+            self._lie_under(points, slope)
+            return
+        # Not a clock as we know them: of its far past nothing can be concluded.
+        recent = tuple(point for point in points if point[0] >= points[-1][0] - _SLOPE_S)
+        self._lie_under(recent, math.copysign(believed, slope))
+
+    def _lie_under(self, points: Sequence[EnvelopePoint], slope: float) -> None:
+        at_s = points[-1][0]
+        # No clock is so slow: what is later has waited, and must not look as if it had not.
+        highest_ns = self.at(at_s) + _PPM * _WILD_PPM * max(at_s - self._at_s, 0.0)
+        base_ns = min(late_ns - slope * (x_s - at_s) for x_s, late_ns in points)
+        self._base_ns = min(base_ns, highest_ns)
+        self._slope, self._at_s = slope, at_s
+
+
+def middle_slope(points: Sequence[EnvelopePoint]) -> float:
+    """Slope of the lower convex hull at the middle of the points [ns/s].
+
+    Of all lines with no point below them that one has the least sum of distances, if points are
+    evenly spread.
+
+    Args:
+        points: In order of device time, at two different times at least.
+    """
+    hull: list[EnvelopePoint] = []
+    for point in points:
+        while len(hull) >= 2 and _is_above(hull[-1], hull[-2], point):
+            hull.pop()
+        hull.append(point)
+    middle_s = (points[0][0] + points[-1][0]) / 2.0
+    for (left_s, left_ns), (right_s, right_ns) in pairwise(hull):
+        if right_s >= middle_s and right_s > left_s:
+            return (right_ns - left_ns) / (right_s - left_s)
+    return 0.0
+
+
+def _is_above(point: EnvelopePoint, before: EnvelopePoint, after: EnvelopePoint) -> bool:
+    """Whether a point is on or above the line between two others."""
+    (x, y), (x0, y0), (x1, y1) = point, before, after
+    return (y - y0) * (x1 - x0) >= (y1 - y0) * (x - x0)

@@ -1,0 +1,150 @@
+"""Times of samples that tell none, from when they were read and how many came together.
+
+A sample that is read at once was taken now. One that waited, because this process or its host stood
+still, must not look as fresh: buffers keep what came first, so that it follows the last sample that
+was read before.
+
+
+The clock of a sensor that stamps its samples but does not number them.
+
+From steady stamps follows what was lost, what came twice, and that the sensor has restarted.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+_AWAKE_NS = 50_000_000
+"""Between two reads of a process that is awake passes less [ns]."""
+
+_CLUMP_NS = 10_000_000
+"""Adapters hand samples over in clumps of less than this [ns]."""
+
+
+class ArrivalTimes:
+    """Times the samples of one sensor.
+
+    Args:
+        period_s: Time between two samples [s].
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ns = round(1e9 * period_s)
+        self._read_ns: int | None = None
+        self._last_ns = 0
+
+    def begin(self) -> None:
+        """The stream begins anew: nothing waits that was not read away."""
+        self._read_ns = None
+
+    def times_ns(self, count: int, now_ns: int) -> list[int]:
+        """Times of samples that were read together, by the host's monotonic clock [ns].
+
+        Args:
+            count: How many; at least one.
+            now_ns: Host monotonic clock when they had been read [ns].
+        """
+        step_ns, read_ns = self._period_ns, self._read_ns
+        self._read_ns = now_ns
+        worth_ns = count * step_ns
+        if read_ns is not None and self._waited(worth_ns, now_ns - read_ns):
+            times = [min(self._last_ns + k * step_ns, now_ns) for k in range(1, count + 1)]
+        else:
+            if read_ns is not None:
+                step_ns = min(step_ns, max(now_ns - self._last_ns, 0) // count)
+            times = [now_ns - k * step_ns for k in range(count - 1, -1, -1)]
+        self._last_ns = times[-1]
+        return times
+
+    def _waited(self, worth_ns: int, since_ns: int) -> bool:
+        """Whether samples worth a time had waited, when this time has passed since the last."""
+        more_than_came = worth_ns > 1.25 * since_ns and worth_ns - since_ns > _CLUMP_NS
+        # Some were lost on the way: those that are there came first.
+        overflown = since_ns > _AWAKE_NS and _CLUMP_NS < worth_ns < 0.8 * since_ns
+        return more_than_came or overflown
+
+
+_BACKLOG_S = 2.0
+"""How far samples may run ahead of the host, which reads what had waited [s]."""
+
+
+class SampleVerdict(Enum):
+    """What a sample's time says of it."""
+
+    NEW = "new"
+    REPEATED = "repeated"
+    DOUBTFUL = "doubtful"
+    RESTARTED = "restarted"
+
+
+class SampleClock:
+    """Unwraps a clock and judges each sample by it.
+
+    ``counters``: ``lost_samples``, ``repeated_samples``, and ``wrong_times`` of samples whose time
+    cannot be and that must not be believed.
+
+    Args:
+        period_us: Time between two samples [us].
+        wrap_us: The clock wraps here [us].
+    """
+
+    def __init__(self, period_us: float, wrap_us: int) -> None:
+        self._period_us, self._wrap_us = period_us, wrap_us
+        self.tick = 0
+        """Samples that the sensor took, lost ones too."""
+        self.time_s = 0.0
+        """Unwrapped time of the last new sample [s]."""
+        self._time_us = 0
+        self._told_us: int | None = None
+        self._heard_s = 0.0
+        self._suspect_us: int | None = None
+        self._paused = False
+        self.counters = dict.fromkeys(("lost_samples", "repeated_samples", "wrong_times"), 0)
+
+    def pause(self) -> None:
+        """The sensor was told to stop for a while: what it does not take is not lost."""
+        self._paused = True
+        self._suspect_us = None
+
+    def take(self, told_us: int, now_s: float) -> SampleVerdict:
+        """Judge the next sample.
+
+        Args:
+            told_us: Its time as told [us].
+            now_s: The host's monotonic time [s].
+        """
+        if self._told_us is None:
+            return self._accept(told_us, now_s, told_us, 1)
+        ahead_us = (told_us - self._told_us) % self._wrap_us
+        if ahead_us == 0:
+            self.counters["repeated_samples"] += 1
+            return SampleVerdict.REPEATED
+        steps = round(ahead_us / self._period_us)
+        host_us = round(1e6 * (now_s - self._heard_s))
+        if steps < 1 or ahead_us > host_us + 1e6 * _BACKLOG_S:
+            if not self._paused:
+                return self._doubt(told_us)
+            # It may have set its clock back for the pause; the host's went on.
+            ahead_us = max(host_us, round(self._period_us))
+            steps = round(ahead_us / self._period_us)
+        if not self._paused:
+            self.counters["lost_samples"] += steps - 1
+        return self._accept(told_us, now_s, ahead_us, steps)
+
+    def _accept(self, told_us: int, now_s: float, ahead_us: int, steps: int) -> SampleVerdict:
+        self.tick += steps
+        self._time_us += ahead_us
+        self.time_s = 1e-6 * self._time_us
+        self._told_us, self._heard_s = told_us, now_s
+        self._suspect_us, self._paused = None, False
+        return SampleVerdict.NEW
+
+    def _doubt(self, told_us: int) -> SampleVerdict:
+        """A time that cannot be: of a damaged sample if it is alone, else the clock began anew."""
+        if self._suspect_us is not None:
+            ahead_us = (told_us - self._suspect_us) % self._wrap_us
+            if 0 < ahead_us < 1e6 * _BACKLOG_S:
+                return SampleVerdict.RESTARTED
+        self._suspect_us = told_us
+        self.counters["wrong_times"] += 1
+        return SampleVerdict.DOUBTFUL

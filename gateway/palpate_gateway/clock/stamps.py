@@ -1,0 +1,370 @@
+"""When was it sampled: device time to host time, and the stamp of each frame.
+
+Three kinds of source need three maps: a live device (its delay is unknown but never negative), a
+recording replayed at its pace (its first frame is now), and one replayed as fast as possible (its
+times stay as recorded, so that the result does not depend on when it is replayed).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+from palpate import clock
+from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, WRENCH
+from palpate.messages import (
+    ElectrodeFrame,
+    FieldFrame,
+    IndenterPoseFrame,
+    Origin,
+    SensorType,
+    Stamp,
+    Tare,
+    WrenchFrame,
+)
+from palpate_gateway.clock.envelope import SETTLED_S, ClockEnvelope
+from palpate_gateway.clock.wall_clock import WallClock
+from palpate_gateway.readings import (
+    ClockObservation,
+    ElectrodeReading,
+    FieldReading,
+    PoseReading,
+    Reading,
+    RecordedMessage,
+    WrenchReading,
+)
+
+ODD_PPM = 1000.0
+"""A clock that is wrong by more [ppm] is no quartz: its rate is not as configured."""
+
+_DELAYS = 512
+"""Number of readings over which the median delay is taken."""
+
+
+class HostTime(NamedTuple):
+    """One instant on the host's monotonic and on its wall clock [ns]."""
+
+    monotonic_ns: int
+    wall_ns: int
+
+
+class ClockQuality(IntEnum):
+    """How good a sensor's stamps are, as its gauge ``clock_quality`` shows."""
+
+    ARRIVAL = 0
+    """The device sends no time: its stamps are times of arrival, late by every delay on the way."""
+    SETTLING = 1
+    """Its clock has been followed for less than four seconds: the drift is not known yet."""
+    FOLLOWED = 2
+    """Its clock is followed, offset and drift."""
+    ODD = 3
+    """Followed, but wrong by more than any quartz: a rate may be configured wrong."""
+
+
+class ClockMap(Protocol):
+    """Maps the device's time to the host's."""
+
+    @property
+    def clock_id(self) -> int:
+        """Identifies the monotonic clock of the mapped times."""
+        ...
+
+    @property
+    def paced(self) -> bool:
+        """Whether a frame must wait until its mapped time before it is published."""
+        ...
+
+    def map(
+        self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
+    ) -> HostTime:
+        """Host time of a reading.
+
+        Args:
+            time_s: The device's time [s].
+            arrival_ns: Host monotonic clock when the reading arrived [ns].
+            observed: Newest observation of the device's clock; None = this reading is the newest.
+        """
+        ...
+
+    def gauges(self) -> Mapping[str, float]:
+        """Gauges of the status; may be called from any thread."""
+        ...
+
+
+class LiveClock:
+    """Follows the clock of a live device by offset and drift; see ``ClockEnvelope``.
+
+    Mapped times keep the order of the device's times and are never later than the arrival.
+
+    Args:
+        wall: The wall clock; None = a new one.
+    """
+
+    clock_id = clock.CLOCK_ID
+    paced = False
+
+    def __init__(self, wall: WallClock | None = None) -> None:
+        self._wall = wall or WallClock()
+        self._envelope = ClockEnvelope()
+        self._first: ClockObservation | None = None
+        self._last_s = -math.inf
+        self._last_ns = 0
+        self._delays_ns = [0] * _DELAYS
+        self._number = 0
+
+    def map(
+        self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
+    ) -> HostTime:
+        """See ``ClockMap``."""
+        device_s, observed_ns = (time_s, arrival_ns) if observed is None else observed
+        first = self._first
+        if first is None:
+            self._first = first = ClockObservation(device_s, observed_ns)
+        # Counted from the first reading, so that a float holds nanoseconds for months.
+        since_s = device_s - first.device_s
+        since_ns = observed_ns - first.arrival_ns
+        self._envelope.add(since_s, since_ns - since_s * 1e9)
+        x_s = time_s - first.device_s
+        mapped_ns = first.arrival_ns + math.floor(x_s * 1e9 + self._envelope.at(x_s))
+        mapped_ns = min(mapped_ns, observed_ns)
+        if time_s >= self._last_s:
+            # The envelope may have moved down since the last reading; stamps must not go back.
+            self._last_s = time_s
+            self._last_ns = mapped_ns = max(mapped_ns, self._last_ns)
+        self._delays_ns[self._number % _DELAYS] = observed_ns - mapped_ns
+        self._number += 1
+        return HostTime(mapped_ns, self._wall.at(mapped_ns, now_ns=observed_ns))
+
+    @property
+    def quality(self) -> ClockQuality:
+        """How good its stamps are."""
+        if self._envelope.span_s < SETTLED_S:
+            return ClockQuality.SETTLING
+        if abs(self._envelope.drift_ppm) > ODD_PPM:
+            return ClockQuality.ODD
+        return ClockQuality.FOLLOWED
+
+    def gauges(self) -> Mapping[str, float]:
+        """Quality; and from the first reading on, drift and median delay of the last readings."""
+        gauges = {"clock_quality": float(self.quality)}
+        delays_ns = sorted(self._delays_ns[: self._number])
+        if delays_ns:
+            gauges["clock_drift_ppm"] = self._envelope.drift_ppm
+            gauges["clock_delay_p50_s"] = 1e-9 * delays_ns[len(delays_ns) // 2]
+        return gauges
+
+
+class ArrivalClock:
+    """For a live device that sends no time: its readings carry host times of arrival already.
+
+    Args:
+        wall: The wall clock; None = a new one.
+    """
+
+    clock_id = clock.CLOCK_ID
+    paced = False
+
+    def __init__(self, wall: WallClock | None = None) -> None:
+        self._wall = wall or WallClock()
+        self._last_ns = 0
+
+    def map(
+        self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
+    ) -> HostTime:
+        """See ``ClockMap``."""
+        self._last_ns = max(self._last_ns, min(round(time_s * 1e9), arrival_ns))
+        return HostTime(self._last_ns, self._wall.at(self._last_ns, now_ns=arrival_ns))
+
+    def gauges(self) -> Mapping[str, float]:
+        """Its quality; there is no clock that could drift."""
+        return {"clock_quality": float(ClockQuality.ARRIVAL)}
+
+
+class _RecordedClock:
+    """Shared by both maps of recordings: device time since the first reading.
+
+    Recorded times can step back, where a log was joined from several; time then stands still.
+    """
+
+    def __init__(self) -> None:
+        self._shift_s: float | None = None
+        self._last_s = 0.0
+
+    def _elapsed_ns(self, time_s: float) -> int:
+        if self._shift_s is None:
+            self._shift_s = -time_s
+        if time_s + self._shift_s < self._last_s:
+            self._shift_s = self._last_s - time_s
+        self._last_s = time_s + self._shift_s
+        return round(self._last_s * 1e9)
+
+    def gauges(self) -> Mapping[str, float]:
+        """None: its times are as good as the recording's."""
+        return {}
+
+
+class PacedClock(_RecordedClock):
+    """A recording at its own pace: its first reading is now."""
+
+    clock_id = clock.CLOCK_ID
+    paced = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._start: HostTime | None = None
+
+    def map(
+        self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
+    ) -> HostTime:
+        """See ``ClockMap``."""
+        if self._start is None:
+            self._start = HostTime(*clock.now())
+        elapsed_ns = self._elapsed_ns(time_s)
+        return HostTime(self._start.monotonic_ns + elapsed_ns, self._start.wall_ns + elapsed_ns)
+
+
+class FileClock(_RecordedClock):
+    """A recording as fast as possible: times as recorded.
+
+    Args:
+        serial: Serial number of the sensor, which makes the clock's id.
+        start_wall_ns: Wall clock at the first reading [ns]; None = not recorded, then the Unix
+            epoch.
+    """
+
+    paced = False
+
+    def __init__(self, serial: str, start_wall_ns: int | None) -> None:
+        super().__init__()
+        self._start_wall_ns = start_wall_ns or 0
+        # Never this host's id: an age computed from these times would mean nothing.
+        named = zlib.crc32(f"file:{serial}:{self._start_wall_ns}".encode()) or 1
+        self.clock_id = named if named != clock.CLOCK_ID else named ^ 1
+
+    def map(
+        self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
+    ) -> HostTime:
+        """See ``ClockMap``."""
+        elapsed_ns = self._elapsed_ns(time_s)
+        return HostTime(elapsed_ns, self._start_wall_ns + elapsed_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class DueMessage:
+    """A message on its way to the bus.
+
+    Attributes:
+        topic: Stream name.
+        message: A message, or the bytes of a recorded one.
+        due_ns: Host monotonic time at which it is to be published [ns]; 0 = at once.
+    """
+
+    topic: str
+    message: ElectrodeFrame | WrenchFrame | IndenterPoseFrame | FieldFrame | Tare | bytes
+    due_ns: int
+
+
+class Stamper:
+    """Turns readings into frames: each stream has its sequence, each frame its stamp.
+
+    Belongs to one thread.
+
+    Args:
+        origin: Where the readings come from.
+    """
+
+    def __init__(self, origin: Origin) -> None:
+        self._origin = origin
+        self._clock: ClockMap | None = None
+        self._serial = ""
+        self._sensor_type: SensorType | None = None
+        self._slot_period_ns = 0
+        self._sequences: dict[str, int] = {}
+
+    def begin(
+        self,
+        clock_map: ClockMap,
+        *,
+        serial: str,
+        sensor_type: SensorType | None,
+        slot_period_s: float,
+    ) -> None:
+        """The device was opened, or opened again: its clock is a new one, the sequences go on.
+
+        Args:
+            clock_map: Maps the times of its readings.
+            serial: Serial number of the sensor.
+            sensor_type: Kind of tactile sensor; None = it has no electrodes.
+            slot_period_s: Time between two slots of a frame [s].
+        """
+        self._clock = clock_map
+        self._serial, self._sensor_type = serial, sensor_type
+        self._slot_period_ns = max(1, round(slot_period_s * 1e9))
+
+    def message(self, reading: Reading, arrival_ns: int, tare_id: int) -> DueMessage:
+        """The frame of a reading; a recorded message stays as it is.
+
+        Args:
+            reading: In order of time.
+            arrival_ns: Host monotonic clock when it arrived [ns].
+            tare_id: The tare in force, for a frame of electrodes.
+        """
+        if self._clock is None:
+            raise RuntimeError("begin() comes before push()")
+        observed = None if isinstance(reading, RecordedMessage) else reading.observed
+        times = self._clock.map(reading.time_s, arrival_ns, observed)
+        due_ns = times.monotonic_ns if self._clock.paced else 0
+        if isinstance(reading, ElectrodeReading):
+            if self._sensor_type is None:
+                raise RuntimeError(f"{self._serial} sends electrodes and has no sensor type")
+            stamp = self._stamp(ELECTRODES.name, reading.tick, times, reading.missed_before)
+            electrodes = ElectrodeFrame(
+                stamp,
+                self._serial,
+                self._sensor_type,
+                reading.electrodes,
+                reading.pdc,
+                reading.pac,
+                reading.tac,
+                reading.tdc,
+                reading.validity,
+                self._slot_period_ns,
+                tare_id,
+            )
+            return DueMessage(ELECTRODES.name, electrodes, due_ns)
+        if isinstance(reading, WrenchReading):
+            stamp = self._stamp(WRENCH.name, reading.tick, times)
+            wrench = WrenchFrame(
+                stamp, reading.serial, reading.force, reading.torque, reading.overload
+            )
+            return DueMessage(WRENCH.name, wrench, due_ns)
+        if isinstance(reading, FieldReading):
+            stamp = self._stamp(FIELD_TRUTH.name, reading.tick, times)
+            field = FieldFrame(stamp, self._serial, reading.mesh_sha256, reading.displacement)
+            return DueMessage(FIELD_TRUTH.name, field, due_ns)
+        if isinstance(reading, PoseReading):
+            stamp = self._stamp(POSE.name, reading.tick, times, reading.missed_before)
+            pose = IndenterPoseFrame(
+                stamp, reading.indenter, reading.position, reading.orientation, reading.in_contact
+            )
+            return DueMessage(POSE.name, pose, due_ns)
+        return DueMessage(reading.topic, reading.payload, due_ns)
+
+    def _stamp(self, topic: str, tick: int, times: HostTime, missed_before: int = 0) -> Stamp:
+        """The next stamp of a stream; ``missed_before`` frames were lost directly before it."""
+        assert self._clock is not None
+        sequence = self._sequences.get(topic, 0) + 1
+        self._sequences[topic] = sequence
+        return Stamp(
+            sequence,
+            tick,
+            times.monotonic_ns,
+            times.wall_ns,
+            self._clock.clock_id,
+            self._origin,
+            missed_before,
+        )

@@ -1,0 +1,254 @@
+"""The host's wall clock beside its monotonic one, and being told when somebody sets it.
+
+The kernel's receive stamps, which are wall times, as host monotonic times.
+
+What the kernel knows of the wall clock: whether something keeps it right, and how well.
+
+Whoever sets the clock by the network (chrony, ntpd, systemd-timesyncd, phc2sys) tells the kernel;
+anybody may ask it. Elsewhere than on Linux, and where a sandbox forbids to ask, it is not known.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+_log = logging.getLogger(__name__)
+
+LOOK_NS = 100_000_000
+"""How often stamps look at the wall clock [ns]."""
+
+_TIGHT_NS = 20_000
+"""Two readings within this time are one instant [ns]."""
+_ATTEMPTS = 4
+
+_STEP_NS = 100_000
+"""A larger change that the readings do not explain is a step [ns]."""
+
+_STEERED = 1e-3
+"""Where the monotonic clock is not steered as the wall clock is, as it is on Linux, they part by
+less than this."""
+
+
+class ClockPair(NamedTuple):
+    """Monotonic and wall clock read together [ns], and how far apart that may have been [ns]."""
+
+    monotonic_ns: int
+    wall_ns: int
+    apart_ns: int
+
+
+def read_pair() -> ClockPair:
+    """Both clocks of this host; read again if this thread was put aside between them."""
+    best: ClockPair | None = None
+    for _ in range(_ATTEMPTS):
+        before_ns = time.monotonic_ns()
+        wall_ns = time.time_ns()
+        apart_ns = time.monotonic_ns() - before_ns
+        if best is None or apart_ns < best.apart_ns:
+            best = ClockPair(before_ns + apart_ns // 2, wall_ns, apart_ns)
+        if apart_ns <= _TIGHT_NS:
+            break
+    assert best is not None
+    return best
+
+
+class WallClock:
+    """Turns monotonic times into wall times; one for all sensors of a process. Safe with threads.
+
+    Linux steers both clocks alike, so what lies between them changes only when somebody sets the
+    wall clock: a step. Stamps follow it within ``LOOK_NS``; monotonic times know nothing of it.
+
+    Args:
+        read: Reads both clocks.
+    """
+
+    def __init__(self, read: Callable[[], ClockPair] = read_pair) -> None:
+        self.steps = 0
+        """How often the wall clock was set."""
+        self._read = read
+        self._lock = threading.Lock()
+        pair = read()
+        self.offset_ns = pair.wall_ns - pair.monotonic_ns
+        """Wall less monotonic clock at the last look [ns]."""
+        self._apart_ns = pair.apart_ns
+        self.looked_ns = pair.monotonic_ns
+        """Monotonic time of the last look [ns]."""
+
+    def at(self, monotonic_ns: int, *, now_ns: int) -> int:
+        """Wall time of a monotonic time [ns].
+
+        Args:
+            monotonic_ns: Which instant [ns].
+            now_ns: The monotonic clock about now, to look again if the last look is old [ns].
+        """
+        if now_ns - self.looked_ns > LOOK_NS:
+            self.look()
+        return monotonic_ns + self.offset_ns
+
+    def look(self) -> None:
+        """Read both clocks now."""
+        with self._lock:
+            pair = self._read()
+            offset_ns = pair.wall_ns - pair.monotonic_ns
+            change_ns = offset_ns - self.offset_ns
+            unsure_ns = pair.apart_ns + self._apart_ns
+            parted_ns = _STEERED * (pair.monotonic_ns - self.looked_ns)
+            self.looked_ns = pair.monotonic_ns
+            if abs(change_ns) > unsure_ns + _STEP_NS + parted_ns:
+                self.steps += 1
+                _log.warning("the wall clock was set by %+.6f s", 1e-9 * change_ns)
+            elif abs(change_ns) <= unsure_ns and pair.apart_ns >= self._apart_ns:
+                return  # the same, and it was read better before
+            self.offset_ns, self._apart_ns = offset_ns, pair.apart_ns
+
+
+OLDEST_NS = 1_000_000_000
+"""Nothing waits longer in a receive queue that is read [ns], unless its reader stood still."""
+
+_PAUSE_NS = 100_000_000
+"""A longer one is remembered, until what waited meanwhile has been read [ns]."""
+
+_EARLY_NS = 100_000
+"""By how much the two clocks may seem out of order when they are read [ns]."""
+
+
+class KernelStamps:
+    """When the kernel received what was read later; belongs to one thread.
+
+    A stamp that cannot be is not believed, and the time of arrival stands for it: none, one in the
+    future or more than a second old (another clock's, or another host's), or any that was made
+    within a second of a step of the wall clock, when it is not known on which side. After a pause
+    between two reads what is read may have waited for all of it: this process may have stood still.
+
+    Args:
+        wall: The wall clock; None = one of its own.
+    """
+
+    def __init__(self, wall: WallClock | None = None) -> None:
+        self._wall = wall or WallClock()
+        self._steps = self._wall.steps
+        self._doubt_until_ns = 0
+        self._read_ns: int | None = None
+        self._paused_ns = self._paused_until_ns = 0
+        self.refused = 0
+        """Stamps that were not believed."""
+
+    def monotonic_ns(self, stamp_s: float, arrival_ns: int) -> int:
+        """Host monotonic time of a stamp [ns], not later than the arrival.
+
+        Args:
+            stamp_s: As python-can tells it [s since the Unix epoch].
+            arrival_ns: Host monotonic clock when it had been read [ns].
+        """
+        if not math.isfinite(stamp_s):
+            self.refused += 1
+            return arrival_ns
+        return self.monotonic_of_ns(round(stamp_s * 1e9), arrival_ns)
+
+    def monotonic_of_ns(self, stamp_ns: int, arrival_ns: int) -> int:
+        """As ``monotonic_ns``, for a stamp in [ns since the Unix epoch]."""
+        if not self._trusted(arrival_ns):
+            self.refused += 1
+            return arrival_ns
+        received_ns = stamp_ns - self._wall.offset_ns
+        if not -_EARLY_NS <= arrival_ns - received_ns <= self._oldest_ns(arrival_ns):
+            self.refused += 1
+            return arrival_ns
+        return min(received_ns, arrival_ns)
+
+    def monotonic_of_all(
+        self, stamps_ns: npt.NDArray[np.int64], arrival_ns: int
+    ) -> npt.NDArray[np.int64]:
+        """As ``monotonic_of_ns``, for the stamps of what came in this order and was read at once.
+
+        None came later than what came after it: while the kernel's stamping is being switched on,
+        which takes it some milliseconds after a bus is opened, it stamps at reading.
+        """
+        if not self._trusted(arrival_ns):
+            self.refused += len(stamps_ns)
+            return np.full(len(stamps_ns), arrival_ns)
+        received_ns = stamps_ns - self._wall.offset_ns
+        waited_ns = arrival_ns - received_ns
+        believed = (waited_ns >= -_EARLY_NS) & (waited_ns <= self._oldest_ns(arrival_ns))
+        self.refused += int(len(believed) - np.count_nonzero(believed))
+        came_ns = np.where(believed, np.minimum(received_ns, arrival_ns), arrival_ns)
+        return np.minimum.accumulate(came_ns[::-1])[::-1]
+
+    def _oldest_ns(self, arrival_ns: int) -> int:
+        """How long what is read now may have waited [ns]."""
+        paused_ns = 0 if self._read_ns is None else arrival_ns - self._read_ns
+        self._read_ns = arrival_ns
+        if arrival_ns > self._paused_until_ns:
+            self._paused_ns = 0
+        if paused_ns > _PAUSE_NS:
+            self._paused_ns = max(self._paused_ns, paused_ns)
+            self._paused_until_ns = arrival_ns + OLDEST_NS
+        return OLDEST_NS + self._paused_ns
+
+    def _trusted(self, arrival_ns: int) -> bool:
+        """Whether stamps that were read now can be on the right side of a step."""
+        wall = self._wall
+        if arrival_ns >= wall.looked_ns:
+            # Looking after the stamp was made, a step can be told; once for all of a batch.
+            wall.look()
+        if wall.steps != self._steps:
+            self._steps = wall.steps
+            self._doubt_until_ns = wall.looked_ns + OLDEST_NS
+        return arrival_ns >= self._doubt_until_ns
+
+
+_UNKNOWN_US = 16_000_000
+"""The kernel's largest error, which means that nothing has corrected the clock for long [us]. Its
+flag STA_UNSYNC would not do: chrony leaves it set unless it also keeps the hardware clock."""
+
+_STRUCT_BYTES = 512
+"""More than struct timex has on any machine."""
+
+
+class _Timex(ctypes.Structure):
+    """The beginning of struct timex, in which longs are as long as the machine's."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+    )
+
+
+class WallDiscipline(NamedTuple):
+    """How the wall clock is kept.
+
+    Attributes:
+        synchronised: Whether something keeps it.
+        error_s: Largest error by the kernel's account [s], as chrony and ntpd tell it; others tell
+            0. It grows by 0.5 ms a second until the clock is corrected again.
+    """
+
+    synchronised: bool
+    error_s: float
+
+
+def wall_discipline() -> WallDiscipline | None:
+    """How the wall clock of this host is kept; None = not known here."""
+    if not sys.platform.startswith("linux"):
+        return None
+    memory = ctypes.create_string_buffer(_STRUCT_BYTES)
+    state = _Timex.from_buffer(memory)
+    try:
+        ask = ctypes.CDLL(None, use_errno=True).adjtimex
+    except (OSError, AttributeError):
+        return None
+    if ask(memory) < 0:
+        return None
+    return WallDiscipline(state.maxerror < _UNKNOWN_US, 1e-6 * state.maxerror)

@@ -1,0 +1,1 @@
+"""The gateway's process: sensors in threads, from reading to bus."""

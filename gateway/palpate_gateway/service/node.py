@@ -1,0 +1,243 @@
+"""The gateway's process: every sensor in its own thread, one status, one presence."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+
+from palpate.bus import Presence, Session, endpoints
+from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, PalpateError
+from palpate.health import Health, HealthReporter
+from palpate.messages import ServiceState
+from palpate.pauses import avoid_pauses
+from palpate_gateway.clock.wall_clock import WallClock, wall_discipline
+from palpate_gateway.condition.condition import RetareRules
+from palpate_gateway.condition.stillness import StillLimits
+from palpate_gateway.config import GatewayConfig, SensorConfig
+from palpate_gateway.device import BusDevice, Device
+from palpate_gateway.drivers import make_device
+from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.worker import SensorWorker
+from palpate_gateway.wrench.device import WrenchDevice
+
+_log = logging.getLogger(__name__)
+
+SERVICE = "gateway"
+
+_POLL_S = 0.05
+_SETTLE_S = 0.3
+"""Between a consumer's presence and the first frame of a lossless replay [s]: presence and
+subscriptions travel apart, and a frame that overtakes the subscription would be lost."""
+
+
+def run(
+    config: GatewayConfig,
+    link: LinkConfig,
+    station: str,
+    stop: threading.Event,
+    *,
+    instance: str = SERVICE,
+) -> None:
+    """Serve the configured sensors until ``stop`` is set, or with ``exit_at_end`` until they end.
+
+    Args:
+        config: Sensors, pace, tare.
+        link: How to join the bus.
+        station: Name of the station.
+        stop: Set it to end.
+        instance: Name of this gateway among several.
+
+    Raises:
+        ConfigError: An unknown driver or option; before the bus is joined.
+        LinkError: The bus cannot be joined.
+        RecordingError: With ``exit_at_end``, a recording was damaged; all before it was published.
+    """
+    devices = [_device(sensor) for sensor in config.sensors]
+    for device in devices:
+        if isinstance(device, BusDevice):
+            device.join(link, station)
+    sources: dict[tuple[str, str], str] = {}
+    wall = WallClock()
+    health = Health(SERVICE, instance)
+    health.set_sensors(tuple(sensor.name for sensor in config.sensors))
+    with Session.open(link, station=station) as session:
+        workers = []
+        for sensor, device in zip(config.sensors, devices, strict=True):
+            # A live source must never wait for a slow subscriber, whatever the pace of others.
+            lossless = config.pace == "fast" and not device.info.live
+            worker = SensorWorker(
+                sensor.name,
+                device,
+                _pipeline(config, device),
+                {
+                    topic.name: session.publisher(topic, sensor=sensor.key_name, lossless=lossless)
+                    for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE)
+                },
+                health,
+                pace=config.pace,
+                stop=stop,
+                wall=wall,
+                claim=partial(_claim, sources, sensor),
+            )
+            workers.append(worker)
+            if isinstance(device, WrenchDevice):
+                session.queryable(endpoints.ZERO, worker.answer_zero, sensor=sensor.name)
+                continue  # what has no electrodes has no baseline
+            if sensor.of is not None:
+                continue  # its finger answers
+            session.queryable(
+                endpoints.TARE,
+                worker.answer_tare,
+                sensor=sensor.name,
+                # Taring takes half a second; looking up a known tare must not wait for it.
+                workers=2,
+            )
+        refresh = partial(_refresh, health, workers, wall)
+        presence = session.presence(SERVICE, instance=instance)
+        with HealthReporter(session, health, refresh=refresh):
+            try:
+                _serve(config, session, workers, health, presence, stop, refresh)
+            finally:
+                if not all(worker.ended.is_set() for worker in workers):
+                    health.set_state(ServiceState.STOPPING)
+                stop.set()
+                presence.not_ready()
+                for worker in workers:
+                    worker.join(2.0)
+                refresh()
+
+
+def _device(sensor: SensorConfig) -> Device:
+    device = make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
+    if sensor.of is not None and device.info.sensor_type is not None:
+        raise ConfigError(
+            f"sensor {sensor.name!r} is of {sensor.of!r}, and a tactile sensor itself",
+            remedy="`of` is for force/torque sensors and poses of the indenter: leave it out",
+        )
+    return device
+
+
+def _pipeline(config: GatewayConfig, device: Device) -> Pipeline:
+    again_s = config.retare_after_s
+    return Pipeline(
+        device.info,
+        tare=config.tare,
+        tare_frames=config.tare_frames,
+        limits=StillLimits(config.tare_max_sd_counts, config.tare_max_pac_sd_counts),
+        retare=None if again_s is None else RetareRules(again_s, config.retare_drift_counts),
+    )
+
+
+def _claim(sources: dict[tuple[str, str], str], sensor: SensorConfig, stream: str) -> None:
+    """One stream has one source, the finger's own first: two would mix their sequences."""
+    source = sources.get((sensor.key_name, stream))
+    if source == sensor.name:
+        return
+    if source is None or sensor.of is None:
+        sources[sensor.key_name, stream] = sensor.name
+    else:
+        raise ConfigError(
+            f"{source!r} and {sensor.name!r} both publish the {stream} of {sensor.key_name!r}",
+            remedy=f"take one of them out of the profile, or leave out `of` of {sensor.name!r}",
+        )
+
+
+def _serve(
+    config: GatewayConfig,
+    session: Session,
+    workers: list[SensorWorker],
+    health: Health,
+    presence: Presence,
+    stop: threading.Event,
+    refresh: Callable[[], None],
+) -> None:
+    if config.wait_for and not _wait_for(config.wait_for, session, health, stop):
+        return
+    avoid_pauses()
+    for worker in workers:
+        worker.start()
+    finished = False
+    while not stop.is_set():
+        for worker in workers:
+            if worker.crash is not None:
+                raise worker.crash
+        _tell(health, workers, presence)
+        if not finished and all(worker.ended.is_set() for worker in workers):
+            finished = True
+            refresh()
+            _finish(health, workers)
+            if config.exit_at_end:
+                stop.wait(config.linger_s)
+                for worker in workers:
+                    if worker.error is not None:
+                        raise worker.error
+                return
+        stop.wait(_POLL_S)
+
+
+def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> None:
+    """Ready while every sensor delivers or has ended well."""
+    if all(worker.ended.is_set() for worker in workers):
+        return
+    if all(worker.serving or worker.ended.is_set() for worker in workers):
+        presence.ready()
+        fine = all(worker.sound for worker in workers)
+        if fine and health.state is not ServiceState.READY:
+            health.set_state(ServiceState.READY, "all sensors deliver")
+    else:
+        presence.not_ready()
+
+
+def _finish(health: Health, workers: list[SensorWorker]) -> None:
+    """Every source has ended: account for it in the status."""
+    frames = sum(worker.pipeline.counters["frames_published"] for worker in workers)
+    failed = [worker for worker in workers if worker.error is not None]
+    if failed:
+        error = failed[0].error
+        assert error is not None
+        health.fail(error)
+        return
+    health.set_state(ServiceState.FINISHED, f"all sources have ended, {frames} frames published")
+    _log.info("all sources have ended, %d frames published", frames)
+
+
+def _refresh(health: Health, workers: list[SensorWorker], wall: WallClock) -> None:
+    """Take over what sensors count and measure; several are told apart by a prefix."""
+    for worker in workers:
+        prefix = f"{worker.name}." if len(workers) > 1 else ""
+        health.set_counts({prefix + name: value for name, value in worker.counters().items()})
+        for name, measured in worker.gauges().items():
+            health.gauge(prefix + name, measured)
+    wall.look()
+    health.set_counts({"wall_steps": wall.steps})
+    kept = wall_discipline()
+    if kept is not None:
+        health.gauge("wall_synchronised", float(kept.synchronised))
+        health.gauge("wall_error_s", kept.error_s)
+
+
+def _wait_for(
+    names: tuple[str, ...], session: Session, health: Health, stop: threading.Event
+) -> bool:
+    """Wait until each service is ready; False if stopped meanwhile."""
+    health.set_state(ServiceState.STARTING, f"waiting for {', '.join(names)}")
+    told_s = time.monotonic()
+    while not stop.is_set():
+        try:
+            ready = {item.service for item in session.alive() if item.ready}
+        except PalpateError as error:
+            health.fail(error, degraded=False)
+            ready = set()
+        missing = [name for name in names if name not in ready]
+        if not missing:
+            return not stop.wait(_SETTLE_S)
+        if time.monotonic() - told_s > 5.0:
+            told_s = time.monotonic()
+            _log.info("waiting for %s to be ready", ", ".join(missing))
+        stop.wait(_POLL_S)
+    return False

@@ -1,0 +1,219 @@
+"""One sensor's way from readings to messages: stamp, condition, tare, and the account of losses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import Future
+from dataclasses import replace
+from math import inf
+
+from palpate.bus.topics import ELECTRODES, TARE
+from palpate.codec import ELECTRODE_FRAME
+from palpate.codec import TARE as TARE_CODEC
+from palpate.errors import DeviceError, WireError
+from palpate.messages import NO_TARE, ElectrodeFrame, Tare
+from palpate_gateway.clock.stamps import ClockMap, DueMessage, Stamper
+from palpate_gateway.condition.condition import Condition, RetareRules
+from palpate_gateway.condition.stillness import StillLimits
+from palpate_gateway.device import DeviceIdentity, DeviceInfo
+from palpate_gateway.readings import Reading, RecordedMessage
+from palpate_gateway.tare import TARE_FRAMES, TareAttempts, TareLedger, TareMode
+
+_HELD_WINDOWS = 10
+"""A recording is held back for this many attempts to tare before it goes out untared."""
+
+
+class Pipeline:
+    """One sensor's way from readings to messages. ``push`` and ``finish`` belong to one thread.
+
+    A live sensor's frames go out at once, before its first tare with ``tare_id`` 0. A recording is
+    held back until its first tare exists, so that every frame carries one.
+
+    Args:
+        info: The device's facts.
+        tare: When to tare first; ``still`` means ``first`` for a recording.
+        tare_frames: Frames in a tare.
+        limits: Noise up to which a sensor counts as still.
+        retare: When to tare again without a request; None = never.
+    """
+
+    def __init__(
+        self,
+        info: DeviceInfo,
+        *,
+        tare: TareMode = "still",
+        tare_frames: int = TARE_FRAMES,
+        limits: StillLimits | None = None,
+        retare: RetareRules | None = None,
+    ) -> None:
+        self._limits = limits or StillLimits()
+        electrodes_only = replace(self._limits, pac_sd=inf, pdc_sd=inf)
+        if tare == "first":
+            self._limits = electrodes_only
+        # A recording cannot wait for better frames.
+        tare_limits = self._limits if info.live else electrodes_only
+        self._tares_itself = tare != "query"
+        self._tares = TareAttempts(tare_frames, tare_limits, at_start=self._tares_itself)
+        self._retare = retare
+        self.condition: Condition | None = None
+        """Condition of the sensor; None = it has no electrodes, or was not opened yet."""
+        self._counts = dict.fromkeys(
+            ("frames_published", "missing_frames", "frames_untared", "retares"), 0
+        )
+        self._info = info
+        self._kind = info.sensor_type
+        self.tare_frames = tare_frames
+        self._serial = ""
+        self._stamper = Stamper(info.origin)
+        self._held: list[DueMessage] = []
+        self._held_frames = 0
+        # Without electrodes there is never a tare: the recording would be held back to its end.
+        self._holding = not info.live and info.sensor_type is not None and self._tares_itself
+
+    @property
+    def ledger(self) -> TareLedger:
+        """Every tare of this run."""
+        return self._tares.ledger
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Frames published, lost and untared; tares; faults of channels."""
+        condition = {} if self.condition is None else self.condition.counters
+        return {**self._counts, **self._tares.counters, **condition}
+
+    @property
+    def tare_error(self) -> DeviceError | None:
+        """Why the last attempt to tare failed; None after a success."""
+        return self._tares.error
+
+    def begin(self, identity: DeviceIdentity, clock: ClockMap) -> None:
+        """The device was opened, or opened again; sequences and tares go on."""
+        self._serial = identity.serial
+        kind = identity.sensor_type or self._info.sensor_type
+        if kind is not self._kind and self.ledger.current_id != NO_TARE:
+            # A finger with another number of electrodes: the old baseline is not its own.
+            self.ledger.leave()
+            if self._tares_itself:
+                self._tares.attempt()
+        if kind is not None and (self.condition is None or kind is not self._kind):
+            rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+            self.condition = Condition(kind.layout, rate_hz, self._limits, self._retare)
+        elif self.condition is not None:
+            self.condition.begin()
+        self._kind = kind
+        self._stamper.begin(
+            clock,
+            serial=identity.serial,
+            sensor_type=kind,
+            slot_period_s=identity.slot_period_s,
+        )
+
+    def ask_tare(self, frames: int) -> Future[Tare]:
+        """Tare with the next frames (0 = the usual number); may be called from any thread.
+
+        Raises:
+            DeviceError: No further frames will come to be averaged.
+        """
+        is_record = self._info.driver == "record"
+        return self._tares.ask(
+            frames,
+            sensor=self._serial or "the sensor",
+            never="it is a record, which brings its own tares" if is_record else "",
+        )
+
+    def push(self, readings: Iterable[Reading], arrival_ns: int) -> list[DueMessage]:
+        """Stamp and tare readings.
+
+        Args:
+            readings: In order of time.
+            arrival_ns: Host monotonic clock when they arrived [ns].
+
+        Returns:
+            What is to be published, in order.
+        """
+        out: list[DueMessage] = []
+        for reading in readings:
+            item = self._stamper.message(reading, arrival_ns, self.ledger.current_id)
+            if isinstance(item.message, ElectrodeFrame):
+                self._counts["missing_frames"] += item.message.stamp.missed_before
+                self._pass(item, out)
+                self._watch(item.message)
+                self._tare(item.message, item.due_ns, out)
+            elif isinstance(reading, RecordedMessage):
+                self._count_recorded(reading)
+                out.append(item)
+            else:
+                self._pass(item, out)
+        return out
+
+    def finish(self, why: str = "the recording has ended") -> list[DueMessage]:
+        """The source has ended: what is still held goes out untared."""
+        self._tares.finish(why)
+        if self._held_frames and self.tare_error is None:
+            self._tares.error = DeviceError(
+                f"{self._serial} delivered {self._held_frames} frames, a tare needs "
+                f"{self.tare_frames}",
+                remedy="replay a longer recording, or lower tare_frames",
+            )
+        return self._release(NO_TARE)
+
+    def _watch(self, frame: ElectrodeFrame) -> None:
+        """Update the condition of the sensor, and tare again where its rules say so."""
+        condition = self.condition
+        assert condition is not None, "begin() comes before push()"
+        if condition.add(frame) and condition.wants_tare and not self._tares.attempting:
+            self._counts["retares"] += 1
+            self._tares.attempt()
+
+    def _tare(self, frame: ElectrodeFrame, due_ns: int, out: list[DueMessage]) -> None:
+        """Offer the frame to the tares that are under way, and publish those it completes."""
+        for tare in self._tares.offer(frame):
+            if self.condition is not None:
+                self.condition.tared(tare)
+            # Published before the frames that were held back for it, and due with the first.
+            out.append(DueMessage(TARE.name, tare, self._held[0].due_ns if self._held else due_ns))
+            if self._holding:
+                out.extend(self._release(tare.tare_id))
+        if self._held_frames >= _HELD_WINDOWS * self.tare_frames:
+            out.extend(self._release(NO_TARE))
+
+    def _pass(self, item: DueMessage, out: list[DueMessage]) -> None:
+        """Publish a message, or hold it back until the first tare exists."""
+        frame = item.message if isinstance(item.message, ElectrodeFrame) else None
+        if self._holding:
+            self._held.append(item)
+            self._held_frames += frame is not None
+            return
+        if frame is not None:
+            self._counts["frames_published"] += 1
+            self._counts["frames_untared"] += frame.tare_id == NO_TARE
+        out.append(item)
+
+    def _release(self, tare_id: int) -> list[DueMessage]:
+        """Stop holding back: all that was held, its frames with this tare."""
+        held, self._held = self._held, []
+        self._holding = False
+        self._held_frames = 0
+        out: list[DueMessage] = []
+        for item in held:
+            if isinstance(item.message, ElectrodeFrame):
+                item = replace(item, message=replace(item.message, tare_id=tare_id))
+            self._pass(item, out)
+        return out
+
+    def _count_recorded(self, reading: RecordedMessage) -> None:
+        """A recorded message goes out as it is; its tare is kept for later requests.
+
+        One that does not decode goes out as well: it was recorded so, and each consumer rejects it.
+        """
+        try:
+            if reading.topic == ELECTRODES.name:
+                self._counts["frames_published"] += 1
+                frame = ELECTRODE_FRAME.decode(reading.payload)
+                self._counts["missing_frames"] += frame.stamp.missed_before
+                self._counts["frames_untared"] += frame.tare_id == NO_TARE
+            elif reading.topic == TARE.name:
+                self._tares.recorded(TARE_CODEC.decode(reading.payload))
+        except WireError:
+            if reading.topic == TARE.name:
+                self._tares.counters["tares_refused"] += 1

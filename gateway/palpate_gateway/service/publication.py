@@ -1,0 +1,105 @@
+"""The end of a sensor's way: its messages go to the bus, and their latency is measured."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from palpate.bus import Publisher
+from palpate.errors import WireError
+from palpate.health import Health
+from palpate_gateway.clock.stamps import DueMessage
+
+_ENCODERS_DECIDE = "the frame was not published; this is a defect of the device driver"
+
+_KEPT = 512
+"""Number of reads whose latencies are kept."""
+
+
+class MessagePublisher:
+    """Publishes the messages of a pipeline.
+
+    Belongs to the thread that reads the sensor; only ``gauges`` may be called from others.
+
+    Args:
+        publishers: A publisher for each stream.
+        health: Receives the errors of messages that cannot be encoded.
+        stop: Ends a wait for a recorded message's time.
+        claim: Called with the name of its stream before each message; raises where another sensor
+            publishes that stream.
+    """
+
+    def __init__(
+        self,
+        publishers: dict[str, Publisher[Any]],
+        health: Health,
+        *,
+        stop: threading.Event,
+        claim: Callable[[str], None],
+    ) -> None:
+        self.counters: Counter[str] = Counter()
+        self._publishers = publishers
+        self._health = health
+        self._stop = stop
+        self._claim = claim
+        self._reasons: set[str] = set()
+        self._latencies_ns: deque[int] = deque(maxlen=_KEPT)
+
+    @property
+    def has_rejected(self) -> bool:
+        """Whether messages could not be encoded."""
+        return bool(self._reasons)
+
+    def gauges(self) -> dict[str, float]:
+        """Median and 99 % of the latency from a reading's arrival in this process to the bus [s].
+
+        Stamping, condition, tare and encoding are inside, transport to this process is not.
+        """
+        latencies_ns = list(self._latencies_ns)
+        if not latencies_ns:
+            return {}
+        p50, p99 = np.percentile(latencies_ns, (50, 99)) * 1e-9
+        return {"publish_p50_s": float(p50), "publish_p99_s": float(p99)}
+
+    def put_read(self, items: list[DueMessage], read_ns: int) -> None:
+        """Publish the messages of one read, and note their latency.
+
+        Args:
+            items: The messages.
+            read_ns: When the device's ``read`` had brought the readings, host monotonic clock [ns].
+        """
+        # A recorded message waits until it is due: its latency would be that of the recording.
+        if self.put(items) and not items[0].due_ns:
+            self._latencies_ns.append(time.monotonic_ns() - read_ns)
+
+    def put(self, items: list[DueMessage]) -> bool:
+        """Publish messages, each when it is due; whether there were any, and all are out."""
+        for item in items:
+            if item.due_ns:
+                wait_s = (item.due_ns - time.monotonic_ns()) * 1e-9
+                if wait_s > 0 and self._stop.wait(wait_s):
+                    return False
+            self._claim(item.topic)
+            publisher = self._publishers[item.topic]
+            try:
+                if isinstance(item.message, bytes):
+                    publisher.put_payload(item.message)
+                else:
+                    publisher.put(item.message)
+            except WireError as error:
+                self.counters["frames_rejected"] += 1
+                self._report_once(error)
+        return bool(items)
+
+    def _report_once(self, error: WireError) -> None:
+        """Report each reason once: a defect of a driver comes with every frame."""
+        if error.reason not in self._reasons:
+            self._reasons.add(error.reason)
+            self._health.fail(
+                WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
+            )

@@ -1,0 +1,333 @@
+"""One sensor's thread: open, read, publish; and when the device is lost, open again.
+
+Readings that waited, because this process or its host stood still, go out with the times at which
+they were sampled, so that consumers see by the stamps that they are old.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future
+from math import inf
+from typing import Any, Literal, TypeVar
+
+from palpate.bus import Publisher
+from palpate.errors import (
+    DeviceError,
+    DeviceLost,
+    DeviceTimeout,
+    ErrorCode,
+    LinkError,
+    PalpateError,
+    RemoteError,
+)
+from palpate.health import Health
+from palpate.messages import NO_TARE, Tare, TareRequest, WrenchZero, WrenchZeroRequest
+from palpate_gateway.clock.stamps import ArrivalClock, ClockMap, FileClock, LiveClock, PacedClock
+from palpate_gateway.clock.wall_clock import WallClock
+from palpate_gateway.device import Device
+from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.publication import MessagePublisher
+from palpate_gateway.service.sensor_report import SensorReport
+from palpate_gateway.wrench.device import WrenchDevice
+from palpate_gateway.wrench.zeroing import Zeroing
+
+_log = logging.getLogger(__name__)
+
+BACKOFF_S = (0.2, 0.4)
+"""First and longest wait before a lost device is opened again [s]: once it can be, its frames come
+again within a second, and finding it takes up to half of that."""
+
+LOST_S = 0.04
+"""A live sensor is reported lost when it is silent for longer than this, and for three of its
+frames [s]: consumers then know within 50 ms."""
+
+_READ_S = 0.5
+_SILENT_READ_S = 0.025
+
+_STALL_S = 0.02
+"""A read that takes longer than it was allowed by more than this [s] shows that the process stood
+still; what came meanwhile has not been read yet."""
+
+_SHORTEST_S = 1e-3
+
+_REMEDY = "look at palpate status; tare when it is back"
+
+Result = TypeVar("Result")
+
+
+class SilenceTimer:
+    """Measures for how long a device has been silent, of the time in which this process listened.
+
+    Args:
+        lost_s: A silence longer than this is reported [s].
+        read_s: How long one read waits during such a silence [s].
+    """
+
+    def __init__(self, lost_s: float, read_s: float) -> None:
+        self._lost_s, self._read_s = lost_s, read_s
+        self.silent_s = 0.0
+        """How long nothing came [s]."""
+        self._began_s = time.monotonic()
+        self._allowed_s = read_s
+        self._stalled = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether the silence is long enough to be reported."""
+        return self.silent_s >= self._lost_s
+
+    def begin(self) -> float:
+        """A read begins: how long it may wait [s], so that a silence is reported when it is due."""
+        left_s = self._lost_s - self.silent_s
+        self._allowed_s = max(left_s, _SHORTEST_S) if left_s > 0.0 else self._read_s
+        self._began_s = time.monotonic()
+        return self._allowed_s
+
+    def arrived(self) -> None:
+        """Something came, and was worked off."""
+        self.silent_s, self._stalled = 0.0, False
+
+    def timed_out(self) -> None:
+        """The read that was begun brought nothing."""
+        took_s = time.monotonic() - self._began_s
+        # Once only: a driver that always takes too long must not hide that nothing comes.
+        if took_s > self._allowed_s + _STALL_S and not self._stalled:
+            self._stalled = True
+            return
+        self.silent_s += took_s
+
+
+class SensorWorker:
+    """Moves one device's readings to the bus until it ends or ``stop`` is set.
+
+    Args:
+        name: The sensor's name in keys.
+        device: A closed device.
+        pipeline: Its pipeline.
+        publishers: A publisher for each stream it may publish.
+        health: Receives its state and its errors.
+        pace: How a recording is paced.
+        stop: Ends the thread.
+        wall: The wall clock of the process; None = a new one.
+        claim: Called with the name of its stream before each message; raises where another sensor
+            publishes that stream.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: Device,
+        pipeline: Pipeline,
+        publishers: dict[str, Publisher[Any]],
+        health: Health,
+        *,
+        pace: Literal["recorded", "fast"],
+        stop: threading.Event,
+        wall: WallClock | None = None,
+        claim: Callable[[str], None] = lambda stream: None,
+    ) -> None:
+        self.name = name
+        self.device = device
+        self.pipeline = pipeline
+        self.error: PalpateError | None = None
+        """Why a recording ended early."""
+        self.crash: BaseException | None = None
+        """A defect that ended the thread."""
+        self.serving = False
+        """Whether the device is open and has delivered."""
+        self.silent = False
+        """Whether nothing has come for longer than ``LOST_S``."""
+        self.ended = threading.Event()
+        """Set when the thread has nothing more to do."""
+        self._health = health
+        self._pace = pace
+        self._wall = wall or WallClock()
+        self._clock_map: ClockMap | None = None
+        self._stop = stop
+        self._publisher = MessagePublisher(publishers, health, stop=stop, claim=claim)
+        self._counters: Counter[str] = Counter()
+        self._device_counters: Counter[str] = Counter()
+        self._report = SensorReport(name, health)
+        self._wrench = device if isinstance(device, WrenchDevice) else None
+        self.zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
+        """Takes the zero of a force/torque sensor on request; None = another kind of sensor."""
+        self._thread = threading.Thread(target=self._run, name=f"sensor {name}", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the thread's end; ``stop`` must be set or the source finite."""
+        self._thread.join(timeout_s)
+
+    def counters(self) -> dict[str, int]:
+        """Everything counted for this sensor since the start."""
+        device = self._device_counters + Counter(self.device.counters)
+        device.pop("frames", None)  # the pipeline counts what was published
+        # The pipeline counts the missing frames of every device; adding Counters drops zeros.
+        zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
+        own = self._counters + self._publisher.counters
+        return {**zeros, **device, **own, **self.pipeline.counters}
+
+    def gauges(self) -> dict[str, float]:
+        """Present measurements: latency, clock, condition."""
+        gauges = self._publisher.gauges()
+        if self._clock_map is not None:
+            gauges.update(self._clock_map.gauges())
+        if self.pipeline.condition is not None:
+            gauges.update(self.pipeline.condition.gauges())
+        return gauges
+
+    @property
+    def sound(self) -> bool:
+        """Whether it delivers, and nothing that it delivers is known to be wrong."""
+        return not (
+            self.error or self.silent or self._publisher.has_rejected or self._report.untrue
+        )
+
+    def _run(self) -> None:
+        self._report.starts()
+        try:
+            self._serve()
+        except LinkError as error:
+            # Without the bus no sensor can be served: the supervisor starts the process afresh.
+            if not self._stop.is_set():
+                self.crash = error
+        except PalpateError as error:
+            self.error = error
+        except BaseException as error:
+            # Handed to the main thread, which ends the process: nobody would see a thread die.
+            _log.exception("sensor %s: defect", self.name)
+            self.crash = error
+        finally:
+            self.serving = False
+            self._give_up("the sensor has ended")
+            self.device.close()
+            self._report.ended(self.error)
+            self.ended.set()
+
+    def _serve(self) -> None:
+        backoff_s = BACKOFF_S[0]
+        while not self._stop.is_set():
+            try:
+                self.device.open()
+                self._clock_map = self._clock()
+                self.pipeline.begin(self.device.identity, self._clock_map)
+                if self._pump():
+                    return
+            except DeviceError as error:
+                if not self.device.info.live:
+                    self._publisher.put(self.pipeline.finish())
+                    raise
+                if self.serving:
+                    backoff_s = BACKOFF_S[0]
+                self.serving = self.silent = False
+                self._counters["device_lost"] += 1
+                self._report.is_lost(error, backoff_s)
+                self._give_up(error.problem)
+            self._device_counters += Counter(self.device.counters)
+            self.device.close()
+            self._stop.wait(backoff_s)
+            backoff_s = min(2.0 * backoff_s, BACKOFF_S[1])
+
+    def _clock(self) -> ClockMap:
+        identity = self.device.identity
+        if self.device.info.live:
+            return (LiveClock if identity.tells_time else ArrivalClock)(self._wall)
+        if self._pace == "recorded":
+            return PacedClock()
+        return FileClock(identity.serial, identity.start_wall_ns)
+
+    def _pump(self) -> bool:
+        """Read and publish; True when a finite source has ended or ``stop`` is set."""
+        info = self.device.info
+        read_s = _SILENT_READ_S if info.live else _READ_S
+        silence = SilenceTimer(max(LOST_S, 3.0 / info.rate_hz) if info.live else inf, read_s)
+        while not self._stop.is_set():
+            try:
+                readings = self.device.read(min(silence.begin(), _READ_S))
+            except DeviceTimeout as error:
+                silence.timed_out()
+                if info.live and silence.silent_s >= self.device.gone_s:
+                    raise DeviceLost(
+                        f"sensor {self.name!r} has been silent for {silence.silent_s:.1f} s",
+                        remedy="check its power and cable; it is opened again by itself",
+                    ) from error
+                if silence.lost and self.serving and not self.silent:
+                    self.silent = True
+                    self._counters["silences"] += 1
+                    self._report.is_silent(silence.silent_s)
+                continue
+            read_ns = time.monotonic_ns()
+            self.silent = False
+            if not readings:
+                self._publisher.put(self.pipeline.finish())
+                self._report.tare_refused(self.pipeline.tare_error)
+                return True
+            self._publisher.put_read(self.pipeline.push(readings, read_ns), read_ns)
+            self._report.tare_refused(self.pipeline.tare_error)
+            self.serving = True
+            if self.zeroing is not None:
+                self.zeroing.follow(readings)
+            lost = self._wrench is not None and self._wrench.zero_lost
+            self._report.delivers(self.pipeline.condition, zero_lost=lost)
+            silence.arrived()
+        return True
+
+    def _give_up(self, why: str) -> None:
+        """Fail the requests for a zero: they must not wait for a sensor that is gone."""
+        if self.zeroing is not None:
+            self.zeroing.give_up(why)
+
+    def answer_tare(self, request: TareRequest) -> Tare:
+        """Look a tare up, or tare with the next frames; may be called from any thread.
+
+        Raises:
+            RemoteError: The id is not known (NOT_FOUND), or the sensor did not deliver in time.
+            DeviceError: The sensor does not deliver, is touched, or a channel is invalid.
+        """
+        if request.tare_id != NO_TARE:
+            return self.pipeline.ledger.find(request.tare_id)
+        self._check_serving()
+        frames = request.frames or self.pipeline.tare_frames
+        wait_s = 2.0 + 2.0 * frames / self.device.info.rate_hz
+        future = self.pipeline.ask_tare(request.frames)
+        return self._result(future, f"{frames} good frames", wait_s)
+
+    def answer_zero(self, request: WrenchZeroRequest) -> WrenchZero:
+        """Take the load of a force/torque sensor as zero; may be called from any thread.
+
+        Raises:
+            DeviceError: The sensor does not deliver, is moved or overloaded, or refuses.
+            RemoteError: It did not deliver in time.
+        """
+        assert self.zeroing is not None, "only a force/torque sensor has a zero"
+        self._check_serving()
+        count = self.zeroing.count(request.readings)
+        wait_s = 10.0 + 4.0 * count / self.device.info.rate_hz
+        what = f"{count} readings before and after its zero"
+        return self._result(self.zeroing.ask(count), what, wait_s)
+
+    def _check_serving(self) -> None:
+        if not self.serving:
+            raise DeviceError(f"sensor {self.name!r} does not deliver at present", remedy=_REMEDY)
+
+    def _result(self, future: Future[Result], what: str, wait_s: float) -> Result:
+        try:
+            return future.result(timeout=wait_s)
+        except TimeoutError as error:
+            if isinstance(error, PalpateError):  # the answer itself is an error of this kind
+                raise
+            future.cancel()
+            raise RemoteError(
+                f"sensor {self.name!r} did not deliver {what} within {wait_s:.1f} s",
+                remedy=_REMEDY,
+                code=ErrorCode.DEADLINE_EXCEEDED,
+                retry_after_s=1.0,
+            ) from error

@@ -1,1 +1,0 @@
-"""The device's time, the host's time, and what a frame says of both."""

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from palpate_gateway.clock.sample_times import ArrivalTimes
+
+MS = 1_000_000
+
+
+def ms(times_ns: list[int]) -> list[float]:
+    return [time / MS for time in times_ns]
+
+
+def test_what_is_read_at_once_is_of_now() -> None:
+    arrivals = ArrivalTimes(0.002)
+    for k in range(1, 50):
+        assert ms(arrivals.times_ns(1, 2 * k * MS)) == [2.0 * k]
+
+
+def test_a_clump_ends_now_and_is_spread_at_the_rate() -> None:
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 100 * MS)
+    assert ms(arrivals.times_ns(4, 108 * MS)) == [102.0, 104.0, 106.0, 108.0]
+
+
+def test_a_faster_sensor_than_it_says_does_not_run_backwards() -> None:
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 100 * MS)
+    assert ms(arrivals.times_ns(4, 104 * MS)) == [101.0, 102.0, 103.0, 104.0]
+
+
+def test_after_a_stall_each_sample_has_the_time_at_which_it_was_taken() -> None:
+    """A second at 500 Hz, read in pieces of what a buffer holds; then live again."""
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 1000 * MS)
+    woke_ms = 2000.0
+    first = ms(arrivals.times_ns(215, round(woke_ms * MS)))
+    second = ms(arrivals.times_ns(215, round((woke_ms + 0.1) * MS)))
+    assert first[0] == 1002.0
+    assert first[-1] == 1430.0
+    assert second[0] == 1432.0
+    rest = ms(arrivals.times_ns(70, round((woke_ms + 0.2) * MS)))
+    assert rest[-1] == woke_ms
+    assert ms(arrivals.times_ns(1, round((woke_ms + 2.0) * MS))) == [2002.0]
+
+
+def test_what_a_full_buffer_kept_came_first() -> None:
+    """Ten seconds of standstill, half a second in the buffer: it is old, and stays old."""
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 1000 * MS)
+    times = ms(arrivals.times_ns(250, 11_000 * MS))
+    assert (times[0], times[-1]) == (1002.0, 1500.0)
+    assert ms(arrivals.times_ns(1, 11_002 * MS)) == [11_002.0]
+
+
+def test_after_a_silence_of_the_sensor_a_sample_is_of_now() -> None:
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 1000 * MS)
+    assert ms(arrivals.times_ns(1, 4000 * MS)) == [4000.0]
+    assert ms(arrivals.times_ns(3, 4006 * MS)) == [4002.0, 4004.0, 4006.0]
+
+
+def test_a_wrong_rate_does_not_make_times_lag() -> None:
+    """A process that reads every 60 ms from a sensor that is one percent slow."""
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 0)
+    for k in range(1, 500):
+        times = ms(arrivals.times_ns(30, round(60.6 * k * MS)))
+        assert times[-1] == round(60.6 * k * MS) / MS
+
+
+def test_a_new_stream_has_no_past() -> None:
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 1000 * MS)
+    arrivals.begin()
+    assert ms(arrivals.times_ns(20, 5000 * MS))[-1] == 5000.0

@@ -1,0 +1,69 @@
+"""Where a sensor's messages leave: how long they took, and what is not counted for it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import pytest
+
+from palpate.health import Health
+from palpate_gateway.clock.stamps import DueMessage
+from palpate_gateway.service.publication import MessagePublisher
+
+
+class Slow:
+    """Takes 20 ms for each message."""
+
+    def __init__(self) -> None:
+        self.payloads: list[bytes] = []
+
+    def put_payload(self, payload: bytes) -> None:
+        time.sleep(0.02)
+        self.payloads.append(payload)
+
+
+def outlet(publisher: Any, stop: threading.Event) -> MessagePublisher:
+    health = Health("gateway", "test")
+    return MessagePublisher({"x": publisher}, health, stop=stop, claim=lambda stream: None)
+
+
+def test_the_time_from_reading_to_bus_is_told() -> None:
+    publisher = Slow()
+    out = outlet(publisher, threading.Event())
+    assert out.gauges() == {}
+    out.put_read([], time.monotonic_ns())
+    assert out.gauges() == {}  # nothing became of the reading
+    for _ in range(3):
+        out.put_read([DueMessage("x", b"a", 0), DueMessage("x", b"b", 0)], time.monotonic_ns())
+    gauges = out.gauges()
+    assert 0.04 <= gauges["publish_p50_s"] <= gauges["publish_p99_s"]
+    assert len(publisher.payloads) == 6
+
+
+def test_who_waits_for_a_recording_is_not_slow() -> None:
+    out = outlet(Slow(), threading.Event())
+    now_ns = time.monotonic_ns()
+    out.put_read([DueMessage("x", b"a", due_ns=now_ns + 30_000_000)], now_ns)
+    assert out.gauges() == {}
+
+
+def test_a_stop_ends_the_wait() -> None:
+    stop, publisher = threading.Event(), Slow()
+    stop.set()
+    due_ns = time.monotonic_ns() + 60_000_000_000
+    assert not outlet(publisher, stop).put([DueMessage("x", b"a", due_ns=due_ns)])
+    assert publisher.payloads == []
+
+
+def test_another_sensors_stream_is_not_published() -> None:
+    def claimed(stream: str) -> None:
+        raise ValueError(stream)
+
+    publisher = Slow()
+    health = Health("gateway", "test")
+    out = MessagePublisher({"x": publisher}, health, stop=threading.Event(), claim=claimed)  # type: ignore[dict-item]
+    with pytest.raises(ValueError, match="x"):
+        out.put([DueMessage("x", b"a", 0)])
+    assert publisher.payloads == []
