@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.rigid import rotation_matrices
-from palpate_deploy.generate.spec import ExperimentSpec
+from palpate_deploy.experiment import parameters_of
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
@@ -23,6 +23,7 @@ from palpate_fem.population.answers import Population
 from palpate_fem.population.member import read_population
 from palpate_fem.service.biotac import BiotacTip
 from palpate_gateway.biotac.conversions import BIOTAC
+from palpate_training.experiment.generate.simulator import ExperimentSpec
 from palpate_training.figures.plate import (
     TOUCHED_COUNTS,
     VENTRAL_COS,
@@ -100,7 +101,7 @@ def main(folder: Path) -> None:
     leans, side, rises = tilts(folder)
     spec = ExperimentSpec()
     geometry = biotac(edge_m=spec.edge_m, layers=2)
-    tip = Fingertip.pressurised(geometry, spec.parameters, SolverSettings())
+    tip = Fingertip.pressurised(geometry, parameters_of(spec), SolverSettings())
     members = [member for member in read_population() if member.wanted.pressed_with("cube")]
     population = Population(BiotacTip(tip).describe(), [member.unit for member in members])
     found: dict[str, list[Floats]] = {member.unit.name: [] for member in members}

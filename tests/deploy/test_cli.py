@@ -26,7 +26,7 @@ from palpate.errors import (
     PalpateError,
     RecordingError,
 )
-from palpate_deploy import training
+from palpate_deploy.cli import data as training
 from palpate_deploy.cli.app import app
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station.host import check_free, free_endpoint

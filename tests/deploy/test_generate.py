@@ -17,33 +17,47 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError, LinkError
 from palpate.files.tape import read_tape
-from palpate_deploy.generate.mechanics import STORE
-from palpate_deploy.generate.pipeline import EXPERIMENT, MIXED, Generated, generate
-from palpate_deploy.generate.sample import make_sample
-from palpate_deploy.generate.spec import FILE, ExperimentSpec, provenance_sha256
-from palpate_deploy.generate.spread import Processes, Ray, WorkerLostError
-from palpate_deploy.generate.trials import FOLDER
+from palpate_deploy.experiment import FemSimulator, FemSpecimen, specimens_of
 from palpate_fem.electrodes.unit import UnitParameters
 from palpate_fem.population.member import PAPER, Member
 from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.experiment import read_experiment, read_mixed
+from palpate_training.experiment.generate.pipeline import (
+    EXPERIMENT,
+    MIXED,
+    STORE,
+    TRIALS,
+    Generated,
+    generate,
+    provenance_sha256,
+)
+from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
+from palpate_training.experiment.generate.sample import make_sample
+from palpate_training.experiment.generate.simulator import ExperimentSpec
+from palpate_training.experiment.generate.workers import (
+    RayCluster,
+    WorkerLostError,
+    WorkerProcesses,
+)
 
 SPEC = ExperimentSpec(
     points=1, angled=1, edge_m=1.2e-3, overtravel_m=0.2e-3, indenters=("sphere_medium",)
 )
 
 
-def members() -> tuple[Member, ...]:
+def specimens() -> tuple[FemSpecimen, ...]:
     """Two units, one of which was pressed deeper than planned."""
     unit = replace(UnitParameters(), noise_counts=1.0)
-    return (
-        Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
-        Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
+    return specimens_of(
+        (
+            Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
+            Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
+        )
     )
 
 
 def run(folder: Path, *, ray: str | None = None) -> Generated:
-    done = generate(folder, SPEC, members(), workers=1, ray=ray)
+    done = generate(folder, SPEC, specimens(), FemSimulator(), workers=1, ray=ray)
     assert done is not None
     return done
 
@@ -89,9 +103,9 @@ def test_a_unit_that_stands_wrong_is_pressed_deeper(generated: Generated) -> Non
 
 def test_rows_carry_the_digest_of_all_that_decides_them(generated: Generated) -> None:
     key = SimulationStore.open(generated.folder / STORE).fingertip().key
-    digest = provenance_sha256(SPEC, members(), key)
+    digest = provenance_sha256(SPEC, specimens(), key)
     assert generated.data.mixed.experiment.provenance.input_sha256 == digest
-    other = provenance_sha256(replace(SPEC, seed=1), members(), key)
+    other = provenance_sha256(replace(SPEC, seed=1), specimens(), key)
     assert other != digest
 
 
@@ -104,8 +118,8 @@ def again(generated: Generated) -> Iterator[Generated]:
 
 def test_a_killed_run_goes_on_with_the_same_rows(again: Generated) -> None:
     before = again.data.experiment
-    trial = next((again.folder / FOLDER).glob("*normal.npz"))
-    kept = next((again.folder / FOLDER).glob("*angled-0.npz"))
+    trial = next((again.folder / TRIALS).glob("*normal.npz"))
+    kept = next((again.folder / TRIALS).glob("*angled-0.npz"))
     stamp = kept.stat().st_mtime_ns
     trial.unlink()
     trial.with_suffix(".part").write_bytes(b"half")
@@ -128,13 +142,13 @@ def test_a_cluster_gives_the_same_rows(generated: Generated, tmp_path: Path) -> 
 
 def test_another_experiment_does_not_go_into_the_same_folder(generated: Generated) -> None:
     with pytest.raises(ConfigError, match="seed 3 is not 0"):
-        generate(generated.folder, replace(SPEC, seed=3), members(), workers=1)
+        generate(generated.folder, replace(SPEC, seed=3), specimens(), FemSimulator(), workers=1)
     with pytest.raises(ConfigError, match="members"):
-        generate(generated.folder, SPEC, members()[:1], workers=1)
+        generate(generated.folder, SPEC, specimens()[:1], FemSimulator(), workers=1)
 
 
 def test_damaged_files_are_named(again: Generated) -> None:
-    trial = next((again.folder / FOLDER).glob("*normal.npz"))
+    trial = next((again.folder / TRIALS).glob("*normal.npz"))
     whole = trial.read_bytes()
     trial.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DatasetError, match=r"normal\.npz"):
@@ -143,16 +157,16 @@ def test_damaged_files_are_named(again: Generated) -> None:
 
 
 def test_a_damaged_spec_is_named(tmp_path: Path) -> None:
-    (tmp_path / FILE).write_text("{", encoding="utf-8")
-    with pytest.raises(ConfigError, match=FILE):
-        generate(tmp_path, SPEC, members(), workers=1)
-    (tmp_path / FILE).write_text(json.dumps({"schema": "other"}), encoding="utf-8")
+    (tmp_path / SPEC_FILE).write_text("{", encoding="utf-8")
+    with pytest.raises(ConfigError, match=SPEC_FILE):
+        generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
+    (tmp_path / SPEC_FILE).write_text(json.dumps({"schema": "other"}), encoding="utf-8")
     with pytest.raises(ConfigError, match="another experiment"):
-        generate(tmp_path, SPEC, members(), workers=1)
+        generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
 
 
 def test_processes_answer_every_task_and_hand_errors_on() -> None:
-    pool = Processes(2)
+    pool = WorkerProcesses(2)
     try:
         answers = sorted(pool.run(math.sqrt, [float(k * k) for k in range(20)]))
         assert answers == [(float(k * k), float(k)) for k in range(20)]
@@ -166,10 +180,10 @@ def test_processes_answer_every_task_and_hand_errors_on() -> None:
 
 KILLED = """
 import os, signal, time
-from palpate_deploy.generate.spread import Processes
+from palpate_training.experiment.generate.workers import WorkerProcesses
 
 if __name__ == "__main__":
-    pool = Processes(1)
+    pool = WorkerProcesses(1)
     pool._pool.submit(time.sleep, 600)
     while not pool._pool._processes:
         time.sleep(0.01)
@@ -209,7 +223,7 @@ def test_ray_that_is_not_there_is_said() -> None:
     pytest.importorskip("ray", reason="needs palpate[cluster]")
     for address in ("127.0.0.1:1", "nowhere:x"):
         with pytest.raises(LinkError, match="no Ray cluster"):
-            Ray(address)
+            RayCluster(address)
 
 
 def test_sample_is_small_and_playable_and_the_rest_lacks_it(
@@ -219,12 +233,15 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     with pytest.raises(DatasetError):
         make_sample(
             generated.folder,
-            members(),
+            specimens(),
+            FemSimulator(),
             tmp_path / "a.h5",
             tmp_path / "a.npz",
             tmp_path / "rest",
         )
-    done = make_sample(generated.folder, members(), tmp_path / "s.h5", tmp_path / "t.npz")
+    done = make_sample(
+        generated.folder, specimens(), FemSimulator(), tmp_path / "s.h5", tmp_path / "t.npz"
+    )
     assert set(done.trajectories) == set(generated.data.mixed.experiment.trajectories)
     small, whole = read_mixed(tmp_path / "s.h5"), generated.data.mixed
     np.testing.assert_array_equal(small.experiment.tared, whole.experiment.tared)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from palpate_deploy import training
+from palpate_deploy.cli import data as training
 from palpate_deploy.cli.bench import bench_app
 from palpate_deploy.cli.files import bundle_app, model_app, register
 from palpate_deploy.cli.options import (

@@ -18,7 +18,7 @@ from palpate.errors import BundleError, PalpateError
 from palpate.extras import require
 from palpate.files.bundle import read_bundle
 from palpate.files.record import RecordWriter
-from palpate_deploy.training import EXTRA_MODULES
+from palpate_deploy.cli.data import EXTRA_MODULES
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline

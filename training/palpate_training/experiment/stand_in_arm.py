@@ -13,6 +13,7 @@ towards them and its origin 150 mm above the bench; the plate with the holes is 
 from __future__ import annotations
 
 import math
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ import numpy.typing as npt
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate.rigid import Floats, Transform
+from palpate_training.experiment.kinematics import Arm
 
 SIDES = ("left", "right")
 FLANGE = "flange"
@@ -108,6 +110,13 @@ def write_arm_urdf(side: str, path: Path) -> Path:
     with written_whole(path) as partial:
         partial.write_text(arm_urdf(side), encoding="utf-8")
     return path
+
+
+def stand_in_arm(side: str) -> Arm:
+    """The open stand-in arm of a side, with its tool."""
+    with tempfile.TemporaryDirectory() as folder:
+        urdf = write_arm_urdf(side, Path(folder) / f"{side}.urdf")
+        return Arm.from_urdf(urdf, FLANGE, tool())
 
 
 def tool() -> Transform:

@@ -28,7 +28,7 @@ class WorkerLostError(PalpateError, RuntimeError):
     code = ErrorCode.UNAVAILABLE
 
 
-class Spread(Protocol):
+class TaskRunner(Protocol):
     """Runs tasks somewhere."""
 
     def run(
@@ -54,7 +54,7 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait_for_end, name="parent", daemon=True).start()
 
 
-class Processes:
+class WorkerProcesses:
     """Worker processes of this host."""
 
     def __init__(self, workers: int) -> None:
@@ -67,7 +67,7 @@ class Processes:
     def run(
         self, function: Callable[[Task], Answer], tasks: Iterable[Task]
     ) -> Iterator[tuple[Task, Answer]]:
-        """See `Spread.run`.
+        """See `TaskRunner.run`.
 
         Raises:
             WorkerLostError: A worker died, e.g. for want of memory.
@@ -121,7 +121,7 @@ REACH_S = 5.0
 """How long a cluster's port may take to answer [s]."""
 
 
-class Ray:
+class RayCluster:
     """A Ray cluster; tasks keep what they make between calls in processes that Ray reuses."""
 
     def __init__(self, address: str) -> None:
@@ -154,7 +154,7 @@ class Ray:
     def run(
         self, function: Callable[[Task], Answer], tasks: Iterable[Task]
     ) -> Iterator[tuple[Task, Answer]]:
-        """See `Spread.run`.
+        """See `TaskRunner.run`.
 
         Raises:
             WorkerLostError: A machine was lost more often than Ray repeats a task.

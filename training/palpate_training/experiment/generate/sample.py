@@ -11,13 +11,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
 from palpate.files.tape import TapePress, build_tape, tape_unit, write_tape
-from palpate_deploy.generate.assemble import skin_mesh
-from palpate_deploy.generate.mechanics import STORE
-from palpate_deploy.generate.pipeline import EXPERIMENT, MIXED
-from palpate_deploy.generate.trials import FOLDER, read_trials
-from palpate_fem.population.member import Member
-from palpate_fem.result import IndentationResult
-from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.basis import encode, fit_basis, subset
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
@@ -28,6 +21,15 @@ from palpate_training.datasets.experiment import (
     write_experiment,
     write_mixed,
 )
+from palpate_training.experiment.generate.data_sets import skin_mesh
+from palpate_training.experiment.generate.pipeline import EXPERIMENT, MIXED, STORE, TRIALS
+from palpate_training.experiment.generate.simulator import (
+    IndentationStore,
+    SimulatedIndentation,
+    Simulator,
+    Specimen,
+)
+from palpate_training.experiment.generate.trials import read_trials
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +41,7 @@ TAPE_STEPS = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class ExperimentSample:
     """What was written.
 
     Attributes:
@@ -56,13 +58,19 @@ class Sample:
 
 
 def make_sample(
-    folder: Path, members: Sequence[Member], dataset: Path, tape: Path, rest: Path | None = None
-) -> Sample:
+    folder: Path,
+    specimens: Sequence[Specimen],
+    simulator: Simulator,
+    dataset: Path,
+    tape: Path,
+    rest: Path | None = None,
+) -> ExperimentSample:
     """Take one normal and one angled trajectory of each indenter.
 
     Args:
         folder: A finished experiment.
-        members: Its units.
+        specimens: Its simulated BioTacs.
+        simulator: Opens its store.
         dataset: Mixed data set to write.
         tape: Tape to write.
         rest: Folder that takes both data sets without these trajectories; None = none. Who plays
@@ -82,12 +90,12 @@ def make_sample(
         write_mixed(rest / MIXED, subset(mixed, _trials(mixed.experiment, wanted, inside=False)))
     small = _fewer_modes(subset(mixed, trials))
     write_mixed(dataset, small)
-    _write_tape(folder, members, wanted, tape)
-    return Sample(wanted, len(trials), dataset.stat().st_size, tape.stat().st_size)
+    _write_tape(folder, specimens, simulator.open_store(folder / STORE), wanted, tape)
+    return ExperimentSample(wanted, len(trials), dataset.stat().st_size, tape.stat().st_size)
 
 
 def _picked(mixed: MixedDataset) -> tuple[str, ...]:
-    """Of each indenter the first normal and the first angled trajectory of most units."""
+    """Of each indenter the first normal and the first angled trajectory of most specimens."""
     data = mixed.experiment
     units = np.bincount(data.trial_trajectory, minlength=len(data.trajectories))
     picked: dict[tuple[str, bool], str] = {}
@@ -117,20 +125,24 @@ def _fewer_modes(mixed: MixedDataset) -> MixedDataset:
     return replace(mixed, basis=basis, coefficients=encode(basis, fields))
 
 
-def _write_tape(folder: Path, members: Sequence[Member], names: Sequence[str], path: Path) -> None:
-    store = SimulationStore.open(folder / STORE)
+def _write_tape(
+    folder: Path,
+    specimens: Sequence[Specimen],
+    store: IndentationStore,
+    names: Sequence[str],
+    path: Path,
+) -> None:
     fingertip = store.fingertip()
     mesh = skin_mesh(fingertip)
-    played = [member.unit for member in members]
     presses, rests = [], {}
     for name in names:
-        done = read_trials(folder / FOLDER, name)
+        done = read_trials(folder / TRIALS, name)
         rests.update({unit: rows[0] for unit, rows in done.counts.items()})
-        counts = np.stack([done.counts[unit.name] for unit in played])
+        counts = np.stack([done.counts[one.name] for one in specimens])
         rest_pa = fingertip.fluid_pressure_pa
-        presses.append(_press(name, store.trajectory(name), counts, rest_pa))
+        presses.append(_press(name, store.indentation(name), counts, rest_pa))
     build = build_tape(
-        units=[tape_unit(unit.name, unit.to_json(), rests[unit.name]) for unit in played],
+        units=[tape_unit(one.name, one.to_json(), rests[one.name]) for one in specimens],
         presses=presses,
         rest_pressure_pa=fingertip.fluid_pressure_pa,
         nodes=mesh.nodes,
@@ -142,7 +154,9 @@ def _write_tape(folder: Path, members: Sequence[Member], names: Sequence[str], p
     write_tape(path, build)
 
 
-def _press(name: str, trajectory: IndentationResult, counts: Floats, rest_pa: float) -> TapePress:
+def _press(
+    name: str, trajectory: SimulatedIndentation, counts: Floats, rest_pa: float
+) -> TapePress:
     """Untouched, then a few of the converged steps."""
     steps = trajectory.steps[: counts.shape[1] - 1]
     some = np.unique(np.linspace(0, len(steps) - 1, TAPE_STEPS).round().astype(int))

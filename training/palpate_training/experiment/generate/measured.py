@@ -10,11 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_deploy.generate.assemble import join, simulated_trial
-from palpate_deploy.generate.mechanics import OnProgress
-from palpate_fem.population.mount import clear_steps
-from palpate_fem.result import IndentationResult
-from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.assembly import assemble_experiment, common_trajectories
 from palpate_training.datasets.container import schema_of
 from palpate_training.datasets.experiment import (
@@ -36,13 +31,20 @@ from palpate_training.datasets.trials import (
     trial_name,
 )
 from palpate_training.experiment.executed_plan import OFFSET_M
+from palpate_training.experiment.generate.data_sets import join, simulated_trial
+from palpate_training.experiment.generate.simulator import (
+    IndentationStore,
+    OnProgress,
+    SimulatedIndentation,
+    Simulator,
+)
 
 Dropped = tuple[tuple[str, str], ...]
 """Trial and reason, of each that was left out."""
 
 
 @dataclass(frozen=True, slots=True)
-class Processed:
+class ProcessedExperiment:
     """What became of the trials of a real experiment.
 
     Attributes:
@@ -61,21 +63,23 @@ class Processed:
 def process_files(
     paths: Sequence[Path],
     out: Path,
+    simulator: Simulator,
     *,
     mechanics: Path | None = None,
     mixed: Path | None = None,
     command: str = "palpate data process",
     on_progress: OnProgress = lambda *_: None,
-) -> Processed:
+) -> ProcessedExperiment:
     """Process files of trials and write the data sets, once all of both is computed.
 
     Args:
         paths: Files of ``palpate data ingest``; read trial by trial.
         out: Experimental data set to write.
+        simulator: Opens the simulation store.
         mechanics: Simulation store, for the mixed data set.
         mixed: Mixed data set to write; given if and only if ``mechanics`` is.
         command: For provenance.
-        on_progress: Hears of each trial and of each part of the work after.
+        on_progress: Called after each trial, and in each part of the work after that.
 
     Raises:
         ConfigError: A file to write holds raw trials, or only one of store and mixed set is given.
@@ -92,7 +96,7 @@ def process_files(
     files = [read_contents(path) for path in paths]
     total = sum(len(one.headers) for one in files)
     _check_once(paths, [[trial_name(header) for header in one.headers] for one in files])
-    store = None if mechanics is None else SimulationStore.open(mechanics)
+    store = None if mechanics is None else simulator.open_store(mechanics)
     rows, lost = process_all(_counted(paths, total, on_progress))
     dropped = tuple(sorted((trial_name(one.header), one.reason) for one in lost))
     if not rows:
@@ -114,11 +118,11 @@ def process_files(
     both: MixedDataset | None = None
     unmixed: Dropped = ()
     if store is not None:
-        both, unmixed = _mix(store, rows, experiment, on_progress)
+        both, unmixed = _mix(simulator, store, rows, experiment, on_progress)
     write_experiment(out, experiment)
     if mixed is not None and both is not None:
         write_mixed(mixed, both)
-    return Processed(experiment, both, dropped, unmixed)
+    return ProcessedExperiment(experiment, both, dropped, unmixed)
 
 
 def _counted(paths: Sequence[Path], total: int, on_progress: OnProgress) -> Iterator[RawTrial]:
@@ -163,7 +167,8 @@ def _check_once(paths: Sequence[Path], names: Sequence[Sequence[str]]) -> None:
 
 
 def _mix(
-    store: SimulationStore,
+    simulator: Simulator,
+    store: IndentationStore,
     rows: Sequence[TrialRows],
     experiment: ExperimentDataset,
     on_progress: OnProgress,
@@ -175,8 +180,8 @@ def _mix(
     believable: list[TrialRows] = []
     names = sorted({one.header.trajectory for one in common})
     for k, name in enumerate(names):
-        trajectory = store.trajectory(name)
-        believed = clear_steps(trajectory, fingertip.mesh.fixed)
+        trajectory = store.indentation(name)
+        believed = simulator.clear_steps(trajectory, fingertip)
         for one in (one for one in common if one.header.trajectory == name):
             if not believed:
                 why = "no step of its simulation before it diverges or meets the mount"
@@ -187,7 +192,9 @@ def _mix(
                 )
             else:
                 believable.append(one)
-                simulated.setdefault(name, simulated_trial(name, trajectory, believed))
+                simulated.setdefault(
+                    name, simulated_trial(name, trajectory, believed, simulator.clearance_m)
+                )
                 continue
             left_out.append((trial_name(one.header), why))
         on_progress(k + 1, len(names), "simulations")
@@ -215,7 +222,7 @@ def _mix(
     return both, tuple(sorted(left_out))
 
 
-def _nothing_mixed(store: SimulationStore, left_out: Sequence[tuple[str, str]]) -> DatasetError:
+def _nothing_mixed(store: IndentationStore, left_out: Sequence[tuple[str, str]]) -> DatasetError:
     trial, why = left_out[-1]
     return DatasetError(
         f"{store.path}: none of {len(left_out)} trials could be mixed; the last: {trial}: {why}",
@@ -223,7 +230,7 @@ def _nothing_mixed(store: SimulationStore, left_out: Sequence[tuple[str, str]]) 
     )
 
 
-def _away(rows: TrialRows, trajectory: IndentationResult) -> float:
+def _away(rows: TrialRows, trajectory: SimulatedIndentation) -> float:
     """Distance of the tip from the line along which the indenter was simulated [m]."""
     start, end = trajectory.path[0, :3], trajectory.path[-1, :3]
     along = (end - start) / np.linalg.norm(end - start)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from palpate.errors import ConfigError
-from palpate_deploy.generate.mechanics import plans_of
-from palpate_deploy.generate.registration import stand_in_arm
-from palpate_deploy.generate.spec import ExperimentSpec
-from palpate_fem.store.content import StoredFingertip
-from palpate_fem.store.read import SimulationStore
-from palpate_fem.trajectory import PlannedIndentation
+from palpate_training.experiment.generate.simulator import (
+    ExperimentSpec,
+    IndentationPlan,
+    IndentationStore,
+    OnProgress,
+    SimulatedFingertip,
+    Simulator,
+)
 from palpate_training.experiment.kinematics import Arm
 from palpate_training.experiment.plan import (
     ARMS,
@@ -25,7 +27,7 @@ from palpate_training.experiment.plan import (
     make_plan,
 )
 from palpate_training.experiment.registration import Registration
-from palpate_training.experiment.stand_in_arm import HOME, sensor_robot
+from palpate_training.experiment.stand_in_arm import HOME, sensor_robot, stand_in_arm
 
 SAME_PATH = 1e-6
 """Paths of the same plan agree to this, in metres and in numbers of a quaternion."""
@@ -59,11 +61,12 @@ def stations_of(
 
 def plan_experiment(
     spec: ExperimentSpec,
-    fingertip: StoredFingertip,
+    fingertip: SimulatedFingertip,
     stations: Mapping[str, Station],
+    simulator: Simulator,
     *,
-    store: SimulationStore | None = None,
-    on_progress: Callable[[int, int, str], None] = lambda *_: None,
+    store: IndentationStore | None = None,
+    on_progress: OnProgress = lambda *_: None,
 ) -> tuple[Plan, list[Eliminated]]:
     """Plan what the twin presses, to the paper's depths.
 
@@ -71,6 +74,7 @@ def plan_experiment(
         spec: Indenters, points, angles and seed; its overtravel is left out.
         fingertip: Whose skin is aimed at.
         stations: By arm; a single one executes everything.
+        simulator: Plans the trajectories on its skin.
         store: Simulation that the trials will be mixed with: what it holds must be this plan's.
         on_progress: Called before each trajectory.
 
@@ -83,7 +87,7 @@ def plan_experiment(
     """
     if not stations:
         raise ConfigError("no arm is registered", remedy="palpate data register")
-    plans = plans_of(replace(spec, overtravel_m=0.0), fingertip)
+    plans = simulator.plans(replace(spec, overtravel_m=0.0), fingertip)
     if store is not None:
         _check_same(plans, store)
 
@@ -97,7 +101,7 @@ def plan_experiment(
     return found
 
 
-def _trajectory(plan: PlannedIndentation, stations: Mapping[str, Station]) -> Trajectory:
+def _trajectory(plan: IndentationPlan, stations: Mapping[str, Station]) -> Trajectory:
     arm = assign_arm(plan.target) if len(stations) > 1 else next(iter(stations))
     return Trajectory(
         trajectory=plan.name,
@@ -110,13 +114,13 @@ def _trajectory(plan: PlannedIndentation, stations: Mapping[str, Station]) -> Tr
     )
 
 
-def _check_same(plans: list[PlannedIndentation], store: SimulationStore) -> None:
+def _check_same(plans: Sequence[IndentationPlan], store: IndentationStore) -> None:
     """Names alone do not tell: with another seed they are the same, and the points are not."""
     there = set(store.ids())
     for plan in plans:
         if plan.name not in there:
             continue
-        off = float(np.abs(store.summary(plan.name).path[0] - plan.path[0]).max())
+        off = float(np.abs(store.start_pose(plan.name) - plan.path[0]).max())
         if off > SAME_PATH:
             raise ConfigError(
                 f"{store.path}: {plan.name} starts {off:.3g} m from this plan's",

@@ -10,12 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_deploy.generate.mechanics import OnProgress
-from palpate_deploy.generate.trials import file_of, read_trials
-from palpate_fem.result import IndentationResult
-from palpate_fem.store.content import StoredFingertip
-from palpate_fem.store.read import SimulationStore
-from palpate_fem.trajectory import CLEARANCE_M
 from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed, mix
 from palpate_training.datasets.basis import fit_basis
 from palpate_training.datasets.experiment import (
@@ -25,6 +19,13 @@ from palpate_training.datasets.experiment import (
 )
 from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.trials import MixedRows, SimulatedTrial, TrialRows
+from palpate_training.experiment.generate.simulator import (
+    IndentationStore,
+    OnProgress,
+    SimulatedFingertip,
+    SimulatedIndentation,
+)
+from palpate_training.experiment.generate.trials import file_of, read_trials
 
 Floats = npt.NDArray[np.float64]
 
@@ -33,7 +34,7 @@ SUBSET = 128
 
 
 @dataclass(frozen=True, slots=True)
-class Assembled:
+class AssembledSets:
     """Both data sets, and what is in neither.
 
     Attributes:
@@ -48,20 +49,22 @@ class Assembled:
 
 
 def assemble(
-    store: SimulationStore,
+    store: IndentationStore,
     folder: Path,
     unit_names: tuple[str, ...],
     provenance: Provenance,
     *,
+    clearance_m: float,
     on_progress: OnProgress,
-) -> Assembled:
+) -> AssembledSets:
     """Make both data sets.
 
     Args:
         store: Simulated trajectories.
         folder: Files of their trials.
-        unit_names: Units, in order.
+        unit_names: Specimens, in order.
         provenance: Of both.
+        clearance_m: How far from the skin the simulated paths start [m].
         on_progress: Called after each trajectory that was read.
 
     Raises:
@@ -79,7 +82,9 @@ def assemble(
         dropped += [(f"{unit} {name}", why) for unit, why in done.dropped]
         if done.rows:
             rows[name] = done.rows
-            simulated[name] = simulated_trial(name, store.trajectory(name), done.believed)
+            simulated[name] = simulated_trial(
+                name, store.indentation(name), done.believed, clearance_m
+            )
         on_progress(k + 1, len(names), "read")
     every = [one for some in rows.values() for one in some]
     experiment = assemble_experiment(every, provenance, unit_names=unit_names)
@@ -92,14 +97,14 @@ def assemble(
         unit_names=unit_names,
         on_progress=on_progress,
     )
-    return Assembled(experiment, mixed, sorted(dropped))
+    return AssembledSets(experiment, mixed, sorted(dropped))
 
 
 def join(
     rows: Sequence[TrialRows],
     simulated: dict[str, SimulatedTrial],
     dropped: list[tuple[str, str]],
-    fingertip: StoredFingertip,
+    fingertip: SimulatedFingertip,
     provenance: Provenance,
     *,
     unit_names: tuple[str, ...],
@@ -113,7 +118,7 @@ def join(
         dropped: Gets trial and reason of each that cannot be mixed.
         fingertip: What was simulated.
         provenance: Of the data set.
-        unit_names: Units, in order.
+        unit_names: Specimens, in order.
         on_progress: Called before each part of the work.
 
     Raises:
@@ -130,17 +135,20 @@ def join(
     return mixed
 
 
-def simulated_trial(name: str, trajectory: IndentationResult, believed: int) -> SimulatedTrial:
+def simulated_trial(
+    name: str, trajectory: SimulatedIndentation, believed: int, clearance_m: float
+) -> SimulatedTrial:
     """A simulated trajectory from first contact on, as it is mixed with trials.
 
     Args:
         name: Its id.
         trajectory: As simulated.
         believed: How many of its steps to take, one or more.
+        clearance_m: How far from the skin its path starts [m].
     """
     steps = trajectory.steps[:believed]
     poses = np.array([step.pose[:3] for step in steps])
-    travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1) - CLEARANCE_M
+    travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1) - clearance_m
     fields = np.array([step.displacement for step in steps], np.float32)
     return SimulatedTrial(
         trajectory=name,
@@ -168,7 +176,7 @@ def _mixed(
             dropped.append((f"{one.header.unit} {one.header.trajectory}", str(error)))
 
 
-def skin_mesh(fingertip: StoredFingertip) -> SkinMesh:
+def skin_mesh(fingertip: SimulatedFingertip) -> SkinMesh:
     """The pressurised skin with its surfaces in triangles, and the nodes that errors count on."""
     nodes = fingertip.pressurised_nodes
     return SkinMesh(

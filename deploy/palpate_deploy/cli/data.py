@@ -1,0 +1,438 @@
+"""``palpate train`` and ``palpate data``: the training room's commands, and those that add fem.
+
+The training room needs an extra that a station does not have, so its commands are imported when
+one is asked for. The commands of this module run the experiment: they give the training room the
+finite elements.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from palpate.command import typed_command
+from palpate.errors import ConfigError, MissingExtraError
+from palpate_deploy.cli.options import JsonOption, show_left_out
+
+if TYPE_CHECKING:
+    from palpate_training.experiment.generate.measured import Dropped, ProcessedExperiment
+    from palpate_training.experiment.generate.pipeline import Generated
+    from palpate_training.experiment.plan import Eliminated, Plan
+
+twin_app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+EXTRA_MODULES = ("torch", "onnx", "h5py", "matplotlib")
+"""What ``palpate[training]`` installs and a bare palpate has not."""
+
+
+class _LazyGroup(typer.core.TyperGroup):
+    """A group whose commands are imported when they are asked for, not when palpate starts."""
+
+    room = ""
+
+    @property  # type: ignore[override]
+    def commands(self) -> dict[str, Any]:
+        """The room's commands.
+
+        Raises:
+            MissingExtraError: The training extra is not installed.
+        """
+        found: dict[str, Any] = typer.main.get_command(_app(self.room)).commands  # type: ignore[attr-defined]
+        return {**found, **self.joined()}
+
+    @commands.setter
+    def commands(self, value: dict[str, Any]) -> None:
+        """Typer sets the commands that it knows at the start: none."""
+
+    def joined(self) -> dict[str, Any]:
+        """Further commands that join this room with another one."""
+        return {}
+
+
+class _TrainGroup(_LazyGroup):
+    room = "train"
+
+
+class _DataGroup(_LazyGroup):
+    room = "data"
+
+    def joined(self) -> dict[str, Any]:
+        """The commands that need the finite elements too."""
+        found: dict[str, Any] = typer.main.get_command(twin_app).commands  # type: ignore[attr-defined]
+        return found
+
+
+train = typer.Typer(
+    cls=_TrainGroup,
+    help="Train, evaluate and export networks (needs palpate[training]).",
+    no_args_is_help=True,
+)
+data = typer.Typer(
+    cls=_DataGroup,
+    help="Data sets: ingest, split, inspect (needs palpate[training]).",
+    no_args_is_help=True,
+)
+for _app_of_room in (train, data):
+    # A group without a callback and with a single command would become that command.
+    _app_of_room.callback()(lambda: None)
+
+
+def _app(room: str) -> typer.Typer:
+    """The training room's own app.
+
+    Raises:
+        MissingExtraError: The training extra is not installed.
+    """
+    try:
+        from palpate_training.cli.__init__ import data_app, train_app
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing in EXTRA_MODULES:
+            raise MissingExtraError(missing, extra="training") from error
+        raise
+    return train_app if room == "train" else data_app
+
+
+@twin_app.command(
+    "generate",
+    epilog="Example: palpate data generate runs/twin  or, small: palpate data generate runs/small"
+    " --points 1 --indenter sphere_medium --edge-mm 1.0",
+)
+def data_generate(
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="Takes all; goes on if begun.")],
+    points: Annotated[int, typer.Option(min=1, help="Points for each indenter.")] = 10,
+    angled: Annotated[int, typer.Option(min=0, max=4, help="Angled paths at each.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Of points, registration and noise.")] = 0,
+    indenter: Annotated[
+        list[str] | None, typer.Option("--indenter", help="May be repeated; none = all nine.")
+    ] = None,
+    units: Annotated[
+        Path | None,
+        typer.Option("--units", metavar="FILE.json", help="Population; none = the shipped three."),
+    ] = None,
+    edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
+    fill_ml: Annotated[float, typer.Option(help="Fluid under the skin [ml].")] = 0.6,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="Processes; 0 = one for each core.")
+    ] = 0,
+    ray: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Work on a Ray cluster: HOST:PORT, auto or local."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Press nine indenters on three simulated BioTacs; write both of the paper's data sets."""
+    from palpate_deploy.experiment import FemSimulator, read_specimens
+    from palpate_fem.cli.model import workers_for
+    from palpate_fem.cli.show import progress_bar
+    from palpate_fem.cli.stopping import stop_on_signal
+    from palpate_fem.config import LIMITS
+    from palpate_fem.indenter.catalogue import make_indenter
+    from palpate_training.experiment.generate.pipeline import generate as run
+    from palpate_training.experiment.generate.simulator import ExperimentSpec
+
+    low, high = LIMITS["fluid_volume_m3"]
+    if not low < fill_ml * 1e-6 <= high:
+        raise typer.BadParameter(f"{fill_ml} ml is not within {low * 1e6:g} to {high * 1e6:g}")
+    specimens = read_specimens(units)
+    spec = ExperimentSpec(
+        points=points,
+        angled=angled,
+        seed=seed,
+        edge_m=edge_mm * 1e-3,
+        fluid_volume_m3=fill_ml * 1e-6,
+        indenters=tuple(make_indenter(name).name for name in indenter or ()),
+    )
+    count, threads = workers_for(workers)
+    with stop_on_signal() as stop, progress_bar() as bar:
+        tasks = {}
+
+        def on_stage(stage: str, done: int, total: int, word: str) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total, info=word)
+
+        result = run(
+            out,
+            spec,
+            specimens,
+            FemSimulator(),
+            workers=count,
+            threads=threads,
+            ray=ray,
+            stop=stop,
+            on_stage=on_stage,
+            command=typed_command(),
+        )
+    if result is None:
+        typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
+        raise typer.Exit(1)
+    if as_json:
+        typer.echo(json.dumps(_generated_summary(result), indent=1))
+    else:
+        _show_generated(result)
+
+
+@twin_app.command(
+    "sample", epilog="Example: palpate data sample runs/twin --dataset sample.h5 --tape twin.npz"
+)
+def data_sample(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A finished experiment.")],
+    dataset: Annotated[Path, typer.Option("--dataset", metavar="FILE.h5", help="To write.")],
+    tape: Annotated[Path, typer.Option("--tape", metavar="FILE.npz", help="To write.")],
+    rest: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Takes both data sets without what the tape plays."),
+    ] = None,
+    units: Annotated[
+        Path | None,
+        typer.Option("--units", metavar="FILE.json", help="Population; none = the shipped three."),
+    ] = None,
+) -> None:
+    """Take a small part of an experiment: a data set for tests, a tape for the virtual finger."""
+    from palpate_deploy.experiment import FemSimulator, read_specimens
+    from palpate_training.experiment.generate.sample import make_sample
+
+    done = make_sample(folder, read_specimens(units), FemSimulator(), dataset, tape, rest)
+    typer.echo(
+        f"{len(done.trajectories)} trajectories; {dataset}: {done.trials} trials,"
+        f" {done.dataset_bytes / 1e6:.2f} MB; {tape}: {done.tape_bytes / 1e6:.2f} MB"
+    )
+
+
+def _generated_summary(result: Generated) -> dict[str, object]:
+    experiment, mixed = result.data.experiment, result.data.mixed
+    return {
+        "folder": str(result.folder),
+        "provenance_sha256": result.provenance_sha256,
+        "trajectories": len(experiment.trajectories),
+        "trials": len(experiment.trial_unit),
+        "rows": len(experiment),
+        "mixed_trials": len(mixed.experiment.trial_unit),
+        "mixed_rows": len(mixed),
+        "modes": len(mixed.basis.modes),
+        "field_loss_mean_um": mixed.basis.loss_mean_m * 1e6,
+        "field_loss_max_um": mixed.basis.loss_max_m * 1e6,
+        "dropped": [list(pair) for pair in result.data.dropped],
+        "seconds": {name: round(value, 1) for name, value in result.seconds.items()},
+        "megabytes": {name: round(value / 1e6, 1) for name, value in result.bytes.items()},
+    }
+
+
+def _show_generated(result: Generated) -> None:
+    summary = _generated_summary(result)
+    dropped = result.data.dropped
+    for key, value in summary.items():
+        if key != "dropped":
+            typer.echo(f"{key:20} {value}")
+    typer.echo(f"{'left out':20} {len(dropped)} trials of one or both data sets")
+    show_left_out(dropped)
+    typer.echo(f"look at it: palpate data inspect {result.folder / 'mixed.h5'}")
+
+
+@twin_app.command(
+    "plan",
+    epilog="Example: palpate data plan plan.jsonl --store runs/twin/mechanics.sim --registration"
+    " registration.json --urdf left=left.urdf --urdf right=right.urdf --tip-frame tip",
+)
+def data_plan(
+    out: Annotated[Path, typer.Argument(metavar="OUT.jsonl", help="Trajectory file to write.")],
+    store: Annotated[
+        Path | None,
+        typer.Option(metavar="STORE.sim", help="Simulation to mix with later; gives the skin."),
+    ] = None,
+    edge_mm: Annotated[
+        float | None, typer.Option(help="Instead of a store: edge of the mesh on the pad [mm].")
+    ] = None,
+    fill_ml: Annotated[
+        float | None, typer.Option(help="Instead of a store: fluid under the skin [ml].")
+    ] = None,
+    points: Annotated[int, typer.Option(min=1, help="Points for each indenter.")] = 10,
+    angled: Annotated[int, typer.Option(min=0, max=4, help="Angled paths at each.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
+    indenter: Annotated[
+        list[str] | None, typer.Option("--indenter", help="May be repeated; none = all nine.")
+    ] = None,
+    registration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Of palpate data register; none = stand-in arms."),
+    ] = None,
+    urdf: Annotated[
+        list[str] | None,
+        typer.Option("--urdf", metavar="ARM=FILE", help="Kinematics; none = poses, no joints."),
+    ] = None,
+    tip_frame: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Frame of the URDF that carries the tool.")
+    ] = None,
+    tool_mm: Annotated[
+        float, typer.Option(help="From that frame along its z to the tip [mm].")
+    ] = 0.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan nine indenters x ten points x (one normal, four angled presses) for one or two arms."""
+    from palpate_deploy.experiment import FemSimulator
+    from palpate_fem.cli.show import console, progress_bar
+    from palpate_fem.indenter.catalogue import make_indenter
+    from palpate_training.cli.experiment import arms_of, by_arm
+    from palpate_training.experiment.generate.planning import plan_experiment, stations_of
+    from palpate_training.experiment.generate.simulator import (
+        EDGE_M,
+        FLUID_VOLUME_M3,
+        ExperimentSpec,
+    )
+    from palpate_training.experiment.registration import read_registrations
+    from palpate_training.experiment.trajectory_file import write_trajectories
+
+    if store is not None and (edge_mm is not None or fill_ml is not None):
+        raise ConfigError(
+            "--store gives the skin, so --edge-mm and --fill-ml have no say",
+            remedy="leave them out, or the store",
+        )
+    spec = ExperimentSpec(
+        points=points,
+        angled=angled,
+        seed=seed,
+        edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3,
+        fluid_volume_m3=FLUID_VOLUME_M3 if fill_ml is None else fill_ml * 1e-6,
+        indenters=tuple(make_indenter(name).name for name in indenter or ()),
+    )
+    stations = stations_of(
+        arms_of(by_arm(urdf or (), "--urdf"), tip_frame, tool_mm * 1e-3),
+        None if registration is None else read_registrations(registration),
+    )
+    simulator = FemSimulator()
+    opened = None if store is None else simulator.open_store(store)
+    with console.status("pressurising the fingertip" if opened is None else "reading the store"):
+        fingertip = simulator.fingertip(spec) if opened is None else opened.fingertip()
+    with progress_bar() as bar:
+        task = bar.add_task("planning", total=None)
+
+        def on_progress(done: int, total: int, word: str) -> None:
+            bar.update(task, completed=done, total=total, info=word)
+
+        found, eliminated = plan_experiment(
+            spec, fingertip, stations, simulator, store=opened, on_progress=on_progress
+        )
+    if not found.motions:
+        raise ConfigError(
+            f"all {len(eliminated)} trajectories are eliminated; the first: {eliminated[0].reason}",
+            remedy="check registration, URDF, --tip-frame and --tool-mm",
+        )
+    write_trajectories(found, out)
+    if as_json:
+        typer.echo(json.dumps(_planned_summary(out, found, eliminated), indent=1))
+    else:
+        _show_planned(out, found, eliminated)
+
+
+def _planned_summary(out: Path, found: Plan, eliminated: list[Eliminated]) -> dict[str, object]:
+    return {
+        "plan": str(out),
+        "trajectories": len(found.motions),
+        "arms": dict(Counter(motion.trajectory.arm for motion in found.motions)),
+        "joints": all(motion.joints is not None for motion in found.motions),
+        "duration_s": float(found.motions[-1].time_s[-1]),
+        "eliminated": [[one.trajectory, one.reason] for one in eliminated],
+    }
+
+
+def _show_planned(out: Path, found: Plan, eliminated: list[Eliminated]) -> None:
+    arms = Counter(motion.trajectory.arm for motion in found.motions)
+    who = ", ".join(f"{arm} {count}" for arm, count in sorted(arms.items()))
+    hours = found.motions[-1].time_s[-1] / 3600.0
+    typer.echo(f"{out}: {len(found.motions)} trajectories ({who}), {hours:.1f} h")
+    typer.echo(f"eliminated: {len(eliminated)}")
+    show_left_out([(one.trajectory, one.reason) for one in eliminated])
+
+
+@twin_app.command(
+    "process",
+    epilog="Example: palpate data process day1.h5 day2.h5 experiment.h5  or: palpate data process"
+    " day1.h5 experiment.h5 --mechanics runs/twin/mechanics.sim --mixed mixed.h5",
+)
+def data_process(
+    trials: Annotated[
+        list[Path], typer.Argument(metavar="TRIALS.h5...", help="Of palpate data ingest.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT.h5", help="Data set to write.")],
+    mechanics: Annotated[
+        Path | None,
+        typer.Option(metavar="STORE.sim", help="Simulation of the same trajectories."),
+    ] = None,
+    mixed: Annotated[
+        Path | None, typer.Option(metavar="MIXED.h5", help="Mixed data set to write.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Process raw trials as the paper does: experimental data set, and mixed with a simulation."""
+    from palpate_deploy.experiment import FemSimulator
+    from palpate_fem.cli.show import progress_bar
+    from palpate_training.experiment.generate.measured import process_files
+
+    with progress_bar() as bar:
+        task = bar.add_task("processing", total=None)
+
+        def on_progress(done: int, total: int, word: str) -> None:
+            bar.update(task, completed=done, total=total, info=word)
+
+        done = process_files(
+            trials,
+            out,
+            FemSimulator(),
+            mechanics=mechanics,
+            mixed=mixed,
+            command=typed_command(),
+            on_progress=on_progress,
+        )
+    if as_json:
+        typer.echo(json.dumps(_processed_summary(done, out, mixed), indent=1))
+    else:
+        _show_processed(done, out, mixed)
+
+
+def _processed_summary(
+    done: ProcessedExperiment, out: Path, mixed: Path | None
+) -> dict[str, object]:
+    found: dict[str, object] = {
+        "experiment": str(out),
+        "units": list(done.experiment.unit_names),
+        "trajectories": len(done.experiment.trajectories),
+        "trials": done.experiment.trials,
+        "rows": len(done.experiment),
+        "dropped": [list(pair) for pair in done.dropped],
+    }
+    if done.mixed is not None:
+        found |= {
+            "mixed": str(mixed),
+            "mixed_trials": done.mixed.experiment.trials,
+            "mixed_rows": len(done.mixed),
+            "modes": len(done.mixed.basis.modes),
+            "field_loss_mean_um": done.mixed.basis.loss_mean_m * 1e6,
+            "unmixed": [list(pair) for pair in done.unmixed],
+        }
+    return found
+
+
+def _show_processed(done: ProcessedExperiment, out: Path, mixed: Path | None) -> None:
+    data = done.experiment
+    typer.echo(
+        f"{out}: {data.trials} trials of {len(data.trajectories)} trajectories,"
+        f" units {', '.join(data.unit_names)}, {len(data)} rows"
+    )
+    _show_dropped("left out", done.dropped)
+    if done.mixed is not None:
+        typer.echo(
+            f"{mixed}: {done.mixed.experiment.trials} trials, {len(done.mixed)} rows,"
+            f" {len(done.mixed.basis.modes)} modes of the field"
+        )
+        _show_dropped("not mixed", done.unmixed)
+
+
+def _show_dropped(what: str, dropped: Dropped) -> None:
+    if dropped:
+        typer.echo(f"{what}: {len(dropped)} trials")
+    show_left_out(dropped)

@@ -1,0 +1,270 @@
+"""The whole experiment: stages in order, each resumable, none begun before its input is there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigError
+from palpate.files.atomic import written_whole
+from palpate_training.datasets.experiment import write_experiment, write_mixed
+from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.features_file import palpate_version
+from palpate_training.experiment.generate.data_sets import AssembledSets, assemble
+from palpate_training.experiment.generate.simulator import (
+    ExperimentSpec,
+    PressedSpecimens,
+    Simulator,
+    Specimen,
+)
+from palpate_training.experiment.generate.trials import make_trials
+from palpate_training.experiment.generate.workers import RayCluster, TaskRunner, WorkerProcesses
+
+EXPERIMENT, MIXED = "experiment.h5", "mixed.h5"
+STORE = "mechanics.sim"
+TRIALS = "trials"
+
+SPEC = "experiment.json"
+SPEC_SCHEMA = "palpate.twin-experiment/1"
+
+IDLE = "idle.npz"
+IDLE_RATE_HZ = 100.0
+IDLE_LENGTH_S = 180.0
+IDLE_SINCE_ON_S = 300.0
+"""Age of a sensor when it is looked at [s]: the idle real ones were still warming up."""
+
+OnStage = Callable[[str, int, int, str], None]
+"""Called with the stage, how many are done, of how many, and a word on them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Generated:
+    """What an experiment came to.
+
+    Attributes:
+        folder: Where it is.
+        data: Both data sets.
+        provenance_sha256: Digest of all that decides their rows, hex.
+        seconds: Time of each stage in this run [s].
+        bytes: Size of each part on the disk.
+    """
+
+    folder: Path
+    data: AssembledSets
+    provenance_sha256: str
+    seconds: dict[str, float]
+    bytes: dict[str, int]
+
+
+def generate(
+    folder: Path,
+    spec: ExperimentSpec,
+    specimens: Sequence[Specimen],
+    simulator: Simulator,
+    *,
+    workers: int,
+    threads: int = 1,
+    ray: str | None = None,
+    stop: threading.Event | None = None,
+    on_stage: OnStage = lambda *_: None,
+    command: str = "palpate data generate",
+) -> Generated | None:
+    """Run an experiment, or go on with it.
+
+    Killed at any time, it goes on where it was: trajectories and trials are files of their own that
+    appear whole.
+
+    Args:
+        folder: Takes everything; made if it is not there.
+        spec: The experiment.
+        specimens: Simulated BioTacs that are pressed.
+        simulator: Simulates skin and electrodes.
+        workers: Processes.
+        threads: Threads of each solver.
+        ray: Address of a Ray cluster that works instead of this host's processes.
+        stop: Set it to end early.
+        on_stage: Called with the progress of each stage.
+        command: For provenance.
+
+    Returns:
+        What came out; None = stopped.
+
+    Raises:
+        ConfigError: The folder holds another experiment.
+        DatasetError: What is there is damaged, or the disk refuses.
+    """
+    stop = stop or threading.Event()
+    keep_spec(folder, spec, specimens)
+    seconds: dict[str, float] = {}
+    cluster = RayCluster(ray) if ray is not None else None
+    try:
+        began = time.monotonic()
+        path = folder / STORE
+        if cluster is not None:
+            complete = simulator.simulate_on_cluster(
+                spec, path, cluster, on_progress=_stage("mechanics", on_stage)
+            )
+        else:
+            complete = simulator.simulate(
+                spec,
+                path,
+                workers=workers,
+                threads=threads,
+                stop=stop,
+                on_progress=_stage("mechanics", on_stage),
+            )
+        seconds["mechanics"] = time.monotonic() - began
+        if not complete:
+            return None
+        store = simulator.open_store(path)
+        began = time.monotonic()
+        runner: TaskRunner = cluster if cluster is not None else WorkerProcesses(workers)
+        try:
+            make_trials(
+                spec,
+                store,
+                specimens,
+                simulator,
+                folder / TRIALS,
+                runner,
+                on_progress=_stage("trials", on_stage),
+            )
+        finally:
+            if runner is not cluster:
+                runner.close()
+        seconds["trials"] = time.monotonic() - began
+    finally:
+        if cluster is not None:
+            cluster.close()
+    began = time.monotonic()
+    digest = provenance_sha256(spec, specimens, store.fingertip().key)
+    provenance = Provenance(
+        source=f"twin: {spec.points} points x {1 + spec.angled} trajectories an indenter",
+        command=command,
+        input_sha256=digest,
+        licence="generated; use as you like",
+        palpate_version=palpate_version(),
+        notes="input_sha256 is the digest of experiment, units and fingertip",
+    )
+    names = tuple(specimen.name for specimen in specimens)
+    data = assemble(
+        store,
+        folder / TRIALS,
+        names,
+        provenance,
+        clearance_m=simulator.clearance_m,
+        on_progress=_stage("data sets", on_stage),
+    )
+    if not (folder / IDLE).exists():
+        pressed = simulator.make_specimens(store.fingertip(), specimens)()
+        write_idle(folder, specimens, pressed, seed=spec.seed)
+    write_experiment(folder / EXPERIMENT, data.experiment)
+    write_mixed(folder / MIXED, data.mixed)
+    seconds["data sets"] = time.monotonic() - began
+    return Generated(folder, data, digest, seconds, _sizes(folder))
+
+
+def _stage(name: str, on_stage: OnStage) -> Callable[[int, int, str], None]:
+    return lambda done, total, word: on_stage(name, done, total, word)
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Bytes of the store, of the trials and of each data set."""
+    return {
+        name: sum(file.stat().st_size for file in _files(folder / name))
+        for name in (STORE, TRIALS, EXPERIMENT, MIXED)
+    }
+
+
+def _files(path: Path) -> list[Path]:
+    return [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+
+
+def provenance_sha256(spec: ExperimentSpec, specimens: Sequence[Specimen], fingertip: str) -> str:
+    """Digest, hex, of all that decides the rows: spec, specimens and the fingertip's own digest."""
+    content = {
+        "spec": asdict(spec),
+        "members": [specimen.content() for specimen in specimens],
+        "fingertip": fingertip,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen]) -> None:
+    """Write the settings into the experiment's folder, or compare them with those that are there.
+
+    Raises:
+        ConfigError: The folder holds another experiment; says what differs.
+    """
+    wanted: dict[str, Any] = {
+        "schema": SPEC_SCHEMA,
+        "spec": asdict(spec),
+        "members": [specimen.content() for specimen in specimens],
+    }
+    wanted = json.loads(json.dumps(wanted))  # tuples become lists, as in the file
+    path = folder / SPEC
+    try:
+        if not path.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            partial = path.with_name(f".{SPEC}.part")
+            partial.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8")
+            partial.replace(path)
+            return
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: {error}", remedy="name another folder, or remove the damaged file"
+        ) from error
+    differs = [key for key in wanted if found.get(key) != wanted[key]]
+    if "spec" in differs:
+        theirs, mine = found.get("spec") or {}, wanted["spec"]
+        differs = [
+            f"{key} {mine.get(key)} is not {theirs.get(key)}"
+            for key in sorted(mine.keys() | theirs.keys())
+            if mine.get(key) != theirs.get(key)
+        ]
+    if differs:
+        raise ConfigError(
+            f"{folder} holds another experiment: {'; '.join(differs)}",
+            remedy="go on with the options it was begun with, or name another folder",
+        )
+
+
+def write_idle(
+    folder: Path, specimens: Sequence[Specimen], pressed: PressedSpecimens, *, seed: int
+) -> Path:
+    """Write the counts of untouched specimens as ``idle.npz``.
+
+    Their noise and drift are compared with those of real sensors.
+
+    Args:
+        folder: Of the experiment.
+        specimens: Simulated BioTacs.
+        pressed: Their electrodes.
+        seed: Of the noise.
+
+    Returns:
+        The file: ``rate_hz`` and, for each specimen, counts of shape (T, 19).
+    """
+    path = folder / IDLE
+    time_s = np.arange(0.0, IDLE_LENGTH_S, 1.0 / IDLE_RATE_HZ)
+    arrays: dict[str, NDArray[np.generic]] = {"rate_hz": np.array(IDLE_RATE_HZ)}
+    for number, specimen in enumerate(specimens):
+        rest = pressed.rest_counts[specimen.name]
+        warmed = specimen.warming(IDLE_SINCE_ON_S + time_s)
+        ideal = np.repeat(rest[None], len(time_s), axis=0)
+        stream = specimen.stream(rest, seed + number)
+        elapsed_s = np.full(len(time_s), 1.0 / IDLE_RATE_HZ)
+        arrays[specimen.name] = stream.read(ideal, time_s, elapsed_s, warmed - warmed[0])
+    with written_whole(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    return path

@@ -1,0 +1,308 @@
+"""Settings of an experiment, and what it needs of a simulation of the fingertip.
+
+Training must not import the finite elements. These protocols are what it asks of them, and deploy
+passes an implementation in. Arrays are in the sensor frame, SI.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate_training.experiment.generate.workers import RayCluster
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+Counts = npt.NDArray[np.uint16]
+
+OnProgress = Callable[[int, int, str], None]
+"""Called with how many are done, of how many, and a word on them."""
+
+FLUID_VOLUME_M3 = 6.0e-7
+"""Fill of the twin [m^3]: docs/adr/0016 says why not what 15.1 mm of thickness would need."""
+
+EDGE_M = 0.6e-3
+"""Edge of the mesh on the pad [m]; the mesh study puts its force error below 1 %."""
+
+OVERTRAVEL_M = 0.6e-3
+"""How much deeper than the paper's depths paths go [m]: robots stand wrong by up to that."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentSpec:
+    """Everything that decides the rows of the data sets.
+
+    Attributes:
+        points: Points for each indenter.
+        angled: Angled paths at each point.
+        seed: Of points, registration and noise.
+        edge_m: Edge of the mesh on the pad [m].
+        fluid_volume_m3: Fill [m^3].
+        overtravel_m: How much deeper than the paper's depths the paths go [m].
+        indenters: Names; empty = all nine.
+    """
+
+    points: int = 10
+    angled: int = 4
+    seed: int = 0
+    edge_m: float = EDGE_M
+    fluid_volume_m3: float = FLUID_VOLUME_M3
+    overtravel_m: float = OVERTRAVEL_M
+    indenters: tuple[str, ...] = ()
+
+
+class IndentationPlan(Protocol):
+    """A trajectory to simulate."""
+
+    @property
+    def name(self) -> str:
+        """Id, ``<indenter>/<point>/<normal|angled-k>``."""
+
+    @property
+    def indenter(self) -> str:
+        """Name of the indenter."""
+
+    @property
+    def target(self) -> Floats:
+        """Point of the skin that it aims at [m], shape (3,)."""
+
+    @property
+    def direction(self) -> Floats:
+        """Where the tip moves, unit, shape (3,)."""
+
+    @property
+    def contact_m(self) -> float:
+        """Travel of the tip beyond the target at first contact [m]."""
+
+    @property
+    def depth_m(self) -> float:
+        """Travel from first contact to the last pose [m]."""
+
+    @property
+    def path(self) -> Floats:
+        """Poses of the tip, the first one clear of the skin, shape (K + 1, 7)."""
+
+
+class SimulatedStep(Protocol):
+    """One converged step of a simulated trajectory."""
+
+    @property
+    def pose(self) -> Floats:
+        """Of the indenter: position [m] and quaternion w x y z, shape (7,)."""
+
+    @property
+    def displacement(self) -> npt.NDArray[np.floating[Any]]:
+        """Of every node from the pressurised state [m], shape (V, 3)."""
+
+    @property
+    def force(self) -> Floats:
+        """Net force on the BioTac [N], shape (3,)."""
+
+    @property
+    def torque(self) -> Floats:
+        """Its moment about the origin [N m], shape (3,)."""
+
+    @property
+    def fluid_pressure_pa(self) -> float:
+        """Above ambient [Pa]."""
+
+
+class SimulatedIndentation(Protocol):
+    """A simulated trajectory; what converged of it."""
+
+    @property
+    def indenter(self) -> str:
+        """Name of the indenter."""
+
+    @property
+    def path(self) -> Floats:
+        """Poses that were asked for, the first one clear of the skin, shape (K + 1, 7)."""
+
+    @property
+    def steps(self) -> Sequence[SimulatedStep]:
+        """Converged steps, in order of the path."""
+
+
+class SkinSolid(Protocol):
+    """The skin's mesh."""
+
+    @property
+    def outer_faces(self) -> Ints:
+        """Triangles or quadrilaterals of the outer surface, outward."""
+
+    @property
+    def inner_faces(self) -> Ints:
+        """Likewise of the inner surface."""
+
+    @property
+    def outer_nodes(self) -> Ints:
+        """Ids of the nodes of the outer surface."""
+
+    @property
+    def sha256(self) -> bytes:
+        """Content hash."""
+
+
+class SimulatedFingertip(Protocol):
+    """The pressurised, untouched fingertip that all trajectories share."""
+
+    @property
+    def mesh(self) -> SkinSolid:
+        """The skin."""
+
+    @property
+    def pressurised_nodes(self) -> Floats:
+        """Positions from which displacements count [m], shape (V, 3)."""
+
+    @property
+    def fluid_pressure_pa(self) -> float:
+        """Above ambient [Pa]."""
+
+    @property
+    def key(self) -> str:
+        """Digest, hex, of mesh, parameters and settings."""
+
+
+class IndentationStore(Protocol):
+    """Simulated trajectories on disk."""
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+
+    def ids(self) -> Collection[str]:
+        """Ids of the trajectories that are there."""
+
+    def fingertip(self) -> SimulatedFingertip:
+        """What was pressed."""
+
+    def indentation(self, name: str) -> SimulatedIndentation:
+        """A trajectory with its fields."""
+
+    def start_pose(self, name: str) -> Floats:
+        """First pose of a trajectory's path, shape (7,)."""
+
+
+class ElectrodeStream(Protocol):
+    """The electrodes of one specimen over time: creep, noise, rounding."""
+
+    def read(self, ideal: Floats, time_s: Floats, elapsed_s: Floats, log_sigma: Floats) -> Counts:
+        """Counts that are read, each electrode at its own instant of the frame.
+
+        Args:
+            ideal: Ideal counts at the starts of frames, shape (T, 19).
+            time_s: Those starts [s], shape (T,).
+            elapsed_s: Since the frame before [s], shape (T,).
+            log_sigma: ln of the fluid's conductivity over that of the ideal counts, shape (T,).
+        """
+
+
+class Specimen(Protocol):
+    """One simulated BioTac; can be pickled."""
+
+    @property
+    def name(self) -> str:
+        """E.g. ``biotac-1``."""
+
+    @property
+    def overtravel_m(self) -> float:
+        """How much deeper it is pressed than planned [m]."""
+
+    @property
+    def temperature_coefficient(self) -> float:
+        """Change of ln conductivity with temperature [1/K]."""
+
+    def pressed_with(self, indenter: str) -> bool:
+        """Whether it meets an indenter."""
+
+    def content(self) -> dict[str, Any]:
+        """All that decides its rows, as plain values; kept in the experiment's file."""
+
+    def to_json(self) -> str:
+        """Its electrical parameters, as a tape holds them."""
+
+    def stream(self, rest: Floats, seed: int) -> ElectrodeStream:
+        """Its electrodes over time, from the untouched state; same seed, same noise.
+
+        Args:
+            rest: Ideal counts of the untouched specimen, shape (19,).
+            seed: Of the noise.
+        """
+
+    def warming(self, age_s: Floats) -> Floats:
+        """Ln of the conductivity at ages since power-on [s], shape (T,)."""
+
+
+class PressedSpecimens(Protocol):
+    """Electrodes of specimens of one fingertip: expensive to make, so a process makes them once."""
+
+    @property
+    def rest_counts(self) -> Mapping[str, Floats]:
+        """Ideal counts of each untouched specimen, by name, shape (19,)."""
+
+    def clear_steps(self, indentation: SimulatedIndentation) -> int:
+        """How many steps there are before the indenter bears on what holds the finger."""
+
+    def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
+        """Ideal counts of each specimen at each step, by name, shape (S, 19)."""
+
+
+MakeSpecimens = Callable[[], PressedSpecimens]
+"""Makes them on a worker: hashable and equal by what it makes; can be pickled."""
+
+
+class Simulator(Protocol):
+    """Finite elements and film electrodes, as the experiment uses them."""
+
+    clearance_m: float
+    """How far from the skin the path of a simulated trajectory starts [m]."""
+
+    def fingertip(self, spec: ExperimentSpec) -> SimulatedFingertip:
+        """Pressurise the fingertip of an experiment, in this process."""
+
+    def plans(
+        self, spec: ExperimentSpec, fingertip: SimulatedFingertip
+    ) -> Sequence[IndentationPlan]:
+        """All trajectories of an experiment, the first points first."""
+
+    def simulate(
+        self,
+        spec: ExperimentSpec,
+        store: Path,
+        *,
+        workers: int,
+        threads: int,
+        stop: threading.Event,
+        on_progress: OnProgress,
+    ) -> bool:
+        """Fill a store on this host; what it holds is not run again.
+
+        Returns:
+            Whether all is there; False = stopped.
+        """
+
+    def simulate_on_cluster(
+        self, spec: ExperimentSpec, store: Path, cluster: RayCluster, *, on_progress: OnProgress
+    ) -> bool:
+        """Fill a store with what the machines of a cluster simulate."""
+
+    def open_store(self, path: Path) -> IndentationStore:
+        """Open a store.
+
+        Raises:
+            DatasetError: There is none, or it is damaged.
+        """
+
+    def make_specimens(
+        self, fingertip: SimulatedFingertip, specimens: Iterable[Specimen]
+    ) -> MakeSpecimens:
+        """What makes the specimens' electrodes in a worker process."""
+
+    def clear_steps(self, indentation: SimulatedIndentation, fingertip: SimulatedFingertip) -> int:
+        """As `PressedSpecimens.clear_steps`, without any electrodes."""

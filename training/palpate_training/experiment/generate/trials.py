@@ -1,0 +1,334 @@
+"""Stage two, the testbed: every simulated trajectory is executed on the specimens that met it.
+
+The work is spread over processes or machines: plain values in, plain values out. A process keeps
+what is expensive to make (the specimens' electrodes) between tasks.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
+from palpate_training.datasets.processing import process
+from palpate_training.datasets.trials import TrialHeader, TrialRows
+from palpate_training.experiment.clearance import pad_poses, simulate_registrations
+from palpate_training.experiment.generate.simulator import (
+    ExperimentSpec,
+    IndentationPlan,
+    IndentationStore,
+    MakeSpecimens,
+    OnProgress,
+    PressedSpecimens,
+    SimulatedIndentation,
+    SimulatedStep,
+    Simulator,
+    Specimen,
+)
+from palpate_training.experiment.generate.workers import TaskRunner
+from palpate_training.experiment.plan import APPROACH_M, ARMS, assign_arm
+from palpate_training.experiment.stand_in_arm import sensor_robot, stand_in_arm
+from palpate_training.experiment.virtual_testbed import contact_travel, perform
+
+Floats = NDArray[np.float64]
+
+WARM_S = 1800.0
+"""Age of sensors when the experiment starts [s]; paper: left untouched for about 30 min."""
+
+TEMPERATURE_WALK_K = 0.03
+"""Random walk of the core's temperature: standard deviation of what it gains in one minute [K]."""
+
+SUFFIX = ".npz"
+
+
+def make_trials(
+    spec: ExperimentSpec,
+    store: IndentationStore,
+    specimens: Sequence[Specimen],
+    simulator: Simulator,
+    folder: Path,
+    runner: TaskRunner,
+    *,
+    on_progress: OnProgress,
+) -> None:
+    """Execute what the store holds; trials that the folder holds already are not made again.
+
+    Args:
+        spec: The experiment.
+        store: Its mechanics; trajectories that are not there yet are left out.
+        specimens: Simulated BioTacs.
+        simulator: Plans the trajectories, makes the electrodes.
+        folder: Takes a file for each trajectory, whole or not at all.
+        runner: Does the work.
+        on_progress: Called after each trajectory.
+
+    Raises:
+        DatasetError: The store is damaged, or the disk refuses.
+    """
+    fingertip = store.fingertip()
+    there = set(store.ids())
+    plans = [plan for plan in simulator.plans(spec, fingertip) if plan.name in there]
+    left = [plan for plan in plans if not file_of(folder, plan.name).exists()]
+    done = len(plans) - len(left)
+    on_progress(done, len(plans), "")
+    if not left:
+        return
+    make = simulator.make_specimens(fingertip, specimens)
+    work: Callable[[TrialTask], bytes] = partial(_work, make)
+    tasks = _tasks(spec, store, specimens, left, simulator.clearance_m)
+    for task, data in runner.run(work, tasks):
+        with written_whole(file_of(folder, task.name)) as part:
+            part.write_bytes(data)
+        done += 1
+        on_progress(done, len(plans), task.name)
+
+
+def read_trials(folder: Path, name: str) -> TrialsDone:
+    """What came of a trajectory.
+
+    Raises:
+        DatasetError: The file is damaged; names it.
+    """
+    path = file_of(folder, name)
+    try:
+        return unpack(path.read_bytes())
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise DatasetError(
+            f"{path} is damaged: {error}", remedy="remove it and run the command again"
+        ) from error
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """File of a trajectory's trials."""
+    return folder / (name.replace("/", "__") + SUFFIX)
+
+
+def registration_errors(specimens: Sequence[Specimen], seed: int) -> dict[str, Floats]:
+    """Tip by kinematics and registration minus true tip [m], for each arm (U, 3), sensor frame.
+
+    Sideways it is what the registration procedure leaves, drawn by its own error model. Along the
+    dorsal axis it is what each specimen was fitted to: published forces tell how deep they were
+    pressed.
+
+    Args:
+        specimens: Each of them was mounted and registered anew.
+        seed: Of the draws.
+    """
+    errors = {}
+    for number, side in enumerate(ARMS):
+        poses = pad_poses(1.0 if side == "left" else -1.0)
+        found = simulate_registrations(
+            stand_in_arm(side), sensor_robot(side), poses, draws=len(specimens), seed=seed + number
+        )
+        drawn = found.constant.copy()
+        drawn[:, 2] = [-specimen.overtravel_m for specimen in specimens]
+        errors[side] = drawn
+    return errors
+
+
+@dataclass(frozen=True, slots=True)
+class TrialTask:
+    """A simulated trajectory to be executed on the specimens.
+
+    Attributes:
+        name: Its id.
+        arm: Which arm executes it.
+        direction: Where it moves, shape (3,).
+        planned_m: Planned travel past first contact [m].
+        trajectory: The simulation.
+        specimens: Those that execute it.
+        errors_m: Registration error of that arm for each of them [m], shape (U, 3).
+        clearance_m: How far from the skin its path starts [m].
+        seed: Of the experiment.
+    """
+
+    name: str
+    arm: str
+    direction: Floats
+    planned_m: float
+    trajectory: SimulatedIndentation
+    specimens: tuple[Specimen, ...]
+    errors_m: Floats
+    clearance_m: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class TrialsDone:
+    """What came of a task.
+
+    Attributes:
+        name: Id of the trajectory.
+        rows: Of each specimen that gave some.
+        dropped: Specimen and reason of each that gave none.
+        counts: Ideal counts of each specimen's electrodes along the simulation, untouched first,
+            shape (S + 1, 19) each, whether it executed the trajectory or not: what a virtual finger
+            plays.
+        believed: Steps S of the simulation that were used.
+    """
+
+    name: str
+    rows: tuple[TrialRows, ...]
+    dropped: tuple[tuple[str, str], ...]
+    counts: dict[str, Floats]
+    believed: int
+
+
+class TrialMaker:
+    """Executes trajectories on the specimens of one fingertip; one in each process."""
+
+    def __init__(self, pressed: PressedSpecimens) -> None:
+        self._pressed = pressed
+
+    def __call__(self, task: TrialTask) -> TrialsDone:
+        """Perform and process the trials of one trajectory."""
+        steps = task.trajectory.steps[: self._pressed.clear_steps(task.trajectory)]
+        answers = self._pressed.counts(steps)
+        counts = {
+            name: np.concatenate([rest[None], answers[name]])
+            for name, rest in self._pressed.rest_counts.items()
+        }
+        kept, dropped = [], []
+        for specimen, error in zip(task.specimens, task.errors_m, strict=True):
+            name = specimen.name
+            try:
+                kept.append(_perform(task, steps, specimen, error, counts[name]))
+            except DatasetError as failure:
+                dropped.append((name, str(failure)))
+        return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
+
+
+def _perform(
+    task: TrialTask,
+    steps: Sequence[SimulatedStep],
+    specimen: Specimen,
+    error: Floats,
+    counts: Floats,
+) -> TrialRows:
+    """One trial: streams as the testbed records them, then the paper's processing."""
+    if not steps:
+        raise DatasetError(
+            f"{specimen.name} {task.name}: no step before it diverges or meets the mount",
+            remedy="nothing to do: the trial is left out, as in the paper",
+        )
+    start = task.trajectory.path[0, :3]
+    poses = np.array([step.pose[:3] for step in steps])
+    travel = np.linalg.norm(poses - start, axis=1) - task.clearance_m
+    tip = np.concatenate([start[None] + task.clearance_m * task.direction, poses])
+    force = np.concatenate([np.zeros((1, 3)), [step.force for step in steps]])
+    contact_m = contact_travel(error, task.direction)
+    length_m = min(APPROACH_M + task.planned_m, contact_m + float(travel[-1]))
+    label = f"{specimen.name}/{task.name}".encode()
+    seed = zlib.crc32(label) ^ task.seed
+    stream = specimen.stream(counts[0], seed)
+    random = np.random.default_rng([seed, 1])
+
+    def read(ideal: Floats, time_s: Floats) -> NDArray[np.uint16]:
+        elapsed = np.diff(time_s, prepend=time_s[0])
+        walk = np.cumsum(random.standard_normal(len(time_s)) * np.sqrt(elapsed / 60.0))
+        drift = specimen.temperature_coefficient * TEMPERATURE_WALK_K * walk
+        return stream.read(ideal, time_s, elapsed, drift)
+
+    raw = perform(
+        TrialHeader(specimen.name, task.name, task.trajectory.indenter, task.arm),
+        travel_m=np.concatenate([[0.0], travel]),
+        force=force,
+        counts=counts,
+        tip=tip,
+        read_electrodes=read,
+        registration_error_m=error,
+        contact_m=contact_m,
+        length_m=np.floor(length_m / 1e-4 + 1e-6) * 1e-4,
+        since_power_on_s=WARM_S,
+        seed=seed,
+    )
+    return process(raw)
+
+
+def pack(done: TrialsDone) -> bytes:
+    """As the bytes of an .npz file, without pickles."""
+    arrays: dict[str, Any] = {"name": np.array(done.name), "units": np.array(list(done.counts))}
+    arrays["believed"] = np.array(done.believed)
+    arrays["dropped"] = np.array(done.dropped, dtype=str).reshape(-1, 2)
+    arrays["rows"] = np.array([list(_header(rows)) for rows in done.rows], dtype=str).reshape(-1, 4)
+    for unit, counts in done.counts.items():
+        arrays[f"counts/{unit}"] = counts
+    for i, rows in enumerate(done.rows):
+        for key in ("rest", "travel_m", "tared", "force", "location"):
+            arrays[f"{i}/{key}"] = getattr(rows, key)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def unpack(data: bytes) -> TrialsDone:
+    """Inverse of `pack`."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        rows = tuple(
+            TrialRows(
+                header=TrialHeader(*(str(word) for word in header)),
+                rest=file[f"{i}/rest"],
+                travel_m=file[f"{i}/travel_m"],
+                tared=file[f"{i}/tared"],
+                force=file[f"{i}/force"],
+                location=file[f"{i}/location"],
+            )
+            for i, header in enumerate(file["rows"])
+        )
+        return TrialsDone(
+            name=str(file["name"]),
+            rows=rows,
+            dropped=tuple((str(unit), str(why)) for unit, why in file["dropped"]),
+            counts={str(unit): file[f"counts/{unit}"] for unit in file["units"]},
+            believed=int(file["believed"]),
+        )
+
+
+def _header(rows: TrialRows) -> tuple[str, str, str, str]:
+    header = rows.header
+    return header.unit, header.trajectory, header.indenter, header.arm
+
+
+def _tasks(
+    spec: ExperimentSpec,
+    store: IndentationStore,
+    specimens: Sequence[Specimen],
+    plans: Sequence[IndentationPlan],
+    clearance_m: float,
+) -> Iterator[TrialTask]:
+    errors = registration_errors(specimens, spec.seed)
+    for plan in plans:
+        who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
+        if not who:
+            continue
+        arm = assign_arm(plan.target)
+        yield TrialTask(
+            name=plan.name,
+            arm=arm,
+            direction=plan.direction,
+            planned_m=plan.depth_m - spec.overtravel_m,
+            trajectory=store.indentation(plan.name),
+            specimens=tuple(specimens[i] for i in who),
+            errors_m=errors[arm][np.array(who)],
+            clearance_m=clearance_m,
+            seed=spec.seed,
+        )
+
+
+@lru_cache(maxsize=1)
+def _maker(make: MakeSpecimens) -> TrialMaker:
+    return TrialMaker(make())
+
+
+def _work(make: MakeSpecimens, task: TrialTask) -> bytes:
+    return pack(_maker(make)(task))
