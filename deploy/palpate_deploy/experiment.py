@@ -30,7 +30,7 @@ from palpate_fem.indenter.outline import outline_of
 from palpate_fem.population.answers import Population
 from palpate_fem.population.member import Member, read_population
 from palpate_fem.population.mount import clear_steps
-from palpate_fem.result import IndentationResult, Step
+from palpate_fem.result import IndentationResult, IndentationStep
 from palpate_fem.service.batch import Batch, BatchReport
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.service.config import DEFAULT_FACTORY
@@ -165,7 +165,7 @@ class FemSpecimens:
 
     def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
         """Ideal counts of each specimen at each step."""
-        return self._population.answer(cast("Sequence[Step]", steps))
+        return self._population.answer(cast("Sequence[IndentationStep]", steps))
 
 
 class FemSpecimensOf:
