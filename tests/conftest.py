@@ -43,6 +43,11 @@ PORTS = range(20_000, 32_000)
 settings.register_profile("palpate", deadline=None)
 settings.load_profile("palpate")
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # readline, which pytest loads, sets it for child processes, and consoles made at import time
+    # would print narrow tables in workers only.
+    os.environ.pop("COLUMNS", None)
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(

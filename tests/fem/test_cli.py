@@ -192,7 +192,7 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
 
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "palpate_fem.cli.run", None)
-    monkeypatch.setattr("palpate_fem.cli.group.EXTRA_MODULES", ("palpate",))
+    monkeypatch.setattr("palpate_fem.cli.group.EXTRA_MODULES", ("palpate_fem",))
     with pytest.raises(MissingExtraError, match=r'pip install "palpate\[fem\]"'):
         fem("run")
 

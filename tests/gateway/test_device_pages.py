@@ -17,7 +17,8 @@ from palpate_gateway.drivers import make_device
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs" / "devices").glob("*.md"))
 SOURCES = "\n".join(
-    path.read_text(encoding="utf-8") for path in (ROOT / "gateway" / "palpate").rglob("*.py")
+    path.read_text(encoding="utf-8")
+    for path in (ROOT / "gateway" / "palpate_gateway").rglob("*.py")
 )
 OF_STATIONS = {
     "biotac_bridge",
