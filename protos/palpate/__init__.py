@@ -5,11 +5,13 @@ A robot needs one name::
     from palpate import Client
 """
 
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from palpate.client import Client
+
+    __version__: str
 
 __all__ = ["Client", "__version__"]
 
@@ -21,5 +23,8 @@ def __getattr__(name: str) -> Any:
 
         return Client
     if name == "__version__":
-        return version("palpate")
+        try:
+            return version("palpate")
+        except PackageNotFoundError:  # a checkout that is not installed
+            return "unknown"
     raise AttributeError(f"module 'palpate' has no attribute {name!r}")

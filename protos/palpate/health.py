@@ -11,9 +11,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 
-from palpate import clock
+from palpate import __version__, clock
 from palpate.bus import Session, endpoints
 from palpate.bus.query import error_reply
 from palpate.bus.topics import STATUS as STATUS_TOPIC
@@ -29,14 +28,6 @@ from palpate.messages import (
 )
 
 _log = logging.getLogger(__name__)
-
-
-def palpate_version() -> str:
-    """Version of the installed distribution."""
-    try:
-        return version("palpate")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 _APART_S = 5e-3
@@ -61,7 +52,7 @@ class Health:
         self._sensors: tuple[str, ...] = ()
         self._sensor_states: dict[str, SensorStatus] = {}
         self._started = time.monotonic()
-        self._version = palpate_version()
+        self._version = __version__
         self.changed = threading.Event()
         """Set when the state changed, so that the reporter tells it at once."""
 

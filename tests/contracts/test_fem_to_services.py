@@ -13,13 +13,11 @@ pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
 from palpate_deploy.cli import files as cli_files
 from palpate_deploy.cli.options import PalpateGroup
-from palpate_fem.store import hdf5 as store_hdf5
 from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
-from palpate_services.viewer import simulation_file
-from palpate_services.viewer.simulation_file import Simulations
+from palpate_services.viewer.simulation_file import DrawnSimulations
 
 NAMES = ["sphere_medium/00/angled", "sphere_medium/00/normal"]
 
@@ -35,23 +33,18 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_both_rooms_name_the_same_schema() -> None:
-    assert simulation_file.SCHEMA == store_hdf5.SCHEMA
-    assert simulation_file.SCHEMA_VERSION == store_hdf5.SCHEMA_VERSION
-
-
 @pytest.mark.parametrize("suffix", [".sim", ".h5"])
 def test_services_read_what_fem_writes(store: Path, suffix: str) -> None:
     path = store.with_suffix(suffix)
-    written, read = SimulationStore.open(path), Simulations(path)
+    written, read = SimulationStore.open(path), DrawnSimulations.open(path)
     assert read.ids() == written.ids() == NAMES
-    tip, finger = written.fingertip(), read.finger()
+    tip, finger = written.fingertip(), read.fingertip()
     np.testing.assert_array_equal(finger.nodes, tip.pressurised_nodes)
     np.testing.assert_array_equal(finger.core_faces, tip.core_faces)
     assert len(finger.outer) == 2 * len(tip.mesh.outer_faces)
     assert finger.facts["friction_coefficient"] == "0.186"
     for name in NAMES:
-        trajectory, press = written.trajectory(name), read.press(name)
+        trajectory, press = written.trajectory(name), read.trajectory(name)
         assert (press.indenter, press.outcome) == (trajectory.indenter, trajectory.outcome.value)
         # The view begins before the first step, with the untouched finger.
         np.testing.assert_array_equal(press.pose[0], trajectory.path[0])
@@ -71,7 +64,7 @@ def test_services_read_what_fem_writes(store: Path, suffix: str) -> None:
 
 def test_inner_and_outer_skin_face_away_from_the_solid(store: Path) -> None:
     """Light falls on what is seen: the outer surface from outside, the inner from the cavity."""
-    finger = Simulations(store).finger()
+    finger = DrawnSimulations.open(store).fingertip()
     for triangles, sign in ((finger.outer, 1), (finger.inner, -1)):
         corners = finger.nodes[triangles]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

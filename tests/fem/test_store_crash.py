@@ -21,7 +21,8 @@ from palpate_fem.store.writer import StoreWriter
 PRELUDE = """
 import json, os, random, select, signal, sys, time
 from pathlib import Path
-from palpate_fem.store.read import FINGERTIP, SimulationStore
+from palpate.files.simulation_store import FINGERTIP
+from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.files import StoreTakenError, StoreDiskError
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.simulation_store import FINGERTIP
 from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreDiskError
-from palpate_fem.store.read import FINGERTIP, SimulationStore
+from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
 
@@ -71,7 +72,7 @@ def _attribute(name: str, value: object) -> Callable[[Path], None]:
     [
         (_attribute("schema", "palpate.features"), "expected 'palpate.simulations'"),
         (_attribute("schema_version", 2), "version 2.*update palpate"),
-        (_attribute("schema_version", 0), "version 0.*make the store again"),
+        (_attribute("schema_version", 0), "version 0.*make the file again"),
         (_attribute("frame", "world"), "frame is 'world'"),
         (lambda path: os.truncate(path, path.stat().st_size // 2), "truncated"),
         (lambda path: os.truncate(path, 0), "truncated"),

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
+from palpate.files.hdf5 import SENSOR_FRAME
+from palpate.files.simulation_store import choose_trajectories, is_simulation_store
 from palpate_services.viewer.layout import border_of, normals_of, shades
 from palpate_services.viewer.simulation import LONGEST_ARROW_M, review_simulations
-from palpate_services.viewer.simulation_file import Simulations, choose, is_simulations
+from palpate_services.viewer.simulation_file import DrawnSimulations
 
 h5py = pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
@@ -32,6 +34,7 @@ def store(tmp_path: Path) -> Path:
     path = tmp_path / "by-hand.h5"
     with h5py.File(path, "w") as file:
         file.attrs["schema"], file.attrs["schema_version"] = "palpate.simulations", 1
+        file.attrs["frame"] = SENSOR_FRAME
         tip = file.create_group("fingertip")
         tip.create_group("parameters").attrs["friction_coefficient"] = 0.186
         tip.attrs["mesh_name"] = "cube"
@@ -151,13 +154,21 @@ def test_trajectory_without_steps_has_a_tab_all_the_same(store: Path, tmp_path: 
 
 def test_choice_is_spread_over_all() -> None:
     ids = sorted(f"{kind}/{at:02}" for kind in ("cube", "ring", "sphere") for at in range(10))
-    assert {name.split("/")[0] for name in choose(ids, (), 3)} == {"cube", "ring", "sphere"}
-    assert choose(ids, (), 100) == ids
-    assert choose(ids, ("ring/0[12]", "cube/05"), 8) == ["cube/05", "ring/01", "ring/02"]
+    assert {name.split("/")[0] for name in choose_trajectories(ids, (), 3)} == {
+        "cube",
+        "ring",
+        "sphere",
+    }
+    assert choose_trajectories(ids, (), 100) == ids
+    assert choose_trajectories(ids, ("ring/0[12]", "cube/05"), 8) == [
+        "cube/05",
+        "ring/01",
+        "ring/02",
+    ]
     with pytest.raises(DatasetError, match="no trajectory is called 'egg'"):
-        choose(ids, ("cube/*", "egg"), 8)
+        choose_trajectories(ids, ("cube/*", "egg"), 8)
     with pytest.raises(DatasetError, match="no trajectory yet"):
-        choose([], (), 8)
+        choose_trajectories([], (), 8)
 
 
 def _set(name: str, value: Any) -> Callable[[Path], None]:
@@ -181,7 +192,7 @@ def _drop(name: str) -> Callable[[Path], None]:
     [
         (_set("schema", "palpate.features"), "expected 'palpate.simulations'"),
         (_set("schema_version", 2), "version 2.*update palpate"),
-        (_drop("fingertip"), "fingertip.*only simulated"),
+        (_drop("fingertip"), "fingertip.*measured trajectories has no fields"),
         (_drop("trajectories/cube/00/normal/displacement"), "displacement"),
         (lambda path: path.write_bytes(path.read_bytes()[:3000]), "truncated"),
         (Path.unlink, "no such store"),
@@ -198,7 +209,7 @@ def test_broken_store_is_named(store: Path, change: Callable[[Path], None], word
 
 def test_folder_that_is_no_store(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no fingertip\.h5 in it"):
-        Simulations(tmp_path)
+        DrawnSimulations.open(tmp_path)
 
 
 def test_view_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
@@ -210,10 +221,10 @@ def test_view_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
 def test_stores_are_told_from_records(store: Path, tmp_path: Path) -> None:
     record = tmp_path / "record.mcap"
     record.write_bytes(b"\x89MCAP0\r\n")
-    assert is_simulations(store)
-    assert is_simulations(tmp_path)
-    assert not is_simulations(record)
-    assert not is_simulations(tmp_path / "none")
+    assert is_simulation_store(store)
+    assert is_simulation_store(tmp_path)
+    assert not is_simulation_store(record)
+    assert not is_simulation_store(tmp_path / "none")
 
 
 def test_surface_of_a_cube() -> None:

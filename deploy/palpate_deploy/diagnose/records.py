@@ -146,9 +146,9 @@ def review_path(
     """
     if not path.exists():
         raise ConfigError(f"{path} does not exist", remedy="check the path")
-    from palpate_services.viewer.simulation_file import is_simulations
+    from palpate.files.simulation_store import is_simulation_store
 
-    if is_simulations(path):
+    if is_simulation_store(path):
         _review_store(path, view, picture, trajectories, most)
     elif trajectories:
         raise ConfigError(
@@ -209,14 +209,14 @@ def _review_store(
 
 def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
     """The overview of a store, or the last step of the one trajectory that is asked for."""
+    from palpate.files.simulation_store import choose_trajectories
     from palpate_fem.plot.step import plot_overview, plot_step
     from palpate_fem.store.read import SimulationStore
-    from palpate_services.viewer.simulation_file import choose
 
     store = SimulationStore.open(path)
     names = store.ids()
     if trajectories:
-        names = choose(names, trajectories, len(names))
+        names = choose_trajectories(names, trajectories, len(names))
     if trajectories and len(names) == 1:
         (name,) = names
         press, outline = store.trajectory(name), store.outline(name)

@@ -14,8 +14,6 @@ validation.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,14 +23,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, DatasetError
-from palpate.extras import require
-from palpate_fem.store.content import check_id
+from palpate.files.hdf5 import (
+    Hdf5Schema,
+    h5py_module,
+    hdf5_written_whole,
+    opened,
+    read_array,
+    schema_of,
+    text,
+)
+from palpate.files.simulation_store import check_id
 
 Floats = NDArray[np.float64]
 
-SCHEMA = "palpate.indentations"
-SCHEMA_VERSION = 1
-SENSOR_FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
+INDENTATIONS = Hdf5Schema(
+    "palpate.indentations",
+    1,
+    "write it with palpate_fem.calibration.measured, or set the attributes of palpate.indentations",
+)
 MEASURED, SIMULATED = "measured", "simulated"
 UNITS = {"pose": "m, 1", "force": "N"}
 COLUMNS = {"pose": 7, "force": 3}
@@ -114,7 +122,6 @@ def write_indentations(path: Path, indentations: Sequence[Indentation], *, sourc
     Raises:
         DatasetError: None, two of one name, of both origins, or the disk refused.
     """
-    h5 = require("h5py", extra="fem")
     if not indentations:
         raise DatasetError(f"nothing to write to {path}", remedy="give at least one trajectory")
     names = [item.name for item in indentations]
@@ -125,31 +132,18 @@ def write_indentations(path: Path, indentations: Sequence[Indentation], *, sourc
         raise DatasetError(
             "measured and simulated trajectories together", remedy="write them into two files"
         )
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5.File(partial, "w") as file:
-            file.attrs["schema"] = SCHEMA
-            file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["frame"] = SENSOR_FRAME
-            file.attrs["origin"] = indentations[0].origin
-            file.attrs["source"] = source
-            for item in indentations:
-                group = file.create_group(f"trajectories/{item.name}")
-                group.attrs["indenter"] = item.indenter
-                group.attrs["sensor"] = item.sensor
-                if item.outcome:
-                    group.attrs["outcome"] = item.outcome
-                for name, unit in UNITS.items():
-                    group.create_dataset(name, data=getattr(item, name)).attrs["unit"] = unit
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # its folder may be what could not be made
-            partial.unlink(missing_ok=True)
+    with hdf5_written_whole(path, extra="fem") as file:
+        file.attrs.update(INDENTATIONS.facts)
+        file.attrs["origin"] = indentations[0].origin
+        file.attrs["source"] = source
+        for item in indentations:
+            group = file.create_group(f"trajectories/{item.name}")
+            group.attrs["indenter"] = item.indenter
+            group.attrs["sensor"] = item.sensor
+            if item.outcome:
+                group.attrs["outcome"] = item.outcome
+            for name, unit in UNITS.items():
+                group.create_dataset(name, data=getattr(item, name)).attrs["unit"] = unit
 
 
 def read_indentations(path: Path) -> tuple[Indentation, ...]:
@@ -165,57 +159,30 @@ def read_indentations(path: Path) -> tuple[Indentation, ...]:
         DatasetError: The file is missing, damaged, of another schema, version, frame or unit, or a
             trajectory is wrong; the message names file and trajectory.
     """
-    h5 = require("h5py", extra="fem")
-    if not path.is_file():
-        raise DatasetError(f"{path}: no such file", remedy="give a file of indentations (.h5)")
-    try:
-        with h5.File(path, "r") as file:
-            origin = _origin(path, file)
-            groups = file.get("trajectories")
-            found = _trajectories(groups, h5.Group) if isinstance(groups, h5.Group) else {}
-            if not found:
-                raise DatasetError(
-                    f"{path}: no trajectories", remedy="write each as a group /trajectories/<id>"
-                )
-            return tuple(_read(path, name, found[name], origin) for name in sorted(found))
-    except OSError as error:
-        raise DatasetError(
-            f"{path}: not a readable HDF5 file (truncated or damaged): {error}",
-            remedy="make it again, or copy it again and compare its size",
-        ) from error
+    h5 = h5py_module("fem")
+    with opened(path, extra="fem", missing="give a file of indentations (.h5)") as file:
+        origin = _origin(path, file)
+        groups = file.get("trajectories")
+        found = _trajectories(groups, h5.Group) if isinstance(groups, h5.Group) else {}
+        if not found:
+            raise DatasetError(
+                f"{path}: no trajectories", remedy="write each as a group /trajectories/<id>"
+            )
+        return tuple(_read(path, name, found[name], origin) for name in sorted(found))
 
 
 def is_file_of(path: Path, schema: str) -> bool:
     """Whether a file is HDF5 and states this schema."""
-    h5 = require("h5py", extra="fem")
     try:
-        with h5.File(path, "r") as file:
-            return _text(file.attrs.get("schema", "")) == schema
-    except OSError:
+        return schema_of(path, extra="fem") == schema
+    except DatasetError:
         return False
 
 
 def _origin(path: Path, file: Any) -> str:
     """Check the attributes at the root and return the origin."""
-    schema = _text(file.attrs.get("schema", ""))
-    if schema != SCHEMA:
-        raise DatasetError(
-            f"{path}: schema is {schema or 'not stated'!r}, expected {SCHEMA!r}",
-            remedy=f"write it with calibration.measured, or set the attributes of {SCHEMA}",
-        )
-    found = file.attrs.get("schema_version", 0)
-    if found != SCHEMA_VERSION:
-        raise DatasetError(
-            f"{path}: schema version {found}, this palpate reads {SCHEMA_VERSION}",
-            remedy="update palpate, or make the file again",
-        )
-    frame = _text(file.attrs.get("frame", ""))
-    if frame != SENSOR_FRAME:
-        raise DatasetError(
-            f"{path}: attribute frame is {frame!r}",
-            remedy=f"rotate poses and forces first; the schema knows only: {SENSOR_FRAME}",
-        )
-    origin = _text(file.attrs.get("origin", ""))
+    INDENTATIONS.check(path, file)
+    origin = text(file.attrs.get("origin", ""))
     if origin not in (MEASURED, SIMULATED):
         raise DatasetError(
             f"{path}: attribute origin is {origin!r}",
@@ -244,38 +211,22 @@ def _read(path: Path, name: str, group: Any, origin: str) -> Indentation:
     try:
         return Indentation(
             name,
-            _text(group.attrs["indenter"]),
-            _text(group.attrs["sensor"]),
+            text(group.attrs["indenter"]),
+            text(group.attrs["sensor"]),
             _array(name, group, "pose"),
             _array(name, group, "force"),
             origin,
-            _text(group.attrs.get("outcome", "")),
+            text(group.attrs.get("outcome", "")),
         )
     except DatasetError as error:
         raise DatasetError(f"{path}: {error.problem}", remedy=error.remedy) from error
 
 
 def _array(trajectory: str, group: Any, name: str) -> Floats:
-    if name not in group or not hasattr(group[name], "dtype"):
+    where = f"trajectory {trajectory!r}"
+    values = read_array(where, group, name, UNITS[name])
+    if values.dtype.kind not in "fiu":
         raise DatasetError(
-            f"trajectory {trajectory!r}: dataset {name!r} is missing",
-            remedy=f"write {name} [{UNITS[name]}], shape (K, {COLUMNS[name]})",
+            f"{where}: {name} holds {values.dtype}, no numbers", remedy=f"write {name} as float64"
         )
-    dataset = group[name]
-    unit = _text(dataset.attrs.get("unit", ""))
-    if unit != UNITS[name]:
-        raise DatasetError(
-            f"trajectory {trajectory!r}: {name} is in {unit or 'no stated unit'!r},"
-            f" expected {UNITS[name]!r}",
-            remedy=f"convert {name} to {UNITS[name]} and set its attribute unit",
-        )
-    if dataset.dtype.kind not in "fiu":
-        raise DatasetError(
-            f"trajectory {trajectory!r}: {name} holds {dataset.dtype}, no numbers",
-            remedy=f"write {name} as float64",
-        )
-    return np.asarray(dataset[()], np.float64)
-
-
-def _text(value: object) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+    return np.asarray(values, np.float64)

@@ -127,7 +127,7 @@ def _check(wanted: Wanted, store: Path | None) -> None:
             "a sweep takes long and its results need a place", remedy="give --store NAME.sim"
         )
     if store is not None:
-        from palpate_fem.store.read import SUFFIX
+        from palpate.files.simulation_store import SUFFIX
 
         if store.suffix != SUFFIX:
             raise ConfigError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import IndentationOutcome
@@ -23,8 +21,6 @@ Setting = bool | int | float | str
 
 Outline = tuple[NDArray[np.floating[Any]], Ints]
 """A closed triangle mesh of an indenter, outward, in its own frame: vertices [m], triangles."""
-
-_ID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*(/[A-Za-z0-9_-][A-Za-z0-9._-]*)*")
 
 SAME_SHAPE_M = 1e-7
 """Pressurised shapes of the same inputs agree to this [m]: far above the solver's tolerance, far
@@ -122,19 +118,6 @@ def named_values(record: Any) -> dict[str, Setting]:
     """Fields of a dataclass of parameters or settings that are not None, by name."""
     values = {field.name: getattr(record, field.name) for field in fields(record)}
     return {name: value for name, value in values.items() if value is not None}
-
-
-def check_id(trajectory: str) -> None:
-    """Check the id of a trajectory: it becomes a path in a folder and in an HDF5 file.
-
-    Raises:
-        ConfigError: It is not made of words of letters, digits, ``.``, ``_``, ``-`` between ``/``.
-    """
-    if not _ID.fullmatch(trajectory) or len(trajectory) > 200:
-        raise ConfigError(
-            f"{trajectory!r} is no id of a trajectory",
-            remedy="use letters, digits, '.', '_' and '-', e.g. sphere_medium/03/normal",
-        )
 
 
 def _plain(value: object) -> object:

@@ -8,9 +8,10 @@ from pathlib import Path
 import h5py
 
 from palpate.errors import DatasetError
+from palpate.files.simulation_store import FINGERTIP, TRAJECTORIES
 from palpate_fem.store.files import Claim, disk_error
 from palpate_fem.store.hdf5 import LIBVER, write_header
-from palpate_fem.store.read import FINGERTIP, TRAJECTORIES, SimulationStore
+from palpate_fem.store.read import SimulationStore
 
 
 def export(

@@ -5,21 +5,18 @@ docs/simulation-store.md is the same in words. Groups only; files and folders ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Callable
 from typing import Any
 
 import h5py
 import numpy as np
 
-from palpate.errors import DatasetError
+from palpate import __version__
+from palpate.files.hdf5 import set_attributes, text
+from palpate.files.simulation_store import SIMULATIONS
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.store.content import StoredFingertip, named_values
-
-SCHEMA = "palpate.simulations"
-SCHEMA_VERSION = 1
-FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
 
 LIBVER = ("v110", "v110")
 """Readable since HDF5 1.10 (2016); the format before it has no checksums of its own structure."""
@@ -59,34 +56,7 @@ def file_image(fill: Callable[[Any], None], *, command: str) -> bytes:
 
 def write_header(file: Any, *, command: str) -> None:
     """Attributes that every file has: schema, frame, maker."""
-    facts = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "frame": FRAME}
-    set_attributes(file, {**facts, "palpate": palpate_version(), "command": command})
-
-
-def check_header(where: str, file: Any) -> None:
-    """Check that a file is one of ours and that we know its version.
-
-    Raises:
-        DatasetError: It is not, or was made by a newer palpate.
-    """
-    schema = text(file.attrs.get("schema", ""))
-    if schema != SCHEMA:
-        raise DatasetError(
-            f"{where}: schema is {schema or 'not stated'!r}, expected {SCHEMA!r}",
-            remedy="name a store that `palpate fem run` wrote, or a file in its schema",
-        )
-    found = int(file.attrs.get("schema_version", 0))
-    if found != SCHEMA_VERSION:
-        raise DatasetError(
-            f"{where}: schema version {found}, this palpate reads {SCHEMA_VERSION}",
-            remedy="update palpate" if found > SCHEMA_VERSION else "make the store again",
-        )
-    frame = text(file.attrs.get("frame", ""))
-    if frame != FRAME:
-        raise DatasetError(
-            f"{where}: attribute frame is {frame!r}",
-            remedy=f"turn everything into the one frame there is and say so: {FRAME}",
-        )
+    set_attributes(file, {**SIMULATIONS.facts, "palpate": __version__, "command": command})
 
 
 def write_fingertip(file: Any, tip: StoredFingertip) -> None:
@@ -123,37 +93,11 @@ def read_fingertip(file: Any) -> StoredFingertip:
     )
 
 
-def palpate_version() -> str:
-    """Version of the installed palpate, for provenance."""
-    try:
-        return version("palpate")
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def text(value: object) -> str:
-    """A string of HDF5, whichever way it was written."""
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
 def _setting(value: Any) -> bool | int | float | str:
     if isinstance(value, bytes):
         return text(value)
     plain: bool | int | float | str = value.item() if isinstance(value, np.generic) else value
     return plain
-
-
-def set_attributes(target: Any, values: Mapping[str, Any]) -> None:
-    """Write attributes, strings with a fixed length.
-
-    HDF5 keeps strings of variable length in a heap without checksum: there a flipped bit is another
-    indenter's name, or a reader that never returns.
-    """
-    for name, value in values.items():
-        if isinstance(value, str):
-            code = value.encode("utf-8", "replace")
-            value = np.array(code, h5py.string_dtype("utf-8", max(1, len(code))))
-        target.attrs[name] = value
 
 
 def create(group: Any, name: str, array: Any, unit: str) -> None:

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from palpate import __version__
+from palpate.files.hdf5 import set_attributes, text
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import Outline, TrajectorySummary
-from palpate_fem.store.hdf5 import PACKED, create, palpate_version, set_attributes, text
+from palpate_fem.store.hdf5 import PACKED, create
 
 SCALAR_FIELDS = {
     "pose": "m, 1",
@@ -67,7 +69,7 @@ def write_trajectory(
             "complete": trajectory.outcome is IndentationOutcome.COMPLETE,
             "sensor": sensor,
             "fingertip": fingertip,
-            "palpate": palpate_version(),
+            "palpate": __version__,
         },
     )
     create(group, "path", np.asarray(trajectory.path, np.float64), "m, 1")

@@ -8,8 +8,9 @@ from typing import Any
 
 from palpate.closing import Closing
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.simulation_store import FINGERTIP, SUFFIX, TRAJECTORIES, check_id
 from palpate_fem.result import IndentationResult
-from palpate_fem.store.content import Outline, StoredFingertip, check_id
+from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.files import (
     PART,
     Claim,
@@ -19,7 +20,7 @@ from palpate_fem.store.files import (
     disk_error,
 )
 from palpate_fem.store.hdf5 import file_image, write_fingertip
-from palpate_fem.store.read import FINGERTIP, SUFFIX, TRAJECTORIES, UNFINISHED, SimulationStore
+from palpate_fem.store.read import UNFINISHED, SimulationStore
 from palpate_fem.store.trajectory import write_trajectory
 
 
@@ -92,9 +93,9 @@ class StoreWriter(SimulationStore, Closing):
         if self._lock is None:
             raise ValueError(f"{self.path} is closed")
         self._check_place(trajectory)
-        claim = Claim(self._file_of(trajectory))
+        claim = Claim(self.file_of(trajectory))
         try:
-            if claim.target.exists() and self._outcome(trajectory) not in UNFINISHED:
+            if claim.target.exists() and self.outcome(trajectory) not in UNFINISHED:
                 raise StoreTakenError(
                     f"{self.path}: {trajectory} is done",
                     remedy=f"leave out what done() lists, or remove {claim.target}",

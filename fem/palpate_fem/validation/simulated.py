@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.errors import DatasetError
+from palpate.files.simulation_store import SIMULATIONS
 from palpate_fem.calibration.align import Floats
 from palpate_fem.calibration.measured import (
     MEASURED,
@@ -19,7 +20,6 @@ from palpate_fem.calibration.measured import (
 from palpate_fem.calibration.runs import Simulated, from_rest
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.store.content import TrajectorySummary
-from palpate_fem.store.hdf5 import SCHEMA as STORE_SCHEMA
 from palpate_fem.store.read import SimulationStore
 
 _SIDEWAYS_M = 20e-6
@@ -40,7 +40,7 @@ def measured_from(path: Path) -> tuple[tuple[Indentation, ...], dict[str, str]]:
     Raises:
         DatasetError: It is neither, or damaged.
     """
-    if path.is_file() and not is_file_of(path, STORE_SCHEMA):
+    if path.is_file() and not is_file_of(path, SIMULATIONS.name):
         return read_indentations(path), {}
     store, found, left_out = SimulationStore.open(path), [], {}
     for name in store.ids():

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from palpate.errors import DatasetError
 from palpate.extras import require
+from palpate.files.simulation_store import choose_trajectories
 from palpate_services.viewer.layout import (
     AXES,
     SIDES,
@@ -27,7 +28,12 @@ from palpate_services.viewer.layout import (
     shades,
 )
 from palpate_services.viewer.rerun import APPLICATION
-from palpate_services.viewer.simulation_file import Finger, Floats, Press, Simulations, choose
+from palpate_services.viewer.simulation_file import (
+    DrawnFingertip,
+    DrawnSimulations,
+    DrawnTrajectory,
+    Floats,
+)
 
 MOST = 8
 """Trajectories in one view unless asked for more: 4 MB each, and as many tabs as fit."""
@@ -68,11 +74,11 @@ def review_simulations(
         MissingExtraError: Rerun or h5py is not installed.
     """
     rr = require("rerun", extra="services")
-    simulations = Simulations(store)
-    names = choose(simulations.ids(), trajectories, most)
-    finger = simulations.finger()
+    simulations = DrawnSimulations.open(store)
+    names = choose_trajectories(simulations.ids(), trajectories, most)
+    finger = simulations.fingertip()
     # One scale for all, so that colours can be compared between tabs.
-    longest_m = max(_furthest(simulations.press(name)) for name in names) or 1e-3
+    longest_m = max(_furthest(simulations.trajectory(name)) for name in names) or 1e-3
     target = store.with_suffix(".rrd") if view is None else view
     stream = rr.RecordingStream(APPLICATION)
     try:
@@ -81,7 +87,7 @@ def review_simulations(
         for count, name in enumerate(names):
             if progress is not None:
                 progress(count, len(names))
-            _Drawing(rr, stream, finger, simulations.press(name), longest_m).draw()
+            _Drawing(rr, stream, finger, simulations.trajectory(name), longest_m).draw()
         stream.flush(timeout_sec=30.0)
     except DatasetError:
         raise
@@ -95,7 +101,7 @@ def review_simulations(
     return target
 
 
-def _furthest(press: Press) -> float:
+def _furthest(press: DrawnTrajectory) -> float:
     return float(np.linalg.norm(press.displacement, axis=2).max(initial=0.0))
 
 
@@ -103,7 +109,7 @@ class _Drawing:
     """One trajectory on its way into the stream."""
 
     def __init__(
-        self, rr: Any, stream: Any, finger: Finger, press: Press, longest_m: float
+        self, rr: Any, stream: Any, finger: DrawnFingertip, press: DrawnTrajectory, longest_m: float
     ) -> None:
         self._rr, self._stream, self._finger, self._press = rr, stream, finger, press
         self._longest_m = longest_m

@@ -14,12 +14,17 @@ from rich.table import Table
 
 from palpate.command import typed_command
 from palpate.errors import ConfigError
+from palpate.files.hdf5 import schema_of
 from palpate_training.cli.experiment import print_trials
-from palpate_training.datasets.container import schema_of
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
 from palpate_training.datasets.features import FeatureDataset
-from palpate_training.datasets.features_file import SCHEMA, UNITS, open_dataset, write_dataset
+from palpate_training.datasets.features_file import (
+    FEATURES_SCHEMA,
+    UNITS,
+    open_dataset,
+    write_dataset,
+)
 from palpate_training.datasets.ingest import (
     BLOCKS_PER_RECORDING,
     ELECTRODE_LAG_ROWS,
@@ -91,11 +96,11 @@ def data_inspect(
 
     palpate data inspect presses.h5
     """
-    schema = schema_of(path) if path.is_file() else ""
-    if schema == TRIALS_SCHEMA:
+    schema = schema_of(path, extra="training") if path.is_file() else ""
+    if schema == TRIALS_SCHEMA.name:
         print_trials(path, as_json=as_json)
         return
-    if schema == SCHEMA:
+    if schema == FEATURES_SCHEMA.name:
         data = open_dataset(path)
         if as_json:
             console.print_json(json.dumps(_features_summary(data)))
@@ -202,7 +207,7 @@ def experiment_table(found: Contents, title: str) -> Table:
 
 def _features_summary(data: FeatureDataset) -> dict[str, Any]:
     return {
-        "kind": SCHEMA,
+        "kind": FEATURES_SCHEMA.name,
         "rows": len(data),
         "groups": len(np.unique(data.group)),
         "blocks": len(np.unique(data.block)),

@@ -16,11 +16,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from palpate import __version__
 from palpate.command import typed_command
 from palpate.errors import ConfigError
 from palpate.rigid import Transform
 from palpate_training.datasets.features import Provenance
-from palpate_training.datasets.features_file import palpate_version
 from palpate_training.datasets.trials import TrialsContents, read_contents, write_trials
 from palpate_training.experiment.kinematics import Arm
 from palpate_training.experiment.plan import ARMS
@@ -138,7 +138,7 @@ def data_ingest(
                 command=typed_command(),
                 input_sha256=_sha256(record),
                 licence=licence,
-                palpate_version=palpate_version(),
+                palpate_version=__version__,
                 notes=f"input_sha256 is of the record; sha256 of the plan: {_sha256(plan)}",
             ),
         )

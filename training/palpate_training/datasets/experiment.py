@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.files.hdf5 import Hdf5Schema
 from palpate_training.datasets.container import Column, Tables, read_tables, write_tables
 from palpate_training.datasets.features import ELECTRODES, Provenance
 
@@ -249,9 +250,10 @@ def _check_finite(data: ExperimentDataset, name: str, values: FloatArray) -> Non
         )
 
 
-EXPERIMENT_SCHEMA = "palpate.experiment"
-MIXED_SCHEMA = "palpate.mixed"
-VERSION = 1
+EXPERIMENT_SCHEMA = Hdf5Schema(
+    "palpate.experiment", 1, "`palpate data inspect` says what the file is"
+)
+MIXED_SCHEMA = Hdf5Schema("palpate.mixed", 1, "`palpate data inspect` says what the file is")
 
 UNITS = {"trial_rest": "counts", "travel_m": "m", "force": "N", "location": "m"}
 """Units of the arrays of a trial or row; all others are numbers."""
@@ -289,7 +291,7 @@ def write_experiment(path: Path, data: ExperimentDataset) -> str:
         DatasetError: The disk refused.
     """
     tables = _experiment_tables(data)
-    return write_tables(path, EXPERIMENT_SCHEMA, VERSION, EXPERIMENT_COLUMNS, tables)
+    return write_tables(path, EXPERIMENT_SCHEMA, EXPERIMENT_COLUMNS, tables)
 
 
 def write_mixed(path: Path, data: MixedDataset) -> str:
@@ -301,7 +303,7 @@ def write_mixed(path: Path, data: MixedDataset) -> str:
     Raises:
         DatasetError: The disk refused.
     """
-    return write_tables(path, MIXED_SCHEMA, VERSION, MIXED_COLUMNS, _mixed_tables(data))
+    return write_tables(path, MIXED_SCHEMA, MIXED_COLUMNS, _mixed_tables(data))
 
 
 def read_experiment(path: Path) -> ExperimentDataset:
@@ -311,7 +313,7 @@ def read_experiment(path: Path) -> ExperimentDataset:
         DatasetError: The file is missing, damaged, of another schema or version, was changed after
             writing, or its content breaks the schema; names the file and the dataset inside.
     """
-    tables = read_tables(path, EXPERIMENT_SCHEMA, VERSION, EXPERIMENT_COLUMNS)
+    tables = read_tables(path, EXPERIMENT_SCHEMA, EXPERIMENT_COLUMNS)
     return _named(path, lambda: _experiment(tables))
 
 
@@ -321,7 +323,7 @@ def read_mixed(path: Path) -> MixedDataset:
     Raises:
         DatasetError: As for ``read_experiment``.
     """
-    tables = read_tables(path, MIXED_SCHEMA, VERSION, MIXED_COLUMNS, _MIXED_NUMBERS)
+    tables = read_tables(path, MIXED_SCHEMA, MIXED_COLUMNS, _MIXED_NUMBERS)
     arrays, numbers = tables.arrays, tables.numbers
 
     def build() -> MixedDataset:

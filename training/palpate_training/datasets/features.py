@@ -20,9 +20,6 @@ BoolArray = npt.NDArray[np.bool_]
 ELECTRODES = 19
 """Sensing electrodes of a BioTac."""
 
-SENSOR_FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
-"""The only frame of schema version 1."""
-
 
 @dataclass(frozen=True, slots=True)
 class Provenance:

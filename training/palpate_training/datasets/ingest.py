@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate import __version__
 from palpate.alignment import linear
 from palpate.bus.topics import ELECTRODES, POSE, TARE, WRENCH
 from palpate.errors import DatasetError
@@ -40,7 +41,6 @@ from palpate.messages import (
 )
 from palpate.sampling import sample_offsets
 from palpate_training.datasets.features import FeatureDataset, Provenance, cut_into_blocks
-from palpate_training.datasets.features_file import palpate_version
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
             command=command,
             input_sha256=digest,
             licence=licence,
-            palpate_version=palpate_version(),
+            palpate_version=__version__,
             notes="wrench and pose at the middle of each frame; group = press",
         ),
         name=str(path),
@@ -333,7 +333,7 @@ def ingest_lasa(
             command=command,
             input_sha256=hashlib.sha256(content).hexdigest(),
             licence="none stated by the authors: measure, do not redistribute",
-            palpate_version=palpate_version(),
+            palpate_version=__version__,
             notes=f"{_NOTES}; electrodes paired with the force {lag_rows} rows before",
         ),
         name=str(path),

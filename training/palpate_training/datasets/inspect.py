@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.container import schema_of
+from palpate.files.hdf5 import schema_of
 from palpate_training.datasets.experiment import (
     EXPERIMENT_SCHEMA,
     MIXED_SCHEMA,
@@ -114,14 +114,14 @@ def load(
             return PUBLISHED, read_published(
                 path.parent, units=[unit], axes=axes, force_on_indenter=force_on_indenter
             )
-    schema = schema_of(path)
-    if schema == EXPERIMENT_SCHEMA:
+    schema = schema_of(path, extra="training")
+    if schema == EXPERIMENT_SCHEMA.name:
         return schema, read_experiment(path)
-    if schema == MIXED_SCHEMA:
+    if schema == MIXED_SCHEMA.name:
         return schema, read_mixed(path)
     raise DatasetError(
-        f"{path}: schema is {schema or 'not stated'!r}, expected {EXPERIMENT_SCHEMA!r} or"
-        f" {MIXED_SCHEMA!r}",
+        f"{path}: schema is {schema or 'not stated'!r}, expected {EXPERIMENT_SCHEMA.name!r} or"
+        f" {MIXED_SCHEMA.name!r}",
         remedy="give a file that palpate wrote, or the folder with biotac1.hdf5 and so on",
     )
 

@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate import __version__
 from palpate.errors import DatasetError
 from palpate.extras import require
+from palpate.files.hdf5 import opened
 from palpate_training.datasets.assembly import assemble_experiment
-from palpate_training.datasets.container import opened
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.datasets.features import ELECTRODES, Provenance
-from palpate_training.datasets.features_file import palpate_version
 from palpate_training.datasets.processing import THRESHOLD_N
 from palpate_training.datasets.trials import TrialHeader, TrialRows
 
@@ -109,7 +109,7 @@ def read_published(
         command=command,
         input_sha256=hashlib.sha256("".join(f.sha256 for f in files).encode()).hexdigest(),
         licence="the publisher's; see where it was downloaded",
-        palpate_version=palpate_version(),
+        palpate_version=__version__,
         notes=f"axes {','.join(axes)}; location was in {files[0].location_unit}; trajectories found"
         " by indenter, fall of the force to 0.5 N and jumps of the tip, and matched over units by"
         " place and direction; input_sha256 is of the arrays",
@@ -135,7 +135,7 @@ class _File:
 
     def __init__(self, path: Path, axes: Sequence[str], force_on_indenter: bool) -> None:
         self.path = path
-        with opened(path) as file:
+        with opened(path, extra="training") as file:
             arrays = {name: _data(path, file, name) for name in GROUPS}
             names = file[_group(path, file, "indenter")]["data"].attrs.get("names")
         rows = len(arrays["electrodes"])

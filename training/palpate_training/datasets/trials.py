@@ -24,16 +24,12 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.container import (
     Column,
     Tables,
-    check_header,
-    hdf5_written_whole,
-    opened,
-    read_array,
     read_provenance,
-    text,
     write_array,
     write_header,
 )
@@ -152,8 +148,7 @@ class MixedRows:
 
 logger = logging.getLogger(__name__)
 
-TRIALS_SCHEMA = "palpate.trials"
-VERSION = 1
+TRIALS_SCHEMA = Hdf5Schema("palpate.trials", 1, "`palpate data inspect` says what the file is")
 GROUP = "trials"
 
 COLUMNS: dict[str, Column] = {
@@ -204,7 +199,7 @@ def write_trials(path: Path, trials: Iterable[RawTrial], provenance: Provenance)
     """
     seen: set[tuple[str, str]] = set()
     digests: list[str] = []
-    with hdf5_written_whole(path) as file:
+    with hdf5_written_whole(path, extra="training") as file:
         for trial in trials:
             _check_new(str(path), trial.header, seen)
             _check_streams(f"{path}: {trial_name(trial.header)}", trial)
@@ -216,9 +211,7 @@ def write_trials(path: Path, trials: Iterable[RawTrial], provenance: Provenance)
         if not digests:
             raise DatasetError(f"{path}: no trials to write", remedy="execute or ingest some")
         digest = _digest_of_all(digests)
-        write_header(
-            file, TRIALS_SCHEMA, VERSION, digest, provenance, {"trial_count": len(digests)}
-        )
+        write_header(file, TRIALS_SCHEMA, digest, provenance, {"trial_count": len(digests)})
     logger.info("wrote %s: %d trials, content %s", path, len(digests), digest[:12])
     return digest
 
@@ -230,7 +223,7 @@ def read_contents(path: Path) -> TrialsContents:
         DatasetError: The file is missing, damaged or truncated, of another schema or version, lacks
             a trial, or holds one twice; names file and group.
     """
-    with opened(path) as file:
+    with opened(path, extra="training") as file:
         return _contents(path, file)
 
 
@@ -243,11 +236,11 @@ def read_trials(path: Path) -> Iterator[RawTrial]:
         DatasetError: As ``read_contents``, or a stream is missing, in another unit, of another type
             or shape, or was changed after writing; names file, trial and dataset.
     """
-    with opened(path) as file:
+    with opened(path, extra="training") as file:
         for number, header in enumerate(_contents(path, file).headers):
             name = _name(number)
             streams: dict[str, Any] = {
-                key: read_array(path, file, f"{name}/{key}", column)
+                key: read_array(path, file, f"{name}/{key}", column.unit, column.dtype)
                 for key, column in COLUMNS.items()
             }
             trial = RawTrial(header=header, **streams)
@@ -261,7 +254,7 @@ def read_trials(path: Path) -> Iterator[RawTrial]:
 
 
 def _contents(path: Path, file: h5py.File) -> TrialsContents:
-    check_header(path, file, TRIALS_SCHEMA, VERSION)
+    TRIALS_SCHEMA.check(path, file)
     for name in ("trial_count", "content_sha256"):
         if name not in file.attrs:
             raise DatasetError(f"{path}: attribute {name} is missing", remedy=_AGAIN)

@@ -198,9 +198,6 @@ def _between(values: Floats, row: npt.NDArray[np.intp], weight: Floats) -> Float
     return np.asarray(values[row] + weight[:, None] * steps[row])
 
 
-Floats = npt.NDArray[np.float64]
-
-
 def _axes(*values: float) -> Floats:
     return np.array(values, np.float64)
 

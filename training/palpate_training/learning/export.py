@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from palpate import __version__
 from palpate.errors import BundleError
 from palpate.extras import require
 from palpate.files.bundle import TASKS, Manifest, write_bundle
@@ -21,7 +22,6 @@ from palpate.files.field_mesh import FieldMesh
 from palpate.files.tasks import tensors_of
 from palpate.messages import SensorType, TensorInfo
 from palpate_training.datasets.experiment import SkinMesh
-from palpate_training.datasets.features_file import palpate_version
 from palpate_training.learning.networks import FieldGraph, Mlp, SynthesisGraph
 
 logger = logging.getLogger(__name__)
@@ -275,7 +275,7 @@ def export_features(
         model_sha256="",
         golden_sha256="",
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-        palpate_version=palpate_version(),
+        palpate_version=__version__,
         opset=OPSET,
         normalisation=dict(normalisation or {}),
     )
@@ -357,7 +357,7 @@ def export_bundle(
         model_sha256="",
         golden_sha256="",
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-        palpate_version=palpate_version(),
+        palpate_version=__version__,
         opset=OPSET,
         normalisation=dict(normalisation),
     )

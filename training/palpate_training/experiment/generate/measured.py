@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.hdf5 import schema_of
 from palpate_training.datasets.assembly import assemble_experiment, common_trajectories
-from palpate_training.datasets.container import schema_of
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,
@@ -19,7 +20,6 @@ from palpate_training.datasets.experiment import (
     write_mixed,
 )
 from palpate_training.datasets.features import Provenance
-from palpate_training.datasets.features_file import palpate_version
 from palpate_training.datasets.processing import process_all
 from palpate_training.datasets.trials import (
     TRIALS_SCHEMA,
@@ -111,7 +111,7 @@ def process_files(
             "\n".join(one.content_sha256 for one in files).encode()
         ).hexdigest(),
         licence="; ".join(dict.fromkeys(one.provenance.licence for one in files)),
-        palpate_version=palpate_version(),
+        palpate_version=__version__,
         notes="input_sha256 is over the content_sha256 of each file of trials",
     )
     experiment = assemble_experiment(rows, provenance)
@@ -142,10 +142,10 @@ def _check_written(paths: Sequence[Path]) -> None:
         if not path.exists():
             continue
         try:
-            held = schema_of(path)
+            held = schema_of(path, extra="training")
         except DatasetError:  # what cannot be read may be replaced
             continue
-        if held == TRIALS_SCHEMA:
+        if held == TRIALS_SCHEMA.name:
             raise ConfigError(
                 f"{path} holds raw trials, which cannot be made again",
                 remedy="name the data set to write last, after the files of trials",

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate import __version__
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.experiment import write_experiment, write_mixed
 from palpate_training.datasets.features import Provenance
-from palpate_training.datasets.features_file import palpate_version
 from palpate_training.experiment.generate.data_sets import AssembledSets, assemble
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
@@ -152,7 +152,7 @@ def generate(
         command=command,
         input_sha256=digest,
         licence="generated; use as you like",
-        palpate_version=palpate_version(),
+        palpate_version=__version__,
         notes="input_sha256 is the digest of experiment, units and fingertip",
     )
     names = tuple(specimen.name for specimen in specimens)

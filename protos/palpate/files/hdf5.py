@@ -1,0 +1,196 @@
+"""HDF5 files of palpate: one header, typed errors, arrays with units.
+
+Every file says at its root what it is: ``schema``, ``schema_version`` and ``frame``. h5py is
+optional, and imported when a file is opened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate.extras import require
+from palpate.files.atomic import written_whole
+
+if TYPE_CHECKING:
+    import h5py
+
+SENSOR_FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
+"""Frame of every file, and the text of its attribute ``frame``."""
+
+COPY_AGAIN = "make it again, or copy it again and compare its size"
+
+
+@dataclass(frozen=True, slots=True)
+class Hdf5Schema:
+    """Header of a kind of file.
+
+    Attributes:
+        name: Value of the attribute ``schema``, e.g. ``palpate.features``.
+        version: Value of the attribute ``schema_version``.
+        remedy: What to do with a file of another schema.
+    """
+
+    name: str
+    version: int
+    remedy: str
+
+    @property
+    def facts(self) -> dict[str, str | int]:
+        """Attributes to write at the root of a file, in this order."""
+        return {"schema": self.name, "schema_version": self.version, "frame": SENSOR_FRAME}
+
+    def check(self, where: object, file: h5py.File) -> None:
+        """Check the header of an open file.
+
+        Args:
+            where: Path of the file, for the error.
+            file: The file.
+
+        Raises:
+            DatasetError: Another schema, version or frame.
+        """
+        found = text(file.attrs.get("schema", ""))
+        if found != self.name:
+            raise DatasetError(
+                f"{where}: schema is {found or 'not stated'!r}, expected {self.name!r}",
+                remedy=self.remedy,
+            )
+        number = int(file.attrs.get("schema_version", 0))
+        if number != self.version:
+            raise DatasetError(
+                f"{where}: schema version {number}, this palpate reads {self.version}",
+                remedy="update palpate" if number > self.version else "make the file again",
+            )
+        frame = text(file.attrs.get("frame", ""))
+        if frame != SENSOR_FRAME:
+            raise DatasetError(
+                f"{where}: attribute frame is {frame!r}",
+                remedy=f"rotate everything first; the schema knows only: {SENSOR_FRAME}",
+            )
+
+
+def h5py_module(extra: str) -> ModuleType:
+    """The package h5py.
+
+    Raises:
+        MissingExtraError: It is not installed; ``extra`` of palpate installs it.
+    """
+    return require("h5py", extra=extra)
+
+
+@contextlib.contextmanager
+def opened(
+    path: Path, *, extra: str, missing: str = "check the path, or make the file"
+) -> Iterator[h5py.File]:
+    """An HDF5 file to read from.
+
+    Args:
+        path: The file.
+        extra: Extra of palpate that installs h5py.
+        missing: What to do if there is no such file.
+
+    Raises:
+        DatasetError: It is missing, truncated or damaged.
+        MissingExtraError: h5py is not installed.
+    """
+    h5 = h5py_module(extra)
+    if not path.is_file():
+        raise DatasetError(f"{path}: no such file", remedy=missing)
+    try:
+        # Our files appear whole and never change, so no lock is needed, which some disks lack.
+        with h5.File(path, "r", locking=False) as file:
+            yield file
+    except (OSError, RuntimeError) as error:
+        raise DatasetError(
+            f"{path}: not a readable HDF5 file (truncated or damaged): {error}", remedy=COPY_AGAIN
+        ) from error
+
+
+@contextlib.contextmanager
+def hdf5_written_whole(path: Path, *, extra: str) -> Iterator[h5py.File]:
+    """An HDF5 file to write to, which gets its name when the block ends without an error.
+
+    Raises:
+        DatasetError: The disk refused.
+        MissingExtraError: h5py is not installed.
+    """
+    h5 = h5py_module(extra)
+    with written_whole(path) as partial, h5.File(partial, "w") as file:
+        yield file
+
+
+def schema_of(path: Path, *, extra: str) -> str:
+    """Schema that a file states; empty where it states none.
+
+    Raises:
+        DatasetError: It is missing or not a readable HDF5 file.
+    """
+    with opened(path, extra=extra) as file:
+        return text(file.attrs.get("schema", ""))
+
+
+def read_array(
+    where: object,
+    group: h5py.Group,
+    name: str,
+    unit: str,
+    dtype: npt.DTypeLike | None = None,
+) -> npt.NDArray[Any]:
+    """Read an array and check its unit and, where given, its type.
+
+    Args:
+        where: Path of the file or name of the group, for the error.
+        group: What holds the array.
+        name: Of the array.
+        unit: Expected value of its attribute ``unit``.
+        dtype: Expected type; ``str`` = an array of texts.
+
+    Raises:
+        DatasetError: It is missing, or has another unit or type.
+    """
+    if name not in group or not hasattr(group[name], "dtype"):
+        raise DatasetError(f"{where}: dataset {name!r} is missing", remedy=f"write {name} [{unit}]")
+    dataset = group[name]
+    found = text(dataset.attrs.get("unit", ""))
+    if found != unit:
+        raise DatasetError(
+            f"{where}: {name} is in {found or 'no stated unit'!r}, expected {unit!r}",
+            remedy=f"convert {name} to {unit} and set its attribute unit",
+        )
+    array: npt.NDArray[Any] = dataset[()]
+    if dtype is str:
+        return np.array([text(value) for value in array], dtype=object)
+    if dtype is not None and array.dtype != dtype:
+        raise DatasetError(
+            f"{where}: {name} is {array.dtype}, expected {np.dtype(dtype)}",
+            remedy=f"convert {name} before writing",
+        )
+    return array
+
+
+def text(value: object) -> str:
+    """An attribute or element of HDF5 as text, whichever way it was written."""
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def set_attributes(target: Any, values: Mapping[str, Any]) -> None:
+    """Write attributes, texts with a fixed length.
+
+    HDF5 keeps texts of variable length in a heap without a checksum: there a flipped bit gives
+    another text, or a reader that never returns.
+    """
+    h5 = h5py_module("fem")
+    for name, value in values.items():
+        if isinstance(value, str):
+            code = value.encode("utf-8", "replace")
+            value = np.array(code, h5.string_dtype("utf-8", max(1, len(code))))
+        target.attrs[name] = value
