@@ -84,6 +84,69 @@ def test_unseen_sensor() -> None:
     assert len(split.validation)
 
 
+def by_block(split: Split, block: splits.Labels) -> dict[str, list[int]]:
+    """Blocks of each side; a block with rows in the guard is listed with its side, too."""
+    sides = ("train", "validation", "test", "guard")
+    return {side: np.unique(block[getattr(split, side)]).tolist() for side in sides}
+
+
+def test_folds_follow_the_order_of_time() -> None:
+    """Twelve blocks of ten rows whose numbers run backwards; every side is known."""
+    block = np.repeat(np.arange(11, -1, -1, dtype=np.int32), 10)
+    made = contiguous_folds(block, np.zeros(120, np.int32), folds=3, guard_rows=0)
+    assert [by_block(split, 11 - block)["test"] for split in made] == [
+        [0, 3, 6, 9],
+        [1, 4, 7, 10],
+        [2, 5, 8, 11],
+    ]
+    assert [by_block(split, 11 - block)["validation"] for split in made] == [
+        [2, 8],
+        [3, 9],
+        [4, 10],
+    ]
+
+
+def test_guard_is_as_wide_as_it_says_on_either_side() -> None:
+    block = np.repeat(np.arange(6, dtype=np.int32), 10)
+    first, *_ = contiguous_folds(block, np.zeros(60, np.int32), folds=3, guard_rows=2)
+    # Test: 0 to 9 and 30 to 39. Validation: 20 to 29, less what is near a test row.
+    assert first.validation.tolist() == list(range(20, 28))
+    assert first.train.tolist() == [*range(12, 18), *range(42, 60)]
+    assert first.guard.tolist() == [10, 11, 18, 19, 28, 29, 40, 41]
+
+
+def test_without_being_asked_five_folds_a_hundred_rows_apart() -> None:
+    block, recording = labels([4000], blocks=10)
+    made = contiguous_folds(block, recording)
+    assert len(made) == 5
+    assert np.min(np.abs(made[0].train[:, None] - made[0].test)) == 101
+    block, sensor = labels([4000, 400], blocks=10)
+    split = unseen_sensor(sensor, block, test_sensor=1)
+    assert np.min(np.abs(split.train[:, None] - split.validation)) == 101
+    with pytest.raises(ValueError, match="at least 3"):
+        contiguous_folds(block, sensor, folds=2)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "validated"), [(1, [0]), (2, [1]), (3, [2]), (12, [2]), (13, [2, 12])]
+)
+def test_every_tenth_block_of_the_seen_sensors_validates(blocks: int, validated: list[int]) -> None:
+    block, sensor = labels([blocks * 20, 20], blocks=blocks)
+    split = unseen_sensor(sensor, block, test_sensor=1, guard_rows=0)
+    assert by_block(split, block)["validation"] == validated
+
+
+def test_groups_are_dealt_in_shares() -> None:
+    group = np.repeat(np.arange(30, dtype=np.int32), 7)
+    split = by_group(group)
+    counts = {side: len(found) for side, found in by_block(split, group).items()}
+    assert counts == {"train": 21, "validation": 3, "test": 6, "guard": 0}
+    np.testing.assert_array_equal(split.test, by_group(group, seed=0).test)
+    few = by_group(group[:35], test_share=0.01, validation_share=0.01)
+    counts = {side: len(found) for side, found in by_block(few, group).items()}
+    assert counts == {"train": 3, "validation": 1, "test": 1, "guard": 0}
+
+
 def test_what_cannot_be_split_is_named() -> None:
     block, recording = labels([300], blocks=5)
     with pytest.raises(DatasetError, match="5 blocks, 5 folds need 10"):

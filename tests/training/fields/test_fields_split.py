@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -43,9 +44,11 @@ def test_a_unit_without_rows_is_no_set(make_mixed: Callable[..., MixedDataset]) 
         of_units(named, by_trajectory(named), ["biotac-9"])
 
 
-@pytest.mark.parametrize("units", [["biotac-7"], []])
-def test_unknown_units_are_named(mixed: MixedDataset, units: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("units", "named"), [(["biotac-7"], "no unit biotac-7"), ([], "no unit (none was asked for)")]
+)
+def test_unknown_units_are_named(mixed: MixedDataset, units: list[str], named: str) -> None:
     split = by_trajectory(mixed.experiment)
-    with pytest.raises(DatasetError, match="no unit") as error:
+    with pytest.raises(DatasetError, match=re.escape(named)) as error:
         of_units(mixed.experiment, split, units)
     assert "biotac-1, biotac-2" in str(error.value)
