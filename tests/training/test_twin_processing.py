@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -86,6 +87,7 @@ def test_last_of_increments_keeps_the_last_sample_of_each(raw: RawTrial) -> None
         ([49, 49], "increment_end"),
         ([49, 400], "increment_end"),
         ([40, 49], "travel does not grow at increment 1"),
+        ([49, 99, 140, 149], "travel does not grow at increment 3"),
     ],
 )
 def test_increments_that_make_no_sense_are_refused(
@@ -94,6 +96,25 @@ def test_increments_that_make_no_sense_are_refused(
     with pytest.raises(DatasetError, match=words) as caught:
         last_of_increments(replace(raw, increment_end=np.array(ends, np.int64)))
     assert "biotac-1 sphere/03/normal" in str(caught.value)
+
+
+def test_an_increment_may_end_with_the_first_sample(raw: RawTrial) -> None:
+    kept = last_of_increments(replace(raw, increment_end=np.array([0, 60])))
+    np.testing.assert_array_equal(kept.time_s, raw.time_s[[0, 60]])
+
+
+def test_travel_counts_from_the_first_time_step(raw: RawTrial) -> None:
+    rows = tare(last_of_increments(replace(raw, travel_m=raw.travel_m + 2e-3)))
+    np.testing.assert_allclose(rows.travel_m, 1e-4 * np.arange(8), atol=1e-15)
+
+
+@pytest.mark.parametrize("stream", ["force", "tip", "travel_m"])
+def test_tare_names_the_row_that_is_not_finite(raw: RawTrial, stream: str) -> None:
+    trial = last_of_increments(raw)
+    values = getattr(trial, stream).copy()
+    values[3] = np.nan
+    with pytest.raises(DatasetError, match=f"{stream} is not finite in row 3"):
+        tare(replace(trial, **{stream: values}))
 
 
 def test_tare_subtracts_the_first_time_step(raw: RawTrial) -> None:
@@ -129,6 +150,44 @@ def test_filter_is_at_5_hz_whatever_the_rate() -> None:
     )
     found = filter_force(trial).force[2000:6000]
     np.testing.assert_allclose(found, 0.5 * wave[2000:6000], atol=2e-3)
+
+
+@pytest.mark.parametrize(("dwell", "padding"), [(50, 16), (10, 9), (2, 1)])
+def test_dwells_are_mirrored_for_five_time_constants(dwell: int, padding: int) -> None:
+    """0.159 s are 16 samples at 100 Hz; a dwell that is shorter is mirrored as far as it goes."""
+    time_s = np.arange(3 * dwell, dtype=np.float64) * 0.01
+    force = np.random.default_rng(3).normal(size=(3 * dwell, 3))
+    counts = np.zeros((3 * dwell, 19), np.uint16)
+    ends = dwell * np.arange(1, 4) - 1
+    found = filter_force(RawTrial(HEADER, time_s, counts, force, force, time_s, ends)).force
+    sections = scipy.signal.butter(1, 5.0, fs=100.0, output="sos")
+    for number in range(3):
+        rows = slice(number * dwell, (number + 1) * dwell)
+        wanted = scipy.signal.sosfiltfilt(
+            sections, force[rows], axis=0, padtype="even", padlen=padding
+        )
+        np.testing.assert_allclose(found[rows], wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_filter_takes_gaps_up_to_half_a_second(raw: RawTrial) -> None:
+    number = np.arange(len(raw.time_s))
+
+    def gap(seconds: float) -> RawTrial:
+        return replace(raw, time_s=(number + (number > 100) * (64 * seconds - 1)) / 64)
+
+    assert filter_force(gap(0.5)).force.shape == raw.force.shape
+    for seconds in (0.6, 0.0):
+        with pytest.raises(DatasetError, match=r"without a gap over 0\.5 s"):
+            filter_force(gap(seconds))
+
+
+def test_one_sample_has_no_rate(raw: RawTrial) -> None:
+    one = replace(
+        raw, time_s=raw.time_s[:1], electrodes=raw.electrodes[:1], force=raw.force[:1],
+        tip=raw.tip[:1], travel_m=raw.travel_m[:1], increment_end=np.array([0]),
+    )  # fmt: skip
+    with pytest.raises(DatasetError, match=r"its steps are inf\.\.-inf s"):
+        filter_force(one)
 
 
 def test_filter_refuses_what_it_cannot_filter(raw: RawTrial) -> None:
@@ -219,6 +278,20 @@ def test_crossing_is_exact_for_any_two_forces(
     share = crossing(before, after)
     assert 0 < share <= 1
     assert np.linalg.norm(before + share * (after - before)) == pytest.approx(0.5, abs=1e-9)
+
+
+def test_crossing_keeps_its_digits_in_a_long_segment() -> None:
+    """A difference of like numbers would leave ten of them."""
+    before, after = along_z(0.5 - 2.0**-20, 2.0**20)
+    share = crossing(before, after)
+    assert share == pytest.approx(2.0**-20 / (2.0**20 - 0.5 + 2.0**-20), rel=1e-13)
+
+
+def test_crossing_where_the_force_starts_at_the_threshold() -> None:
+    before, after = np.array([0.5, 0.0, 0.0]), np.array([0.4, 0.0, 3.0])
+    assert crossing(before, after) == pytest.approx(0.1 / 9.01), "it falls below before it rises"
+    rounded = before + np.array([5e-10, 0.0, 0.0])
+    assert crossing(rounded, np.array([0.5, 0.6, 0.0])) == pytest.approx(0, abs=1e-8)
 
 
 def test_a_segment_that_does_not_cross_is_a_mistake() -> None:
