@@ -151,6 +151,9 @@ def test_saturated_samples_are_counted_and_kept() -> None:
     readings, assembler = assemble(slots)
     assert assembler.counters["saturated_samples"] == 2
     assert readings[0].validity == ch.ALL_VALID
+    for value in (0, 4095):
+        alone = [*slots_of(1)[:-1], slots_of(1)[-1]._replace(value=value)]
+        assert assemble(alone)[1].counters["saturated_samples"] == 1
 
 
 slot_strategy = st.builds(

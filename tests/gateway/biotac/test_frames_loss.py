@@ -149,6 +149,31 @@ def test_a_sample_that_may_be_one_of_two_is_placed_by_time_or_left_out() -> None
         assert bad_channels(readings[1], layout) == ["E3", *sorted([name, gone])]
 
 
+def test_times_place_a_sample_unless_they_were_made_by_counting() -> None:
+    layout = BIOTAC_LAYOUT
+    slots = frame_of(1, layout, told=False) + frame_of(2, layout, told=False)
+    del slots[44 + 3 : 44 + 5]  # a PAC sample, and E3 behind it
+    assembler = FrameAssembler(PERIOD_S)
+    readings = assembler.push(slot_block(slots)) + assembler.finish()
+    assert bad_channels(readings[1], layout) == ["E3", "PAC[1]"]
+
+
+def test_a_frame_is_cut_if_it_ends_unlike_the_one_before() -> None:
+    first, second = frame_of(1, BIOTAC_LAYOUT), frame_of(2, BIOTAC_LAYOUT)
+    assembler = FrameAssembler(PERIOD_S)
+    assert not assembler.ends_inside_frame, "nothing has begun"
+    assembler.push(slot_block(first[:-1]))
+    assert assembler.ends_inside_frame, "how frames end is not known yet"
+    assembler.push(slot_block(first[-1:]))
+    assert not assembler.ends_inside_frame
+    assembler.push(slot_block(second[:-2]))
+    assert assembler.ends_inside_frame
+    assembler.push(slot_block(second[-2:]))
+    assembler.push(slot_block([*frame_of(3, BIOTAC_LAYOUT)[:9], *frame_of(3, BIOTAC_LAYOUT)[10:]]))
+    assert assembler.pending_slots == 43
+    assert not assembler.ends_inside_frame, "a slot was lost on the way"
+
+
 def test_repeated_slots_change_nothing() -> None:
     layout = BIOTAC_LAYOUT
     whole, second = frame_of(1, layout, told=False), frame_of(2, layout, told=False)
