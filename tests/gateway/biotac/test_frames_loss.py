@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -242,6 +243,52 @@ class LongWay(FrameAssembler):
 
     def _take_usual(self, slots: SlotBlock, readings: list[ElectrodeReading]) -> int:
         return 0
+
+
+class CountedLongWay(FrameAssembler):
+    """Counts the slots that go the long way."""
+
+    slots = 0
+
+    def _assemble(self, slots: SlotBlock, starts: npt.NDArray[np.int64]) -> list[ElectrodeReading]:
+        self.slots += len(slots)
+        return super()._assemble(slots, starts)
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_whole_frames_go_the_quick_way(layout: FrameLayout, told: bool) -> None:
+    assembler = CountedLongWay(PERIOD_S, layout)
+    assembler.push(slot_block([*frame_of(1, layout, told=told), *frame_of(2, layout, told=told)]))
+    learnt = assembler.slots
+    several = [slot for frame in range(3, 7) for slot in frame_of(frame, layout, told=told)]
+    assert len(assembler.push(slot_block(several))) == 4
+    assert assembler.slots == learnt, "the order of sampling was known"
+    assembler.push(slot_block(frame_of(7, layout, told=told)[1:]))
+    assembler.finish()
+    assert assembler.slots > learnt
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("counter", ["frame", "batch"])
+def test_halves_of_two_frames_are_no_whole_one(counter: str, told: bool) -> None:
+    """Though their channels come in the usual order."""
+    layout = BIOTAC_LAYOUT
+    later = [slot._replace(**{counter: 9}) for slot in frame_of(3, layout, told=told)]
+    halves = [*frame_of(3, layout, told=told)[:22], *later[22:]]
+    readings, _ = assemble([*frame_of(1, layout), *frame_of(2, layout), *halves], layout)
+    assert [len(bad_channels(one, layout)) for one in readings] == [0, 0, 22, 22]
+
+
+def test_a_round_from_another_place_goes_the_long_way() -> None:
+    """Usual channels, but positions that tell of another round: the channels decide."""
+    layout = BIOTAC_LAYOUT
+    assembler = CountedLongWay(PERIOD_S, layout)
+    assembler.push(slot_block([*frame_of(1, layout), *frame_of(2, layout)]))
+    learnt = assembler.slots
+    moved = [s._replace(position=(s.position + 2) % 44) for s in frame_of(3, layout)]
+    assembler.push(slot_block(moved))
+    assert assembler.slots == learnt + len(moved)
 
 
 @st.composite
