@@ -12,11 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.electrodes.film import FilmMesh, film_mesh
+from palpate_fem.electrodes.film import FilmMesh, film_mesh, onto
 from palpate_fem.electrodes.gap import GapFinder
 from palpate_fem.electrodes.residual import CLAMP_X_M, fit_of, thickness
-from palpate_fem.electrodes.table import DISC_TERMINAL, TERMINALS
+from palpate_fem.electrodes.table import DISC_DIAMETER_M, DISC_TERMINAL, TERMINALS
 from palpate_fem.electrodes.unit import UnitParameters
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.parametric import biotac
@@ -81,6 +82,37 @@ def test_discs_have_their_area_and_grow_smoothly() -> None:
     np.testing.assert_allclose(areas, wanted, rtol=0.02)
     bend = np.diff(np.log(areas), 2, axis=0) - np.diff(np.log(wanted), 2, axis=0)
     assert np.abs(bend).max() < 1e-3
+
+
+def test_rings_of_nodes_stand_about_each_disc() -> None:
+    """The current leaves at the rim: 71 nodes within it, a disc's own triangles between them."""
+    core = finger().core
+    mesh = film_mesh(core)
+    assert np.bincount(mesh.terminal + 1)[1:].tolist() == [4 * 116] + [116] * 19
+    radius = DISC_DIAMETER_M / 2
+    for electrode, centre in enumerate(onto(core, ELECTRODE_POSITIONS)[0], start=1):
+        (terminal,) = np.unique(DISC_TERMINAL[electrode - 1])
+        own = np.unique(mesh.faces[mesh.terminal == terminal])
+        distance = np.sort(np.linalg.norm(mesh.nodes[own] - centre, axis=1)) / radius
+        shares = np.repeat([0.0, 0.4, 0.7, 0.88, 1.0], [1, 8, 14, 24, 24])
+        # On the curved core a disc is stretched by up to 7 % to keep its area.
+        np.testing.assert_allclose(distance, shares, rtol=0.08, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("recess_m", "edge_m", "nodes", "area_mm2", "back_mm"),
+    [(0.0, 0.55e-3, 3430, 445.707, -6.10), (0.0, 0.8e-3, 3001, 445.228, -6.05),
+     (0.25e-3, 0.55e-3, 3366, 412.713, -6.12)],
+)  # fmt: skip
+def test_film_mesh_is_the_one_that_results_were_made_on(
+    recess_m: float, edge_m: float, nodes: int, area_mm2: float, back_mm: float
+) -> None:
+    mesh = film_mesh(finger().core, recess_m=recess_m, edge_m=edge_m)
+    assert len(mesh.nodes) == nodes
+    assert mesh.areas.sum() * 1e6 == pytest.approx(area_mm2, abs=2e-3)
+    middle_m = mesh.nodes.mean(axis=0)
+    assert middle_m[0] * 1e3 == pytest.approx(back_mm, abs=6e-3)
+    assert abs(middle_m[1]) < 1e-12, "symmetric"
 
 
 @pytest.mark.parametrize("key", ["edge_m", "disc_diameter_m", "recess_m"])

@@ -64,6 +64,7 @@ def test_live_frames_go_out_at_once_and_carry_the_tare_later() -> None:
     assert ids[10:] == [tare.tare_id] * 15
     assert out[10].message is tare  # before the first frame that names it
     assert made.counters["frames_untared"] == 10
+    assert made.counters["frames_published"] == 25
     assert made.ledger.find(tare.tare_id) is tare
 
 
@@ -76,6 +77,9 @@ def test_recording_is_held_until_its_tare() -> None:
     assert [frame.tare_id for frame in frames(out)] == [tare.tare_id] * 14
     assert [frame.stamp.sequence for frame in frames(out)] == list(range(1, 15))
     assert made.counters["frames_untared"] == 0
+    assert made.counters["frames_published"] == 14
+    assert made.finish() == []
+    assert made.tare_error is None, "nothing is held any more"
 
 
 def test_short_recording_goes_out_untared_and_says_so() -> None:
@@ -142,8 +146,17 @@ def test_no_tare_after_the_end() -> None:
     made.finish()
     with pytest.raises(DeviceError, match="not tared: the recording has ended"):
         future.result(timeout=0)
-    with pytest.raises(DeviceError, match="cannot be tared: the recording has ended"):
+    with pytest.raises(DeviceError, match="BT1 cannot be tared: the recording has ended"):
         made.ask_tare(5)
+
+
+def test_rate_of_the_condition_is_that_of_the_slots() -> None:
+    """44 slots at 4400 Hz are 100 frames a second."""
+    made = pipeline(live=True)
+    others = frames(pipeline(live=True).push(readings(200), 10**9))
+    assert made.condition is not None
+    ends = [k for k, frame in enumerate(others, start=1) if made.condition.add(frame)]
+    assert ends == list(range(20, 201, 20)), "blocks of 0.2 s"
 
 
 def test_paced_items_are_due_at_their_stamp() -> None:
