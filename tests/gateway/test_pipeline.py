@@ -242,3 +242,10 @@ def test_what_a_record_lost_when_it_was_taken_is_told_again_by_its_replay() -> N
     replay.push([*recorded, RecordedMessage("electrodes", b"not a frame", 0.05)], 0)
     assert replay.counters["missing_frames"] == 12
     assert replay.counters["frames_published"] == 5
+
+
+def test_recorded_tares_that_do_not_decode_are_counted_and_go_out() -> None:
+    replay = pipeline(live=False)
+    damaged = [RecordedMessage(topic, b"damaged", 0.01) for topic in ("tare", "electrodes")]
+    assert [item.topic for item in replay.push(damaged, 0)] == ["tare", "electrodes"]
+    assert replay.counters["tares_refused"] == 1
