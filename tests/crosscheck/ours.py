@@ -111,7 +111,7 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
     start = np.array([0.0, 0.0, contact.height_m, *UPSIDE_DOWN])
     press = PosedIndenter(Indenter("ball", (ball,)), start, contact.friction)
     state, forces = SolutionState.at_rest(mesh), []
-    system.settle(state, press)
+    system.update_anchors(state, press)
     was = np.zeros(3)
     for to in contact.path():
         done, size = 0.0, 1.0
@@ -123,7 +123,7 @@ def indent(contact: SphereOnBlock, grading: Grading) -> Floats:
             report, balance = newton.solve(trial, moved, volume=None)
             if report.converged:
                 state, done = trial, share
-                system.settle(state, moved)
+                system.update_anchors(state, moved)
                 continue
             size /= 2
             if size < SMALLEST_STEP:

@@ -168,7 +168,7 @@ def friction_arrays(surface: ContactSurface, twin: Contact) -> list[tuple[wp.arr
         (surface.wanted_traction_array, twin.wanted_traction),
         (surface.traction_slope, twin.traction_slope),
         (surface.coupled, area[:, None] * twin.coupled),
-        (surface.rest, area[:, None, None] * twin.rest),
+        (surface.unsymmetric, area[:, None, None] * twin.rest),
     ]
 
 
@@ -207,9 +207,9 @@ def test_kernels_equal_the_twin(
     rest = pressed.matrix(outer, mesh.outer_faces, out.rest)
     move = np.random.default_rng(3).normal(0.0, 1e-6, len(rest))
     if friction:
-        assert difference(system.rest_product(move), rest @ move) < SAME
+        assert difference(system.unsymmetric_product(move), rest @ move) < SAME
     else:
-        assert not system.slides
+        assert not system.is_unsymmetric
     state.core_pressure[:] = 0.0
     held = np.zeros(mesh.nodes.shape, bool)
     apart = EquilibriumSystem(mesh, None, **SKIN, contact=SOFT, held=held)
@@ -269,7 +269,7 @@ def test_assembled_tangent_is_the_derivative_of_the_forces(
         state.position = here + sign * step * move
         pressed.settle()
         forces.append(system.balance(state, pressed.press).unbalanced)
-    found = matrix @ move.ravel() + system.rest_product(move.ravel())
+    found = matrix @ move.ravel() + system.unsymmetric_product(move.ravel())
     assert difference(found, (forces[0] - forces[1]) / (2 * step)) < 1e-6
 
 
@@ -280,7 +280,7 @@ def test_sticking_to_a_flat_has_a_symmetric_tangent(squeeze: Squeeze) -> None:
     pressed.system.balance(pressed.state, pressed.press)
     surface = pressed.system.outer
     assert 2 in surface.status.numpy()
-    assert np.abs(surface.rest.numpy()).max() < 1e-9 * SOFT.tangential_stiffness * 1e-6
+    assert np.abs(surface.unsymmetric.numpy()).max() < 1e-9 * SOFT.tangential_stiffness * 1e-6
 
 
 def test_an_indenter_that_is_gone_leaves_nothing(squeeze: Squeeze) -> None:
@@ -293,6 +293,6 @@ def test_an_indenter_that_is_gone_leaves_nothing(squeeze: Squeeze) -> None:
         balance = system.balance(state, away)
         system.tangent_values()
         assert not balance.indenter.any()
-        assert not system.slides
+        assert not system.is_unsymmetric
         assert not system.coupled_force().any()
         assert not system.outer.status.numpy().any()

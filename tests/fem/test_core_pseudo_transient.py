@@ -1,4 +1,4 @@
-"""Creeping: from an unstable state to a stable one, without a force of its own."""
+"""Pseudo-transient continuation: from an unstable state to a stable one, without added forces."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.newton import (
-    LEAST,
-    MOST,
-    START,
+    FIRST_VISCOSITY,
+    LEAST_VISCOSITY,
+    MOST_VISCOSITY,
     NewtonSettings,
     NewtonSolver,
     PseudoTransient,
@@ -33,26 +33,26 @@ Fill = Callable[..., Fingertip]
 BALL = make_indenter("sphere_medium")
 
 
-def test_drag_falls_to_none_and_comes_back_where_nothing_is_won() -> None:
-    creep = PseudoTransient()
-    drags = [creep.drag]
+def test_viscosity_falls_to_none_and_comes_back_where_nothing_is_won() -> None:
+    continuation = PseudoTransient()
+    viscosities = [continuation.viscosity]
     for residual in (1.0, 3.0, 0.5, 2.0, 0.3, 0.1):  # leaving an unstable state, forces may grow
-        creep.after(residual)
-        drags.append(creep.drag)
-    assert drags[0] == START
-    assert all(later < earlier or later == 0.0 for earlier, later in pairwise(drags))
-    assert creep.drag == 0.0
-    creep.after(0.29)
-    assert creep.drag == START  # two iterations ago it was as good
+        continuation.after(residual)
+        viscosities.append(continuation.viscosity)
+    assert viscosities[0] == FIRST_VISCOSITY
+    assert all(later < earlier or later == 0.0 for earlier, later in pairwise(viscosities))
+    assert continuation.viscosity == 0.0
+    continuation.after(0.29)
+    assert continuation.viscosity == FIRST_VISCOSITY  # two iterations ago it was as good
 
 
-def test_drag_rises_from_none_as_far_as_it_may() -> None:
-    creep = PseudoTransient(drag=0.0)
-    creep.rise()
-    assert creep.drag == LEAST
-    while creep.may_rise:
-        creep.rise()
-    assert creep.drag == MOST
+def test_viscosity_rises_from_none_as_far_as_it_may() -> None:
+    continuation = PseudoTransient(viscosity=0.0)
+    continuation.rise()
+    assert continuation.viscosity == LEAST_VISCOSITY
+    while continuation.can_rise:
+        continuation.rise()
+    assert continuation.viscosity == MOST_VISCOSITY
 
 
 def newton_of(
@@ -78,7 +78,7 @@ def column(block: Mesh) -> tuple[SolidMesh, NDArray[np.bool_], SolutionState]:
 
 
 @pytest.mark.parametrize("solver", ["fronts", "fronts-double", "superlu"])
-def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
+def test_a_column_stays_straight_by_newton_and_buckles_by_continuation(
     column: tuple[SolidMesh, NDArray[np.bool_], SolutionState], solver: str
 ) -> None:
     """Newton finds the unstable straight column; nothing real would stay there."""
@@ -93,7 +93,8 @@ def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
     assert np.abs(axis[:2] - 0.5e-3).max() < 1e-9
 
     bent = start.copy()
-    bent.position[middle, 0] += 1e-6  # the least disturbance: creeping follows it, not the column
+    # Continuation follows the least disturbance, not the straight column.
+    bent.position[middle, 0] += 1e-6
     report, balance = newton.solve(bent, None, volume=None, pseudo_transient=True)
     assert report.converged, report.residuals
     assert bent.position[middle, 0].mean() - 0.5e-3 > 0.5e-3
@@ -106,7 +107,7 @@ def test_a_column_stays_straight_by_newton_and_buckles_where_it_creeps(
     assert plain.residual == balance.residual
 
 
-def test_creeping_arrives_where_plain_steps_do(finger: Fingertip) -> None:
+def test_continuation_arrives_where_plain_steps_do(finger: Fingertip) -> None:
     low = finger.nodes[:, 2].min()
     answers = []
     for continued in (False, True):
@@ -143,7 +144,7 @@ def test_a_point_that_lets_go_does_so_at_once(finger: Fingertip) -> None:
 
 
 def test_a_snap_ends_the_trajectory_before_it(fill: Fill) -> None:
-    """Where only creeping finds an answer, and one that bears much less."""
+    """Where only continuation finds an answer, and one that bears much less."""
     finger = fill()
     finger.newton.settings = NewtonSettings(iterations=1)
     low = finger.nodes[:, 2].min()

@@ -1,8 +1,7 @@
-"""Constants of contact, and an indenter at a pose.
+"""Contact of the skin's two surfaces: outside with the indenter, inside with the core.
 
-One surface of the mesh, with what contact leaves at its points.
-
-Contact of the skin's two surfaces: outside with the indenter, inside with the core.
+The laws, and why pressures and tractions of contact are unknowns of their own, are in
+``contact_kernels``; this module holds the constants, the arrays and the launches.
 """
 
 from __future__ import annotations
@@ -27,15 +26,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ContactSettings:
-    """Numbers of the contact laws, per unpressurised area.
+    """Constants of the contact laws, per unpressurised area.
 
     Attributes:
-        stiffness: Of the normal law [Pa/m]; 1 MPa, a hard pinch, is 0.5 um deep.
+        stiffness: Of the normal law [Pa/m]; at 1 MPa, a hard pinch, the penetration is 0.5 um.
         tangential_stiffness: Of a sticking point [Pa/m]; 0.1 MPa moves it by 2 um.
-        complement: c that decides between sticking and sliding [Pa/m]; it does not touch the
-            answer. At most the skin's own stiffness (mu over an element): with more, a point whose
-            way changes sign from iteration to iteration slides for ever.
-        margin_m: Points farther from a surface are not looked at [m].
+        complement: c of the complementarity function that decides between sticking and sliding
+            [Pa/m]. The solution does not depend on it. It must not exceed the skin's own stiffness
+            (mu over the size of an element): with more, a point whose displacement changes sign
+            from iteration to iteration slides for ever (ADR 0013).
+        margin_m: Points farther than this from a surface are not evaluated [m].
     """
 
     stiffness: float = 2e12
@@ -53,7 +53,7 @@ class ContactSettings:
         )
 
     def law(self, friction: float) -> ContactLaw:
-        """The same for the kernels."""
+        """The constants as the kernels take them, with a Coulomb coefficient."""
         law = ContactLaw()
         law.stiffness = wp.float64(self.stiffness)
         law.friction = wp.float64(friction)
@@ -65,32 +65,37 @@ class ContactSettings:
 class PosedIndenter:
     """An indenter at a pose (7,): position [m] and quaternion w x y z, sensor frame."""
 
-    def __init__(self, indenter: Indenter, pose: Floats, friction: float) -> None:
-        self.shape, self.friction = indenter, friction
-        self.primitives = scalars(indenter.packed())
+    def __init__(
+        self, shape: Indenter, pose: Floats, friction: float, primitives: wp.array | None = None
+    ) -> None:
+        self.shape, self.friction = shape, friction
+        self.primitives = scalars(shape.packed()) if primitives is None else primitives
         self.tip = np.asarray(pose[:3], np.float64)
         self.rotation = rotation_matrices(pose[3:])
 
     def at(self, pose: Floats) -> PosedIndenter:
-        """The same at another pose."""
-        other = object.__new__(PosedIndenter)
-        other.shape, other.friction, other.primitives = (
-            self.shape,
-            self.friction,
-            self.primitives,
-        )
-        other.tip, other.rotation = np.asarray(pose[:3], np.float64), rotation_matrices(pose[3:])
-        return other
+        """The same indenter at another pose."""
+        return PosedIndenter(self.shape, pose, self.friction, self.primitives)
 
     def to_local(self, points: Floats) -> Floats:
-        """Points of the sensor frame in the indenter's."""
+        """Points of the sensor frame in the indenter frame."""
         return np.asarray((points - self.tip) @ self.rotation)
 
 
 class ContactSurface:
-    """One surface of the mesh, with what contact leaves at its quadrature points."""
+    """One surface of the mesh, and the results of the contact kernels at its points.
+
+    The contact points are the corners of the faces; arrays have the shape (faces, corners).
+    """
 
     def __init__(self, nodes: Floats, faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> None:
+        """Prepare the arrays.
+
+        Args:
+            nodes: Undeformed positions [m], (V, 3).
+            faces: Node ids (F, k); may be empty.
+            pairs: Block of each node pair of each face in the tangent, (F, k, k).
+        """
         self.count = len(faces)
         corners = faces.shape[1] if faces.ndim == 2 else 3
         self.points = corners
@@ -112,19 +117,19 @@ class ContactSurface:
         self.misfit = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
         self.tangent = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
         self.coupled = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
-        self.rest = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
-        self._freezing = (self.slope, self.traction_slope, self.status, self.rest)
+        self.unsymmetric = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
+        self._freezing = (self.slope, self.traction_slope, self.status, self.unsymmetric)
         self._frozen = [wp.clone(array) for array in self._freezing]
         self._sliding = wp.zeros(0, dtype=wp.int32, device=DEVICE)
 
     @property
     def model(self) -> list[wp.array]:
-        """What every contact kernel takes first."""
+        """First arguments of each contact kernel."""
         return [self.faces, self.shape, self.area]
 
     @property
     def results(self) -> list[wp.array]:
-        """What every contact kernel fills."""
+        """First outputs of each contact kernel."""
         return [
             self.status,
             self.gap_array,
@@ -138,17 +143,17 @@ class ContactSurface:
         """Keep what belongs to the tangent that is being factorised."""
         for kept, now in zip(self._frozen, self._freezing, strict=True):
             wp.copy(kept, now)
-        rest = self.rest.numpy().reshape(self.count, 9 * self.points)
-        sliding = np.flatnonzero(np.any(rest != 0.0, axis=1)).astype(np.int32)
+        unsymmetric = self.unsymmetric.numpy().reshape(self.count, 9 * self.points)
+        sliding = np.flatnonzero(np.any(unsymmetric != 0.0, axis=1)).astype(np.int32)
         self._sliding = wp.array(sliding, dtype=wp.int32, device=DEVICE)
 
     @property
-    def slides(self) -> bool:
+    def is_unsymmetric(self) -> bool:
         """Whether the frozen tangent has an unsymmetric share."""
         return len(self._sliding) > 0
 
     def add_tangent(self, blocks: wp.array) -> None:
-        """Add the symmetric tangents of the points that touch."""
+        """Add the symmetric tangents of the touching points."""
         if self.count:
             wp.launch(
                 contact_kernels.point_tangent,
@@ -158,10 +163,10 @@ class ContactSurface:
                 device=DEVICE,
             )
 
-    def add_rest_product(self, change: wp.array, product: wp.array) -> None:
-        """Add the frozen unsymmetric share times a change of the nodes."""
+    def add_unsymmetric_product(self, change: wp.array, product: wp.array) -> None:
+        """Add the frozen unsymmetric share of the tangent times a change of the nodes."""
         wp.launch(
-            contact_kernels.rest_product,
+            contact_kernels.unsymmetric_product,
             dim=len(self._sliding),
             inputs=[self.faces, self.shape, self._sliding, self._frozen[3]],
             outputs=[change, product],
@@ -170,11 +175,11 @@ class ContactSurface:
 
     @property
     def changed(self) -> bool:
-        """Whether any point's status differs from the frozen one."""
+        """Whether the status of any point differs from the frozen one."""
         return not np.array_equal(self._frozen[2].numpy(), self.status.numpy())
 
-    def forget(self) -> None:
-        """Nothing is near."""
+    def clear(self) -> None:
+        """Set the results of a surface that nothing is near to."""
         self.gap[:] = np.inf
         self._wanted[:] = 0.0
         self._wanted_traction[:] = 0.0
@@ -185,16 +190,16 @@ class ContactSurface:
             self.misfit,
             self.tangent,
             self.coupled,
-            self.rest,
+            self.unsymmetric,
         ):
             array.zero_()
 
-    def misfit_of(self, pressure: Floats) -> float:
-        """Largest difference of pressures from what the law wants [Pa]."""
+    def pressure_misfit(self, pressure: Floats) -> float:
+        """Largest difference between pressures and what the normal law demands [Pa]."""
         return float(np.abs(self._wanted - pressure).max()) if self.count else 0.0
 
     def traction_misfit(self, traction: Floats) -> float:
-        """Largest difference of tractions from what friction wants [Pa]."""
+        """Largest difference between tractions and what the friction law demands [Pa]."""
         return float(np.abs(self._wanted_traction - traction).max()) if self.count else 0.0
 
     def updated_pressure(self, moved: wp.array) -> tuple[Floats, Floats]:
@@ -220,11 +225,11 @@ class ContactSurface:
             )
         return pressure, traction
 
-    def add_load(self, load: wp.array, force: wp.array) -> None:
+    def subtract_load(self, load: wp.array, force: wp.array) -> None:
         """Subtract a load at the points (F, Q) from nodal forces."""
         if self.count:
             wp.launch(
-                contact_kernels.misfit_force,
+                contact_kernels.subtract_load,
                 dim=self.count,
                 inputs=[self.faces, self.shape, load],
                 outputs=[force],
@@ -232,14 +237,14 @@ class ContactSurface:
             )
 
     def points_at(self, position: Floats) -> Floats:
-        """Where the contact points are [m], (F, Q, 3)."""
+        """Positions of the contact points [m], (F, Q, 3)."""
         return np.asarray(np.einsum("qa,fai->fqi", self.shape_values, position[self._corners]))
 
     def current_area(self, position: Floats) -> Floats:
-        """Area that belongs to each corner, the integral of its shape function [m^2], (F, Q).
+        """Area of each corner, the integral of its shape function over the face [m^2], (F, Q).
 
-        The Jacobian at the corner itself would do on squares only: on distorted faces it is not the
-        corner's share, and an even pressure would push unevenly.
+        The Jacobian at the corner itself is its share of the area on parallelograms only. On a
+        distorted face an even pressure with such weights would push unevenly.
         """
         element = face_element(self.points)
         edges = np.einsum("qad,fai->fqdi", element.gradient, position[self._corners])
@@ -256,24 +261,24 @@ class IndenterContact:
         self._force = vec3s(self.force)
 
     def evaluate(
-        self, state: SolutionState, press: PosedIndenter | None, position: wp.array
+        self, state: SolutionState, indenter: PosedIndenter | None, position: wp.array
     ) -> None:
-        """Minus the nodal forces on the skin, and what each point has to say."""
+        """Evaluate minus the nodal forces on the skin, and the results at each point."""
         self.force[:] = 0.0
         surface = self.surface
-        if press is None or not surface.count:
-            surface.forget()
+        if indenter is None or not surface.count:
+            surface.clear()
             return
         wp.launch(
             contact_kernels.indenter_contact,
             dim=surface.count,
             inputs=[
                 *surface.model,
-                press.primitives,
-                self.settings.law(press.friction),
+                indenter.primitives,
+                self.settings.law(indenter.friction),
                 wp.float64(self.settings.margin_m),
-                wp.vec3d(*press.tip),
-                wp.mat33d(*press.rotation.ravel()),
+                wp.vec3d(*indenter.tip),
+                wp.mat33d(*indenter.rotation.ravel()),
                 position,
                 scalars(state.indenter_pressure),
                 vec3s(state.traction),
@@ -284,7 +289,7 @@ class IndenterContact:
                 surface.wanted_traction_array,
                 surface.traction_slope,
                 surface.coupled,
-                surface.rest,
+                surface.unsymmetric,
                 self._force,
             ],
             device=DEVICE,
@@ -307,11 +312,11 @@ class CoreContact:
         self._table = scalars(core.coefficients if core else np.zeros((4, 4, 4)))
 
     def evaluate(self, state: SolutionState, position: wp.array) -> None:
-        """Minus the nodal forces on the skin, and what each point has to say."""
+        """Evaluate minus the nodal forces on the skin, and the results at each point."""
         self.force[:] = 0.0
         surface, core = self.surface, self.core
         if core is None or not surface.count:
-            surface.forget()
+            surface.clear()
             return
         wp.launch(
             contact_kernels.core_contact,
@@ -322,6 +327,8 @@ class CoreContact:
                 wp.vec3d(*core.origin),
                 wp.float64(core.spacing),
                 self.settings.law(0.0),
+                # The kernel first looks at one coefficient of the point's cell, whose node is up
+                # to sqrt(3) spacings away from the point.
                 wp.float64(self.settings.margin_m + 2 * core.spacing),
                 position,
                 scalars(state.core_pressure),

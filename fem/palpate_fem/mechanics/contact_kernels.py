@@ -1,33 +1,30 @@
 # mypy: ignore-errors
-"""Contact at points, as kernels see it: normal law and friction.
+"""Contact laws and kernels: friction with the indenter, frictionless contact with the core.
 
-Points are the corners of the surface faces (Lobatto points).
+Contact points are the corners of the surface faces (Lobatto points).
 
-Normal law, with gap g and stiffness e per *reference* area, so that frictionless contact has an
-energy::
+**Normal law**, with gap g and stiffness e per *undeformed* area, so that frictionless contact has
+an energy::
 
     p = e max(0, -g)
 
-so stiff that nothing is deeper than a few micrometres. Coulomb friction by return mapping: a point
-sticks to an anchor on the indenter by a spring of stiffness k; the spring's traction is capped at
-mu p, and what is beyond moves the anchor at the end of the increment.
+so stiff that the penetration stays below a few micrometres. **Coulomb friction** by return
+mapping: a spring of stiffness k ties a sticking point to an anchor on the indenter; its traction is
+capped at mu p, and what exceeds the cap moves the anchor at the end of the increment.
 
-Pressures and tractions are states of their own, as in the elements: an iterate's values come from
-the linear solve, not from gap and slip, because so stiff laws would turn each micrometre of
-curvature into a megapascal. Whether a point touches, sticks or slides is decided from both
-(primal-dual active set; Hueber and Wohlmuth 2005, Gitterle et al. 2010)::
+Pressures and tractions are unknowns of their own, as in the elements: their iterates come from the
+linear solve, not from gap and slip, because laws so stiff would turn each micrometre of curvature
+into a megapascal. Whether a point touches, sticks or slides is decided from both (primal-dual
+active set; Hueber and Wohlmuth 2005, Gitterle et al. 2010)::
 
     touches: g < 0 or p > 0            slides: |t + c (d - t / k)| > mu p
 
-with d the tangential way from the anchor. Points lie in the corners, where the nodes are: as many
-conditions as unknowns. With 2 x 2 inner points there are four times as many; they contradict one
-another by the facet's sagitta, and the sets cycle (tried, not kept).
+with d the tangential displacement from the anchor. The points are the nodes of the surface, so
+there are as many conditions as unknowns. Quadrature points inside the faces (2 x 2) would be four
+times as many; their conditions contradict one another by the sagitta of the facet, and the sets
+cycle (ADR 0013).
 
-NumPy twins: ``contact.py``.
-
-Kernels of contact: the outer faces with the indenter, and what all contact shares.
-
-Kernel of frictionless contact with the core, whose distance is a tabulated cubic B-spline.
+A NumPy twin of each function is in ``tests/fem/numpy_mechanics.py``.
 """
 
 from __future__ import annotations
@@ -51,7 +48,7 @@ class ContactLaw:
 
 @wp.struct
 class LinearisedFriction:
-    """Linearised friction at a point: status 1 sticks, 2 slides; traction, and its derivatives."""
+    """Linearised friction at a point: status 1 sticks, 2 slides; traction and its derivatives."""
 
     status: int
     wanted: wp.vec3d
@@ -61,7 +58,7 @@ class LinearisedFriction:
 
 @wp.func
 def normal_law(law: ContactLaw, pressure: wp.float64, gap: wp.float64) -> wp.vec2d:
-    """Linearised law at a pressure and a gap: what p should be [Pa], and -dp/dg [Pa/m]."""
+    """Linearised normal law: the pressure that it demands [Pa], and -dp/dg [Pa/m]."""
     if gap < wp.float64(0.0) or pressure > wp.float64(0.0):
         return wp.vec2d(-law.stiffness * gap, law.stiffness)
     return wp.vec2d(wp.float64(0.0), wp.float64(0.0))
@@ -76,7 +73,7 @@ def friction_law(
     curvature: wp.mat33d,
     arm: wp.vec3d,
 ) -> LinearisedFriction:
-    """Linearised friction of a touching point whose way from its anchor is ``arm``."""
+    """Linearised friction of a touching point at ``arm`` from its anchor."""
     answer = LinearisedFriction()
     k = law.tangential_stiffness
     along = wp.dot(normal, arm)
@@ -89,6 +86,7 @@ def friction_law(
         - wp.outer(normal, curvature * arm)
     )
     now = traction - wp.dot(normal, traction) * normal
+    # The sign of |trial| - mu p tells sticking from sliding, in an iterate as in the solution.
     trial = now + law.complement * (way - now / k)
     size = wp.length(trial)
     limit = law.friction * pressure
@@ -97,6 +95,8 @@ def friction_law(
         answer.wanted = k * way
         answer.by_position = k * turn
         return answer
+    # Newton's step for t = mu p trial / |trial|, solved for t at the point (the inverse is known in
+    # closed form); it converges to the return mapping.
     answer.status = 2
     t = trial / size
     share = limit / size
@@ -136,15 +136,16 @@ def indenter_contact(
     wanted_traction_out: wp.array2d(dtype=wp.vec3d),
     traction_slope_out: wp.array2d(dtype=wp.mat33d),
     coupled_out: wp.array2d(dtype=wp.vec3d),
-    rest_out: wp.array2d(dtype=wp.mat33d),
+    unsymmetric_out: wp.array2d(dtype=wp.mat33d),
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """Frictional contact of the outer faces with the indenter.
 
-    Anchors are in the indenter's frame. Adds minus the contact force to ``force_out``. A symmetric
-    approximation of the tangent goes to ``tangent_out``, what it lacks to ``rest_out``: mostly the
-    growth of the sliding friction with pressure. That term must not be symmetrised: its mirror
-    image would make the matrix indefinite, by the square of half the friction coefficient.
+    Anchors are in the indenter frame. Adds minus the contact force to ``force_out``. A symmetric
+    approximation of the tangent goes to ``tangent_out`` and the difference to
+    ``unsymmetric_out``: mostly the growth of sliding friction with pressure. That term must not be
+    symmetrised: its transpose would make the matrix indefinite, by the square of half the friction
+    coefficient.
     """
     f = wp.tid()
     k = faces.shape[1]
@@ -162,9 +163,9 @@ def indenter_contact(
         wanted_traction_out[f, q] = wp.vec3d()
         traction_slope_out[f, q] = wp.mat33d()
         coupled_out[f, q] = wp.vec3d()
-        rest_out[f, q] = wp.mat33d()
+        unsymmetric_out[f, q] = wp.mat33d()
         p = pressure_in[f, q]
-        # Far points have none of these: their pressure was taken away when they left.
+        # Points beyond the margin have no pressure: it was set to zero when they separated.
         if near.gap < margin:
             normal = rotation * near.normal
             answer = normal_law(law, p, near.gap)
@@ -178,12 +179,14 @@ def indenter_contact(
                 residual = p * normal
                 misfit = (answer[0] - p) * normal
                 d = wp.outer(slope, normal) - p * curvature
-                rest = wp.mat33d()
+                unsymmetric = wp.mat33d()
                 if law.friction > wp.float64(0.0):
                     t = traction_in[f, q]
                     arm = x - (tip + rotation * anchor_in[f, q])
                     rub = friction_law(law, p, t, normal, curvature, arm)
                     status_out[f, q] = 1 + rub.status
+                    # Friction by the change of pressure. It is kept apart (``coupled``), as the
+                    # demanded pressure of a new point is far too large before the linear solve.
                     grown = (answer[0] - p) * rub.by_pressure
                     wanted_traction_out[f, q] = rub.wanted + grown
                     coupled_out[f, q] = -w * grown
@@ -193,11 +196,11 @@ def indenter_contact(
                     misfit -= rub.wanted - t
                     symmetric = wp.float64(0.5) * (rub.by_position + wp.transpose(rub.by_position))
                     d += symmetric
-                    rest = rub.by_position - symmetric - coupled
+                    unsymmetric = rub.by_position - symmetric - coupled
                 misfit_out[f, q] = w * misfit
                 for a in range(k):
                     wp.atomic_sub(force_out, faces[f, a], (w * shape[q, a]) * residual)
-                rest_out[f, q] = w * rest
+                unsymmetric_out[f, q] = w * unsymmetric
                 tangent_out[f, q] = w * d
 
 
@@ -212,7 +215,7 @@ def point_tangent(
     # Out:
     block_out: wp.array(dtype=wp.mat33d),
 ):
-    """Add the tangents of the points that touch to the upper node-pair blocks."""
+    """Add the tangents of the touching points to the upper node-pair blocks."""
     f = wp.tid()
     for q in range(shape.shape[0]):
         if status_in[f, q] > 0:
@@ -224,13 +227,13 @@ def point_tangent(
 
 
 @wp.kernel
-def rest_product(
+def unsymmetric_product(
     # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     # State in:
     sliding_in: wp.array(dtype=wp.int32),
-    rest_in: wp.array2d(dtype=wp.mat33d),
+    unsymmetric_in: wp.array2d(dtype=wp.mat33d),
     vector_in: wp.array(dtype=wp.vec3d),
     # Out:
     product_out: wp.array(dtype=wp.vec3d),
@@ -242,25 +245,25 @@ def rest_product(
         v = wp.vec3d()
         for a in range(k):
             v += shape[q, a] * vector_in[faces[f, a]]
-        moved = rest_in[f, q] * v
+        moved = unsymmetric_in[f, q] * v
         for a in range(k):
             wp.atomic_add(product_out, faces[f, a], shape[q, a] * moved)
 
 
 @wp.kernel
-def misfit_force(
+def subtract_load(
     # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     # State in:
-    misfit_in: wp.array2d(dtype=wp.vec3d),
+    load_in: wp.array2d(dtype=wp.vec3d),
     # Out:
     force_out: wp.array(dtype=wp.vec3d),
 ):
-    """Add the load (a residual) that condensing the contact pressures puts on the nodes."""
+    """Subtract a load at the contact points from nodal forces."""
     f = wp.tid()
     for q in range(shape.shape[0]):
-        m = misfit_in[f, q]
+        m = load_in[f, q]
         if wp.length_sq(m) > wp.float64(0.0):
             for a in range(faces.shape[1]):
                 wp.atomic_sub(force_out, faces[f, a], shape[q, a] * m)
@@ -282,9 +285,9 @@ def pressure_update(
     pressure_out: wp.array2d(dtype=wp.float64),
     traction_out: wp.array2d(dtype=wp.vec3d),
 ):
-    """Pressures, none negative, and tractions that go with a change of the nodes, to first order.
+    """Pressures, none negative, and tractions after a change of the nodes, to first order.
 
-    The slopes are those of the factorised tangent.
+    The slopes are those of the factorised tangent, see `element_kernels.pressure_update`.
     """
     f = wp.tid()
     for q in range(shape.shape[0]):
@@ -351,10 +354,10 @@ def core_contact(
     tangent_out: wp.array2d(dtype=wp.mat33d),
     force_out: wp.array(dtype=wp.vec3d),
 ):
-    """Frictionless contact of the inner faces with the core, a tabulated distance.
+    """Frictionless contact of the inner faces with the core, whose distance is a cubic B-spline.
 
-    Adds minus the contact force (a residual) to ``force_out``. Points whose sample is farther
-    than ``margin`` are left out.
+    Adds minus the contact force to ``force_out``. Points in a cell whose coefficient exceeds
+    ``margin`` are skipped.
     """
     f = wp.tid()
     k = faces.shape[1]

@@ -1,19 +1,22 @@
 # mypy: ignore-errors
-"""Kernels of the skin: incompressible neo-Hooke with one pressure an element (Q1-P0).
+"""Kernels of the skin (nearly incompressible neo-Hooke) and of the fluid that it encloses.
 
-Energy of an element, with v its volume and p its pressure (Simo, Taylor and Pister 1985)::
+The element has linear displacements and one pressure (Q1-P0, mean dilatation; Simo, Taylor and
+Pister 1985). Its energy, with v its volume and p its pressure::
 
     sum_q w_q mu/2 (J^(-2/3) I1 - 3 + barrier b^2)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
 
-and b = max(0, |ln J| - 0.25), which nothing feels but skin in a pinch (see ``material.py``).
+with the barrier's b = max(0, |ln J| - 0.25), see ``material``.
 
-The pressure is condensed: the tangent keeps the size of the displacements, but p is a state of its
-own, so Newton's convergence does not depend on kappa. NumPy twins: ``element.py``.
+The pressure is condensed: the tangent is as large as the displacements alone. But p is an unknown
+of its own, updated by the linear solve, so the number of Newton iterations does not grow with
+kappa. One pressure for each element avoids volumetric locking: only the *mean* volume is kept.
 
-One thread handles one element; two threads of the host may run two ranges of them at once, so each
-adds into arrays of its own.
+The fluid's volume is a third of the integral of x . n over the closed inner surface; its gradient
+and second derivative are exact for bilinear faces (``reference_element.volume_form``).
 
-Kernel of the sealed fluid: the volume that a closed surface encloses, and its derivatives.
+One Warp thread handles one element or face. Two host threads may run two ranges of elements at
+once, so each adds into arrays of its own. NumPy twins: ``tests/fem/numpy_mechanics.py``.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def beyond(j: wp.float64):
-    """How far ln J is past where the barrier begins, with its sign: b sign(ln J)."""
+    """Barrier of the volume at a point: b sign(ln J)."""
     logarithm = wp.log(wp.max(j, wp.float64(1.0e-3)))
     return wp.sign(logarithm) * wp.max(wp.abs(logarithm) - FROM, wp.float64(0.0))
 
@@ -52,7 +55,7 @@ def element_state(
     volume_gradient_out: wp.array2d(dtype=wp.vec3d),
     force_out: wp.array(dtype=wp.vec3d),
 ):
-    """Add internal nodal forces; element volumes, their gradients and the smallest J."""
+    """Add internal nodal forces; set element volumes, their gradients and the smallest J."""
     e = first + wp.tid()
     n = elements.shape[1]
     pressure = pressure_in[e]
@@ -100,7 +103,7 @@ def point_state(
     right_out: wp.array3d(dtype=wp.vec3d),
     scale_out: wp.array2d(dtype=wp.vec2d),
 ):
-    """Vectors a tangent is made of, per element, quadrature point and node.
+    """Vectors of which the tangent is made, for each element, quadrature point and node.
 
     With g = F^-T grad N and h = F grad N: spatial = g, left = -2/3 c h, right = left + (2/9 c I1 +
     w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J)),
@@ -187,10 +190,10 @@ def pressure_update(
     # Out:
     pressure_out: wp.array(dtype=wp.float64),
 ):
-    """Element pressures that belong to a change of the nodal positions, to first order.
+    """Element pressures after a change of the nodal positions, to first order.
 
-    The gradients are those of the factorised tangent: pressures and displacements then solve one
-    and the same linear system, which matters because kappa would magnify any difference.
+    The gradients are those of the factorised tangent, so that pressures and displacements solve one
+    linear system: kappa would magnify any difference.
     """
     e = wp.tid()
     v = volume_in[e] - rest_volume[e]
@@ -212,7 +215,7 @@ def pressure_misfit(
     # Out:
     force_out: wp.array(dtype=wp.vec3d),
 ):
-    """Add the load that condensing the element pressures puts on the nodes."""
+    """Add the load on the nodes by static condensation of the element pressures."""
     e = wp.tid()
     misfit = bulk_over_volume[e] * (volume_in[e] - rest_volume[e]) - pressure_in[e]
     for a in range(elements.shape[1]):
@@ -265,7 +268,7 @@ def cavity_volume(
     volume_out: wp.array(dtype=wp.float64),
     gradient_out: wp.array(dtype=wp.vec3d),
 ):
-    """Volume under each face and, added to the nodes, its gradient (``volume_form``)."""
+    """Set the volume under each face; add its gradient to the nodes."""
     f = wp.tid()
     k = faces.shape[1]
     volume = wp.float64(0.0)

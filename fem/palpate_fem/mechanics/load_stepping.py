@@ -144,7 +144,7 @@ class LoadStepping:
         self.at = _Progress(rest.copy(), PosedIndenter(indenter, self.path[0], friction))
         self.outcome: IndentationOutcome | None = None
         self.reason = ""
-        newton.system.settle(self.at.state, self.at.indenter)
+        newton.system.update_anchors(self.at.state, self.at.indenter)
         newton.forget()
 
     def run(self) -> IndentationResult:
@@ -224,7 +224,7 @@ class LoadStepping:
                 report.converged = False
         if report.converged:
             self.at = _Progress(trial, indenter, _force(balance), start, length)
-            self.newton.system.settle(trial, indenter)
+            self.newton.system.update_anchors(trial, indenter)
         else:
             self.at.previous = None
         return report, balance

@@ -1,9 +1,9 @@
-"""The skin's law: isochoric neo-Hooke; energy, first Piola stress and tangent at points.
+"""The skin's material: isochoric neo-Hooke; energy, first Piola stress and tangent at points.
 
-An element's *mean* volume is kept by its pressure; the volume at one of its quadrature points is
-not, and where skin is pinched between a hard indenter and the core the points of one element may
-go to J = 0.3 beside J = 2 (an hourglass that Q1-P0 does not resist), until Newton finds no
-equilibrium. A barrier takes over there, and is exactly nothing below: J within 0.78..1.28.
+The pressure of an element keeps its *mean* volume, but not the volume at each of its quadrature
+points. Where skin is pinched between a hard indenter and the core, the points of one element may
+go to J = 0.3 beside J = 2, an hourglass mode that Q1-P0 does not resist, and Newton's method finds
+no equilibrium. A barrier resists it; for J within 0.78..1.28 it is exactly zero (ADR 0013).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 VOLUME_BARRIER = 60.0
-"""Stiffness of the barrier in shear moduli; see ADR 0013 for what it does to forces."""
+"""Stiffness of the barrier in shear moduli; ADR 0013 says how little it changes forces."""
 
 BARRIER_FROM = 0.25
 """|ln J| at which the barrier begins."""
@@ -26,12 +26,12 @@ BARRIER_FROM = 0.25
 class NeoHooke:
     """W = mu/2 (J^(-2/3) tr(F^T F) - 3 + barrier max(0, |ln J| - 0.25)^2).
 
-    For J = 1 this is the paper's equation "neo_hookean" up to a constant; an element's volume is
-    its pressure's affair. The arguments ``f`` are deformation gradients, shape (..., 3, 3).
+    For J = 1 this is the paper's equation "neo_hookean" up to a constant; the volumetric part
+    belongs to the element and its pressure. ``f`` are deformation gradients, shape (..., 3, 3).
 
     Attributes:
         mu: Shear modulus [Pa].
-        barrier: Against volume that changes at a point alone, in shear moduli; 0 = none.
+        barrier: Stiffness against a change of volume at a single point, in shear moduli; 0 = none.
     """
 
     mu: float
@@ -69,12 +69,13 @@ class NeoHooke:
 
     @staticmethod
     def _beyond(j: Floats) -> tuple[Floats, Floats]:
-        """How far |ln J| is past where the barrier begins, and the sign of ln J."""
+        """Excess of |ln J| over where the barrier begins, at least 0, and the sign of ln J."""
         logarithm = np.log(j)
         beyond = np.maximum(0.0, np.abs(logarithm) - BARRIER_FROM)
         return np.asarray(beyond), np.asarray(np.sign(logarithm))
 
     def _parts(self, f: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return mu J^(-2/3), tr(F^T F) and F^-T."""
         j = np.linalg.det(f)[..., None, None]
         trace = np.sum(f * f, axis=(-2, -1))[..., None, None]
         inverse_t = np.asarray(np.linalg.inv(f).swapaxes(-1, -2), np.float64)

@@ -1,17 +1,8 @@
-"""How strongly skin is held back when it creeps into an equilibrium that Newton cannot reach.
+"""Newton's method for one increment of the load.
 
-Pinched between a hard indenter and the core, skin may have an unstable direction: a node of its
-inner surface that is let go moves *into* the core, and one that is held pulls. No order of touching
-and letting go ends then. Real skin is viscous and moves to its next stable state; so does this one,
-by implicit Euler steps of one Newton iteration each (pseudo-transient continuation; Kelley and
-Keyes 1998): a drag, of the skin's own shear stiffness times a factor, is added to the tangent, and
-not to the forces. What it converges to is an equilibrium without any drag.
-
-It is raised until no direction is unstable, which the inertia of the factorised matrix tells, and
-falls from iteration to iteration. (By what is unbalanced it cannot be steered: that grows while the
-skin leaves an unstable state.)
-
-Newton's method for one increment: bordered by the fluid, with friction's unsymmetric share.
+The linear system of an iteration is the sparse symmetric tangent, bordered by the fluid pressure,
+plus the unsymmetric share of friction, which corrects the solution of the symmetric part. Where
+skin is pinched so hard that this does not converge, pseudo-transient continuation takes its place.
 """
 
 from __future__ import annotations
@@ -30,70 +21,38 @@ from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import SparseFactor
 
-START = 1.0
-FALL, RISE = 0.3, 3.0
-NONE, LEAST, MOST = 3e-3, 1e-2, 100.0
-STALLED = 0.8
-"""Unbalanced force over that two iterations ago from which it is taken not to fall."""
-
-
-@dataclass(slots=True)
-class PseudoTransient:
-    """Drag from iteration to iteration.
-
-    Attributes:
-        drag: Its factor now.
-    """
-
-    drag: float = START
-    _past: list[float] = field(default_factory=list)
-
-    @property
-    def may_rise(self) -> bool:
-        """Whether more drag is worth trying."""
-        return self.drag < MOST
-
-    def rise(self) -> None:
-        """A direction is unstable: hold back more."""
-        self.drag = min(MOST, max(LEAST, RISE * self.drag))
-
-    def after(self, residual: float) -> None:
-        """An iteration has left this much of the force unbalanced."""
-        stalled = len(self._past) >= 2 and residual > STALLED * self._past[-2]
-        if stalled and self.drag == 0.0:
-            self.drag = START
-        else:
-            self.drag = FALL * self.drag if FALL * self.drag > NONE else 0.0
-        self._past.append(residual)
-
-
 Floats = NDArray[np.float64]
 
-
 DAMP_FROM = 6
-"""Iterations after which an error that does not fall is taken for a cycle."""
+"""Iterations after which an error that does not decrease is taken for a cycle."""
 
+SMALL_CORRECTION = 0.3
+"""Share of the solution below which one correction for the unsymmetric tangent is enough."""
 
-SMALL_REST = 0.3
-"""Share of the answer below which friction's rest is answered by one correction."""
+FIRST_VISCOSITY = 1.0
+VISCOSITY_FALL, VISCOSITY_RISE = 0.3, 3.0
+NO_VISCOSITY, LEAST_VISCOSITY, MOST_VISCOSITY = 3e-3, 1e-2, 100.0
+
+STALLED = 0.8
+"""Residual over that two iterations before from which the iteration is taken to stall."""
 
 
 @dataclass(frozen=True, slots=True)
 class NewtonSettings:
-    """When to stop, and how far to go.
+    """Tolerances and limits of an increment.
 
     Attributes:
         tolerance: Unbalanced force over the scale of the forces that cancel.
         volume_tolerance: Relative error of the cavity's volume and of each element's.
         gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
         traction_tolerance: Error of a point's friction over the largest traction.
-        iterations: Give up after this many.
-        pseudo_transient_iterations: The same where the skin is held back.
-        largest_move_m: A longer step of any node is shortened [m].
-        keep_factor: A factor is kept while each iteration shrinks the error at least this much
-            and no contact changes.
-        keep_elastic: The skin's share of the tangent is kept within an increment while each
-            iteration shrinks the error at least this much.
+        iterations: Most iterations of Newton's method.
+        pseudo_transient_iterations: Most iterations of pseudo-transient continuation.
+        largest_move_m: Displacement of any node in one iteration; longer moves are shortened [m].
+        keep_factor: The factorised matrix is used again while each iteration shrinks the error to
+            this share of it or less, and the active set of contact does not change.
+        keep_elastic: The tangent of skin and fluid is used again within an increment while each
+            iteration shrinks the error to this share of it or less.
     """
 
     tolerance: float = 1e-6
@@ -109,7 +68,7 @@ class NewtonSettings:
 
 @dataclass(slots=True)
 class NewtonReport:
-    """How an increment went."""
+    """How an increment went; ``reason`` says why it did not converge."""
 
     iterations: int = 0
     factorisations: int = 0
@@ -118,21 +77,68 @@ class NewtonReport:
     reason: str = ""
 
 
+@dataclass(slots=True)
+class PseudoTransient:
+    """Pseudo-transient continuation (Kelley and Keyes 1998): the viscosity of each iteration.
+
+    Skin that is pinched between a hard indenter and the core may have an unstable direction: a node
+    of its inner surface moves *into* the core when its contact is released, and its contact pulls
+    when it is kept. The active set of contact then never comes to rest. Real skin is viscous and
+    flows to its next stable state. So does this one, by implicit Euler steps of one Newton
+    iteration each::
+
+        (K + eta M) dx = -r(x)
+
+    with the tangent K, the unbalanced force r and a diagonal M of the size of the skin's stiffness.
+    The viscosity eta (over the time step) is in the tangent only, not in the forces, so the limit
+    is an equilibrium without viscosity.
+
+    eta rises until K + eta M has no negative eigenvalue, which the inertia of its factor tells, and
+    falls from iteration to iteration. It must not be steered by the residual, as usual elsewhere:
+    the residual grows while the skin leaves an unstable state.
+
+    Attributes:
+        viscosity: eta of the next iteration.
+    """
+
+    viscosity: float = FIRST_VISCOSITY
+    _residuals: list[float] = field(default_factory=list)
+
+    @property
+    def can_rise(self) -> bool:
+        """Whether the viscosity is below its limit."""
+        return self.viscosity < MOST_VISCOSITY
+
+    def rise(self) -> None:
+        """Raise the viscosity, because a direction is unstable."""
+        self.viscosity = min(MOST_VISCOSITY, max(LEAST_VISCOSITY, VISCOSITY_RISE * self.viscosity))
+
+    def after(self, residual: float) -> None:
+        """Lower the viscosity after an iteration; begin again where it is 0 and nothing is won."""
+        stalled = len(self._residuals) >= 2 and residual > STALLED * self._residuals[-2]
+        if stalled and self.viscosity == 0.0:
+            self.viscosity = FIRST_VISCOSITY
+        else:
+            lower = VISCOSITY_FALL * self.viscosity
+            self.viscosity = lower if lower > NO_VISCOSITY else 0.0
+        self._residuals.append(residual)
+
+
 class NewtonSolver:
-    """Solves increments of one system; keeps its factor between them."""
+    """Solves increments of one system; keeps its factorised tangent between them."""
 
     def __init__(
         self, system: EquilibriumSystem, factor: SparseFactor, settings: NewtonSettings
     ) -> None:
         self.system, self.factor, self.settings = system, factor, settings
-        # Volume gradient at the factorised state, and the factor's answer to it.
+        # Border of the factorised tangent K: the volume gradient b there, and K^-1 b.
         self._border: tuple[Floats, Floats] | None = None
-        self._has_elastic = False  # whether the skin's share was ever made
+        self._has_elastic = False  # whether the tangent of skin and fluid was ever evaluated
 
     def solve(
         self,
         state: SolutionState,
-        press: PosedIndenter | None,
+        indenter: PosedIndenter | None,
         *,
         volume: float | None,
         should_stop: Callable[[], bool] | None = None,
@@ -141,27 +147,27 @@ class NewtonSolver:
         """Bring ``state`` into equilibrium, in place.
 
         Args:
-            state: Start; holds the answer, or the last iterate, afterwards.
-            press: Indenter at its pose.
-            volume: Volume the cavity shall have [m^3]; None = the fluid pressure is given.
-            should_stop: Asked once an iteration; True ends it unconverged.
-            pseudo_transient: Whether to use pseudo-transient continuation, see `PseudoTransient`.
+            state: Start; afterwards the solution, or the last iterate.
+            indenter: Indenter at its pose.
+            volume: Volume that the cavity has to take [m^3]; None = the fluid pressure is given.
+            should_stop: Called in each iteration; True ends it unconverged.
+            pseudo_transient: Whether to use pseudo-transient continuation: slower, but it converges
+                where the active set of plain Newton iterations cycles.
         """
+        continuation = PseudoTransient() if pseudo_transient else None
         with one_thread():
-            return self._iterate(
-                state, press, volume, should_stop, PseudoTransient() if pseudo_transient else None
-            )
+            return self._iterate(state, indenter, volume, should_stop, continuation)
 
     def _iterate(
         self,
         state: SolutionState,
-        press: PosedIndenter | None,
+        indenter: PosedIndenter | None,
         volume: float | None,
         should_stop: Callable[[], bool] | None,
         continuation: PseudoTransient | None,
     ) -> tuple[NewtonReport, ForceBalance]:
         settings, system, report = self.settings, self.system, NewtonReport()
-        balance = system.balance(state, press)
+        balance = system.balance(state, indenter)
         fits, elastic = False, not (self._has_elastic and settings.keep_elastic)
         limit = settings.pseudo_transient_iterations if continuation else settings.iterations
         error = self._error(balance, volume)
@@ -178,12 +184,12 @@ class NewtonSolver:
                 return report, balance
             try:
                 if continuation:
-                    report.factorisations += self._held_back(continuation)
+                    report.factorisations += self._factorise_stable(continuation)
                 elif not fits:
                     self._factorise(elastic=elastic)
                     report.factorisations += 1
                 damping = 1.0 if continuation else self._damping(report)
-                balance = self._step(state, press, balance, volume, damping)
+                balance = self._step(state, indenter, balance, volume, damping)
             except SimulationError as failure:
                 report.reason = failure.problem
                 return report, balance
@@ -193,37 +199,42 @@ class NewtonSolver:
             if not np.isfinite(error):
                 report.reason = "the equations gave no number"
                 return report, balance
-            # What touches and sticks changes from one iteration to the next, the skin's own
-            # stiffness from one increment to the next: it is done anew once the first iteration
-            # has come near.
+            # The active set of contact changes from one iteration to the next, the skin's own
+            # tangent little within an increment: it is evaluated again after the first iteration,
+            # which brings the state near, and then only where convergence is slow.
             elastic = report.iterations == 1 or error > settings.keep_elastic * before
             fits = error < settings.keep_factor * before and not system.sets_changed
             if continuation:
                 continuation.after(balance.residual)
 
     def forget(self) -> None:
-        """Keep nothing of the last tangent: what follows does not depend on what came before."""
+        """Drop the last tangent, so that the next solution does not depend on earlier ones."""
         self._border, self._has_elastic = None, False
 
-    def _factorise(self, *, elastic: bool, drag: float = 0.0) -> None:
+    def _factorise(self, *, elastic: bool, viscosity: float = 0.0) -> None:
         self._border = None
-        self.factor.factorise(self.system.tangent_values(elastic=elastic, drag=drag))
+        self.factor.factorise(self.system.tangent_values(elastic=elastic, viscosity=viscosity))
         self._has_elastic = True
 
-    def _held_back(self, continuation: PseudoTransient) -> int:
-        """Factorise with a drag that leaves no unstable direction; how many factorisations."""
-        self._factorise(elastic=True, drag=continuation.drag)
+    def _factorise_stable(self, continuation: PseudoTransient) -> int:
+        """Factorise with a viscosity that leaves no unstable direction; returns how often.
+
+        By Sylvester's law of inertia the signs of the pivots are those of the eigenvalues, so the
+        factor tells the number of unstable directions at no cost.
+        """
+        self._factorise(elastic=True, viscosity=continuation.viscosity)
         count = 1
-        while self.factor.negative and continuation.may_rise:
+        while self.factor.negative and continuation.can_rise:
             continuation.rise()
-            self._factorise(elastic=False, drag=continuation.drag)
+            self._factorise(elastic=False, viscosity=continuation.viscosity)
             count += 1
         return count
 
     def _damping(self, report: NewtonReport) -> float:
-        """Fraction of the next step: half where the error goes round in circles.
+        """Fraction of the next step: less than 1 where the error cycles.
 
-        Sets of sticking and sliding points may alternate between two, which a full step jumps over.
+        The sets of sticking and sliding points may alternate between two. Steps of half and three
+        quarters, in turn, end between them.
         """
         past = report.residuals
         if report.iterations < DAMP_FROM or past[-1] < 0.3 * min(past[-4:-1]):
@@ -231,7 +242,7 @@ class NewtonSolver:
         return 0.5 if report.iterations % 2 else 0.75
 
     def _error(self, balance: ForceBalance, volume: float | None) -> float:
-        """Largest of the relative errors, each over its tolerance's size."""
+        """Largest of the relative errors, weighted by their tolerances."""
         error = balance.residual
         if volume is not None:
             error = max(error, abs(balance.volume - volume) / volume)
@@ -258,34 +269,16 @@ class NewtonSolver:
     def _step(
         self,
         state: SolutionState,
-        press: PosedIndenter | None,
+        indenter: PosedIndenter | None,
         balance: ForceBalance,
         volume: float | None,
         damping: float,
     ) -> ForceBalance:
-        """One linear solve and the move along it, shortened where needed."""
+        """Solve the linear system once and move along its solution, shortened where needed."""
         settings, system = self.settings, self.system
-        free = system.pattern.free
-        # The condensed residual: pressures are eliminated, so their misfit loads the nodes.
-        right = -(balance.unbalanced + system.misfit_force(state))
-        if volume is None or self._border is not None:
-            change = np.asarray(self.factor.solve(right))
-        else:
-            gradient = balance.volume_gradient.reshape(-1)[free].copy()
-            change, answer = self.factor.solve(np.stack((right, gradient), axis=1)).T
-            # Without friction's share: the volume is met exactly all the same, and what the forces
-            # miss is small, as the fluid's pressure changes little in a step.
-            self._border = (gradient, answer)
-        if system.slides:
-            change = self._with_rest(change, -system.coupled_force())
-        pressure_change = 0.0
-        if volume is not None and self._border is not None:
-            gradient, answer = self._border
-            stiffness = float(gradient @ answer)
-            pressure_change = (volume - balance.volume - float(gradient @ change)) / stiffness
-            change = change + pressure_change * answer
+        change, pressure_change = self._linear_solution(state, balance, volume)
         move = np.zeros_like(state.position)
-        move.reshape(-1)[free] = change
+        move.reshape(-1)[system.pattern.free] = change
         if not np.isfinite(change).all():
             raise SimulationError("the linear solve gave no number", remedy="smaller increments")
         longest = float(np.sqrt((move * move).sum(axis=1).max()))
@@ -302,33 +295,67 @@ class NewtonSolver:
                 strict=True,
             ):
                 now[:] = before + fraction * (target - before)
-            # A point that lets go does so at once: half of its pressure again and again would
-            # never be none, and the point would hang on.
+            # A contact opens at once, however short the step: a fraction of its pressure again and
+            # again would never become zero, and the point would stay in the active set.
             for now, target in zip(
                 (state.core_pressure, state.indenter_pressure), targets[1:3], strict=True
             ):
                 now[target <= 0.0] = 0.0
             state.traction[targets[2] <= 0.0] = 0.0
-            trial = system.balance(state, press)
+            trial = system.balance(state, indenter)
             if trial.smallest_jacobian > 0.0:
                 return trial
             fraction *= 0.5
         raise SimulationError("an element turns inside out", remedy="use smaller increments")
 
-    def _with_rest(self, answer: Floats, coupled: Floats) -> Floats:
-        """Correct an answer of the symmetric tangent for friction's unsymmetric rest.
+    def _linear_solution(
+        self, state: SolutionState, balance: ForceBalance, volume: float | None
+    ) -> tuple[Floats, float]:
+        """Change of the free unknowns (n,) and of the fluid pressure [Pa].
+
+        With the fluid sealed, the tangent K is bordered by the volume gradient b::
+
+            [ K   -b ] [dx]   [ -r          ]
+            [ b^T  0 ] [dp] = [ V_goal - V  ]
+
+        and solved by block elimination: dx = x0 + dp K^-1 b, with b^T dx = V_goal - V.
+        """
+        system = self.system
+        # The pressures are condensed, so their misfit loads the nodes.
+        right = -(balance.unbalanced + system.misfit_force(state))
+        if volume is None or self._border is not None:
+            change = np.asarray(self.factor.solve(right))
+        else:
+            gradient = balance.volume_gradient.reshape(-1)[system.pattern.free].copy()
+            change, answer = self.factor.solve(np.stack((right, gradient), axis=1)).T
+            # K^-1 b leaves out the unsymmetric share of friction. The volume is met exactly all the
+            # same; the error of the forces is small, as the pressure changes little in a step.
+            self._border = (gradient, answer)
+        if system.is_unsymmetric:
+            change = self._with_unsymmetric_share(change, -system.coupled_force())
+        if volume is None or self._border is None:
+            return change, 0.0
+        gradient, answer = self._border
+        stiffness = float(gradient @ answer)
+        pressure_change = (volume - balance.volume - float(gradient @ change)) / stiffness
+        return change + pressure_change * answer, pressure_change
+
+    def _with_unsymmetric_share(self, answer: Floats, coupled: Floats) -> Floats:
+        """Correct a solution of the symmetric tangent for the unsymmetric share of friction.
 
         Args:
-            answer: Of the symmetric tangent.
-            coupled: More of the right-hand side, that the rest's product with the answer nearly
-                cancels.
+            answer: Solution with the symmetric tangent S.
+            coupled: Further load, which the unsymmetric share U times the answer nearly cancels.
+
+        Returns:
+            Approximate solution of (S + U) x = S answer + coupled.
         """
-        left_over = coupled - self.system.rest_product(answer)
+        left_over = coupled - self.system.unsymmetric_product(answer)
         more = np.asarray(self.factor.solve(left_over))
-        if np.linalg.norm(more) > SMALL_REST * np.linalg.norm(answer):
+        if np.linalg.norm(more) > SMALL_CORRECTION * np.linalg.norm(answer):
             operator = LinearOperator(
                 (len(answer), len(answer)),
-                matvec=lambda v: v + self.factor.solve(self.system.rest_product(v)),
+                matvec=lambda v: v + self.factor.solve(self.system.unsymmetric_product(v)),
                 dtype=np.float64,
             )
             more, _ = gmres(operator, more, rtol=1e-1, atol=0.0, restart=8, maxiter=1)

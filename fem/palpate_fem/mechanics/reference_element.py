@@ -14,7 +14,7 @@ from palpate_fem.mesh.solid import SolidMesh
 Floats = NDArray[np.float64]
 
 _GAUSS = 1.0 / np.sqrt(3.0)
-_HEXAHEDRON = np.array(
+_CORNERS = np.array(
     [(-1, -1), (1, -1), (1, 1), (-1, 1)], np.float64
 )  # corners of a quadrilateral, counter-clockwise
 # Three points inside a triangle (degree 2) and their weights; Strang and Fix.
@@ -39,7 +39,7 @@ class ReferenceElement:
 def quadrilateral_at(points: Floats) -> tuple[Floats, Floats]:
     """Bilinear shape functions (Q, 4) and their derivatives (Q, 4, 2) at points (Q, 2)."""
     xi, eta = points[:, :1], points[:, 1:]
-    a, b = _HEXAHEDRON[:, 0], _HEXAHEDRON[:, 1]
+    a, b = _CORNERS[:, 0], _CORNERS[:, 1]
     shape = (1 + a * xi) * (1 + b * eta) / 4
     return shape, np.stack([a * (1 + b * eta) / 4, b * (1 + a * xi) / 4], axis=-1)
 
@@ -82,10 +82,11 @@ def solid_element(nodes: int) -> ReferenceElement:
 
 @cache
 def volume_form(nodes: int) -> Floats:
-    """C with V = sum_abc C_abc x_a . (x_b x x_c): signed volume under a face, (k, k, k).
+    """Form C of the volume under a face, V = sum_abc C_abc x_a . (x_b x x_c), (k, k, k).
 
-    Exact for planar and bilinear faces: one third of the integral of x . n dA. Fully antisymmetric,
-    so dV/dx_a = 3 sum_bc C_abc x_b x x_c, and the second derivative is skew.
+    By the divergence theorem V is one third of the integral of x . n dA; exact for triangles and
+    bilinear quadrilaterals. C is fully antisymmetric, so dV/dx_a = 3 sum_bc C_abc x_b x x_c, and
+    the second derivative is skew.
     """
     face = face_element(nodes)
     shape, gradient = face.shape, face.gradient
@@ -99,9 +100,9 @@ def volume_form(nodes: int) -> Floats:
 
 @cache
 def corner_element(nodes: int) -> ReferenceElement:
-    """Face with its corners as quadrature points (Lobatto 2 x 2; vertex rule of the triangle)."""
+    """Face with its corners as quadrature points, for contact (Lobatto 2 x 2; vertex rule)."""
     if nodes == 4:
-        return ReferenceElement(*quadrilateral_at(_HEXAHEDRON), np.ones(4))
+        return ReferenceElement(*quadrilateral_at(_CORNERS), np.ones(4))
     points = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
     return ReferenceElement(*triangle_at(points), np.full(3, 1 / 6))
 

@@ -1,7 +1,4 @@
-"""The skin's elements on the device, and the launches of their kernels.
-
-The sealed fluid on the device: the volume inside the skin, and its derivatives.
-"""
+"""The skin's elements and the fluid cavity inside: arrays and launches of the kernels."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ Floats = NDArray[np.float64]
 
 
 class SkinElements:
-    """Elements of one mesh with one material; see ``element_kernels``."""
+    """Elements of one mesh with one material; see `element_kernels`."""
 
     def __init__(
         self,
@@ -34,10 +31,10 @@ class SkinElements:
 
         Args:
             mesh: The skin.
-            pairs: Block of each node pair of each element.
+            pairs: Block of each node pair of each element in the tangent, (E, n, n).
             shear_modulus_pa: Neo-Hookean modulus [Pa].
             bulk_ratio: Bulk over shear modulus.
-            volume_barrier: See ``NeoHooke.barrier``.
+            volume_barrier: See `NeoHooke.barrier`.
         """
         self.mu, self.volume_barrier = shear_modulus_pa, volume_barrier
         self.gradient_values, self.weight_values = rest_gradients(mesh)
@@ -52,7 +49,7 @@ class SkinElements:
         self._volume, self._jacobian = scalars(np.zeros(self.count)), scalars(np.zeros(self.count))
         self._volume_gradient = vec3s(np.zeros((self.count, nodes, 3)))
         self._frozen_gradient = vec3s(np.zeros((self.count, nodes, 3)))
-        # Spatial gradients and their companions, of which the tangent is made.
+        # Results of `point_state`, of which the tangent is made.
         self._parts = [vec3s(np.zeros((self.count, points, nodes, 3))) for _ in range(3)]
         self._parts.append(wp.zeros((self.count, points), dtype=wp.vec2d, device=DEVICE))
 
@@ -71,7 +68,7 @@ class SkinElements:
     def add_tangent(
         self, first: int, count: int, position: wp.array, pressure: wp.array, blocks: wp.array
     ) -> None:
-        """Add the tangent of a range of elements; after `add_forces` at the same state."""
+        """Add the tangent of a range of elements; `add_forces` comes first, at the same state."""
         wp.launch(
             element_kernels.point_state,
             dim=count,
@@ -99,7 +96,7 @@ class SkinElements:
         wp.copy(self._frozen_gradient, self._volume_gradient)
 
     def updated_pressure(self, moved: wp.array) -> Floats:
-        """Element pressures that go with a change of the nodes, to first order [Pa], (E,)."""
+        """Element pressures after a change of the nodes, to first order [Pa], (E,)."""
         pressure = np.zeros(self.count)
         wp.launch(
             element_kernels.pressure_update,
@@ -111,7 +108,7 @@ class SkinElements:
         return pressure
 
     def add_misfit(self, pressure: Floats, force: wp.array) -> None:
-        """Add the load that condensing the element pressures puts on the nodes."""
+        """Add the load on the nodes by static condensation of the element pressures."""
         wp.launch(
             element_kernels.pressure_misfit,
             dim=self.count,
@@ -160,7 +157,7 @@ class SkinElements:
 
 
 class FluidCavity:
-    """What the inner surface encloses; without one the volume is zero."""
+    """The volume that the inner surface encloses; without such a surface it is zero."""
 
     def __init__(self, surface: ContactSurface, nodes: int) -> None:
         self.surface = surface
@@ -171,11 +168,11 @@ class FluidCavity:
 
     @property
     def volume(self) -> float:
-        """At the last evaluation [m^3]."""
+        """Volume at the last evaluation [m^3]."""
         return float(self._volumes.numpy().sum())
 
     def evaluate(self, position: wp.array) -> None:
-        """Volume, and its gradient by the nodes."""
+        """Evaluate the volume and its gradient by the nodal positions."""
         self.gradient[:] = 0.0
         surface = self.surface
         if surface.count:
@@ -188,7 +185,7 @@ class FluidCavity:
             )
 
     def add_tangent(self, position: wp.array, pressure: float, blocks: wp.array) -> None:
-        """Add what a fluid pressure [Pa] that follows the surface does to the tangent."""
+        """Add the tangent of a fluid pressure [Pa], a follower load."""
         surface = self.surface
         if surface.count:
             wp.launch(

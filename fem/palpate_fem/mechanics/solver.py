@@ -1,4 +1,8 @@
-"""Load stepping: pressurise once, then follow an indenter's path."""
+"""A fingertip in finite elements: pressurised once, then indented again and again.
+
+Reading order of this folder: `material`, `reference_element`, `skin` (with ``element_kernels``),
+`contact` (with ``contact_kernels``), `state`, `system`, `newton`, `load_stepping`, and this module.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,10 @@ Floats = NDArray[np.float64]
 
 STEPS_TO_PRESSURISE = 4
 REFERENCE_MODULUS_PA = 2.8e5
+"""Shear modulus for which the default contact constants are made: the paper's optimum [Pa]."""
 THICKNESS_TOLERANCE_M = 1e-8
+LARGEST_RISE_M = 0.5e-3
+"""Change of thickness in one filling step [m]: the secant is good and Newton starts near."""
 
 
 class Fingertip:
@@ -35,7 +42,7 @@ class Fingertip:
     def __init__(
         self, geometry: FingertipGeometry, parameters: FingertipParameters, settings: SolverSettings
     ) -> None:
-        """Use `pressurised`; this makes the unfilled one."""
+        """An unpressurised fingertip; use `pressurised`."""
         self.geometry, self.parameters, self.settings = geometry, parameters, settings
         self.system = EquilibriumSystem(
             geometry.mesh,
@@ -64,12 +71,12 @@ class Fingertip:
         settings: SolverSettings | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Fingertip:
-        """Fill the fluid in.
+        """A fingertip that is filled with its fluid.
 
         Args:
             geometry: Mesh and core.
-            parameters: Physical parameters.
-            settings: How to solve.
+            parameters: Physical parameters; None = the paper's optimum.
+            settings: Tolerances and limits of the solver.
             progress: Called with the fraction done.
 
         Raises:
@@ -102,6 +109,7 @@ class Fingertip:
         return self.cavity_m3 - self.core_volume
 
     def _pressurise(self, progress: Callable[[float], None]) -> None:
+        """Fill to the given volume, or by a secant on the volume to the given thickness."""
         parameters, state = self.parameters, self.state
         self.cavity_m3 = self.system.balance(state, None).volume
         if parameters.fluid_volume_m3 is not None:
@@ -119,16 +127,16 @@ class Fingertip:
                 remedy="raise total_thickness_m or give fluid_volume_m3",
             )
         begin = low[1]
-        slope = 0.35 / area  # of thickness by volume; measured on the BioTac: 1.45 mm in 474 mm^3
+        # First guess of d thickness / d volume; the BioTac grows by 1.45 mm in 474 mm^3.
+        slope = 0.35 / area
         previous, reached = low, 0.0
         for _ in range(40):
             missing = wanted - self.total_thickness_m
             if abs(missing) < THICKNESS_TOLERANCE_M:
                 progress(1.0)
                 return
-            # Steps of at most 0.5 mm: the secant is good there and Newton starts near.
-            aim = math.copysign(min(abs(missing), 0.5e-3), missing)
-            self._fill_to(self.cavity_m3 + aim / slope, 1)
+            rise = math.copysign(min(abs(missing), LARGEST_RISE_M), missing)
+            self._fill_to(self.cavity_m3 + rise / slope, 1)
             now = (self.cavity_m3, self.total_thickness_m)
             if abs(now[0] - previous[0]) > 1e-16:
                 slope = (now[1] - previous[1]) / (now[0] - previous[0])
@@ -136,7 +144,7 @@ class Fingertip:
             if slope <= 0.0:
                 break
             reached = max(reached, min(0.99, (now[1] - begin) / max(wanted - begin, 1e-12)))
-            progress(reached)  # never backwards, though the secant may overshoot
+            progress(reached)  # never falls, though the secant may overshoot
         raise SimulationError(
             f"the skin does not get {wanted * 1e3:.2f} mm thick by filling; it reached "
             f"{self.total_thickness_m * 1e3:.2f} mm",
@@ -144,6 +152,7 @@ class Fingertip:
         )
 
     def _fill_to(self, cavity: float, steps: int) -> None:
+        """Bring the cavity to a volume [m^3] in steps; those that do not converge are halved."""
         start, done, size = self.cavity_m3, 0.0, 1.0 / steps
         while done < 1.0 - 1e-12:
             kept = self.state.copy()
@@ -169,7 +178,7 @@ class Fingertip:
         on_step: Callable[[IndentationStep], None] | None = None,
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
     ) -> LoadStepping:
-        """An indentation that is ready to run; `indent` checks its path and runs it."""
+        """An indentation that is ready to run; its path is not checked, as `indent` does."""
         return LoadStepping(
             self.newton,
             self.settings,
@@ -190,19 +199,20 @@ class Fingertip:
         on_step: Callable[[IndentationStep], None] | None = None,
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
     ) -> IndentationResult:
-        """Follow a path of poses (K, 7); the first does not touch the skin.
+        """Move an indenter along a path and compute the skin's response.
 
         Args:
-            indenter: What presses.
-            path: Poses of the indenter in the sensor frame: position [m], quaternion w x y z.
+            indenter: The indenter.
+            path: Poses in the sensor frame: position [m], quaternion w x y z, (K, 7). The first
+                does not touch the skin.
             on_step: Called with each converged step.
-            should_stop: Asked often; an outcome ends the trajectory with it.
+            should_stop: Called at least once in each iteration; an outcome ends the indentation.
 
         Returns:
-            The converged steps; if not all, why, and how far it came.
+            The converged steps; if not all of them, why, and how far the indenter came.
 
         Raises:
-            ConfigError: The path is no path.
+            ConfigError: The path is not valid, see `check_path`.
             SimulationError: The indenter starts inside the skin.
         """
         path = check_path(path)

@@ -1,7 +1,4 @@
-"""Unknowns and memory of one fingertip at one moment.
-
-The equations at one state: what does not cancel, and how far each law is missed.
-"""
+"""Solution of the discrete problem, and the balance of forces there."""
 
 from __future__ import annotations
 
@@ -14,17 +11,23 @@ from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
 
+FORCE_FLOOR_N = 1e-6
+"""Least scale of the forces [N], for a body without load; rounding errors are far below."""
+
+TRACTION_FLOOR_PA = 100.0
+"""Least scale of the tractions [Pa]; a light touch makes a thousand times more."""
+
 
 @dataclass(slots=True)
 class SolutionState:
-    """What one increment hands to the next.
+    """Unknowns and history of one fingertip at one moment; the start of the next increment.
 
     Attributes:
         position: Nodal positions [m], (V, 3).
         pressure: Element pressures, positive in tension [Pa], (E,).
         fluid_pressure: Above ambient [Pa].
         core_pressure: Contact pressure on the core [Pa], (inner faces, points).
-        indenter_pressure: The same on the indenter, (outer faces, points).
+        indenter_pressure: Contact pressure on the indenter [Pa], (outer faces, points).
         traction: Friction of each point on the indenter [Pa], (outer faces, points, 3).
         anchor: Where each point sticks to the indenter, in its frame [m], (outer faces, points, 3).
     """
@@ -70,29 +73,23 @@ def _points(faces: NDArray[np.int32]) -> int:
     return int(faces.shape[1]) if faces.ndim == 2 else 0
 
 
-FORCE_FLOOR_N = 1e-6
-"""Scale of force where nothing presses [N]: rounding alone is far below."""
-
-TRACTION_FLOOR_PA = 100.0
-"""Scale of tractions where nothing rubs [Pa]: a thousandth of what a light press makes."""
-
-
 @dataclass(slots=True)
 class ForceBalance:
-    """The equations at one state.
+    """Forces at one state, what does not cancel, and by how much each law is violated.
 
     Attributes:
-        internal: Nodal forces of the skin's stress (a residual: sum of all four is zero), (V, 3).
+        internal: Nodal forces of the skin's stress, (V, 3). Internal, indenter and core forces,
+            less those of the fluid, add up to zero at the free nodes.
         indenter: Minus the nodal forces of the indenter on the skin, (V, 3).
-        core: Minus those of the core.
-        volume_gradient: Derivative of the cavity's volume by the nodes [m^2], (V, 3).
+        core: Minus the nodal forces of the core on the skin, (V, 3).
+        volume_gradient: Derivative of the cavity's volume by the nodal positions [m^2], (V, 3).
         volume: Of the cavity [m^3].
-        unbalanced: The sum over the free unknowns, fluid pressure included [N], (n,).
+        unbalanced: Their sum at the free unknowns, fluid pressure included [N], (n,).
         scale: Norm of the nodal forces that have to cancel [N].
-        strain_error: Largest |v - v0 - v0 p / kappa| / v0.
-        gap_error_m: By how much the gap of the worst contact point misses its law [m].
-        traction_error: By how much friction's worst traction misses its law, over the largest.
-        smallest_jacobian: Of all quadrature points.
+        strain_error: Largest |v - v0 - v0 p / kappa| / v0 of an element.
+        gap_error_m: Largest difference between a contact point's gap and its law's [m].
+        traction_error: Largest difference between a traction and its law's, over the largest one.
+        smallest_jacobian: Smallest det F of all quadrature points.
     """
 
     internal: Floats

@@ -1,6 +1,8 @@
-"""Sparsity of the tangent: node-pair blocks, and where they go in the matrix of free unknowns.
+"""The discrete equilibrium of skin, fluid, core and indenter: residual and tangent.
 
-The discrete equilibrium of skin, fluid, core and indenter: residual and tangent.
+The tangent is symmetric and sparse; it is assembled as 3 x 3 blocks, one for each pair of nodes
+that share an element. The fluid's pressure, which couples all inner nodes, is not in it: Newton's
+method borders the matrix with it (``newton``).
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from palpate_fem.mechanics.state import TRACTION_FLOOR_PA, ForceBalance, Solutio
 from palpate_fem.mesh.core import DistanceGrid
 from palpate_fem.mesh.solid import SolidMesh
 
+Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
@@ -41,9 +44,9 @@ class TangentPattern:
         outer_pairs: The same for the faces of the outer surface.
         inner_pairs: The same for the faces of the inner surface.
         free: Free unknowns among all 3 V, ascending.
-        indptr: Of the upper triangle in CSR.
-        indices: Of the upper triangle in CSR, sorted.
-        gather: Which entry of the flattened blocks each value of the triangle is.
+        indptr: Upper triangle in CSR format: begin of each row.
+        indices: Upper triangle in CSR format: columns, sorted.
+        gather: Place of each value of the triangle in the flattened blocks.
     """
 
     blocks: int
@@ -59,10 +62,10 @@ class TangentPattern:
 def make_pattern(
     held: NDArray[np.bool_], elements: Ints, outer: Ints, inner: Ints
 ) -> TangentPattern:
-    """Pattern of a mesh.
+    """Sparsity pattern of a mesh.
 
     Args:
-        held: Which components of which nodes are prescribed, (V, 3).
+        held: Prescribed components of the nodes, (V, 3).
         elements: Node ids (E, n).
         outer: Faces of the outer surface, each part of an element.
         inner: Faces of the inner surface, each part of an element.
@@ -95,23 +98,23 @@ def make_pattern(
 
 
 def _keys(cells: Ints, nodes: int) -> NDArray[np.int64]:
-    """Number of each ordered node pair of each cell; -1 below the diagonal."""
+    """Number of each ordered pair of nodes of each cell; -1 below the diagonal."""
     low, high = cells[:, :, None].astype(np.int64), cells[:, None, :].astype(np.int64)
     return np.asarray(np.where(low <= high, low * nodes + high, -1))
 
 
 def _find(keys: NDArray[np.int64], cells: Ints, nodes: int) -> Ints:
+    """Block of each pair of nodes of each cell; -1 below the diagonal."""
     wanted = _keys(cells, nodes)
     return np.where(wanted >= 0, np.searchsorted(keys, wanted), -1).astype(np.int32)
 
 
-Floats = NDArray[np.float64]
-
 THREADS = 2
+"""Host threads that work on the two halves of the elements: a Warp launch on the CPU uses one."""
 
 
 class EquilibriumSystem:
-    """Equations of one mesh; the unknowns come and go as `SolutionState`."""
+    """Equations of one mesh: constant; the unknowns are passed in as a `SolutionState`."""
 
     def __init__(
         self,
@@ -133,10 +136,10 @@ class EquilibriumSystem:
             bulk_ratio: Bulk over shear modulus.
             contact: Constants of the contact laws.
             volume_barrier: See ``NeoHooke.barrier``.
-            held: Prescribed components (V, 3); None = the mesh's fixed nodes. Their positions are
-                those in the state.
+            held: Prescribed components (V, 3); None = the mesh's fixed nodes. They keep the
+                positions that they have in the state.
         """
-        # Compiled now: two threads that meet a new kernel would both compile it.
+        # Loaded before the threads start: two that use a new kernel at once would both compile it.
         for module in (contact_kernels, element_kernels):
             wp.load_module(module, device=DEVICE)
         self.mesh, self.contact = mesh, contact
@@ -145,7 +148,7 @@ class EquilibriumSystem:
             held[mesh.fixed] = True
         self.pattern = make_pattern(held, mesh.elements, mesh.outer_faces, mesh.inner_faces)
         self._held = np.flatnonzero(held)
-        self.load = np.zeros(mesh.nodes.shape)  # dead nodal forces [N]; tests set them
+        self.load = np.zeros(mesh.nodes.shape)  # dead nodal forces [N], for verification
         self.skin = SkinElements(
             mesh,
             self.pattern.element_pairs,
@@ -159,8 +162,8 @@ class EquilibriumSystem:
         self.on_indenter = IndenterContact(self.outer, nodes, contact)
         self.on_core = CoreContact(self.inner, nodes, contact, core)
         self._cavity = FluidCavity(self.inner, nodes)
-        # One array a thread: nodal forces of the skin, and node-pair blocks of the tangent without
-        # contact. The tangent of contact is added to a sum of these.
+        # For each thread: nodal forces of the skin, and blocks of the tangent of skin and fluid.
+        # The tangent of contact, which changes more often, is added to a copy of their sum.
         self._forces = [np.zeros((nodes, 3)) for _ in range(THREADS)]
         self._force_arrays = [vec3s(force) for force in self._forces]
         self._blocks = [np.zeros((self.pattern.blocks, 9)) for _ in range(THREADS)]
@@ -168,18 +171,20 @@ class EquilibriumSystem:
         self._sum = np.zeros((self.pattern.blocks, 9))
         self._sum_array = mat33s(self._sum.reshape(-1, 3, 3))
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="palpate-fem")
+        # Pseudo-viscosity of a node (see `PseudoTransient`): mu times the edge of the cube that is
+        # its share of the skin's volume, which is of the size of its elastic stiffness.
         share = np.zeros(nodes)
         corners = mesh.elements.shape[1]
         np.add.at(share, mesh.elements, (self.skin.rest_volume / corners)[:, None])
-        self._drag = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
+        self._viscosity = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
         self._at: tuple[wp.array, wp.array, float] | None = None
 
-    def balance(self, state: SolutionState, press: PosedIndenter | None) -> ForceBalance:
+    def balance(self, state: SolutionState, indenter: PosedIndenter | None) -> ForceBalance:
         """Evaluate the equations.
 
         Args:
-            state: Where. `tangent_values` reads it again: leave it until then as it is.
-            press: Indenter and its pose; None = none.
+            state: Where. `tangent_values` reads it again; it must not change in between.
+            indenter: Indenter at its pose; None = none.
         """
         position, pressure = vec3s(state.position), scalars(state.pressure)
         self._at = (position, pressure, state.fluid_pressure)
@@ -188,7 +193,7 @@ class EquilibriumSystem:
         def first_half() -> None:
             self._forces[0][:] = 0.0
             self.skin.add_forces(0, half, position, pressure, self._force_arrays[0])
-            self.on_indenter.evaluate(state, press, position)
+            self.on_indenter.evaluate(state, indenter, position)
 
         def second_half() -> None:
             self._forces[1][:] = 0.0
@@ -200,16 +205,18 @@ class EquilibriumSystem:
         self._both(first_half, second_half)
         return self._sum_up(state)
 
-    def tangent_values(self, *, elastic: bool = True, drag: float = 0.0) -> Floats:
+    def tangent_values(self, *, elastic: bool = True, viscosity: float = 0.0) -> Floats:
         """Upper triangle of the symmetric tangent at the last `balance`.
 
-        What belongs to this tangent (volume gradients, friction's rest) is kept until the next.
+        What belongs to this tangent (volume gradients, contact normals, the unsymmetric share of
+        friction) is kept until the next one: with the stiff bulk modulus and contact laws, a
+        difference between it and the factorised matrix would be magnified.
 
         Args:
-            elastic: Whether skin and fluid are done anew; else they are those of the last time, and
-                only contact is new.
-            drag: Stiffness that holds every node where it is, in units of the skin's own: mu times
-                the edge of the cube that is the node's share of the skin.
+            elastic: Whether the tangent of skin and fluid is evaluated; else the last one is used
+                again, and only that of contact is new.
+            viscosity: Pseudo-viscosity over the pseudo-time step, in units of the skin's own
+                stiffness; it is added to the diagonal.
         """
         if elastic:
             assert self._at is not None
@@ -234,32 +241,33 @@ class EquilibriumSystem:
             surface.add_tangent(self._sum_array)
             surface.freeze()
         values = self._sum.reshape(-1)[self.pattern.gather]
-        values[self.pattern.indptr[:-1]] += drag * self._drag  # a row begins with its diagonal
+        # Each row of the triangle begins with its diagonal.
+        values[self.pattern.indptr[:-1]] += viscosity * self._viscosity
         return values
 
     @property
-    def slides(self) -> bool:
-        """Whether the last tangent has an unsymmetric share."""
-        return self.outer.slides
+    def is_unsymmetric(self) -> bool:
+        """Whether the last tangent has an unsymmetric share, because a point slides."""
+        return self.outer.is_unsymmetric
 
-    def rest_product(self, change: Floats) -> Floats:
+    def unsymmetric_product(self, change: Floats) -> Floats:
         """(Tangent - its symmetric approximation) times a change of the free unknowns, (n,)."""
         full = np.zeros_like(self.mesh.nodes)
         full.reshape(-1)[self.pattern.free] = change
         product = np.zeros_like(full)
-        self.outer.add_rest_product(vec3s(full), vec3s(product))
+        self.outer.add_unsymmetric_product(vec3s(full), vec3s(product))
         return product.reshape(-1)[self.pattern.free]
 
     @property
     def sets_changed(self) -> bool:
-        """Whether a point touches, sticks or slides that did not when the tangent was made."""
+        """Whether the active set has changed since the tangent: who touches, sticks or slides."""
         return self.outer.changed or self.inner.changed
 
     def updated_pressures(self, change: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Pressures that go with a change (V, 3) from the last evaluated state, to first order.
+        """Recover the condensed unknowns after a change (V, 3) of the last evaluated state.
 
         Returns:
-            Those of the elements (E,), on the core and on the indenter (faces, points), and the
+            Pressures of the elements (E,), on the core and on the indenter (faces, points), and the
             tractions on the indenter (faces, points, 3).
         """
         moved = vec3s(change)
@@ -267,34 +275,34 @@ class EquilibriumSystem:
         return self.skin.updated_pressure(moved), core, *self.outer.updated_pressure(moved)
 
     def misfit_force(self, state: SolutionState) -> Floats:
-        """Load that condensing the pressures puts on the free unknowns [N], (n,)."""
+        """Load on the free unknowns by static condensation of the pressures [N], (n,)."""
         force = np.zeros_like(self.mesh.nodes)
         array = vec3s(force)
         self.skin.add_misfit(state.pressure, array)
         for surface in (self.inner, self.outer):
-            surface.add_load(surface.misfit, array)
+            surface.subtract_load(surface.misfit, array)
         return force.reshape(-1)[self.pattern.free]
 
     def coupled_force(self) -> Floats:
-        """Part of `misfit_force` that comes with the friction of grown pressures, (n,).
+        """Load by the friction that follows a change of the contact pressures [N], (n,).
 
-        Kept apart: a new point's pressure is its depth times an enormous stiffness until the linear
-        solve has answered, and friction must follow the answer, not the question.
+        It is not part of `misfit_force`: the demanded pressure of a new point is its penetration
+        times an enormous stiffness. Friction has to follow the pressure after the linear solve.
         """
         force = np.zeros_like(self.mesh.nodes)
-        self.outer.add_load(self.outer.coupled, vec3s(force))
+        self.outer.subtract_load(self.outer.coupled, vec3s(force))
         return force.reshape(-1)[self.pattern.free]
 
-    def settle(self, state: SolutionState, press: PosedIndenter) -> None:
-        """After an increment: anchors such that each point's spring carries its traction.
+    def update_anchors(self, state: SolutionState, indenter: PosedIndenter) -> None:
+        """Place the anchors after an increment, so that each point's spring carries its traction.
 
-        Those of points that slid thereby move along; all others stay, or start where they are.
+        Anchors of points that slid move along; those of points without contact follow the skin.
         """
         stretch = state.traction / self.contact.tangential_stiffness
-        state.anchor[:] = press.to_local(self.outer.points_at(state.position) - stretch)
+        state.anchor[:] = indenter.to_local(self.outer.points_at(state.position) - stretch)
 
     def _both(self, first: Callable[[], None], second: Callable[[], None]) -> None:
-        """Run two halves at once; Warp launches release the interpreter."""
+        """Run two halves at once; Warp launches release the interpreter lock."""
         other = self._pool.submit(second)
         first()
         other.result()
@@ -322,8 +330,8 @@ class EquilibriumSystem:
             ),
             strain_error=self.skin.strain_error(state.pressure),
             gap_error_m=max(
-                self.inner.misfit_of(state.core_pressure) / self.contact.stiffness,
-                self.outer.misfit_of(state.indenter_pressure) / self.contact.stiffness,
+                self.inner.pressure_misfit(state.core_pressure) / self.contact.stiffness,
+                self.outer.pressure_misfit(state.indenter_pressure) / self.contact.stiffness,
             ),
             traction_error=self.outer.traction_misfit(state.traction)
             / max(float(np.abs(state.traction).max(initial=0.0)), TRACTION_FLOOR_PA),

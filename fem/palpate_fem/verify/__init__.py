@@ -1,4 +1,4 @@
-"""``palpate fem verify``: the solver against closed forms, other programs, and itself.
+"""Verification of the solver: against closed forms, other programs and conservation laws.
 
 ::
 
@@ -34,12 +34,12 @@ PUBLIC_SKIN = "nvlabs_biotac_mesh"
 def suite(
     *, quick: bool = False, only: str = "", shared_data: Path | None = None
 ) -> tuple[VerificationCase, ...]:
-    """The checks, not yet run; each is called without arguments and gives its `VerificationCheck`.
+    """The checks that are to be run; each is called without arguments.
 
     Args:
-        quick: Leave out those that take long.
-        only: Word in the name, whatever its case; empty for all.
-        shared_data: Folder that holds the public BioTac's; None = beside the project.
+        quick: Leave out slow checks.
+        only: Word in the name, upper or lower case; empty for all.
+        shared_data: Folder that holds the public BioTac meshes; None = beside the project.
     """
     folder = (shared_data or SHARED_DATA) / PUBLIC_SKIN
     every = (
@@ -62,13 +62,13 @@ def run(
     shared_data: Path | None = None,
     on_check: Callable[[VerificationCheck, int, int], None] | None = None,
 ) -> list[VerificationCheck]:
-    """Run the suite.
+    """Run the suite (``palpate fem verify``).
 
     Args:
         only: See `suite`.
-        slow: Also those that take long.
+        slow: Also run slow checks.
         shared_data: See `suite`.
-        on_check: Called after each with it, how many are done, and of how many.
+        on_check: Called after each check with it, the number done and the total.
     """
     cases = suite(quick=not slow, only=only, shared_data=shared_data)
     checks = []

@@ -1,8 +1,8 @@
-"""Indenters of the verification: plane, ball, punch and roll, and where they are.
+"""Indenters, solids and fingertips of the verification.
 
-A solid on the test stand: equations, state and tight solution, with energies and reactions.
-
-Fingertips to press: a ball of skin around a ball, and the parametric BioTac, coarse.
+`VerificationBody` is one solid with its equations and state, solved to tight tolerances, with its
+energies and reactions. `TouchedFingertip` is one with a sealed fluid and an indenter that just
+touches it.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def about_y(angle: float) -> Floats:
 MU = 2.8e5  # [Pa], the paper's optimum
 BULK_RATIO = 1e4
 
-# Far tighter than production, so that what is seen is the discretisation.
+# Far tighter than in production, so that errors are those of the discretisation.
 TIGHT = NewtonSettings(
     tolerance=1e-11,
     volume_tolerance=1e-11,
@@ -88,7 +88,7 @@ TIGHT = NewtonSettings(
 
 
 class VerificationBody:
-    """One solid; ``state`` goes on from solution to solution."""
+    """One solid; each solution starts from the last one, ``state``."""
 
     def __init__(
         self,
@@ -101,16 +101,16 @@ class VerificationBody:
         contact: ContactSettings | None = None,
         settings: NewtonSettings = TIGHT,
     ) -> None:
-        """Put it up.
+        """Prepare the equations of a solid at rest.
 
         Args:
             mesh: The solid.
             held: Prescribed components (V, 3); None = the mesh's fixed nodes.
-            core: Inside, or None.
+            core: Distance to a rigid core inside; None = no core.
             mu: Shear modulus [Pa].
             bulk_ratio: Bulk over shear modulus.
             contact: Constants of the contact laws.
-            settings: When an increment is solved.
+            settings: Tolerances of an increment.
         """
         self.mesh, self.mu, self.bulk = mesh, mu, bulk_ratio * mu
         self.contact = contact or ContactSettings()
@@ -125,7 +125,7 @@ class VerificationBody:
 
     @cached_property
     def newton(self) -> NewtonSolver:
-        """Made when first needed: half of the bodies are only looked at."""
+        """The solver, made when first used: half of the bodies are only evaluated."""
         pattern = self.system.pattern
         return NewtonSolver(
             self.system,
@@ -138,10 +138,10 @@ class VerificationBody:
     def solve(
         self, press: PosedIndenter | None = None, *, volume: float | None = None
     ) -> ForceBalance:
-        """Equilibrium from where it is; then anchors follow what slid.
+        """Solve for the equilibrium, starting from the present state; then update the anchors.
 
         Raises:
-            SimulationError: There is none, or it was not found.
+            SimulationError: Newton's method did not converge.
         """
         self.report, balance = self.newton.solve(self.state, press, volume=volume)
         if not self.report.converged:
@@ -150,12 +150,12 @@ class VerificationBody:
                 remedy="use smaller increments",
             )
         if press is not None:
-            self.settle(press)
+            self.update_anchors(press)
         return balance
 
-    def settle(self, press: PosedIndenter) -> None:
-        """See `EquilibriumSystem.settle`."""
-        self.system.settle(self.state, press)
+    def update_anchors(self, press: PosedIndenter) -> None:
+        """See `EquilibriumSystem.update_anchors`."""
+        self.system.update_anchors(self.state, press)
 
     def contact_points(self) -> Floats:
         """See `Surface.points_at`."""
@@ -168,7 +168,7 @@ class VerificationBody:
         return np.where(self.held, total, 0.0)
 
     def strain_energy(self) -> float:
-        """Stored in the skin, to second order in what is left of the residuals [J]."""
+        """Energy stored in the skin [J]; the error is of second order in the residuals."""
         return self.energy_at(self.state.position, self.state.pressure)
 
     def energy_at(self, position: Floats, pressure: Floats) -> float:
@@ -181,7 +181,7 @@ class VerificationBody:
         return float(isochoric + (swelling - skin.rest_volume * pressure**2 / 2 / self.bulk).sum())
 
     def contact_energy(self) -> float:
-        """Stored in the springs of contact, indenter and core [J]."""
+        """Energy stored in the springs of contact with indenter and core [J]."""
         state, contact = self.state, self.contact
         outer, inner = self.system.outer.area_values, self.system.inner.area_values
         normal = (outer * state.indenter_pressure**2).sum() + (inner * state.core_pressure**2).sum()
@@ -190,14 +190,21 @@ class VerificationBody:
 
 
 INNER_M, OUTER_M, CORE_M, BALL_M = 3.0e-3, 4.5e-3, 2.95e-3, 2.0e-3
-FILLED = 1.06  # cavity over the unpressurised one
-ASIDE_M = (0.31e-3, 0.17e-3)  # of the indenter: no symmetry
+FILLED = 1.06  # volume of the cavity over the unpressurised one
+ASIDE_M = (0.31e-3, 0.17e-3)  # offset of the indenter, which breaks the symmetry
 EDGE_M = 1.4e-3  # of the coarse BioTac
 
 
 @dataclass
 class TouchedFingertip:
-    """A pressurised body, the sealed volume [m^3], and an indenter whose z = 0 just touches."""
+    """A pressurised fingertip and an indenter that just touches it.
+
+    Attributes:
+        body: Skin, fluid and core.
+        volume: Of the sealed cavity [m^3].
+        press: The indenter.
+        start: Position of the indenter where it touches [m], (3,).
+    """
 
     body: VerificationBody
     volume: float
@@ -205,16 +212,16 @@ class TouchedFingertip:
     start: Floats
 
     def at(self, move: Floats) -> ForceBalance:
-        """Equilibrium with the indenter moved by so much from where it touches [m]."""
+        """Equilibrium with the indenter moved from where it touches [m]."""
         return self.body.solve(self.placed(move), volume=self.volume)
 
     def placed(self, move: Floats) -> PosedIndenter:
-        """The indenter there."""
+        """The indenter, moved from where it touches [m]."""
         return self.press.at(pose(self.start + move))
 
 
 def round_core(radius: float, spacing: float) -> DistanceGrid:
-    """A ball around the origin, tabulated with a margin of 1 mm or more."""
+    """Distance to a ball around the origin, tabulated with a margin of at least 1 mm."""
     half = int(np.ceil((radius + 1e-3) / spacing)) + 2
     line = spacing * np.arange(-half, half + 1)
     at = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
@@ -224,7 +231,7 @@ def round_core(radius: float, spacing: float) -> DistanceGrid:
 def round_finger(
     *, friction: float, scale: float = 1.0, mu: float = MU, stiffness: float = 1.0
 ) -> TouchedFingertip:
-    """A ball of skin, its upper part held, around a ball; filled, and ready to be pressed.
+    """A hollow ball of skin around a ball, its upper part held, filled with fluid.
 
     Args:
         friction: Of the indenter.
@@ -255,7 +262,7 @@ def _coarse() -> tuple[FingertipGeometry, Fingertip]:
 
 
 def biotac_finger(*, friction: float, aside: tuple[float, float]) -> TouchedFingertip:
-    """The parametric BioTac, coarse, and a ball of 3.5 mm under the pad at x, y [m]."""
+    """The parametric BioTac, coarse, and a ball of radius 3.5 mm under the pad at x, y [m]."""
     geometry, tip = _coarse()
     body = VerificationBody(geometry.mesh, core=geometry.core.grid)
     body.state = tip.state.copy()
@@ -265,7 +272,7 @@ def biotac_finger(*, friction: float, aside: tuple[float, float]) -> TouchedFing
 def _touched(
     body: VerificationBody, volume: float, indenter: Indenter, aside: Floats, friction: float
 ) -> TouchedFingertip:
-    """Raise the indenter until it touches the highest of the contact points above it."""
+    """Raise the indenter until it touches the first of the contact points above it."""
     press = PosedIndenter(indenter, pose((0.0, 0.0, 0.0)), friction)
     radius = indenter.primitives[0].rounding
     x, y, z = np.moveaxis(body.contact_points(), -1, 0)
@@ -273,5 +280,5 @@ def _touched(
     below = (off < radius**2) & (z < 0)
     height = (z[below] + radius - np.sqrt(radius**2 - off[below])).min()
     finger = TouchedFingertip(body, volume, press, np.array([*aside, height]))
-    body.settle(finger.placed(np.zeros(3)))
+    body.update_anchors(finger.placed(np.zeros(3)))
     return finger

@@ -1,4 +1,4 @@
-"""What a check is: a measured number, what it should be, and how far off it may be."""
+"""A check of the verification: a measured number, its reference and the tolerance."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from palpate.errors import PalpateError
 
 @dataclass(frozen=True, slots=True)
 class VerificationCheck:
-    """One line of the suite.
+    """One line of the suite: a check that has been run.
 
     Attributes:
         name: ``topic/what``.
-        value: What was measured; NaN if nothing could be.
-        reference: What it should be.
+        value: Measured value; NaN if it could not be measured.
+        reference: Expected value.
         tolerance: Allowed deviation: a share of the reference, or absolute where that is 0.
         unit: Of value and reference; empty for pure numbers.
         passed: Whether it is within the tolerance.
-        seconds: What it took; work shared with other checks counts for the first of them.
+        seconds: Time it took; work that checks share counts for the first of them.
         note: Where the reference comes from, or why there is no value.
-        skipped: Not measured, because something that is not part of the program is not there.
+        skipped: Not measured, because data are missing that are not part of palpate.
     """
 
     name: str
@@ -39,7 +39,7 @@ class VerificationCheck:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What a check's function returns; see `VerificationCheck`."""
+    """Result of a check's function; see `VerificationCheck`."""
 
     value: float
     reference: float = 0.0
@@ -47,7 +47,7 @@ class Measurement:
 
 
 class MissingDataError(Exception):
-    """Something that is not part of the program is not there; the message says what."""
+    """Data that are not part of palpate are missing; the message says which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class VerificationCase:
 
     Attributes:
         name: ``topic/what``.
-        measure: Does the work.
+        measure: Function that measures.
         tolerance: See `VerificationCheck`.
         unit: Of value and reference.
         slow: Takes more than a few seconds.
@@ -71,7 +71,7 @@ class VerificationCase:
     at_least: bool = False
 
     def __call__(self) -> VerificationCheck:
-        """Run it; a simulation that cannot be run is a check that fails."""
+        """Run it; a simulation that raises an error is a failed check."""
         started = time.perf_counter()
         skipped = False
         try:

@@ -1,6 +1,6 @@
 """Homogeneous stretches, inflated spheres and tubes against textbook formulas.
 
-Cook's membrane against felupe, and Newton's count against the bulk modulus.
+Also Cook's membrane against felupe, and the number of Newton iterations for two bulk moduli.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from palpate_fem.verify.meshes import (
 INNER_M, OUTER_M = 5.5e-3, 7.07e-3  # a ball of the BioTac's size
 FINEST = (6, 3)  # edges of a patch of the octant, layers
 EVER_FINER = ((2, 1), (4, 2), (8, 4))
-# Thin walls and small strains leave fewer digits: positions are rounded, strains are differences.
+# Thin walls and small strains leave fewer digits: strains are differences of rounded positions.
 FEWER_DIGITS = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-9)
 
 
@@ -73,7 +73,7 @@ def thick_tube(stretch: float, ratio: float) -> float:
 def blown(
     edges: int, layers: int, ratio: float, stretches: tuple[float, ...], wedges: bool = False
 ) -> dict[float, float]:
-    """Find p / mu of an eighth of a sphere at the volume of each stretch, by volume control."""
+    """Compute p / mu of an eighth of a sphere at the volume of each stretch, by volume control."""
     mesh = octant(edges, INNER_M, INNER_M * ratio, layers, wedges=wedges)
     body = VerificationBody(mesh, held=on_planes(mesh), bulk_ratio=1e6, settings=FEWER_DIGITS)
     rest = body.system.balance(body.state, None).volume
@@ -103,7 +103,7 @@ def sphere_of_biotac(stretch: float) -> Measurement:
 
 
 def sphere_order(*, wedges: bool) -> Measurement:
-    """Slope of log error over log edge from the two finest of three meshes."""
+    """Order of convergence: slope of log error over log edge, from the two finest meshes."""
     exact = thick_sphere(1.1, 1.5)
     error = [abs(blown(e, n, 1.5, (1.1,), wedges)[1.1] - exact) for e, n in EVER_FINER]
     note = "errors " + ", ".join(f"{e / exact:.2%}" for e in error)
@@ -119,7 +119,7 @@ def balloon(stretch: float) -> Measurement:
 
 @cache
 def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[float, float]:
-    """Find p / mu of a tube, B/A = 1.5, whose inner nodes are moved out."""
+    """Compute p / mu of a tube, B/A = 1.5, whose inner nodes are moved outward."""
     around = 4 * layers
     mesh = quarter_tube(around, INNER_M, 1.5 * INNER_M, layers)
     held = on_planes(mesh)
@@ -134,7 +134,7 @@ def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[
             balance = body.solve()
         outward = mesh.nodes[bore, :2] / INNER_M
         push = float((body.reactions(balance)[bore, :2] * outward).sum())
-        # Of the polygon: what the bore's cross-section grows by when the nodes move.
+        # Derivative of the area of the bore's polygon by the outward displacement of its nodes.
         growth = stretch * INNER_M * around * np.sin(np.pi / 2 / around)
         found[stretch] = push / growth / np.ptp(mesh.nodes[:, 2]) / MU
         last = stretch
@@ -146,7 +146,7 @@ def tube(stretch: float) -> Measurement:
     return Measurement(_tube((1.1, 1.5, 2.0), 1e6, 3)[stretch], thick_tube(stretch, 1.5), "p / mu")
 
 
-SMALL = 1e-4  # strain: what is not linear in it is far below the tolerance
+SMALL = 1e-4  # strain; terms of second order are far below the tolerance
 
 
 def bulk_ratio(nu: float) -> float:
@@ -179,20 +179,20 @@ def lame(shape: str, nu: float) -> Measurement:
 
 
 def lame_change(shape: str) -> Measurement:
-    """How much the relative error changes from nu = 0.3 to 0.4999: locking would show here."""
+    """Change of the relative error from nu = 0.3 to 0.4999, which would show locking."""
     errors = [m.value / m.reference - 1 for m in (lame(shape, 0.3), lame(shape, 0.4999))]
     return Measurement(errors[1] - errors[0], 0.0, f"errors {errors[0]:.2%}, {errors[1]:.2%}")
 
 
 COOK_MU, COOK_BULK, COOK_FORCE = 80.194, 400_890.0, 100.0
-# Vertical way of the free end's upper corner with felupe 11's hexahedra of constant pressure, by
-# edges a side; four digits are published, hence the tolerance.
+# Vertical displacement of the free end's upper corner with felupe 11's hexahedra of constant
+# pressure, by edges of a side; four digits are published, hence the tolerance.
 COOK = {4: 6.020, 8: 6.619, 16: 6.814, 32: 6.884}
-COOK_LIMIT = 6.92  # of ever finer meshes, Richardson
+COOK_LIMIT = 6.92  # Richardson extrapolation
 
 
 def cooks_corner(edges: int) -> float:
-    """Vertical way of the corner: plane strain, a dead shear force at the free end."""
+    """Vertical displacement of the corner: plane strain, a dead shear force at the free end."""
     mesh = cooks_membrane(edges)
     held = np.zeros(mesh.nodes.shape, bool)
     held[:, 2] = True
@@ -212,17 +212,17 @@ def cooks_corner(edges: int) -> float:
 
 
 def cook(edges: int) -> Measurement:
-    """The same element by another code gives the same way."""
+    """The same element in another code gives the same displacement."""
     return Measurement(cooks_corner(edges), COOK[edges], "felupe, Q1P0")
 
 
 def cook_limit() -> Measurement:
-    """It does not lock: the finest mesh is near the limit."""
+    """The element does not lock: the finest mesh is near the limit."""
     return Measurement(cooks_corner(32), COOK_LIMIT, "limit of felupe's series")
 
 
 def newton_count() -> Measurement:
-    """Iterations of an inflation by 10 % at kappa / mu = 1e6, and at 1e2."""
+    """Newton iterations of an inflation by 10 % at kappa / mu = 1e6, against those at 1e2."""
     counts = []
     for ratio in (1e6, 1e2):
         mesh = octant(4, 5.5e-3, 7.07e-3, 2)

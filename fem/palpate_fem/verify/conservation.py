@@ -1,8 +1,8 @@
-"""The sealed fluid: its volume stays, and volume control and pressure control are one law.
+"""Laws that hold without a closed form: volume, balance, energy, symmetry, scaling, work.
 
-What holds without a closed form: balance, energy, symmetry and scaling.
-
-Loading and unloading: work equals what is stored plus what friction takes, step by step.
+First the sealed fluid: its volume is conserved, and volume and pressure control agree. Then balance
+of forces and moments, the force as derivative of the energy, symmetry and scaling. Last, cycles of
+loading and unloading: the work equals the stored energy plus the loss by friction.
 """
 
 from __future__ import annotations
@@ -52,7 +52,11 @@ def sealed() -> Measurement:
 
 @cache
 def _dented() -> tuple[float, float, float]:
-    """Empty skin under an indenter: volume lost, and then, sealed there, p / mu and force."""
+    """An empty skin that an indenter dents, and the same skin sealed at that volume.
+
+    Returns:
+        Relative loss of volume; p / mu of the sealed skin; relative difference of nodal forces.
+    """
     press = PosedIndenter(ball(BALL_M), pose((0.0, 0.0, -OUTER_M + DENT_M)), 0.0)
     empty = _skin()
     rest = empty.system.balance(empty.state, None).volume
@@ -64,18 +68,18 @@ def _dented() -> tuple[float, float, float]:
 
 
 def unsealed() -> Measurement:
-    """Sealed at the volume that an empty skin takes by itself, a dented skin has no pressure."""
+    """Sealed at the volume that it takes when empty, a dented skin has no fluid pressure."""
     lost, pressure, _ = _dented()
     return Measurement(pressure, note=f"p / mu; the dent takes {lost:.2%} of the volume")
 
 
 def unsealed_force() -> Measurement:
-    """And the same nodal forces."""
+    """Nodal forces of that sealed skin against those of the empty one."""
     return Measurement(_dented()[2])
 
 
 def two_controls() -> Measurement:
-    """Filled to a volume it finds a pressure; at that pressure, from rest, the same volume."""
+    """The pressure found by volume control leads to the same volume by pressure control."""
     by_volume = _skin()
     volume = 1.1 * by_volume.system.balance(by_volume.state, None).volume
     by_volume.solve(volume=volume)
@@ -105,7 +109,7 @@ def _forces(finger: TouchedFingertip, balance: ForceBalance) -> dict[str, Floats
 
 @cache
 def _pressed_biotac() -> tuple[float, float, float, str]:
-    """A finger rubbed and pinched on its core.
+    """A fingertip that is rubbed and pinched on its core.
 
     Returns:
         Imbalance of force and of moment over the indenter's, deepest penetration [m], and the
@@ -130,7 +134,7 @@ def _pressed_biotac() -> tuple[float, float, float, str]:
 
 
 def force_balance() -> Measurement:
-    """Indenter, core, fluid and supports: their forces on the skin add up to nothing."""
+    """The forces of indenter, core, fluid and supports on the skin add up to zero."""
     return Measurement(_pressed_biotac()[0], note=_pressed_biotac()[3])
 
 
@@ -140,15 +144,15 @@ def moment_balance() -> Measurement:
 
 
 def penetration() -> Measurement:
-    """How deep the worst point is in indenter or core."""
+    """Deepest penetration of a point into indenter or core."""
     return Measurement(_pressed_biotac()[2] * 1e6)
 
 
 def potential(finger: TouchedFingertip, move: Floats) -> float:
     """Energy whose stationary point is the equilibrium with the indenter there [J].
 
-    Mixed in all pressures, so that what Newton leaves over counts in the second order only:
-    skin, minus p_f (V - V_0), and of each contact point -w (p g + p^2 / (2 e)).
+    Mixed in all pressures, so that the error is of second order in Newton's residual: energy of the
+    skin, minus p_f (V - V_0), minus w (p g + p^2 / (2 e)) of each contact point.
     """
     body = finger.body
     balance, state = finger.at(move), body.state
@@ -165,7 +169,7 @@ def potential(finger: TouchedFingertip, move: Floats) -> float:
 
 
 def energy_derivative() -> Measurement:
-    """The force is the energy's derivative by the indenter's way (five points, frictionless)."""
+    """Without friction the force is the derivative of the energy by the indenter's position."""
     finger, depth, step = round_finger(friction=0.0), 0.75e-3, 1e-7
     for share in (0.25, 0.5, 0.75, 1.0):
         force = -finger.at(share * depth * UP).indenter.sum(axis=0)[2]
@@ -194,12 +198,12 @@ def _pressed_in_the_middle() -> tuple[float, float]:
 
 
 def mirror_displacement() -> Measurement:
-    """Pressed and rubbed in the middle plane it moves as its mirror image does."""
+    """Pressed and rubbed in its plane of symmetry, the skin deforms symmetrically."""
     return Measurement(_pressed_in_the_middle()[0])
 
 
 def mirror_force() -> Measurement:
-    """The force has no component across the plane."""
+    """The force has no component across the plane of symmetry."""
     return Measurement(_pressed_in_the_middle()[1])
 
 
@@ -219,8 +223,8 @@ def _answer(scale: float, mu: float, stiffness: float) -> tuple[Floats, Floats]:
 def scaling(scale: float, modulus: float, stiffness: float) -> Measurement:
     """Largest relative deviation of displacements and of forces from those of the original.
 
-    Forces go with modulus and with the square of lengths; contact's constants, which are pressures
-    per length, go along.
+    Forces are proportional to the modulus and to the square of lengths; the constants of contact,
+    which are pressures per length, are scaled accordingly.
     """
     moved, force = _answer(1.0, MU, 1.0)
     other, other_force = _answer(scale, modulus * MU, stiffness)
@@ -232,7 +236,7 @@ def scaling(scale: float, modulus: float, stiffness: float) -> Measurement:
 
 
 def newton_in_contact() -> Measurement:
-    """Residuals of an increment without friction, once the set of touching points is found."""
+    """Order of Newton's method without friction, once the set of touching points is found."""
     finger = round_finger(friction=0.0)
     for k in range(1, 6):
         finger.at(0.1e-3 * k * UP)
@@ -240,8 +244,8 @@ def newton_in_contact() -> Measurement:
     return Measurement(order_of(residuals), 2.0, " ".join(f"{r:.0e}" for r in residuals))
 
 
-COARSE, FINE, FINEST = 4, 16, 32  # steps a leg
-# Press, drag, drag back, lift [m]: corners of the indenter's way.
+COARSE, FINE, FINEST = 4, 16, 32  # increments for each leg of a cycle
+# Press, drag, drag back, lift [m]: corners of the indenter's path.
 CORNERS_M = np.array(
     [
         (0.0, 0.0, 0.0),
@@ -255,14 +259,14 @@ CORNERS_M = np.array(
 
 @dataclass(frozen=True, slots=True)
 class LoadCycle:
-    """Energies [J] of one time around.
+    """Energies [J] of one cycle.
 
     Attributes:
-        work: Of the indenter on the finger: force times way, by the trapezoidal rule.
-        stored: At the end less at the start.
-        lost: In friction: traction times the way of the sliding points' anchors, the same rule.
+        work: Of the indenter on the skin: force times displacement, by the trapezoidal rule.
+        stored: Stored energy at the end less that at the start.
+        lost: To friction: traction times displacement of the sliding points' anchors, same rule.
         most: Largest stored energy.
-        least_lost: Of any increment, with the traction at its end.
+        least_lost: Smallest loss of any increment, with the traction at its end.
         apart_m: Largest distance of a node from where it started [m].
     """
 
@@ -275,13 +279,13 @@ class LoadCycle:
 
     @property
     def miss(self) -> float:
-        """Work that is neither stored nor lost, over the largest stored energy."""
+        """Error of the energy balance over the largest stored energy."""
         return (self.work - self.stored - self.lost) / self.most
 
 
 @cache
 def cycle(friction: float, steps: int) -> LoadCycle:
-    """Once around in ``steps`` increments for each leg."""
+    """One cycle in ``steps`` increments for each leg."""
     finger = round_finger(friction=friction)
     body, start = finger.body, finger.body.state.position.copy()
     rest = body.strain_energy() + body.contact_energy()
@@ -294,7 +298,7 @@ def cycle(friction: float, steps: int) -> LoadCycle:
             traction, anchor = body.state.traction.copy(), body.state.anchor.copy()
             last, force = force, -finger.at(move).indenter.sum(axis=0)
             work += float((force + last) @ (move - before)) / 2
-            # The indenter does not turn, so its frame's axes are the sensor's.
+            # The indenter does not turn, so the axes of its frame are those of the sensor frame.
             slid = body.system.outer.area_values[..., None] * (body.state.anchor - anchor)
             lost += float(((traction + body.state.traction) / 2 * slid).sum())
             least = min(least, float((body.state.traction * slid).sum()))
@@ -305,7 +309,7 @@ def cycle(friction: float, steps: int) -> LoadCycle:
 
 
 def closed_cycle() -> Measurement:
-    """Without friction all work comes back."""
+    """Without friction the work of a cycle is zero."""
     around = cycle(0.0, COARSE)
     return Measurement(
         max(abs(around.work), abs(around.stored)) / around.most, note="over the most"
@@ -313,26 +317,26 @@ def closed_cycle() -> Measurement:
 
 
 def same_shape() -> Measurement:
-    """Without friction every node comes back."""
+    """Without friction every node returns to its place."""
     return Measurement(cycle(0.0, COARSE).apart_m * 1e9)
 
 
 def work_balance(steps: int) -> Measurement:
-    """Work = stored + lost in friction."""
+    """Work = stored energy + loss by friction."""
     around = cycle(FRICTION, steps)
     note = f"{around.lost * 1e6:.2f} uJ lost of {around.most * 1e6:.2f} uJ, {steps} steps a leg"
     return Measurement(around.miss, note=note)
 
 
 def work_order() -> Measurement:
-    """Slope of log miss over log step from coarse to fine steps; kinks at stick and slip cost."""
+    """Order of convergence of the work balance; lower than 2 by the kinks at stick and slip."""
     misses = [abs(cycle(FRICTION, steps).miss) for steps in (COARSE, FINE)]
     order = np.log(misses[0] / misses[1]) / np.log(FINE / COARSE)
     return Measurement(order, 1.0, ", ".join(f"{miss:.1e}" for miss in misses))
 
 
 def dissipation() -> Measurement:
-    """In no increment does friction give energy: least of all over the most stored."""
+    """Friction never gives energy: smallest loss of an increment over the largest stored energy."""
     around = cycle(FRICTION, FINE)
     return Measurement(around.least_lost / around.most)
 

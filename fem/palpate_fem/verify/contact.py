@@ -28,19 +28,19 @@ Floats = NDArray[np.float64]
 FAR = 60.0  # size of the body over the contact's: a half-space to 1 %
 GROWTH = 1.5
 ACROSS = 8  # elements from the middle to the edge of contact
-# Rounding in the large far elements is 1e-9 of the small force.
+# Rounding errors in the large far elements are 1e-9 of the small force.
 SETTINGS = replace(TIGHT, tolerance=1e-7, volume_tolerance=1e-9, gap_tolerance_m=1e-12)
 
 
-# Rings and layers are finest, 0.05 of the radius, at the punch's rim, which lies between two rings:
-# there its singular pressure is felt as if the rim were where it is.
+# Rings and layers are finest, 0.05 of the radius, at the rim of the punch, where its pressure is
+# singular. It lies between two rings, so that the force is that of a rim at its true radius.
 PUNCH_RINGS = (0.3, 0.5, 0.65, 0.775, 0.875, 0.925, 0.975, 1.025, 1.075, 1.125)
 
 
 def _pressed(
     mesh: SolidMesh, held: NDArray[np.bool_], indenter: Indenter, depth: float
 ) -> tuple[VerificationBody, ForceBalance]:
-    """Pressed to a depth [m], the deep end held."""
+    """Press an indenter to a depth [m] into a body whose deep end is held."""
     held = held.copy()
     held[mesh.nodes[:, 2] > mesh.nodes[:, 2].max() - 1e-12] = True
     body = VerificationBody(mesh, held=held, settings=SETTINGS)
@@ -55,7 +55,7 @@ def _quarter(mesh: SolidMesh) -> NDArray[np.bool_]:
 
 
 def _mean_square(balance: ForceBalance, distance: Floats) -> float:
-    """Of the distance from the middle, weighted with the nodal forces along z [m^2]."""
+    """Mean square distance from the middle, weighted with the nodal forces along z [m^2]."""
     force = -balance.indenter[:, 2]
     return float((force * distance**2).sum() / force.sum())
 
@@ -64,8 +64,8 @@ def _mean_square(balance: ForceBalance, distance: Floats) -> float:
 def hertz(radius: float, depth: float) -> tuple[float, float, float]:
     """Force [N], contact radius [m] and pressure in the middle [Pa] of a ball on a half-space.
 
-    A quarter. The radius is that of Hertz' pressure with the same mean square distance,
-    a^2 = 5/2 <r^2>, which does not jump from node to node.
+    A quarter is meshed. The contact radius is that of Hertz' pressure with the same mean square
+    distance, a^2 = 5/2 <r^2>, which is not restricted to nodes.
     """
     a = np.sqrt(radius * depth)
     radii = graded(a / ACROSS, 1.3 * a, FAR * a, GROWTH)[2:]
@@ -141,10 +141,10 @@ def line_contact_pressure() -> Measurement:
 
 
 def contact_patch(shake: float) -> Measurement:
-    """A block squeezed by a plane: the same pressure everywhere.
+    """A block that a plane compresses: the pressure is uniform.
 
     Args:
-        shake: By how much of an edge the surface's nodes are moved at random along it.
+        shake: Random displacement of the surface's nodes along it, as a share of an edge.
     """
     line = np.linspace(0.0, 1e-3, 6)
     points, quads = rectangle(line, line)
@@ -164,7 +164,7 @@ def contact_patch(shake: float) -> Measurement:
 def free_slide() -> Measurement:
     """A coarse ball dragged over a frictionless plane: tangential over normal force.
 
-    Barriers between facets fail this ("No Free Slide"); a plane's normal is the same everywhere.
+    Contact between facets with barriers fails this ("No Free Slide").
     """
     mesh = hollow_sphere(4, 3e-3, 4e-3, 1)
     held = np.zeros(mesh.nodes.shape, bool)

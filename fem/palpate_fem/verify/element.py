@@ -45,7 +45,7 @@ def _on_edge(mesh: SolidMesh) -> NDArray[np.bool_]:
 
 
 def patch(strain: Floats, *, wedges: bool) -> Measurement:
-    """Linear motion of the boundary of a distorted cube: the inside follows to the last digits."""
+    """Linear displacement of the boundary of a distorted cube: the inside follows exactly."""
     mesh = _cube(wedges=wedges)
     held = np.zeros(mesh.nodes.shape, bool)
     held[_on_edge(mesh)] = True
@@ -59,7 +59,7 @@ def patch(strain: Floats, *, wedges: bool) -> Measurement:
 
 
 def patch_pressure(*, wedges: bool) -> Measurement:
-    """The same under equal swelling: every element finds the same pressure."""
+    """The same under uniform swelling: all elements have the same pressure."""
     mesh = _cube(wedges=wedges)
     held = np.zeros(mesh.nodes.shape, bool)
     held[_on_edge(mesh)] = True
@@ -70,7 +70,7 @@ def patch_pressure(*, wedges: bool) -> Measurement:
 
 
 def rigid_motion(*, wedges: bool) -> Measurement:
-    """Turned and moved, a body at rest has no energy, force or change of volume."""
+    """A body at rest that is turned and moved has no energy, force or change of volume."""
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=wedges)
     body = VerificationBody(mesh)
     rest = body.system.balance(body.state, None)
@@ -82,7 +82,7 @@ def rigid_motion(*, wedges: bool) -> Measurement:
 
 
 def objectivity() -> Measurement:
-    """A loaded state turned with its indenter: forces turn, energy and volume stay."""
+    """A loaded state turned with its indenter: forces turn, energy and volume do not change."""
     mesh = hollow_sphere(4, INNER_M, OUTER_M, 2)
     body = VerificationBody(mesh)
     random = np.random.default_rng(1)
@@ -92,7 +92,7 @@ def objectivity() -> Measurement:
     body.state.traction += random.normal(scale=1e4, size=body.state.traction.shape)
     at = np.array([1e-4, 2e-4, -OUTER_M + 3e-4])
     press = PosedIndenter(ball(3.5e-3), pose(at), 0.2)
-    body.settle(press)
+    body.update_anchors(press)
     before, energy = body.system.balance(body.state, press), body.strain_energy()
     turn = rotation_matrices(QUATERNION)
     body.state.position = body.state.position @ turn.T
@@ -111,13 +111,13 @@ def objectivity() -> Measurement:
 
 
 def order_of(residuals: Sequence[float]) -> float:
-    """Exponent q of r_next ~ r^q from the last three residuals that are above rounding."""
+    """Exponent q of r_next ~ r^q from the last three residuals above rounding errors."""
     a, b, c = [r for r in residuals if r > 1e-12][-3:]
     return float(np.log(c / b) / np.log(b / a))
 
 
 def newton_order(*, wedges: bool) -> Measurement:
-    """Residuals of an inflation: the last three fall quadratically."""
+    """The last three residuals of an inflation decrease quadratically."""
     mesh = octant(4, INNER_M, 1.5 * INNER_M, 2, wedges=wedges)
     body = VerificationBody(mesh, held=on_planes(mesh))
     rest = body.system.balance(body.state, None).volume

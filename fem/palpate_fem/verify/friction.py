@@ -1,4 +1,4 @@
-"""Coulomb friction of a block on a plane: stick, slip, ramp, reversal, and no creep."""
+"""Coulomb friction of a block on a plane: stick, slip, ramp, reversal, and no drift."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FRICTION = 0.186
 SIDE_M, HEIGHT_M = 4e-3, 1e-3
 WEIGHT_N = 0.05
 PRESS_M, SLIDE_M = 3e-5, 1e-3  # by the plane
-# Near the slip angle nothing but a little elasticity is left; what does not converge soon, slides.
+# Near the slip angle little stiffness is left. A block that does not converge soon, slides.
 NEAR_SLIP = replace(TIGHT, tolerance=1e-11, gap_tolerance_m=1e-15, iterations=25)
 
 
@@ -52,21 +52,21 @@ class SlidingBlock:
         self.angle = angle
         self.body = VerificationBody(mesh, held=held, bulk_ratio=bulk_ratio, settings=settings)
         self.press = PosedIndenter(plane(), self.pose(0.0, 0.0), FRICTION)
-        self.body.settle(self.press)
+        self.body.update_anchors(self.press)
 
     def pose(self, along: float, up: float) -> Floats:
-        """Of the plane, moved along itself and against the block [m]."""
+        """Pose of the plane, moved along itself and towards the block [m]."""
         return pose(self.turn @ [along, 0.0, up], about_y(self.angle))
 
     def slide(self, along: float, up: float) -> tuple[float, float]:
-        """Move the plane there; its push on the block along and across itself [N]."""
+        """Move the plane and solve; its force on the block along and across the plane [N]."""
         balance = self.body.solve(self.press.at(self.pose(along, up)))
         push = -balance.indenter.sum(axis=0) @ self.turn
         self.balance = balance
         return float(push[0]), float(push[2])
 
     def weigh(self, slope: float) -> None:
-        """Its weight, evenly over its volume, as on a ramp that falls towards +x [rad]."""
+        """Load the block with its weight, as on a ramp that falls towards +x [rad]."""
         mesh, volume = self.body.mesh, self.body.system.skin.rest_volume
         share = np.zeros(len(mesh.nodes))
         np.add.at(share, mesh.elements, (volume / volume.sum() / 8)[:, None])
@@ -76,10 +76,10 @@ class SlidingBlock:
 
 @cache
 def dragged(angle: float) -> tuple[float, float]:
-    """A clamped block, pressed, dragged along and back, on a plane turned by an angle.
+    """A clamped block that is pressed and dragged along and back on a plane turned by an angle.
 
     Returns:
-        Tangential over normal force while it slides forth, and back.
+        Tangential over normal force while it slides along, and back.
     """
     block = SlidingBlock(clamped=True, angle=angle)
     for along, up in ((0.0, 1e-5), (0.0, PRESS_M), (1e-5, PRESS_M)):
@@ -93,7 +93,7 @@ def dragged(angle: float) -> tuple[float, float]:
 
 
 def stick() -> Measurement:
-    """Half way to its slip angle a block hangs in the springs of sticking: way = T / (k area).
+    """Half way to its slip angle a block is held by the springs of sticking: u = T / (k area).
 
     Of a material that does not bulge under its weight (nu = 0), so that no point slides.
     """
@@ -120,7 +120,7 @@ def reversal(angle: float) -> Measurement:
 
 
 def slip_angle() -> Measurement:
-    """The steepest ramp on which a free block lies still: atan(mu); at 30 degrees it does not."""
+    """The steepest ramp on which a free block sticks: atan(mu); found by bisection."""
     block = SlidingBlock(settings=NEAR_SLIP)
     block.weigh(0.0)
     block.slide(0.0, 1e-6)
@@ -138,19 +138,19 @@ def slip_angle() -> Measurement:
 
 
 def tether() -> Measurement:
-    """What holds a block on a ramp of 30 degrees that slips under it: W (sin - mu cos)."""
+    """Force that holds a tied block on a slipping ramp of 30 degrees: W (sin - mu cos)."""
     slope = np.radians(30.0)
     block = SlidingBlock(tied=True)
     block.weigh(slope)
     for k in range(8):
         block.slide(-1e-4 * k, 1e-6)
-    # Weight that lies on tied nodes goes into the tether without being seen by the sole.
+    # The weight of the tied nodes goes into the tether directly, not through the contact.
     load = block.body.system.load[block.top].sum(axis=0)
     pull = load[0] - block.body.reactions(block.balance)[:, 0].sum()
     return Measurement(pull, WEIGHT_N * (np.sin(slope) - FRICTION * np.cos(slope)))
 
 
-def no_creep(increments: int) -> Measurement:
+def no_drift(increments: int) -> Measurement:
     """A block at 95 % of its slip angle, solved again and again from a disturbed state."""
     block = SlidingBlock(edges=2, settings=replace(TIGHT, tolerance=1e-10, gap_tolerance_m=1e-13))
     for share in (0.0, 0.5, 0.95):
@@ -175,5 +175,5 @@ CHECKS = (
     ),
     VerificationCase("friction/slip angle of a ramp", slip_angle, 1e-6, "degrees"),
     VerificationCase("friction/tether on a ramp of 30 degrees", tether, 1e-6, "N"),
-    VerificationCase("friction/no creep under load", partial(no_creep, 1000), 1.0, "nm"),
+    VerificationCase("friction/no creep under load", partial(no_drift, 1000), 1.0, "nm"),
 )

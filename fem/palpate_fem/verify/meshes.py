@@ -1,4 +1,4 @@
-"""Small structured solids whose answers are known."""
+"""Small structured solids for the verification."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def quarter_disc(radii: Floats, around: int) -> tuple[Floats, Ints]:
     """Quarter of a disc as quads: a rounded square in the middle, rings of nodes outside.
 
     Args:
-        radii: Of the rings, ascending; the first bounds the middle.
+        radii: Radii of the rings [m], ascending; the first bounds the middle.
         around: Quads on a ring, even.
     """
     half = around // 2
@@ -57,7 +57,7 @@ def triangles(quads: Ints) -> Ints:
 
 
 def slab(points: Floats, faces: Ints, depths: Floats, *, name: str = "slab") -> SolidMesh:
-    """A solid below a flat contact surface: it looks to -z, where indenters come from.
+    """A solid behind a flat contact surface, whose normal is -z, where indenters come from.
 
     Args:
         points: In the plane [m], shape (C, 2).
@@ -77,7 +77,7 @@ def slab(points: Floats, faces: Ints, depths: Floats, *, name: str = "slab") -> 
 
 
 def solid(mesh: SolidMesh) -> SolidMesh:
-    """The same without a cavity."""
+    """The same mesh without a cavity."""
     none = np.empty((0, 3), np.int32)
     return replace(mesh, inner_faces=none, inner_elements=none[:, 0])
 
@@ -98,7 +98,7 @@ def graded(fine: float, even: float, end: float, growth: float) -> Floats:
 def octant(
     edges: int, inner: float, outer: float, layers: int, *, wedges: bool = False
 ) -> SolidMesh:
-    """An eighth of a hollow sphere: x, y, z >= 0; three quarters of a cube's faces made round.
+    """An eighth of a hollow sphere: x, y, z >= 0; three patches on the faces of a cube, projected.
 
     Args:
         edges: Quads along a side of each of the three patches.
@@ -141,7 +141,7 @@ def _ball(
 
 
 def _merged(points: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Points that coincide made one."""
+    """Merge coincident points."""
     _, first, number = np.unique(
         np.round(points, 9), axis=0, return_index=True, return_inverse=True
     )

@@ -1,4 +1,4 @@
-"""The public BioTac skin filled by 430 mm^3: figures that must not change.
+"""The public BioTac skin filled with 430 mm^3: a regression against other programs.
 
 The skin is held as `read_nvlabs` holds it; there is no core. Independent reference: the public
 tetrahedra, quadratic with element pressure (P2-P0), and wedges of another program grown from the
@@ -51,13 +51,13 @@ def filled(folder: Path, layers: int, bulk_ratio: float) -> tuple[float, float]:
 
 
 def pressure(folder: Path, layers: int) -> Measurement:
-    """By layers, against wedges of another program."""
+    """Fluid pressure by layers, against wedges of another program."""
     found, thickness = filled(folder, layers, 1e3)
     return Measurement(found, WEDGES_KPA[layers], f"{thickness:.2f} mm thick")
 
 
 def against_quadratic(folder: Path) -> Measurement:
-    """Against quadratic tetrahedra, which do not lock; on the public tetrahedra themselves."""
+    """Fluid pressure against quadratic tetrahedra, which do not lock, on the public mesh itself."""
     return Measurement(filled(folder, 2, 1e3)[0], QUADRATIC_KPA, "P2-P0")
 
 

@@ -20,15 +20,15 @@ Floats = NDArray[np.float64]
 
 INNER_M, OUTER_M = 5.5e-3, 7.07e-3
 CORE_M = 5.49e-3
-STEP_M = 1e-8  # of the differences: (step / radius)^2 and rounding / step are both below 1e-9
+STEP_M = 1e-8  # of the differences; truncation (step / radius)^2 and rounding / step are below 1e-9
 FRICTION = 0.2
 TOLERANCE = 1e-6
-# Turned, so that no axis is special.
+# A turn that no axis is special in.
 TURN = np.array([1.0, 0.1, 0.2, 0.0]) / np.linalg.norm([1.0, 0.1, 0.2, 0.0])
 
 
 def _shaken(*, wedges: bool = False, core: bool = False) -> tuple[VerificationBody, Floats]:
-    """A body whose nodes are moved at random, none held, and a random direction (V, 3)."""
+    """A free body whose nodes are displaced at random, and a random direction (V, 3)."""
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=True) if wedges else hollow_sphere(
         8, INNER_M, OUTER_M, 1
     )  # fmt: skip
@@ -40,10 +40,10 @@ def _shaken(*, wedges: bool = False, core: bool = False) -> tuple[VerificationBo
 
 
 def _follow(body: VerificationBody, press: PosedIndenter | None) -> None:
-    """Pressures and tractions that obey their laws exactly where the nodes are.
+    """Set pressures and tractions to what their laws demand at the nodal positions.
 
-    The solver's tangent is that of the equations with these unknowns eliminated; here they are, by
-    the laws as NumPy says them.
+    The solver's tangent is that of the equations with these unknowns eliminated; here NumPy
+    eliminates them.
     """
     state, skin, contact = body.state, body.system.skin, body.contact
     f = np.einsum("eai,eqaj->eqij", state.position[body.mesh.elements], skin.gradient_values)
@@ -81,8 +81,8 @@ def _product(body: VerificationBody, press: PosedIndenter | None, direction: Flo
     upper = sp.csr_matrix((system.tangent_values(), pattern.indices, pattern.indptr))
     flat = direction.ravel()
     product = upper @ flat + sp.triu(upper, 1).T @ flat
-    if system.slides:
-        product = product + system.rest_product(flat)
+    if system.is_unsymmetric:
+        product = product + system.unsymmetric_product(flat)
     return np.asarray(product).reshape(-1, 3)
 
 
@@ -121,14 +121,14 @@ def element_force(*, wedges: bool) -> Measurement:
 
 
 def element_tangent(*, wedges: bool) -> Measurement:
-    """The condensed tangent is the derivative of the nodal forces, element pressures following."""
+    """The condensed tangent is the derivative of the nodal forces with pressures eliminated."""
     body, direction = _shaken(wedges=wedges)
     expected = _difference(body, None, direction, lambda balance: balance.internal)
     return _off(_product(body, None, direction), expected)
 
 
 def fluid_gradient() -> Measurement:
-    """dV/dx by the differences of the cavity's volume."""
+    """Gradient dV/dx against differences of the cavity's volume."""
     body, direction = _shaken()
     state, volumes = body.state.copy(), []
     for sign in (1.0, -1.0):
@@ -140,7 +140,7 @@ def fluid_gradient() -> Measurement:
 
 
 def fluid_tangent() -> Measurement:
-    """The follower pressure's tangent -p d2V/dx2 by the differences of dV/dx."""
+    """Tangent of the follower pressure, -p d2V/dx2, against differences of dV/dx."""
     body, direction = _shaken()
     without = _product(body, None, direction)
     body.state.fluid_pressure = MU
@@ -159,7 +159,7 @@ def core_tangent() -> Measurement:
 
 
 def contact_tangent(friction: float, slip_m: float) -> Measurement:
-    """Contact with a ball: gap and curvature, then friction by an arm of anchors ``slip_m``."""
+    """Contact with a ball; with friction, points are displaced by ``slip_m`` from their anchors."""
     body, direction = _shaken()
     press = PosedIndenter(ball(3.5e-3), pose((1e-4, 2e-4, -OUTER_M + 3e-4), TURN), friction)
     body.state.anchor[:] = press.to_local(body.contact_points() - slip_m * np.array([1, 0.3, 0.1]))
