@@ -19,9 +19,9 @@ from palpate_gateway.device import Device
 ENTRY_POINTS = "palpate.devices"
 
 DRIVERS: dict[str, str] = {
-    "virtual": "palpate_gateway.virtual.finger:Virtual",
+    "virtual": "palpate_gateway.virtual.finger:VirtualFinger",
     "text_log": "palpate_gateway.recordings.text_log:TextLog",
-    "record": "palpate_gateway.recordings.record:Record",
+    "record": "palpate_gateway.recordings.record:RecordReplay",
     "biotac_can": "palpate_gateway.biotac.can_fingers:BiotacCan",
     "biotac_bridge": "palpate_gateway.biotac.bridge:BiotacBridge",
     "biotac_pic32": "palpate_gateway.biotac.pic32:BiotacPic32",

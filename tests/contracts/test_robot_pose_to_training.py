@@ -26,7 +26,7 @@ from palpate_gateway.drivers import DRIVERS
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.readings import PoseReading, Reading
 from palpate_gateway.service import node
-from palpate_gateway.virtual.finger import Virtual
+from palpate_gateway.virtual.finger import VirtualFinger
 from palpate_services.config import RecorderConfig
 from palpate_services.recorder.service import run_recorder
 
@@ -48,7 +48,7 @@ SENSORS = [
 TIP = (0.004, 0.0, -0.011)
 
 
-class WithoutPose(Virtual):
+class WithoutPose(VirtualFinger):
     """A finger and a force/torque sensor, as on a bench: neither knows where the indenter is."""
 
     def _read(self, timeout_s: float) -> list[Reading]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import serial
 
-from palpate_gateway.emulators.biotac_bridge import crc16_x25
+from palpate_gateway.emulators.lines import crc16_x25
 
 PATIENCE_S = 20.0
 HELLO, SLOTS, STATUS = 1, 2, 3

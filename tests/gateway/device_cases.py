@@ -207,7 +207,7 @@ CASES: tuple[Case, ...] = (
     _serial(
         "wrench_robotous-serial",
         "wrench_robotous",
-        lambda: _class("robotous:RobotousSerial")(ramp, baud=921600),
+        lambda: _class("robotous:RobotousSerialEmulator")(ramp, baud=921600),
         "port",
         baud=921600,
         rate_hz=500,
@@ -216,7 +216,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "wrench_robotous-can",
         "wrench_robotous",
-        lambda: _class("robotous:RobotousCan")(ramp, channel=_can_channel()),
+        lambda: _class("robotous:RobotousCanEmulator")(ramp, channel=_can_channel()),
         lambda emulator: {**_on_can(emulator), "rate_hz": 500},
         nowhere={"interface": "virtual", "channel": "nobody-is-here"},
         names="nobody-is-here",
@@ -225,7 +225,8 @@ CASES: tuple[Case, ...] = (
         packages=("can",),
     ),
     _serial(
-        "wrench_bota", "wrench_bota", lambda: _class("bota:Bota")(ramp, boot_s=0.05), "port",
+        "wrench_bota", "wrench_bota",
+        lambda: _class("bota:BotaEmulator")(ramp, boot_s=0.05), "port",
         rate_hz=800, boot_s=0.5,
     ),
     Case(

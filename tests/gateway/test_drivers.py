@@ -9,7 +9,7 @@ import pytest
 
 from palpate.errors import ConfigError, MissingExtraError
 from palpate_gateway import drivers
-from palpate_gateway.virtual.finger import Virtual
+from palpate_gateway.virtual.finger import VirtualFinger
 
 
 def test_built_in_drivers() -> None:
@@ -37,14 +37,14 @@ def test_unknown_option_names_the_nearest() -> None:
 
 
 def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("mine", "palpate_gateway.virtual.finger:Virtual", drivers.ENTRY_POINTS)
+    point = EntryPoint("mine", "palpate_gateway.virtual.finger:VirtualFinger", drivers.ENTRY_POINTS)
 
     def fake(**query: Any) -> EntryPoints:
         return EntryPoints([point]).select(**query)
 
     monkeypatch.setattr(drivers, "entry_points", fake)
     assert "mine" in drivers.driver_names()
-    assert drivers.load_driver("mine") is Virtual
+    assert drivers.load_driver("mine") is VirtualFinger
 
 
 @pytest.mark.parametrize(

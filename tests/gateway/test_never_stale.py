@@ -24,7 +24,7 @@ from palpate.messages import ElectrodeFrame, WrenchFrame
 from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
 from palpate_gateway.emulators.emulator import HostTimed
 from palpate_gateway.emulators.kms40 import Kms40Emulator
-from palpate_gateway.emulators.robotous import RobotousSerial
+from palpate_gateway.emulators.robotous import RobotousSerialEmulator
 
 PATIENCE_S = 20.0
 STOPPED_S = 1.5
@@ -89,7 +89,7 @@ def running(bus: Any) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Now]]
     kms, rft, biotac = NowWrench(), NowWrench(), NowCounts()
     with ExitStack() as stack:
         first = stack.enter_context(Kms40Emulator(kms))
-        second = stack.enter_context(RobotousSerial(rft))
+        second = stack.enter_context(RobotousSerialEmulator(rft))
         third = stack.enter_context(BiotacBridgeEmulator(fingers=1, counts=biotac, hello_s=0.2))
         host, _, port = first.address.partition(":")
         sensors = [

@@ -189,10 +189,10 @@ def test_lost_device_is_opened_again(bus: Any, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_defect_of_a_driver_ends_the_process(bus: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: virtual.Virtual, timeout_s: float) -> list[Reading]:
+    def broken(self: virtual.VirtualFinger, timeout_s: float) -> list[Reading]:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(virtual.Virtual, "_read", broken)
+    monkeypatch.setattr(virtual.VirtualFinger, "_read", broken)
     with pytest.raises(ZeroDivisionError):
         node.run(GatewayConfig(), bus.link, "lab", threading.Event())
 

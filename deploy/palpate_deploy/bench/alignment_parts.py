@@ -20,7 +20,7 @@ import numpy.typing as npt
 from palpate_deploy.bench.harness import stop_on_sigterm
 from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
 from palpate_gateway.emulators.biotac_slots import Counts, CountTrack, Indices, Times
-from palpate_gateway.emulators.bota import Bota
+from palpate_gateway.emulators.bota import BotaEmulator
 from palpate_gateway.emulators.emulator import Emulator, HostTimed
 from palpate_gateway.emulators.kms40 import Kms40Emulator
 from palpate_gateway.emulators.rdt import RdtEmulator
@@ -204,7 +204,7 @@ def main() -> None:
         source = RampForce(lateness)
         serve(RdtEmulator("netft", source, port=int(told[0]), http_port=int(told[1])), stop)
     elif kind == "bota":
-        serve(Bota(RampForce(lateness), path=told[0]), stop)
+        serve(BotaEmulator(RampForce(lateness), path=told[0]), stop)
     else:
         be_robot(told[0], told[1], lateness, stop)
     lateness.write(Path(late_file))

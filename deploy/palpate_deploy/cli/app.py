@@ -30,7 +30,7 @@ from palpate_deploy.cli.options import (
 from palpate_deploy.station.logs import LogFormat, LogLevel, configure
 from palpate_fem.cli.app import fem_app
 from palpate_gateway.cli.app import gateway_app
-from palpate_gateway.cli.emulate_app import emulate_app
+from palpate_gateway.cli.emulate import emulate_app
 
 app = typer.Typer(
     cls=PalpateGroup,

@@ -1,1 +1,1 @@
-"""Commands of the gateway: what is there, whether it answers, and devices in software."""
+"""Commands of the gateway: list, probe and monitor devices, and emulate them."""

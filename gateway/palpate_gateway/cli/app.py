@@ -1,4 +1,4 @@
-"""``palpate gateway``: signatures and help only; each command's work is in its own module.
+"""``palpate gateway``: signatures and help of the commands; their work is in other modules.
 
 Nothing heavy is imported before a command runs: ``palpate --help`` must not wait for NumPy.
 """
@@ -10,26 +10,27 @@ from typing import Annotated
 import typer
 
 gateway_app = typer.Typer(
-    help="Sensors without a station: which drivers and ports there are, and whether one answers.",
+    help="Sensors without a station: available drivers and ports, and whether a device answers.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
 DriverArgument = Annotated[
-    str, typer.Argument(metavar="DRIVER", help="A driver; `palpate gateway list` shows them.")
+    str, typer.Argument(metavar="DRIVER", help="A driver; `palpate gateway list` shows all.")
 ]
 OptionsArgument = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="KEY=VALUE...", help="Its options; values as in TOML, dotted keys for tables."
+        metavar="KEY=VALUE...",
+        help="Its options; values as in TOML, dotted keys for tables.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
 
 def example(*lines: str) -> str:
-    """The end of a command's help: runnable lines."""
+    """Examples for the end of a command's help: lines that can be run."""
     return "Example: " + "  or  ".join(lines)
 
 
@@ -51,11 +52,11 @@ def probe(
     driver: DriverArgument,
     options: OptionsArgument = None,
     seconds: Annotated[
-        float, typer.Option(min=0.1, help="How long the rate is measured [s].")
+        float, typer.Option(min=0.1, help="Duration of the measurement of the rate [s].")
     ] = 2.0,
     json_: JsonOption = False,
 ) -> None:
-    """Open a device and tell who it is, its rate, its first reading and its counters."""
+    """Open a device; show its identity, rate, first reading and counters."""
     from palpate_gateway.cli.probe import probe_command
 
     raise typer.Exit(probe_command(driver, options or [], seconds=seconds, as_json=json_))
@@ -75,7 +76,7 @@ def monitor(
     ] = 0,
     json_: Annotated[bool, typer.Option("--json", help="One line of JSON each second.")] = False,
 ) -> None:
-    """Watch a device live: values, rate, age, counters; one that is lost is opened again."""
-    from palpate_gateway.cli.monitor import monitor_command
+    """Show a device live: values, rate, age, counters; a lost device is opened again."""
+    from palpate_gateway.cli.probe import monitor_command
 
     raise typer.Exit(monitor_command(driver, options or [], seconds=seconds, as_json=json_))

@@ -1,114 +1,291 @@
-"""Runs an emulator as a program: where it is, what reads it, its faults, how much it has sent."""
+"""``palpate emulate``: the table that makes the commands, one for each device.
+
+Nothing heavy is imported before a command runs: ``palpate --help`` must not wait for NumPy.
+"""
 
 from __future__ import annotations
 
-import math
-import threading
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+import enum
+from dataclasses import dataclass
+from inspect import Parameter, Signature
+from pathlib import Path
+from typing import Any
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
-from palpate.errors import DeviceError, LinkError
-from palpate_gateway.cli.emulated import Emulated
-from palpate_gateway.cli.faults import Fault, parse_faults
-from palpate_gateway.cli.key_values import command_words, sensor_toml
-from palpate_gateway.cli.stopping import until_told
+from palpate_gateway.cli.app import example
+from palpate_gateway.emulators import FAULTS
 
-_TICK_S = 0.02
-_SHOW_S = 0.5
+emulate_app = typer.Typer(
+    help="A device in software, at an address of its own, until Ctrl-C; with faults on demand.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+MULTICAST = "239.74.163.2"
+"""python-can's own group for its bus over UDP."""
 
 
-def emulate_command(device: Emulated, faults: Sequence[str], seconds: float) -> None:
-    """Serve until ``seconds`` have passed (0 = Ctrl-C).
+class Play(enum.StrEnum):
+    """What an emulated device measures."""
 
-    Raises:
-        ConfigError: A fault is unknown.
-        LinkError: The address cannot be had.
-        DeviceError: It cannot go on, e.g. its bus is gone.
+    TWIN = "twin"
+    IDLE = "idle"
+    PRESS = "press"
+
+
+class ElectrodeCount(enum.StrEnum):
+    """Electrodes of a BioTac, and of a BioTac SP."""
+
+    BIOTAC = "19"
+    BIOTAC_SP = "24"
+
+
+class RdtProduct(enum.StrEnum):
+    """Sensors that speak RDT, by their names in the driver's options."""
+
+    NET_FT = "ati_net_ft"
+    AXIA = "ati_axia"
+    FTN = "schunk_ftn"
+    HEX = "onrobot_hex"
+
+
+@dataclass(frozen=True, slots=True)
+class EmulateCommand:
+    """One command.
+
+    Attributes:
+        help: Its help.
+        options: Its options, besides those of the fault plan and the duration.
+        examples: Two lines for the end of its help.
+        faults: Remark on its faults.
     """
-    plan = parse_faults(faults, device.emulator.faults)
-    console = Console(stderr=True)
-    with until_told(), _crashes() as crashes:
-        try:
-            device.emulator.start()
-        except device.failures as error:
-            raise LinkError(
-                f"{device.name}: no device can be put there: {error}",
-                remedy="choose another address, port, link or channel; ports below 1024 need root",
-            ) from error
-        try:
-            _introduce(device)
-            line = Live(console=console, auto_refresh=False) if console.is_terminal else None
-            with line or nullcontext():
-                _serve(device, plan, seconds, line, crashes)
-        finally:
-            device.emulator.stop()
-            typer.echo(f"{device.name}: {device.emulator.sent} samples sent", err=True)
+
+    help: str
+    options: tuple[Parameter, ...]
+    examples: tuple[str, str]
+    faults: str = ""
 
 
-@contextmanager
-def _crashes() -> Iterator[list[BaseException]]:
-    """What threads died of: an emulator that has died must not look like one that serves."""
-    crashes: list[BaseException] = []
-    before = threading.excepthook
-
-    def keep(crash: threading.ExceptHookArgs) -> None:
-        crashes.append(crash.exc_value or RuntimeError(str(crash.exc_type)))
-
-    threading.excepthook = keep
-    try:
-        yield crashes
-    finally:
-        threading.excepthook = before
+def _option(
+    name: str, type_: Any, default: Any, help_: str, *flags: str, **limits: Any
+) -> Parameter:
+    """A parameter of a command."""
+    option = typer.Option(default, *flags, help=help_, **limits)
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=option, annotation=type_)
 
 
-def _introduce(device: Emulated) -> None:
-    """Its address, the profile's tables that read it, and a command that tries it."""
-    typer.echo(f"# {device.name} at {device.emulator.address}; Ctrl-C ends it. For a profile:")
-    sensors = device.sensors()
-    for name, options in sensors:
-        typer.echo("\n" + sensor_toml(name, device.driver, options), nl=False)
-    typer.echo(f"\n# palpate gateway probe {device.driver} {command_words(sensors[0][1])}")
+def _baud(default: int, help_: str = "Its speed [bit/s].", **limits: int) -> Parameter:
+    return _option("baud", int, default, help_, **limits)
 
 
-def _serve(
-    device: Emulated,
-    plan: Sequence[Fault],
-    seconds: float,
-    live: Live | None,
-    crashes: Sequence[BaseException],
-) -> None:
-    emulator, waiting = device.emulator, list(plan)
-    began_s = shown_s = time.monotonic()
-    shown, rate_hz = 0, 0.0
-    until_s = seconds or math.inf
-    while (elapsed_s := time.monotonic() - began_s) < until_s:
-        if crashes:
-            raise DeviceError(
-                f"{device.name}: it cannot go on: {crashes[0]!r}",
-                remedy="check its bus or address; if they are right, report this",
-            ) from crashes[0]
-        while waiting and waiting[0].start_s <= elapsed_s:
-            fault = waiting.pop(0)
-            emulator.inject(fault.name, fault.duration_s)
-            how = f"for {fault.duration_s:g} s" if fault.duration_s else "once"
-            _say(live, f"{elapsed_s:.1f} s: {fault.name} {how}")
-        since_s = time.monotonic() - shown_s
-        if live is not None and since_s >= _SHOW_S:
-            rate_hz = (emulator.sent - shown) / since_s
-            shown, shown_s = emulator.sent, time.monotonic()
-            line = f"{emulator.address}  {elapsed_s:.0f} s  {shown} samples sent  {rate_hz:.0f}/s"
-            live.update(Text(line), refresh=True)
-        time.sleep(min(_TICK_S, until_s - elapsed_s))
+def _fingers(most: int, help_: str) -> Parameter:
+    return _option("fingers", int, 3, help_, min=1, max=most)
 
 
-def _say(live: Live | None, text: str) -> None:
-    if live is None:
-        typer.echo(text, err=True)
-    else:
-        live.console.print(text, markup=False, highlight=False)
+_HOST = _option("host", str, "127.0.0.1", "Address to listen at.")
+_PORT = _option("port", int, 0, "Port to listen at; 0 = any free one.", min=0, max=65535)
+_LINK = _option(
+    "link", Path | None, None, "Name of the serial line; else a new one.", metavar="PATH"
+)
+_CHANNEL = _option("channel", str, MULTICAST, "Name of the bus.")
+_SLOTS = (_option("slot_rate_hz", float, 4400, "Sampled channels each second.", min=1, max=10_000),)
+_ROUND = (
+    _option("pac_first", bool, False, "A round begins with PAC, not with E1.", "--pac-first"),
+    _option(
+        "electrodes",
+        ElectrodeCount,
+        ElectrodeCount.BIOTAC,
+        "24 = BioTac SP, rounds of 54 slots.",
+    ),
+)
+_PLAY = (
+    _option("play", Play, Play.TWIN, "The digital twin, nothing, or a slow press without physics."),
+    _option("seed", int, 0, "Seed of the twin; finger N of a line has this one plus N - 1.", min=0),
+)
+_FINGER = _option(
+    "finger", int, 1, "The finger of the line that it belongs to, with the same seed.", min=1
+)
+_UNIT = _option(
+    "unit", str, "", "The twin's specimen, a name or number; else another for each seed."
+)
+_END = (
+    _option(
+        "trajectory",
+        list[str] | None,
+        None,
+        "A trajectory of the twin; repeatable. Else all.",
+        "--trajectory",
+        metavar="ID",
+    ),
+    _option(
+        "epoch",
+        float,
+        0.0,
+        "When the twin's loops begin [s since 1970]; the same for all of a scene.",
+    ),
+    _option(
+        "drift_ppm",
+        float,
+        200.0,
+        "Excess speed of its clock, during clock_drift [1e-6].",
+        min=-100_000,
+        max=100_000,
+    ),
+    _option(
+        "fault",
+        list[str] | None,
+        None,
+        "A fault that starts after so many seconds, once or for a time; repeatable.",
+        "--fault",
+        metavar="NAME@START[+SECONDS]",
+    ),
+    _option("seconds", float, 0, "End after this time [s]; 0 = at Ctrl-C.", min=0),
+)
+_ON_WRENCH = (*_PLAY, _FINGER, *_END)
+_ON_FINGERS = (*_PLAY, _UNIT, *_END)
+
+COMMANDS = {
+    "kms40": EmulateCommand(
+        "A Weiss KMS 40 over TCP; its client sets the rate.",
+        (
+            _HOST,
+            _PORT,
+            _option("serial", int, 310042, "Its serial number.", min=0),
+            *_ON_WRENCH,
+        ),
+        ("kms40 --port 10000", "kms40 --fault silence@10+3"),
+    ),
+    "rdt": EmulateCommand(
+        "An ATI Net F/T or Axia, a Schunk FTN or an OnRobot HEX over UDP.",
+        (
+            _option("product", RdtProduct, RdtProduct.NET_FT, "Which of them."),
+            _HOST,
+            _PORT,
+            _option(
+                "http_port", int, 0, "Port of its web page; 0 = any free one.", min=0, max=65535
+            ),
+            _option(
+                "rate_hz", float, 0, "Records each second; 0 = 1000, of a HEX 100.", min=0, max=8000
+            ),
+            *_ON_WRENCH,
+        ),
+        (
+            "rdt --product ati_axia --rate-hz 1000",
+            "rdt --product onrobot_hex --fault lost@5 --fault overload@8+2",
+        ),
+    ),
+    "robotous": EmulateCommand(
+        "A Robotous RFT on a serial line or on CAN; its client sets the rate.",
+        (
+            _LINK,
+            _baud(115200, "Speed of the serial line [bit/s]."),
+            _option("interface", str, "", "python-can's kind of bus; on a serial line without it."),
+            _CHANNEL,
+            _option("model", str, "RFT64-SB01", "The model that it reports."),
+            _option("serial", str, "RFT-1", "Its serial number."),
+            *_ON_WRENCH,
+        ),
+        ("robotous --link ./rft", f"robotous --interface udp_multicast --channel {MULTICAST}"),
+        faults="; on CAN busoff, not crc",
+    ),
+    "bota": EmulateCommand(
+        "A Bota SensONE or Rokubi on a serial line; its client sets the rate.",
+        (_LINK, _baud(460800), *_ON_WRENCH),
+        ("bota --link ./bota", "bota --fault restart@20"),
+    ),
+    "biotac-can": EmulateCommand(
+        "BioTacs at SynTouch's CAN interface: one CAN frame for each sampled channel.",
+        (
+            _option(
+                "interface",
+                str,
+                "udp_multicast",
+                "python-can's kind of bus; udp_multicast needs no hardware.",
+            ),
+            _CHANNEL,
+            _option(
+                "bus",
+                list[str] | None,
+                None,
+                "More options of python-can; repeatable.",
+                "--bus",
+                metavar="KEY=VALUE",
+            ),
+            _fingers(3, "BioTacs on the bus."),
+            _option("can_id", int, 1, "Identifier of frames.", min=0, max=0x7FF),
+            *_SLOTS,
+            *_ROUND,
+            *_ON_FINGERS,
+        ),
+        (
+            "biotac-can --fingers 2",
+            "biotac-can --interface socketcan --channel vcan0 --fault absent@10+5",
+        ),
+    ),
+    "biotac-bridge": EmulateCommand(
+        "BioTacs behind our own microcontroller bridge, on a serial line.",
+        (
+            _LINK,
+            _baud(460800, min=1),
+            _fingers(5, "BioTacs that it samples."),
+            _option("source_id", int, 1, "The bridge's id.", min=0, max=255),
+            *_SLOTS,
+            _option("slots_per_packet", int, 44, "Slots of a packet, 5 to 10 ms.", min=22, max=44),
+            *_ROUND,
+            *_ON_FINGERS,
+        ),
+        ("biotac-bridge --link ./bridge", "biotac-bridge --fingers 1 --fault crc@10+1"),
+    ),
+    "biotac-pic32": EmulateCommand(
+        "A BioTac polled by a PIC32 board, on a serial line; silent until its client starts it.",
+        (
+            _LINK,
+            _baud(230400, min=1),
+            _option(
+                "electrodes_first", bool, False, "It has the older firmware.", "--electrodes-first"
+            ),
+            *_ON_FINGERS,
+        ),
+        ("biotac-pic32 --link ./pic32", "biotac-pic32 --electrodes-first --fault cut@10"),
+    ),
+    "robot": EmulateCommand(
+        "A robot that carries an indenter and publishes the pose of its flange over Zenoh.",
+        (
+            _option("name", str, "arm", "Its name on the bus.", "--robot"),
+            _option(
+                "connect",
+                str,
+                "",
+                "Endpoint of a router, e.g. tcp/127.0.0.1:7447; else it runs its own.",
+            ),
+            _PORT,
+            _option("station", str, "lab", "Station on which it publishes."),
+            _option("rate_hz", float, 250, "Poses each second.", min=1, max=2000),
+            *_ON_WRENCH,
+        ),
+        ("robot --rate-hz 1000", "robot --connect tcp/127.0.0.1:7447 --fault restart@20+2"),
+    ),
+}
+"""The commands, by name; ``emulate_devices`` has a maker for each device."""
+
+
+def _add(name: str, command: EmulateCommand) -> None:
+    def run(**values: Any) -> None:
+        from palpate_gateway.cli.emulate_devices import make_emulated
+        from palpate_gateway.cli.emulate_run import run_emulator
+
+        faults, seconds = values.pop("fault") or [], values.pop("seconds")
+        run_emulator(make_emulated(name, values), faults, seconds)
+
+    # Typer reads a command's options from the signature of its function.
+    vars(run).update(__signature__=Signature(command.options), __doc__=None)
+    faults = " ".join(sorted(FAULTS[name])) + command.faults
+    lines = [f"palpate emulate {line}" for line in command.examples]
+    epilog = f"Faults: {faults}. {example(*lines)}"
+    emulate_app.command(name, help=command.help, epilog=epilog)(run)
+
+
+for _name, _command in COMMANDS.items():
+    _add(_name, _command)

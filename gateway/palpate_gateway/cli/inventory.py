@@ -19,7 +19,7 @@ from palpate.extras import require
 from palpate_gateway.drivers import driver_names, load_driver
 
 BY_ID = Path("/dev/serial/by-id")
-"""Names of serial ports that stay the same when plugs change places."""
+"""Names of serial ports that do not depend on the USB socket."""
 
 _PACKAGE_OF = {
     "palpate_gateway.ports.can_bus": "can",
@@ -28,13 +28,13 @@ _PACKAGE_OF = {
 _DISTRIBUTION = {"can": "python-can", "serial": "pyserial"}
 
 _NOT_HARDWARE = frozenset({"virtual", "udp_multicast", "serial", "socketcand"})
-"""What python-can offers on every host, or finds only by listening on the network for seconds."""
+"""Interfaces without hardware, or that python-can finds only by seconds of network traffic."""
 
 _DETECT_S = 2.0
 
 
 def list_command(*, as_json: bool) -> None:
-    """Print all of it."""
+    """Print drivers, serial ports and CAN interfaces."""
     drivers = [_about(name) for name in driver_names()]
     found = {"drivers": drivers, "serial_ports": _serial_ports(), "can_interfaces": _can_buses()}
     if as_json:
@@ -63,7 +63,7 @@ def _show(found: list[dict[str, str]] | str, keys: tuple[str, ...]) -> None:
 
 
 def _about(name: str) -> dict[str, str]:
-    """Name of a driver, a line on it, and what of its extra is missing."""
+    """Name of a driver, its description, and its missing packages."""
     try:
         module = importlib.import_module(load_driver(name).__module__)
     except PalpateError as error:
@@ -74,14 +74,14 @@ def _about(name: str) -> dict[str, str]:
     told = ", ".join(_DISTRIBUTION[one] for one in missing)
     return {
         "name": name,
-        # Where the protocol is described is of no use to who looks for a driver.
+        # The reference of the protocol is of no use in a list of drivers.
         "about": re.sub(r" \([^()]*hardware reference[^()]*\)", "", line).rstrip("."),
         "missing": f'{told}; pip install "palpate[gateway]"' if missing else "",
     }
 
 
 def _parts(module: ModuleType, seen: set[str] | None = None) -> Iterator[str]:
-    """Names of the gateway's modules that a module is made of, itself included."""
+    """Names of the gateway's modules that a module uses, and its own name."""
     seen = {module.__name__} if seen is None else seen
     yield module.__name__
     for value in list(vars(module).values()):
@@ -97,7 +97,7 @@ def _home(value: Any) -> str:
 
 
 def _serial_ports() -> list[dict[str, str]] | str:
-    """Ports with their steady names; why there can be none."""
+    """Ports with their names by id; a message if they cannot be listed."""
     try:
         list_ports = require("serial.tools.list_ports", extra="gateway")
     except MissingExtraError as error:
@@ -112,12 +112,12 @@ def _serial_ports() -> list[dict[str, str]] | str:
 
 
 def _can_buses() -> list[dict[str, str]] | str:
-    """Adapters that python-can sees; why there can be none."""
+    """Adapters that python-can finds; a message if they cannot be listed."""
     try:
         can = require("can", extra="gateway")
     except MissingExtraError as error:
         return str(error)
-    # Each kind that lacks its vendor's library says so in the log, which nobody asked for.
+    # Each kind without its vendor's library logs a warning, which is of no use here.
     log = logging.getLogger("can")
     before = log.level
     log.setLevel(logging.CRITICAL)
@@ -134,7 +134,7 @@ def _configs(can: ModuleType, kind: str) -> list[dict[str, str]]:
     try:
         configs = can.detect_available_configs(kind, timeout=_DETECT_S)
     except Exception:
-        # Whatever the driver of a vendor raises: it has no adapter to offer.
+        # A vendor's driver may raise anything; then it has no adapter to offer.
         return []
     out = []
     for config in configs:

@@ -1,7 +1,7 @@
 """Options of a driver on the command line, and the same options as TOML.
 
-``rate_hz=200``, ``mount.carries=indenter``, ``trajectories='["a", "b"]'``: what is right of the
-equals sign is a TOML value, and a plain string where it is none.
+``rate_hz=200``, ``mount.carries=indenter``, ``trajectories='["a", "b"]'``: the text after the
+equals sign is a TOML value, or a plain string if it is not valid TOML.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def parse_key_values(pairs: Iterable[str], texts: Container[str] = ()) -> dict[s
 
     Args:
         pairs: As typed.
-        texts: Keys whose values are strings whatever they look like, e.g. a serial number.
+        texts: Keys whose values are always strings, e.g. a serial number.
 
     Raises:
         ConfigError: A word has no equals sign or an empty key, or a key is given twice.
@@ -49,18 +49,18 @@ def parse_key_values(pairs: Iterable[str], texts: Container[str] = ()) -> dict[s
 
 
 def parse_value(text: str) -> Any:
-    """A TOML value; the text itself where it is none."""
+    """A TOML value; the text itself if it is not valid TOML."""
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text
     value = table.pop("value")
-    # More keys come from a line break inside; no driver has an option that is a date.
+    # A line break in the text may make more keys; no driver has an option that is a date.
     return text if table or isinstance(value, (date, datetime, time)) else value
 
 
 def text_keys(options_class: type[StrictConfig]) -> frozenset[str]:
-    """Options that are strings."""
+    """Names of options that are strings."""
     fields = options_class.model_fields.items()
     return frozenset(name for name, field in fields if field.annotation is str)
 
@@ -74,7 +74,7 @@ def sensor_toml(name: str, driver: str, options: Mapping[str, Any]) -> str:
 
 
 def command_words(options: Mapping[str, Any], prefix: str = "") -> str:
-    """The same options as words of a command."""
+    """Options as words of a command line."""
     words = []
     for key, value in options.items():
         if isinstance(value, Mapping):
@@ -88,7 +88,7 @@ def command_words(options: Mapping[str, Any], prefix: str = "") -> str:
 def _toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
-    # JSON writes strings, numbers and truth values as TOML does.
+    # JSON writes strings, numbers and booleans as TOML does.
     return json.dumps(value, ensure_ascii=False)
 
 

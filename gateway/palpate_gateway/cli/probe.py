@@ -1,28 +1,42 @@
-"""``palpate gateway probe``: open a device once and tell all that it tells."""
+"""``palpate gateway probe`` and ``monitor``: a device's values, rate, age and counters.
+
+Probe opens a device once and reports all that it gives; monitor shows it live.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
-from palpate.errors import DeviceError
+from palpate.errors import DeviceError, DeviceTimeout
 from palpate_gateway.cli.key_values import parse_key_values, text_keys
-from palpate_gateway.cli.measuring import Streams, measure
-from palpate_gateway.cli.reading_text import text_of, values_of
+from palpate_gateway.cli.signals import until_signal
+from palpate_gateway.cli.streams import DeviceStream, DeviceStreams, measure, text_of, values_of
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import load_driver, make_device
 
 _FAILED = 1
+_READ_S = 0.1
+_AGAIN_S = 0.5
+"""Pause before a lost device is opened again [s]."""
+_REPORT_S = 1.0
+_REFRESH_S = 0.25
 _RATE_TOLERANCE = 0.05
 _OF_NOMINAL_RATE = ("electrodes", "wrench", "pose")
-"""Streams that come at a device's rate; a virtual finger's others may be slower."""
+"""Streams at the rate of the device; other streams of a virtual finger may be slower."""
 
 
 def device_of(driver: str, pairs: Sequence[str]) -> Device:
-    """The closed device that a command line describes.
+    """The device of a command line, closed.
 
     Raises:
         ConfigError: Unknown driver, or an option is unknown or wrong.
@@ -33,10 +47,10 @@ def device_of(driver: str, pairs: Sequence[str]) -> Device:
 
 
 def probe_command(driver: str, pairs: Sequence[str], *, seconds: float, as_json: bool) -> int:
-    """Print what a device tells.
+    """Print identity, rates, first readings and counters of a device.
 
     Returns:
-        0, or 1 if it cannot be opened or brings nothing.
+        0, or 1 if it cannot be opened or gives no reading.
 
     Raises:
         ConfigError: Unknown driver, or an option is unknown or wrong.
@@ -62,7 +76,7 @@ def probe_command(driver: str, pairs: Sequence[str], *, seconds: float, as_json:
     return 0
 
 
-def _found(device: Device, streams: Streams) -> dict[str, Any]:
+def _found(device: Device, streams: DeviceStreams) -> dict[str, Any]:
     info = device.info
     return {
         "driver": info.driver,
@@ -82,17 +96,17 @@ def _found(device: Device, streams: Streams) -> dict[str, Any]:
     }
 
 
-def _show(device: Device, found: dict[str, Any], streams: Streams) -> None:
+def _show(device: Device, found: dict[str, Any], streams: DeviceStreams) -> None:
     nominal_hz = device.info.rate_hz
     typer.echo(f"serial     {found['serial']}")
     typer.echo(f"nominal    {nominal_hz:.2f} Hz")
     for name, stream in streams.by_name.items():
         rate_hz = stream.rate_hz
-        told = "rate not known, too few came" if rate_hz is None else f"{rate_hz:.2f} Hz"
+        told = "rate unknown: too few readings" if rate_hz is None else f"{rate_hz:.2f} Hz"
         typer.echo(f"{name:11}{told} ({stream.readings} readings)")
         nominal = device.info.live and name in _OF_NOMINAL_RATE
         if nominal and rate_hz and abs(rate_hz / nominal_hz - 1.0) > _RATE_TOLERANCE:
-            typer.echo(f"{'':11}note: this is not the nominal rate; look at the counters")
+            typer.echo(f"{'':11}note: this is not the nominal rate; see the counters")
         for line in text_of(stream.first):
             typer.echo(f"{'':11}{line}")
     for line in counter_lines(found["counters"]):
@@ -100,8 +114,145 @@ def _show(device: Device, found: dict[str, Any], streams: Streams) -> None:
 
 
 def counter_lines(counters: Mapping[str, int]) -> list[str]:
-    """Counters that counted, and the names of those that did not."""
+    """Counters above 0, and the names of those at 0."""
     told = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()) if count)
     zero = ", ".join(name for name, count in sorted(counters.items()) if not count)
     lines = [f"counters   {told or 'none'}"]
     return [*lines, f"    all 0: {zero}"] if zero else lines
+
+
+class DeviceMonitor:
+    """Reads a device, and opens it again when it is lost.
+
+    Args:
+        device: The device, closed.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.streams = DeviceStreams()
+        self.lost = 0
+        """How often the device was lost."""
+        self.error: DeviceError | None = None
+        """Error that stops the readings now."""
+        self.ended = False
+        self._again_s = 0.0
+
+    def step(self) -> None:
+        """Read for a tenth of a second."""
+        if not self.device.is_open and time.monotonic() < self._again_s:
+            time.sleep(_READ_S)
+            return
+        try:
+            self.device.open()
+            readings = self.device.read(_READ_S)
+        except DeviceError as error:
+            if self.device.is_open and isinstance(error, DeviceTimeout):
+                return  # the age of its last reading shows it
+            self.lost += self.device.is_open
+            self.error = error
+            self.device.close()
+            self._again_s = time.monotonic() + _AGAIN_S
+            return
+        self.error = None
+        self.ended = not readings
+        self.streams.add(readings, time.monotonic())
+
+    @property
+    def state(self) -> str:
+        """State of the device."""
+        if self.error is not None:
+            return f"lost: {self.error}"
+        return "ended" if self.ended else "open"
+
+    def counters(self) -> dict[str, int]:
+        """Counters of the device since its last opening, and how often it was lost."""
+        return {**self.device.counters, "device_lost": self.lost}
+
+
+def monitor_command(driver: str, pairs: Sequence[str], *, seconds: float, as_json: bool) -> int:
+    """Show a device until ``seconds`` have passed (0 = Ctrl-C) or it ends.
+
+    Raises:
+        ConfigError: Unknown driver, or an option is unknown or wrong.
+        MissingExtraError: The driver needs a package that is not installed.
+        DeviceError: It cannot be opened at the start.
+    """
+    monitor = DeviceMonitor(device_of(driver, pairs))
+    console = Console()
+    with until_signal(), monitor.device:
+        if console.is_terminal and not as_json:
+            with Live(console=console, auto_refresh=False) as live:
+                for _ in _reports(monitor, seconds, _REFRESH_S):
+                    live.update(_picture(monitor), refresh=True)
+        else:
+            for began_s in _reports(monitor, seconds, _REPORT_S):
+                elapsed_s = time.monotonic() - began_s
+                typer.echo(_json(monitor, elapsed_s) if as_json else _line(monitor, elapsed_s))
+    return 0
+
+
+def _reports(monitor: DeviceMonitor, seconds: float, every_s: float) -> Iterator[float]:
+    """The start's time, each time that a report is due and at the end."""
+    began_s = time.monotonic()
+    until = began_s + seconds if seconds else math.inf
+    due_s = measured_s = began_s
+    while time.monotonic() < until and not monitor.ended:
+        due_s += every_s
+        while time.monotonic() < min(due_s, until) and not monitor.ended:
+            monitor.step()
+        # Rates are measured over a second, although the picture is drawn more often.
+        if time.monotonic() >= min(measured_s + _REPORT_S, until):
+            measured_s += _REPORT_S
+            monitor.streams.restart()
+        yield began_s
+
+
+def _rate(stream: DeviceStream) -> str:
+    return "no rate" if stream.shown_hz is None else f"{stream.shown_hz:.1f} Hz"
+
+
+def _age_s(stream: DeviceStream) -> float:
+    return time.monotonic() - stream.last_s
+
+
+def _picture(monitor: DeviceMonitor) -> Group:
+    table = Table()
+    values = []
+    for heading in ("stream", "readings", "rate", "age"):
+        table.add_column(heading, justify="left" if heading == "stream" else "right", no_wrap=True)
+    for name, stream in monitor.streams.by_name.items():
+        table.add_row(name, str(stream.readings), _rate(stream), f"{_age_s(stream):.2f} s")
+        # The values of a finger are too wide for a column of the table.
+        values += [f"{name:10} {line}" for line in text_of(stream.last)]
+    counters = counter_lines(monitor.counters())
+    title = f"{monitor.device.info.model}: {monitor.state}"
+    return Group(Text(title), table, Text("\n".join([*values, "", *counters])))
+
+
+def _line(monitor: DeviceMonitor, elapsed_s: float) -> str:
+    parts = [f"{elapsed_s:7.1f} s  {monitor.state}"]
+    for name, stream in monitor.streams.by_name.items():
+        age = f"age {_age_s(stream):.2f} s"
+        parts.append(f"{name} {_rate(stream)} {age}: {'; '.join(text_of(stream.last))}")
+    return "  |  ".join(parts)
+
+
+def _json(monitor: DeviceMonitor, elapsed_s: float) -> str:
+    streams = {
+        name: {
+            "readings": stream.readings,
+            "rate_hz": stream.shown_hz,
+            "age_s": round(_age_s(stream), 4),
+            "last": values_of(stream.last),
+        }
+        for name, stream in monitor.streams.by_name.items()
+    }
+    return json.dumps(
+        {
+            "elapsed_s": round(elapsed_s, 3),
+            "state": monitor.state,
+            "streams": streams,
+            "counters": monitor.counters(),
+        }
+    )

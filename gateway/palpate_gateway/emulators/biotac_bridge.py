@@ -1,8 +1,8 @@
 """A microcontroller bridge in software, on a serial line (format D, hardware reference 2.6).
 
-Written from the page and the byte table of the format, with a COBS and a CRC of its own. What they
-leave open is decided here: one sequence counts the packets of all types; a HELLO and a STATUS carry
-the time of the next slot; what is not sent has been counted.
+Written from the page and the byte table of the format, with a COBS and a CRC of its own. Choices
+where these leave something open: one sequence counts the packets of all types; a HELLO and a STATUS
+carry the time of the next slot; packets that are not sent are counted.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import ClassVar
 
+from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.biotac_slots import (
     ELECTRODES,
     WORD_FAULTS,
@@ -21,11 +22,8 @@ from palpate_gateway.emulators.biotac_slots import (
     idle_counts,
     round_of,
 )
-from palpate_gateway.emulators.crc16 import crc16_x25
-from palpate_gateway.emulators.emulator import Emulator, tell_lead
-from palpate_gateway.emulators.serial_line import SerialLine
-
-__all__ = ["HELLO", "SLOTS", "STATUS", "BiotacBridgeEmulator", "crc16_x25", "stuffed"]
+from palpate_gateway.emulators.emulator import set_lead
+from palpate_gateway.emulators.lines import SerialEmulator, SerialLine, crc16_x25
 
 HELLO, SLOTS, STATUS = 1, 2, 3
 """Types of packets."""
@@ -38,43 +36,41 @@ _TICK_S = 1e-3
 _STOPPED_S = 1.0
 
 
-class BiotacBridgeEmulator(Emulator):
+class BiotacBridgeEmulator(SerialEmulator):
     """The bridge and its fingers.
 
-    Faults of words: ``SlotBlocks.with_faults``; the first two are also counted in the next STATUS.
-    Faults of packets with slots, and of the line:
+    Faults of words: see ``SlotBlocks.with_faults``; ``parity`` and ``error_word`` are also counted
+    in the next STATUS. Faults of packets with slots, and of the line:
 
     * ``crc``: one bit of each packet is wrong;
-    * ``cut``: packets come without their ends, and take the next one with them;
-    * ``junk``: noise comes before each;
-    * ``lost``: they do not come; ``overrun``: the same, and the next STATUS counts their slots;
-    * ``repeated``: each comes twice;
-    * ``silence``: nothing comes, and the sampling goes on;
-    * ``unplug``: the line is gone; when it is back, numbers and times have gone on;
-    * ``restart``: nothing comes, then all of it begins anew: numbers, time, the round, HELLO;
+    * ``cut``: each packet lacks its end, which also spoils the next one;
+    * ``junk``: noise before each packet;
+    * ``lost``: packets are missing; ``overrun``: so, too, and the next STATUS counts their slots;
+    * ``repeated``: each packet comes twice;
+    * ``silence``: nothing comes, while the sampling continues;
+    * ``unplug``: the line is gone, while numbers and times continue;
+    * ``restart``: nothing comes, then numbers, time and round start again, with a HELLO;
     * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
 
     Args:
-        fingers: Fingers that it samples.
-        counts: What they measure.
-        serials: Their serial numbers; () = ``BT-EMU-1`` and so on.
-        source: Its source id.
-        baud: Its speed [bit/s].
+        fingers: Number of fingers that it samples.
+        counts: Counts of the fingers.
+        serials: Serial numbers of the fingers; () = ``BT-EMU-1`` and so on.
+        source: Source id.
+        baud: Speed [bit/s].
         path: Name of the line; "" = a new one.
         slot_rate_hz: Slots each second.
         slots_per_packet: Slots of a packet, 22..44.
-        pac_first: Whether a sampling round begins with PAC.
+        pac_first: Whether a round begins with PAC.
         electrodes: 19, or 24 of the BioTac SP.
         hello_s: Time between two HELLOs [s].
         status_s: Time between two STATUSes [s].
         sequence: Number of the first packet after the start.
         clock_us: Its clock at the start [us].
-        drift_ppm: How much too fast its clock is while it drifts [1e-6].
+        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "crc cut junk lost overrun repeated silence restart unplug clock_drift".split()
-    ) | frozenset(WORD_FAULTS)
+    faults: ClassVar = FAULTS["biotac-bridge"]
 
     def __init__(
         self,
@@ -113,11 +109,6 @@ class BiotacBridgeEmulator(Emulator):
         self._boot()
         self._sequence, self._clock_us = sequence, float(clock_us)
 
-    @property
-    def address(self) -> str:
-        """The line's name."""
-        return self._line.path
-
     def _boot(self) -> None:
         self._slot = self._sequence = 0
         self._clock_us = 0.0
@@ -125,16 +116,10 @@ class BiotacBridgeEmulator(Emulator):
         self.error_words = self.overruns = 0
         self._next_hello, self._next_status = 0, self._status_slots
 
-    def _listen(self) -> None:
-        self._line.plug()
-
-    def _hang_up(self) -> None:
-        self._line.close()
-
     def _serve(self) -> None:
-        # The next slot is sampled at this time.
+        # ``_due_s`` is the time at which the next slot is sampled.
         self._began_s = self._due_s = time.monotonic()
-        tell_lead(self._counts, self._began_s)
+        set_lead(self._counts, self._began_s)
         starts = True
         while not self._stop.is_set():
             self._line.keep_plugged(not self.faulty("unplug"))
@@ -145,7 +130,7 @@ class BiotacBridgeEmulator(Emulator):
                 self._stop.wait(_TICK_S)
                 continue
             if starts:
-                self._line.write(b"\0")  # ends whatever noise the start has made
+                self._line.write(b"\0")  # ends any noise of the start
                 starts = False
             drift = self._drift if self.faulty("clock_drift") else 0.0
             step_s = 1.0 / (self.rate_hz * (1.0 + drift))
@@ -157,7 +142,7 @@ class BiotacBridgeEmulator(Emulator):
             self._stop.wait(_TICK_S)
 
     def _announce(self) -> None:
-        """Send what is due besides slots."""
+        """Send the HELLO and the STATUS that are due."""
         if self._slot >= self._next_hello:
             self._next_hello = self._slot + self._hello_slots
             body = struct.pack("<BHB", self._fingers, round(self.rate_hz), self._round)
@@ -191,7 +176,7 @@ class BiotacBridgeEmulator(Emulator):
         self._clock_us += 1e6 * self._together / self.rate_hz
 
     def _count(self, wrong: set[str]) -> None:
-        """What the bridge sees of wrong words."""
+        """Count wrong words as the bridge sees them."""
         if "absent" in wrong and self._fingers == 1:
             return
         if "error_word" in wrong:
@@ -206,7 +191,7 @@ class BiotacBridgeEmulator(Emulator):
         return packet + struct.pack("<H", crc16_x25(packet))
 
     def _send(self, packet: bytes) -> None:
-        """A packet with slots."""
+        """Send a packet with slots."""
         wire = stuffed(packet)
         if not self.sound:
             if self.faulty("silence") or self.faulty("lost"):
@@ -236,9 +221,9 @@ class BiotacBridgeEmulator(Emulator):
 
 
 def stuffed(packet: bytes) -> bytes:
-    """A packet by COBS, with its end.
+    """A packet in COBS, with its end.
 
-    Each run of bytes without a zero is preceded by its length and one; the longest run is 254.
+    Each run of bytes without a zero is preceded by its length plus one; the longest run is 254.
     """
     out = bytearray()
     for run in packet.split(b"\0"):

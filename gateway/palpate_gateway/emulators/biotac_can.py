@@ -1,4 +1,4 @@
-"""SynTouch's CAN interface in software: a frame for each sampled channel (reference 2.1)."""
+"""SynTouch's CAN interface in software: a frame for each slot (hardware reference 2.1)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from typing import Any, ClassVar
 
 from palpate.extras import require
+from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.biotac_slots import (
     ELECTRODES,
     WORD_FAULTS,
@@ -14,10 +15,8 @@ from palpate_gateway.emulators.biotac_slots import (
     idle_counts,
     round_of,
 )
-from palpate_gateway.emulators.can_errors import BUS_ERROR, BUS_OFF, RESTARTED, error_frame
-from palpate_gateway.emulators.emulator import Emulator, tell_lead
-
-__all__ = ["BiotacCanEmulator", "idle_counts"]
+from palpate_gateway.emulators.emulator import Emulator, set_lead
+from palpate_gateway.emulators.lines import BUS_ERROR, BUS_OFF, RESTARTED, error_frame
 
 _TICK_S = 1e-3
 _BLOCK_SLOTS = 440
@@ -27,35 +26,33 @@ _STOPPED_S = 1.0
 class BiotacCanEmulator(Emulator):
     """Up to three BioTacs at one CAN interface.
 
-    Faults of words: ``SlotBlocks.with_faults``. Faults of frames and of the interface:
+    Faults of words: see ``SlotBlocks.with_faults``. Faults of frames and of the interface:
 
-    * ``lost``: slots are sampled, and their frames do not come;
+    * ``lost``: slots are sampled, but their frames are missing;
     * ``repeated``: each frame comes twice;
-    * ``short``: the last byte of each frame is missing;
-    * ``foreign``: a frame of another device with the same identifier comes before each;
-    * ``bus_error``: an error frame comes before each;
+    * ``short``: each frame lacks its last byte;
+    * ``foreign``: before each frame comes one of another device with the same identifier;
+    * ``bus_error``: before each frame comes an error frame;
     * ``busoff``: an error frame says that the controller is off the bus, then nothing comes; at the
-      end another says that it was started again, and frames come as if nothing had been;
-    * ``silence``: nothing comes, and the sampling goes on;
-    * ``unplug``, ``restart``: nothing comes, then a round begins anew;
+      end another one says that the controller was restarted, and the frames continue;
+    * ``silence``: nothing comes, while the sampling continues;
+    * ``unplug``, ``restart``: nothing comes, then a new round begins;
     * ``clock_drift``: slots come at another rate.
 
     Args:
         interface: python-can's kind of bus.
-        channel: Which bus.
+        channel: Name of the bus.
         fingers: Words in each frame, 1..3.
-        counts: What the fingers measure.
+        counts: Counts of the fingers.
         can_id: Identifier of the frames.
         slot_rate_hz: Frames each second.
-        pac_first: Whether a sampling round begins with PAC.
+        pac_first: Whether a round begins with PAC.
         electrodes: 19, or 24 of the BioTac SP.
-        drift_ppm: How much too fast its clock is while it drifts [1e-6].
-        options: More of python-can's options.
+        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
+        options: More options of python-can.
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "lost repeated short foreign bus_error busoff silence unplug restart clock_drift".split()
-    ) | frozenset(WORD_FAULTS)
+    faults: ClassVar = FAULTS["biotac-can"]
 
     def __init__(
         self,
@@ -81,8 +78,9 @@ class BiotacCanEmulator(Emulator):
         self._message: Any = None
         self._off = False
         self.frames = 0
-        """Rounds of slots that were sent whole."""
-        # The next slot; what is prepared, how much of it is sent, when its first slot is sampled.
+        """Rounds of slots that were sent complete."""
+        # The next slot; the prepared block, the number of its slots that are sent, and the time at
+        # which its first slot is sampled.
         self._slot = self._at = 0
         self._block: list[bytes] = []
         self._began_s = self._block_s = 0.0
@@ -96,7 +94,7 @@ class BiotacCanEmulator(Emulator):
     def _listen(self) -> None:
         self._can = require("can", extra="gateway")
         self._bus = self._can.Bus(**self._arguments)
-        # Making a message costs as much as sending it: all data frames are this one.
+        # To make a message costs as much as to send it, so one message serves for all data frames.
         self._message = self._can.Message(arbitration_id=self._can_id, is_extended_id=False)
 
     def _hang_up(self) -> None:
@@ -104,12 +102,12 @@ class BiotacCanEmulator(Emulator):
 
     def _serve(self) -> None:
         self._began_s = self._block_s = time.monotonic()
-        tell_lead(self._counts, self._began_s)
+        set_lead(self._counts, self._began_s)
         while not self._stop.is_set():
             now_s = time.monotonic()
             if self._off or not self.sound:
                 self._change(now_s)
-            # Slots that are due go out together: no clock of a PC wakes a thread 4400 times.
+            # Slots that are due are sent together: no PC wakes a thread 4400 times each second.
             due = int((now_s - self._block_s) / self._step_s)
             if (due - self._at) * self._step_s > _STOPPED_S:  # this process stood still
                 self._block_s = now_s - self._at * self._step_s
@@ -121,10 +119,10 @@ class BiotacCanEmulator(Emulator):
                 self._send(self._block[self._at])
                 self._at += 1
                 self._slot += 1
-            time.sleep(_TICK_S)  # cheaper than to wait for an event
+            time.sleep(_TICK_S)  # costs less than to wait for the event
 
     def _prepare(self) -> None:
-        """The next slots, from the one that is due next."""
+        """Prepare the next block of slots."""
         self._block_s += self._at * self._step_s
         drift = self._drift if not self.sound and self.faulty("clock_drift") else 0.0
         self._step_s = 1.0 / (self.rate_hz * (1.0 + drift))
@@ -133,7 +131,7 @@ class BiotacCanEmulator(Emulator):
         self._at = 0
 
     def _change(self, now_s: float) -> None:
-        """Have the faults of the whole interface."""
+        """Apply the faults of the whole interface."""
         if self.faulty("restart") or self.faulty("unplug"):
             self._slot, self._at, self._block = 0, 0, []
             self._block_s = now_s
@@ -153,7 +151,7 @@ class BiotacCanEmulator(Emulator):
         self.frames += self._slot % (self._last_place + 1) == self._last_place
 
     def _with_faults(self, data: bytes) -> bytes:
-        """The frame with the faults of now; empty = it does not come."""
+        """The frame with the present faults; empty = no frame is sent."""
         wrong = {fault for fault in WORD_FAULTS if self.faulty(fault)}
         if wrong:
             time_s = self._block_s - self._began_s + self._at * self._step_s

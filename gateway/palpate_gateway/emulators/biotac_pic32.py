@@ -1,8 +1,9 @@
 """The PIC32 board that polls one BioTac, in software, on a serial line (hardware reference 2.2).
 
-What the page leaves open is decided here: the firmware with the electrodes first sends them before
-pac, pdc, tac and tdc; a stopped run ends with the all-zero record; letters that the page does not
-explain, and lines of more than a letter, get no answer; the core timer runs on between runs.
+Choices where the page leaves something open: the firmware with the electrodes first sends them
+before pac, pdc, tac and tdc; a stopped run ends with the all-zero record; letters that the page
+does not explain, and lines of more than one letter, get no answer; the core timer also runs between
+runs.
 """
 
 from __future__ import annotations
@@ -12,53 +13,52 @@ import struct
 import time
 from typing import ClassVar
 
+from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.biotac_slots import CountSource, idle_counts
-from palpate_gateway.emulators.emulator import Emulator, Pace, tell_lead
-from palpate_gateway.emulators.serial_line import SerialLine
+from palpate_gateway.emulators.emulator import SampleTicker, set_lead
+from palpate_gateway.emulators.lines import SerialEmulator, SerialLine
 
 TICK_HZ = 40e6
-"""Rate of the core timer, half that of the processor."""
+"""Rate of the core timer, half of the processor's [Hz]."""
 
 RECORD_BYTES = 58
-"""Length of a record of a run."""
+"""Length of a record of a run [bytes]."""
 
 _IDLE_S = 0.02
 _LONGEST_LINE = 64
 
 
-class BiotacPic32Emulator(Emulator):
+class BiotacPic32Emulator(SerialEmulator):
     """The board, its BioTac and its load cell.
 
-    Its format has neither a checksum nor a number, and the words have lost their parity on the
-    board: a wrong bit below 4096 cannot be seen by anybody, so there is no such fault. There are:
+    Its format has neither a checksum nor a sequence number, and the board drops the parity of the
+    words. So a wrong bit below 4096 cannot be detected, and there is no such fault. The faults are:
 
-    * ``cut``: the end of each record is missing;
-    * ``junk``: up to 57 bytes come before each;
-    * ``high_bits``: a channel of each has a number above 4095;
-    * ``lost``: records are sampled and do not come;
-    * ``repeated``: each comes twice;
+    * ``cut``: each record lacks its end;
+    * ``junk``: up to 57 bytes before each record;
+    * ``high_bits``: one channel of each record is above 4095;
+    * ``lost``: records are sampled, but missing;
+    * ``repeated``: each record comes twice;
     * ``end``: the board ends the run by itself, with the all-zero record;
-    * ``silence``: nothing comes, and the clock goes on;
-    * ``unplug``: the line is gone; the run goes on;
-    * ``restart``: the board forgets the run, and its clock begins anew;
+    * ``silence``: nothing comes, while the clock continues;
+    * ``unplug``: the line is gone, while the run continues;
+    * ``restart``: the board stops the run, and its clock starts again;
     * ``saturated``: all channels are 4095; ``absent``: all are 0, as without a finger;
-    * ``stuck``: all channels are what they were when it began;
+    * ``stuck``: all channels repeat their counts from its begin;
     * ``clock_drift``: the core timer runs at another speed.
 
     Args:
-        counts: What the finger measures.
+        counts: Counts of the finger.
         electrodes_first: Whether it has the older firmware.
-        baud: Its speed [bit/s].
+        baud: Speed [bit/s].
         path: Name of the line; "" = a new one.
         rate_hz: Polls of all channels each second.
         ticks: Its core timer at the start.
         load_g: Load cell and reference [g].
-        drift_ppm: How much too fast its clock is while it drifts [1e-6].
+        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "cut junk lost repeated silence restart unplug clock_drift".split()
-    ) | frozenset({"high_bits", "saturated", "absent", "stuck", "end"})
+    faults: ClassVar = FAULTS["biotac-pic32"]
 
     def __init__(
         self,
@@ -80,33 +80,22 @@ class BiotacPic32Emulator(Emulator):
         self._boot()
         self._ticks = float(ticks)
 
-    @property
-    def address(self) -> str:
-        """The line's name."""
-        return self._line.path
-
     def _boot(self) -> None:
         self.running = False
         self._came = b""
         self._ticks = self._time_s = 0.0
 
-    def _listen(self) -> None:
-        self._line.plug()
-
-    def _hang_up(self) -> None:
-        self._line.close()
-
     def _serve(self) -> None:
-        pace = Pace(self.rate_hz, self._stop)
+        ticker = SampleTicker(self.rate_hz, self._stop)
         while not self._stop.is_set():
             self._line.keep_plugged(not self.faulty("unplug"))
             if self.faulty("restart"):
                 self._boot()
             due_s = time.monotonic()
             if self.running:
-                due_s = pace.wait()
+                due_s = ticker.wait()
                 self._pass_time(1.0 / self.rate_hz)
-            tell_lead(self._counts, due_s - self._time_s)
+            set_lead(self._counts, due_s - self._time_s)
             self._came += self._line.read(0.0 if self.running else _IDLE_S)
             *lines, rest = self._came.split(b"\n")
             self._came = rest[-_LONGEST_LINE:]
@@ -115,7 +104,7 @@ class BiotacPic32Emulator(Emulator):
                 self._obey(line)
             if not was_running:
                 self._pass_time(_IDLE_S)
-                pace = Pace(self.rate_hz, self._stop)
+                ticker = SampleTicker(self.rate_hz, self._stop)
             elif self.running:
                 self._sample()
 
@@ -164,7 +153,7 @@ class BiotacPic32Emulator(Emulator):
             self._line.write(record[: self._random.randint(1, RECORD_BYTES - 1)])
             return
         if self.faulty("high_bits"):
-            # Upper half of a channel's number: a bit that no count of 12 bits has.
+            # A bit in the upper byte of a channel that no 12-bit count has.
             record[5 + 2 * self._random.randrange(23)] |= 0x40
             self._line.write(record)
             return

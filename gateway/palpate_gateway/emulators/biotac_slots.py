@@ -1,8 +1,8 @@
-"""What a BioTac's host asks for slot by slot, and the words that it answers (reference 1.3 to 1.7).
+"""Sampling commands of a BioTac's host, and the BioTac's answers (hardware reference 1.3 to 1.7).
 
-Written from the page's tables: 80 is PAC, 83 PDC, 85 TAC, 86 TDC, A2 to C7 are E1 to E19, C8 to D0
-E20 to E24 of the BioTac SP; a word is data[11:5] and parity, data[4:0], two zeros and parity; every
-byte has an odd number of ones.
+Written from the tables of the page: 80 is PAC, 83 PDC, 85 TAC, 86 TDC, A2 to C7 are E1 to E19, C8
+to D0 are E20 to E24 of the BioTac SP. A word is data[11:5] and parity, data[4:0], two zeros and
+parity; every byte has an odd number of ones.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ ELECTRODE_COMMANDS = bytes.fromhex("A2A4A7A8ABADAEB0B3B5B6B9BABCBFC1C2C4C7 C8CBC
 """Sampling commands of E1..E24."""
 
 SLOW_COMMANDS = bytes.fromhex("838586")
-"""Of PDC, TAC, TDC, in the order of a round."""
+"""Sampling commands of PDC, TAC, TDC, in the order of a round."""
 
 PAC_COMMAND = 0x80
 
 ELECTRODES = 19
 ELECTRODES_SP = 24
-"""Of the BioTac SP: rounds of 54 slots."""
+"""Electrodes of the BioTac SP, whose rounds have 54 slots."""
 
 CHANNELS = ELECTRODES + 4
-"""Counts of a source: E1..E19, PDC, TAC, TDC, PAC."""
+"""Number of counts of a source: E1..E19, PDC, TAC, TDC, PAC."""
 
 WORD_FAULTS = ("parity", "absent", "error_word", "saturated", "stuck")
-"""Faults of what fingers answer: see ``SlotBlocks.with_faults``."""
+"""Faults of the words of fingers: see ``SlotBlocks.with_faults``."""
 
 CountSource = Callable[[float, int], Sequence[int]]
-"""Counts of E1..E19, PDC, TAC, TDC and PAC at a time [s] of a finger (from 0), 23 numbers."""
+"""Gives E1..E19, PDC, TAC, TDC and PAC (23 counts) at a time [s] of a finger (from 0)."""
 
 Times = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -46,7 +46,7 @@ _PRESSED = (-300, -500, -700)
 
 
 class CountTrack(HostTimed, ABC):
-    """A source that gives many slots at once; as a ``CountSource`` it gives one instant."""
+    """A source that gives the counts of many slots at once; it is a ``CountSource``, too."""
 
     def __call__(self, t: float, finger: int) -> Sequence[int]:
         """All 23 counts at a time."""
@@ -56,11 +56,11 @@ class CountTrack(HostTimed, ABC):
 
     @abstractmethod
     def slots(self, times_s: Times, places: Indices, finger: int) -> Counts:
-        """The count of one channel at each time; places are those among the 23."""
+        """The count of one channel at each time; ``places`` are indices into the 23 counts."""
 
 
 def idle_counts(t: float, finger: int) -> Sequence[int]:
-    """An untouched finger: every channel another number, the PAC alive."""
+    """An untouched finger: a different count for each channel, and a PAC that changes."""
     pac = 2040 + round(t * 4400.0) % 5
     return [*(2000 + 50 * k + finger for k in range(19)), 2600 + finger, 2045, 1914, pac]
 
@@ -76,9 +76,9 @@ def press_counts(t: float, finger: int) -> Sequence[int]:
 
 
 def round_of(electrodes: int = ELECTRODES, *, pac_first: bool = False) -> list[tuple[int, int]]:
-    """Command and place among the counts of each slot of a sampling round.
+    """Command and place (index of the count) of each slot of a round.
 
-    What a source does not know, E20..E24 of a BioTac SP, has the places from ``CHANNELS`` on.
+    E20..E24 of a BioTac SP, which sources do not give, have the places from ``CHANNELS`` on.
     """
     if electrodes not in (ELECTRODES, ELECTRODES_SP):
         raise ValueError(f"electrodes {electrodes} is neither {ELECTRODES} nor {ELECTRODES_SP}")
@@ -93,7 +93,7 @@ def round_of(electrodes: int = ELECTRODES, *, pac_first: bool = False) -> list[t
 
 
 def count_at(counts: Sequence[int], place: int) -> int:
-    """The count of a place; E20..E24 repeat E17, E7..E10, which lie near, with 40 counts more."""
+    """The count of a place; E20..E24 are those of the nearby E17, E7..E10 plus 40 counts."""
     if place < CHANNELS:
         return counts[place]
     return min(counts[_SP_REPEATS[place - CHANNELS]] + _SP_MORE, 4095)
@@ -105,7 +105,7 @@ def word(value: int) -> bytes:
 
 
 def _odd(upper: int) -> int:
-    """A byte with an odd number of ones: the lowest bit makes it so."""
+    """A byte with an odd number of ones; the lowest bit is the parity."""
     return upper | (upper.bit_count() + 1) % 2
 
 
@@ -113,10 +113,10 @@ _WORDS = np.array([list(word(value)) for value in range(4096)], np.uint8)
 
 
 class SlotBlocks:
-    """Command and words of many slots at once, for a sender with little time for each.
+    """Payloads of many slots at once: at 4400 slots per second there is little time for each.
 
     Args:
-        source: What the fingers measure.
+        source: Counts of the fingers.
         fingers: Words of each slot.
         order: Command and place of each slot of a round.
     """
@@ -129,7 +129,7 @@ class SlotBlocks:
         self._stuck_s: float | None = None
 
     def block(self, slot: int, count: int, time_s: float, step_s: float) -> list[bytes]:
-        """Payloads of the slots from one on, the first at a time, each a step after the other."""
+        """Payloads (command and words) of slots, the first at ``time_s``, ``step_s`` apart."""
         where = np.arange(slot, slot + count) % self._length
         times_s: Times = time_s + step_s * np.arange(count, dtype=np.float64)
         places = self._places[where]
@@ -144,9 +144,9 @@ class SlotBlocks:
     def with_faults(self, slot: int, time_s: float, faults: Collection[str]) -> bytes:
         """Payload of one slot with some of ``WORD_FAULTS``.
 
-        ``stuck``: all fingers measure what they did when it began; ``saturated``: they answer 4095;
-        ``parity``: one bit of the first finger's word is wrong; ``error_word``: the first says that
-        it had too little time; ``absent``: the last is not there.
+        ``stuck``: all fingers repeat the counts from its begin; ``saturated``: all answer 4095;
+        ``parity``: one bit of the first finger's word is wrong; ``error_word``: the first finger
+        reports too little sampling delay; ``absent``: the last finger does not answer.
         """
         if "stuck" not in faults:
             self._stuck_s = None

@@ -1,8 +1,8 @@
 """A Bota SensONE or Rokubi in software, on a serial line (hardware reference 3.6).
 
-What the page leaves open is decided here: a command ends by itself where its length is known, else
-by an end of line or a pause; one that is refused is answered with result 1 (``r,0,f,1``); offsets
-are added to the wrench; a new speed holds from the next start; what was not saved is lost then.
+Choices where the page leaves something open: a command of known length ends by itself, another one
+by an end of line or a pause; a refused command is answered with result 1 (``r,0,f,1``); offsets are
+added to the wrench; a new speed holds from the next start, which forgets what was not saved.
 """
 
 from __future__ import annotations
@@ -15,17 +15,15 @@ import time
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-from palpate_gateway.emulators.crc16 import crc16_x25
-from palpate_gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press, tell_lead
-from palpate_gateway.emulators.serial_line import SerialLine
-
-__all__ = ["BAUDS", "SINCS", "Bota", "Settings", "crc16_x25"]
+from palpate_gateway.emulators import FAULTS
+from palpate_gateway.emulators.emulator import SampleTicker, WrenchSource, set_lead, slow_press
+from palpate_gateway.emulators.lines import SerialEmulator, SerialLine, crc16_x25
 
 BAUDS = (9600, 57600, 115200, 230400, 460800)
-"""Speeds [bit/s] by their code."""
+"""Speeds [bit/s]; a command gives the index."""
 
 SINCS = (51, 64, 128, 205, 256, 512)
-"""Lengths of the filter."""
+"""Lengths of the sinc filter."""
 
 _SINC_PERIOD_US = 19.53125
 _IDLE_S = 0.02
@@ -36,8 +34,8 @@ _COMMAND = re.compile(
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What the commands change.
+class BotaSettings:
+    """Settings that the commands change.
 
     Attributes:
         compensated: Temperature compensation.
@@ -56,34 +54,32 @@ class Settings:
     offsets: tuple[float, ...] = (0.0,) * 6
 
 
-class Bota(Emulator):
+class BotaEmulator(SerialEmulator):
     """The sensor.
 
     Faults:
 
-    * ``crc``: one bit of each frame is wrong; ``cut``: its end is missing; ``junk``: noise comes
-      before it; ``lost``: it does not come; ``repeated``: it comes twice;
-    * ``silence``: nothing comes, and its clock goes on;
-    * ``restart``: it boots, with its text and with its clock from 0;
-    * ``unplug``: the line is gone, and the sensor goes on;
-    * ``late``, ``overload``, ``error``, ``raw``: a bit of the status; with the last two the values
-      are wrong;
-    * ``nan``: Fz is no number; ``stuck``: frames repeat what was felt when it began;
+    * ``crc``: one bit of each frame is wrong; ``cut``: each frame lacks its end; ``junk``: noise
+      before each frame; ``lost``: frames are missing; ``repeated``: each frame comes twice;
+    * ``silence``: nothing comes, while its clock continues;
+    * ``restart``: it boots, sends its boot text, and its clock starts from 0;
+    * ``unplug``: the line is gone, while the sensor continues;
+    * ``late``, ``overload``, ``error``, ``raw``: a bit of the status is set; with the last two the
+      values are wrong;
+    * ``nan``: Fz is not a number; ``stuck``: frames repeat the load from its begin;
     * ``clock_drift``: its clock runs at another speed than its converter.
 
     Args:
         source: The load.
-        baud: Its speed [bit/s].
+        baud: Speed [bit/s].
         path: Name of the line; "" = a new one.
-        runs_after_boot: It streams after a start; else it waits to be asked.
-        boot_s: How long a start takes [s].
+        runs_after_boot: Whether it streams after a start without a request.
+        boot_s: Duration of a start [s].
         clock_us: Its clock at the first sample [us].
-        drift_ppm: How much too fast its clock is while it drifts [1e-6].
+        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "crc cut junk lost repeated silence restart unplug clock_drift nan stuck".split()
-    ) | frozenset(_STATUS)
+    faults: ClassVar = FAULTS["bota"]
 
     def __init__(
         self,
@@ -101,15 +97,10 @@ class Bota(Emulator):
         self._line = SerialLine(baud, path)
         self._runs_after_boot, self._boot_s = runs_after_boot, boot_s
         self._random = random.Random(6)
-        self._saved = Settings(baud=baud)
+        self._saved = BotaSettings(baud=baud)
         self._time_s = 0.0
         self._boot()
         self._clock_us = float(clock_us)
-
-    @property
-    def address(self) -> str:
-        """The line's name."""
-        return self._line.path
 
     def _boot(self) -> None:
         self.mode: Literal["boot", "wait", "config", "run"] = "boot"
@@ -119,23 +110,17 @@ class Bota(Emulator):
         self._line.baud = self._saved.baud
         self._apply(self._saved)
 
-    def _apply(self, settings: Settings) -> None:
+    def _apply(self, settings: BotaSettings) -> None:
         self.settings = settings
         self.rate_hz = 1e6 / (_SINC_PERIOD_US * settings.sinc)
-        self._pace = Pace(self.rate_hz, self._stop)
-
-    def _listen(self) -> None:
-        self._line.plug()
-
-    def _hang_up(self) -> None:
-        self._line.close()
+        self._ticker = SampleTicker(self.rate_hz, self._stop)
 
     def _serve(self) -> None:
         while not self._stop.is_set():
             self._line.keep_plugged(not self.faulty("unplug"))
             if self.faulty("restart"):
                 self._boot()
-            due_s = self._pace.wait() if self.mode == "run" else 0.0
+            due_s = self._ticker.wait() if self.mode == "run" else 0.0
             data = self._line.read(0.0 if self.mode == "run" else _IDLE_S)
             if self.mode == "boot":
                 self._end_boot()
@@ -187,23 +172,23 @@ class Bota(Emulator):
         self._say(f"r,0,{command},0")
         if command == "R":
             self.mode = "run"
-            self._pace = Pace(self.rate_hz, self._stop)
+            self._ticker = SampleTicker(self.rate_hz, self._stop)
 
     def _set(self, command: str, numbers: list[int]) -> bool:
-        """Take the four numbers of ``c`` or ``f``; whether they are in their ranges."""
+        """Apply the four numbers of ``c`` or ``f``; False if one is out of range."""
         first, second, third, fourth = numbers
         if command == "f" and first in SINCS and max(second, third, fourth) <= 1:
             self._apply(replace(self.settings, sinc=first))
         elif command == "c" and max(first, second, third) <= 1 and fourth < len(BAUDS):
             compensated, calibrated, csv = bool(first), bool(second), bool(third)
-            now = Settings(compensated, calibrated, csv, BAUDS[fourth])
+            now = BotaSettings(compensated, calibrated, csv, BAUDS[fourth])
             self._apply(replace(now, sinc=self.settings.sinc, offsets=self.settings.offsets))
         else:
             return False
         return True
 
     def _take(self, command: str, values: str) -> None:
-        """Offsets, or a row of the matrix, which has no effect here."""
+        """Apply offsets; a row of the matrix is accepted and has no effect."""
         try:
             numbers = tuple(float(value) for value in values.split(",")[1:])
         except ValueError:
@@ -216,7 +201,7 @@ class Bota(Emulator):
     def _sample(self, due_s: float) -> None:
         period_us = 1e6 / self.rate_hz
         self._time_s += period_us * 1e-6
-        tell_lead(self._source, due_s - self._time_s)
+        set_lead(self._source, due_s - self._time_s)
         self._clock_us += period_us * (1.0 + self._drift if self.faulty("clock_drift") else 1.0)
         frame = self._frame()
         if self.faulty("silence") or self.faulty("lost"):
@@ -236,7 +221,7 @@ class Bota(Emulator):
                 self._line.write(frame)
 
     def _frame(self) -> bytes:
-        """The present sample."""
+        """The present sample as a frame, or as a line of text."""
         felt = self._source(self.held(self._time_s))
         values = [a + b for a, b in zip(felt, self.settings.offsets, strict=True)]
         status = sum(bit for name, bit in _STATUS.items() if self.faulty(name))

@@ -1,9 +1,4 @@
-"""The contract of an emulator: a device in software, at a real address, that misbehaves on request.
-
-Emulators are written from the byte tables of the protocol page and import nothing of
-``palpate_gateway.protocols``: a decoder that misreads the page must not agree with its own mirror
-image.
-"""
+"""The interface of an emulator: a device in software, at a real address, with faults on request."""
 
 from __future__ import annotations
 
@@ -17,14 +12,14 @@ Wrench = tuple[float, float, float, float, float, float]
 """Fx Fy Fz [N] Tx Ty Tz [N m]."""
 
 WrenchSource = Callable[[float], Sequence[float]]
-"""Wrench at a time of the emulator's own [s], which counts from its start."""
+"""Gives the wrench at a time of the emulator's own clock [s], which counts from its start."""
 
 
 class HostTimed:
-    """A source that goes by the host's clock, so that several emulators play one scene.
+    """A source that follows the host's clock, so that several emulators play one scene.
 
     Attributes:
-        lead_s: The host's monotonic time less the emulator's own [s], as its emulator tells it.
+        lead_s: Host's monotonic time less the emulator's own time [s]; its emulator sets it.
     """
 
     lead_s = 0.0
@@ -45,7 +40,7 @@ class Emulator(ABC):
             raise ValueError(f"rate_hz {rate_hz} is not in 0..100000")
         self.rate_hz = rate_hz
         self.sent = 0
-        """Samples that were sent whole and right."""
+        """Samples that were sent complete and correct."""
         self._until: dict[str, float] = {}
         self._held_s: float | None = None
         self._lock = threading.Lock()
@@ -55,10 +50,10 @@ class Emulator(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """What a user would give a driver, e.g. a device file or ``host:port``."""
+        """Address for a driver's options, e.g. a device file or ``host:port``."""
 
     def inject(self, fault: str, duration_s: float = 0.0) -> None:
-        """Have a fault for a time; 0 = once, at the next sample.
+        """Start a fault for a duration [s]; 0 = once, at the next sample.
 
         Raises:
             ValueError: It has no such fault.
@@ -68,7 +63,7 @@ class Emulator(ABC):
             self._until[fault] = time.monotonic() + duration_s if duration_s > 0.0 else 0.0
 
     def faulty(self, fault: str) -> bool:
-        """Whether to have a fault now; one that was asked for once is had once."""
+        """Whether a fault acts now; a call that returns True uses up a fault injected for once."""
         with self._lock:
             until = self._until.get(fault)
             if until is None:
@@ -78,7 +73,7 @@ class Emulator(ABC):
             return until == 0.0 or time.monotonic() < until
 
     def end(self, fault: str) -> None:
-        """End a fault now, or take it back if it has not come yet.
+        """End a fault now, or cancel it if it has not acted yet.
 
         Raises:
             ValueError: It has no such fault.
@@ -89,11 +84,11 @@ class Emulator(ABC):
 
     @property
     def sound(self) -> bool:
-        """Whether it has no fault now, and none to come; cheap, for it is asked at each sample."""
+        """Whether no fault acts or waits; cheap, because it is checked at each sample."""
         return not self._until
 
     def held(self, t: float) -> float:
-        """When to measure: now, or while the fault ``stuck`` lasts, when it began."""
+        """Time to measure at [s]: ``t``, or during the fault ``stuck`` the time of its begin."""
         if self.sound or not self.faulty("stuck"):
             self._held_s = None
             return t
@@ -106,13 +101,13 @@ class Emulator(ABC):
             raise ValueError(f"fault {fault!r} is none of {', '.join(sorted(self.faults))}")
 
     def start(self) -> None:
-        """Begin to serve; the address is valid afterwards."""
+        """Start to serve; the address is valid afterwards."""
         self._listen()
         self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End; twice is harmless."""
+        """Stop serving; a second call does nothing."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(5.0)
@@ -129,7 +124,7 @@ class Emulator(ABC):
 
     @abstractmethod
     def _hang_up(self) -> None:
-        """Close everything."""
+        """Close what ``_listen`` opened, and all connections."""
 
     def __enter__(self) -> Self:
         self.start()
@@ -139,39 +134,39 @@ class Emulator(ABC):
         self.stop()
 
 
-def tell_lead(source: object, lead_s: float) -> None:
-    """Tell a source that goes by the host's clock how far that is ahead of the emulator's [s]."""
+def set_lead(source: object, lead_s: float) -> None:
+    """Set ``lead_s`` of a source that follows the host's clock; other sources are left alone."""
     if isinstance(source, HostTimed):
         source.lead_s = lead_s
 
 
 def no_load(t: float) -> Wrench:
-    """Nothing is felt."""
+    """No load."""
     return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def slow_press(t: float) -> Wrench:
-    """A wrench that changes slowly: a press of 4 N every five seconds, with some shear."""
+    """A slow load: up to 4 N every five seconds, with some shear."""
     share = max(0.0, 1.0 - abs(t % 5.0 - 2.5) / 1.5)
     return (0.5 * share, -0.25 * share, 4.0 * share, 0.004 * share, -0.008 * share, 0.001 * share)
 
 
-class Pace:
-    """Ticks at a rate, without drift; after a pause it goes on from now.
+class SampleTicker:
+    """Ticks at a rate, without drift; after a pause of this process it continues from now.
 
     Args:
         rate_hz: Ticks each second.
-        stop: Ends the wait.
+        stop: Event that ends a wait.
     """
 
     def __init__(self, rate_hz: float, stop: threading.Event) -> None:
         self._period_s, self._stop = 1.0 / rate_hz, stop
         self.fast = 0.0
-        """Share by which it is faster than its rate."""
+        """Relative excess of its rate, e.g. 2e-4."""
         self._next_s = time.monotonic()
 
     def wait(self) -> float:
-        """Until the next tick, or until told to stop; when it was due [s, monotonic]."""
+        """Wait until the next tick or until ``stop``; when the tick was due [s, monotonic]."""
         self._next_s += self._period_s / (1.0 + self.fast)
         left_s = self._next_s - time.monotonic()
         if left_s > 0.0:

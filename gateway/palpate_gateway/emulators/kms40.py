@@ -1,7 +1,7 @@
 """A Weiss Robotics KMS 40 in software: lines of text over TCP (hardware reference 3.1).
 
-Where the page says "echo" the reply is ``NAME=value``, and ``NAME()`` asks what is set: so the
-source RL reads them.
+Where the page says "echo", the reply is ``NAME=value``, and ``NAME()`` asks for the setting: the
+source RL of the reference reads them so.
 """
 
 from __future__ import annotations
@@ -16,7 +16,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from palpate_gateway.emulators.emulator import Emulator, Pace, WrenchSource, slow_press, tell_lead
+from palpate_gateway.emulators import FAULTS
+from palpate_gateway.emulators.emulator import (
+    Emulator,
+    SampleTicker,
+    WrenchSource,
+    set_lead,
+    slow_press,
+)
 
 _CALL = re.compile(r"([A-Z][A-Z0-9]*)\((.*)\)")
 _AT_ONCE = 4096
@@ -29,35 +36,34 @@ _CALIBRATED, _STABLE, _TARE_ON, _FILTER_ON, _RUNNING = 0, 1, 2, 3, 4
 _OVERRANGE, _CALIBRATION_FAULT = 20, 26
 
 _RANGE = np.array([120.0] * 3 + [3.0] * 3)
-"""[N] and [N m]."""
+"""Measuring range [N] and [N m]."""
 
 
 class Kms40Emulator(Emulator):
-    """Serves one client at a time; as in the device, what is set outlives a connection.
+    """Serves one client at a time; as in the device, settings outlive a connection.
 
     Faults:
 
-    * ``cut``: the second half of each line is missing, its end too; ``junk``: noise before it;
-    * ``lost``: lines do not come; ``repeated``: each comes twice;
-    * ``nan``: the values are no numbers; ``stuck``: they repeat what was felt when it began;
-    * ``silence``: nothing comes, no answer either; ``stopped``: it streams no more until asked;
-    * ``restart``: the connection is reset, and nothing that was set is remembered;
-    * ``unplug``: nobody listens at its address;
-    * ``overload``, ``error``: a flag says so: the range of Fz, a fault of the calibration;
+    * ``cut``: each line lacks its second half and its line end; ``junk``: noise before each line;
+    * ``lost``: lines are missing; ``repeated``: each comes twice;
+    * ``nan``: the values are not numbers; ``stuck``: they repeat the load from its begin;
+    * ``silence``: neither samples nor answers come; ``stopped``: it stops streaming until a
+      request;
+    * ``restart``: the connection is reset, and all settings return to their defaults;
+    * ``unplug``: no device is at its address;
+    * ``overload``, ``error``: a flag is set, for the range of Fz or for a fault of the calibration;
     * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
 
     Args:
-        source: What it feels.
+        source: The load.
         host: Address to listen at.
-        port: 0 = any free one.
-        serial: Its serial number.
-        stamped: Data lines end with the device's time.
-        drift_ppm: How much too fast its clock is while it drifts [1e-6].
+        port: Port to listen at; 0 = any free one.
+        serial: Serial number.
+        stamped: Whether data lines end with the device's time.
+        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "cut junk lost repeated nan stuck silence stopped restart unplug overload error".split()
-    ) | {"clock_drift"}
+    faults: ClassVar = FAULTS["kms40"]
 
     def __init__(
         self,
@@ -86,12 +92,12 @@ class Kms40Emulator(Emulator):
 
     @property
     def streaming(self) -> bool:
-        """Whether it sends samples by itself."""
+        """Whether it streams samples."""
         return self._streaming
 
     @property
     def divider(self) -> int:
-        """Every which sample is sent."""
+        """Every n-th sample is sent."""
         return self._settings["LDIV"][0]
 
     def _power_up(self) -> None:
@@ -117,12 +123,12 @@ class Kms40Emulator(Emulator):
         self._incoming = b""
 
     def _serve(self) -> None:
-        pace = Pace(self.rate_hz, self._stop)
+        ticker = SampleTicker(self.rate_hz, self._stop)
         while not self._stop.is_set():
-            pace.fast = self._drift if self.faulty("clock_drift") else 0.0
-            due_s = pace.wait()
+            ticker.fast = self._drift if self.faulty("clock_drift") else 0.0
+            due_s = ticker.wait()
             self._ticks += 1
-            tell_lead(self._source, due_s - self._ticks / self.rate_hz)
+            set_lead(self._source, due_s - self._ticks / self.rate_hz)
             if self.faulty("restart"):
                 self._restart()
             if self.faulty("unplug"):
@@ -132,11 +138,11 @@ class Kms40Emulator(Emulator):
                 self._listen()
             if self.faulty("stopped"):
                 self._streaming = False
-            with contextlib.suppress(OSError):  # Whoever has gone is noticed at the next tick.
+            with contextlib.suppress(OSError):  # A lost client is noticed at the next tick.
                 self._serve_client()
 
     def _restart(self) -> None:
-        """Lose power: a connection of before is reset, nothing is remembered."""
+        """Lose power: reset the connection and forget all settings."""
         if self._client is not None:
             self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._drop_client()
@@ -194,7 +200,7 @@ class Kms40Emulator(Emulator):
             client.sendall(line + b"\n")
 
     def answer(self, line: str) -> str:
-        """The reply to one request, both without their line ends."""
+        """The reply to one request, both without line ends."""
         call = _CALL.fullmatch(line)
         if call is None:
             return _error(_FORMAT)
@@ -237,20 +243,20 @@ class Kms40Emulator(Emulator):
         if len(numbers) > size or not all(least <= n <= most for n in numbers):
             return _error(_INVALID)
         if name == "TARE" and numbers:
-            # The page advises to stop the stream first; this device insists on it.
+            # The page advises to stop the stream first; this emulator requires it.
             if self._streaming:
                 return _error(_ALREADY_RUNNING)
-            self._tare = self._felt() if numbers[0] else None
+            self._tare = self._load() if numbers[0] else None
         if numbers:
             self._settings[name] = numbers
         values = ",".join(map(str, self._settings[name]))
         return f"{name}={{{values}}}" if name == "LMASK" else f"{name}={values}"
 
-    def _felt(self) -> np.ndarray:
+    def _load(self) -> np.ndarray:
         return np.asarray(self._source(self.held(self._ticks / self.rate_hz)), np.float64)
 
     def _data_line(self) -> str:
-        values = self._felt() - (0.0 if self._tare is None else self._tare)
+        values = self._load() - (0.0 if self._tare is None else self._tare)
         chosen = [
             f"{value:.4f}" for value, on in zip(values, self._settings["LMASK"], strict=True) if on
         ]
@@ -265,7 +271,7 @@ class Kms40Emulator(Emulator):
             bits.add(_FILTER_ON)
         if self._streaming:
             bits.add(_RUNNING)
-        bits.update(int(axis) + _OVERRANGE for axis in np.flatnonzero(abs(self._felt()) > _RANGE))
+        bits.update(int(axis) + _OVERRANGE for axis in np.flatnonzero(abs(self._load()) > _RANGE))
         if self.faulty("overload"):
             bits.add(_OVERRANGE + 2)
         if self.faulty("error"):

@@ -1,6 +1,6 @@
-"""A robot in software: a program on the bus that tells where its flange is.
+"""A robot in software: a program on the bus that publishes the pose of its flange.
 
-Without a router to join it is one, at a loopback port of its own.
+Without the address of a router it runs its own, at a loopback port.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import Pose, RobotPoseFrame
 from palpate.rigid import compose, inverse
-from palpate_gateway.emulators.emulator import Emulator, Pace, tell_lead
+from palpate_gateway.emulators import FAULTS
+from palpate_gateway.emulators.emulator import Emulator, SampleTicker, set_lead
 
 TipSource = Callable[[float], Pose]
-"""Pose of the tip in the sensor frame at a time of the emulator's own [s]."""
+"""Gives the pose of the tip in the sensor frame at a time of the emulator's own [s]."""
 
 BASE_SENSOR = Pose((0.4, 0.0, 0.1), (0.0, 1.0, 0.0, 0.0))
-"""A finger that lies on its nail before the robot: its z points down."""
+"""Pose of a finger that lies on its nail in front of the robot: its z axis points down."""
 
 FLANGE_INDENTER = Pose((0.0, 0.0, 0.12), (1.0, 0.0, 0.0, 0.0))
-"""A straight tool."""
+"""Pose of the indenter: a straight tool."""
 
 _JOIN_S = 5.0
 _BACK_NS = 5_000_000_000
@@ -37,43 +38,41 @@ _NAN, _TOO_LONG = struct.pack("<d", float("nan")), struct.pack("<d", 2.0)
 
 
 def above_the_pad(t: float) -> Pose:
-    """Nothing is touched."""
+    """The tip rests above the pad, without contact."""
     return Pose((-0.004, 0.0, -0.016), (1.0, 0.0, 0.0, 0.0))
 
 
 def slow_approach(t: float) -> Pose:
-    """The tip of a press every five seconds, as ``slow_press`` has its wrench."""
+    """The tip of an indentation every five seconds, at the times of ``slow_press``."""
     share = max(0.0, 1.0 - abs(t % 5.0 - 2.5) / 1.5)
     return Pose((-0.004, 0.0, -0.016 + 0.007 * share), (1.0, 0.0, 0.0, 0.0))
 
 
 class RobotEmulator(Emulator):
-    """Tells poses of a flange that carries an indenter.
+    """Publishes poses of a flange that carries an indenter.
 
     Faults:
 
-    * ``lost``: poses do not come; ``repeated``: each comes twice;
-    * ``late``: every other one comes after the next;
-    * ``nan``, ``long``: a quaternion with a part that is no number, or is 2;
-    * ``stuck``: it tells where it was when the fault began;
-    * ``wrong_time``: its times are five seconds back;
-    * ``silence``: its program stands still; ``unplug``: it has left the bus;
-    * ``restart``: its program ends and, when the fault ends, begins anew, as its clock does;
+    * ``lost``: poses are missing; ``repeated``: each comes twice;
+    * ``late``: every other pose comes after the next one;
+    * ``nan``, ``long``: a part of the quaternion is not a number, or is 2;
+    * ``stuck``: it repeats the pose from its begin;
+    * ``wrong_time``: its times are five seconds in the past;
+    * ``silence``: its program hangs; ``unplug``: it has left the bus;
+    * ``restart``: its program ends; when the fault ends, program and clock start again;
     * ``clock_drift``: its clock, and with it its loop, runs at another speed.
 
     Args:
-        tip: Where the tip of its indenter is.
-        robot: Its name on the bus.
+        tip: Pose of the tip of its indenter.
+        robot: Name on the bus.
         rate_hz: Poses each second.
-        connect: Endpoint of the router; empty = be one.
-        port: To be a router at; 0 = any free one.
-        station: On which it publishes.
-        drift_ppm: How much too fast its clock is while it drifts [1e-6].
+        connect: Endpoint of the router; empty = run a router.
+        port: Port of its own router; 0 = any free one.
+        station: Station on which it publishes.
+        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "lost repeated late nan long stuck wrong_time silence unplug restart clock_drift".split()
-    )
+    faults: ClassVar = FAULTS["robot"]
 
     def __init__(
         self,
@@ -104,7 +103,7 @@ class RobotEmulator(Emulator):
         return self._connect or f"tcp/127.0.0.1:{self._port}"
 
     def _begin(self, tick: int) -> None:
-        """Its program starts."""
+        """Start its program."""
         self._run_id = secrets.randbits(64) or 1
         self._sequence, self._first_tick = 0, tick
 
@@ -139,18 +138,18 @@ class RobotEmulator(Emulator):
             self._router = None
 
     def _serve(self) -> None:
-        pace = Pace(self.rate_hz, self._stop)
+        ticker = SampleTicker(self.rate_hz, self._stop)
         self._began_s = time.monotonic()
-        tell_lead(self._tip, self._began_s)
+        set_lead(self._tip, self._began_s)
         tick = 0
         while not self._stop.is_set():
-            pace.fast = self._drift if self.faulty("clock_drift") else 0.0
-            due_s = pace.wait()
+            ticker.fast = self._drift if self.faulty("clock_drift") else 0.0
+            due_s = ticker.wait()
             tick += 1
             self._step(tick, due_s - self._began_s)
 
     def _step(self, tick: int, t: float) -> None:
-        """One turn of its loop."""
+        """One cycle of its loop."""
         if self._gone():
             return
         if self._away:
@@ -172,7 +171,7 @@ class RobotEmulator(Emulator):
             self._tell(payload)
 
     def _gone(self) -> bool:
-        """Whether it does not run, or is not on the bus."""
+        """Whether its program does not run, or is not on the bus."""
         if self.faulty("restart"):
             self._away = True
             return True
@@ -180,7 +179,7 @@ class RobotEmulator(Emulator):
             self._leave()
             return True
         if self._publisher is None:
-            with suppress(LinkError):  # the router is away, too; next time
+            with suppress(LinkError):  # the router is away, too; it tries again
                 self._join()
         return self._publisher is None
 
@@ -191,7 +190,8 @@ class RobotEmulator(Emulator):
         flange = compose(compose(BASE_SENSOR, tip), inverse(FLANGE_INDENTER))
         frame = RobotPoseFrame(self.robot, self._sequence, time_ns, flange, self._run_id)
         payload = ROBOT_POSE.codec.encode(frame)
-        # A number that is 0 is not on the wire; of a quaternion one never is.
+        # Protobuf omits a field that is 0, so the fault is put into the largest part of the
+        # quaternion.
         largest = struct.pack("<d", max(flange.orientation, key=abs))
         for fault, wrong in (("nan", _NAN), ("long", _TOO_LONG)):
             if self.faulty(fault):

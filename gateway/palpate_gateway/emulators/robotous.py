@@ -1,34 +1,223 @@
-"""A Robotous RFT in software, on a serial line or on CAN (hardware reference 3.5)."""
+"""A Robotous RFT in software, on a serial line or on CAN (hardware reference 3.5).
+
+Choices where the page leaves something open: requests that the page does not name, and requests
+with a wrong sum, get no answer; at a restart all settings but speed and identifiers return to their
+defaults; request 4 and the reply to 5 carry the three identifiers in D2, D3 and D4.
+"""
 
 from __future__ import annotations
 
+import random
+import time
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from palpate.extras import require
-from palpate_gateway.emulators.can_errors import BUS_OFF, RESTARTED, error_frame
-from palpate_gateway.emulators.emulator import WrenchSource, slow_press
-from palpate_gateway.emulators.robotous_sensor import BAUDS, MOST_HZ, TORQUE_DIVISORS, Robotous
-from palpate_gateway.emulators.serial_line import SerialLine
+from palpate_gateway.emulators import FAULTS
+from palpate_gateway.emulators.emulator import (
+    Emulator,
+    SampleTicker,
+    WrenchSource,
+    set_lead,
+    slow_press,
+)
+from palpate_gateway.emulators.lines import (
+    BUS_OFF,
+    RESTARTED,
+    SerialEmulator,
+    SerialLine,
+    error_frame,
+)
 
-__all__ = ["TORQUE_DIVISORS", "Robotous", "RobotousCan", "RobotousSerial"]
+FORCE_DIVISOR = 50.0
+"""Counts per N, all models."""
+
+TORQUE_DIVISORS = {
+    **dict.fromkeys(("RFT40-SA01", "RFT44-SB01", "RFT60-HA01", "RFT64-SB01", "RFT76-HA01"), 2000.0),
+    **dict.fromkeys(("RFT80-6A01", "RFT82-HA02"), 1000.0),
+}
+"""Counts per N m."""
+
+_RATES_HZ = (200, 10, 20, 50, 100, 200, 333, 500, 1000)
+BAUDS = (115200, 921600, 460800, 230400, 115200, 57600)
+"""Speeds [bit/s]; a request gives the index."""
+
+MOST_HZ = {921600: 1000, 460800: 500, 230400: 500, 115200: 333, 57600: 200}
+"""Highest rate [Hz] by speed [bit/s]."""
+
+_OK, _OUT_OF_RANGE = b"\x01", b"\x00\x02"
+_FX_OVERLOADED = 0b100000
+_NO_LOAD: Sequence[float] = (0.0,) * 6
+_IDLE_S = 0.02
 
 
-class RobotousSerial(Robotous):
-    """An RFT with a UART.
+class RobotousEmulator(Emulator):
+    """What both kinds of line share: requests, settings and samples.
 
-    Besides the faults of every ``Robotous``: ``crc``, one bit of each frame is wrong, and
-    ``unplug``, the line is gone while the sensor goes on.
+    Faults on both kinds of line:
+
+    * ``lost``: samples are missing; no sequence number shows it;
+    * ``repeated``: each sample comes twice; ``cut``: each lacks its second half; ``junk``: noise
+      before each;
+    * ``silence``: no sample comes, but requests are answered;
+    * ``restart``: it is silent until the next start request, and its zero is gone;
+    * ``overload``: the bit of Fx is set, and counted;
+    * ``stuck``: samples repeat the load from its begin;
+    * ``clock_drift``: samples come at another rate.
 
     Args:
         source: The load.
-        baud: Its speed [bit/s].
+        model: Its answer to the request for the model, one of ``TORQUE_DIVISORS``.
+        serial: Serial number.
+        drift_ppm: Excess rate of its samples during ``clock_drift`` [1e-6].
+    """
+
+    def __init__(
+        self,
+        source: WrenchSource = slow_press,
+        model: str = "RFT64-SB01",
+        serial: str = "RFT-1",
+        drift_ppm: float = 200.0,
+    ) -> None:
+        super().__init__(_RATES_HZ[0])
+        self._source, self._model, self._serial = source, model, serial
+        self._scale = 3 * (FORCE_DIVISOR,) + 3 * (TORQUE_DIVISORS[model],)
+        self._time_s, self._drift = 0.0, drift_ppm * 1e-6
+        self._away = False
+        self._random = random.Random(5)
+        self.ids = self._new_ids = (0x64, 0x01, 0x02)
+        """CAN identifiers of requests, and of the first and second half of answers."""
+        self.baud_code = 0
+        self._most_hz = 1000
+        self._power_up()
+
+    def _power_up(self) -> None:
+        """The state at power-up: silent until a request."""
+        self.running = False
+        self.filter_code = (0, 0)
+        self.ids = self._new_ids
+        self._bias = _NO_LOAD
+        self._overloads = [0] * 6
+        self._set_rate(0)
+
+    def _set_rate(self, code: int) -> None:
+        self.rate_code, self.rate_hz = code, float(_RATES_HZ[code])
+        self._ticker = SampleTicker(self.rate_hz, self._stop)
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            self._ticker.fast = self._drift if self.faulty("clock_drift") else 0.0
+            due_s = self._ticker.wait() if self.running else time.monotonic()
+            requests = self._requests(0.0 if self.running else _IDLE_S)
+            if self.faulty("restart"):
+                self._power_up()
+                continue
+            for request in requests:
+                self._answer(request)
+            self._time_s += 1.0 / self.rate_hz if self.running else _IDLE_S
+            set_lead(self._source, due_s - self._time_s)
+            if self.running:
+                self._sample()
+
+    def _answer(self, request: bytes) -> None:
+        command, value, more = request[0], request[1], request[2]
+        if self.running and command not in (12, 16, 17):
+            return
+        if command == 10:
+            self._send(self._data(command))
+        elif command in (11, 12):
+            self.running = command == 11
+            self._ticker = SampleTicker(self.rate_hz, self._stop)
+        elif command == 17:
+            self._bias = self._source(self._time_s) if value == 1 else _NO_LOAD
+        else:
+            answer = self._reply(command)
+            if command in (4, 6, 8, 15):
+                answer = _OK if self._set(command, value, more, request[3]) else _OUT_OF_RANGE
+            if answer is not None:
+                self._send(bytes([command]) + answer[:15].ljust(15, b"\0"))
+
+    def _reply(self, command: int) -> bytes | None:
+        """The answer to a request that changes nothing; None = no answer."""
+        return {
+            1: self._model.encode("ascii"),
+            2: self._serial.encode("ascii"),
+            3: b"1.7",
+            5: bytes(self.ids),
+            7: bytes([self.baud_code]),
+            9: bytes(self.filter_code),
+            16: bytes([self.rate_code]),
+            18: bytes(min(count, 255) for count in self._overloads),
+        }.get(command)
+
+    def _set(self, command: int, value: int, more: int, most: int) -> bool:
+        """Apply a setting; False if it is out of range."""
+        if command == 4 and value and more and most:
+            self._new_ids = (value, more, most)
+        elif command == 6 and value < len(BAUDS):
+            self.baud_code = value
+        elif command == 8 and value <= 1 and value <= more <= 14:
+            self.filter_code = (value, more)
+        elif command == 15 and value < len(_RATES_HZ) and _RATES_HZ[value] <= self._most_hz:
+            self._set_rate(value)
+        else:
+            return False
+        return True
+
+    def _data(self, command: int) -> bytes:
+        """D1..D16 of a data frame."""
+        status = _FX_OVERLOADED if self.faulty("overload") else 0
+        self._overloads[0] += status == _FX_OVERLOADED
+        load = self._source(self.held(self._time_s))
+        axes = zip(load, self._bias, self._scale, strict=True)
+        counts = [round((value - bias) * scale) for value, bias, scale in axes]
+        limited = [min(max(count, -0x8000), 0x7FFF) for count in counts]
+        fields = b"".join(count.to_bytes(2, "big", signed=True) for count in limited)
+        return bytes([command]) + fields + bytes([status, 0, 0])
+
+    def _sample(self) -> None:
+        data = self._data(11)
+        if self._away or self.faulty("silence") or self.faulty("lost"):
+            return
+        if self.faulty("junk"):
+            self._spoil("junk", data)
+        for fault in ("cut", "crc"):
+            if fault in self.faults and self.faulty(fault):
+                self._spoil(fault, data)
+                return
+        self._send(data)
+        self.sent += 1
+        if self.faulty("repeated"):
+            self._send(data)
+
+    @abstractmethod
+    def _requests(self, timeout_s: float) -> list[bytes]:
+        """D1..D8 of the received requests."""
+
+    @abstractmethod
+    def _send(self, data: bytes) -> None:
+        """Send D1..D16."""
+
+    @abstractmethod
+    def _spoil(self, fault: str, data: bytes) -> None:
+        """Send D1..D16 with a fault, or the noise before them."""
+
+
+class RobotousSerialEmulator(SerialEmulator, RobotousEmulator):
+    """An RFT with a UART.
+
+    More faults: ``crc``: one bit of each frame is wrong; ``unplug``: the line is gone, while the
+    sensor continues.
+
+    Args:
+        source: The load.
+        baud: Speed [bit/s].
         path: Name of the line; "" = a new one.
         more: Model, serial number, drift.
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "crc cut junk lost repeated silence restart unplug overload stuck clock_drift".split()
-    )
+    faults: ClassVar = FAULTS["robotous"]
 
     def __init__(
         self, source: WrenchSource = slow_press, baud: int = 115200, path: str = "", **more: Any
@@ -38,17 +227,6 @@ class RobotousSerial(Robotous):
         super().__init__(source, **more)
         self.baud_code = BAUDS.index(baud)
         self._power_up()
-
-    @property
-    def address(self) -> str:
-        """The line's name."""
-        return self._line.path
-
-    def _listen(self) -> None:
-        self._line.plug()
-
-    def _hang_up(self) -> None:
-        self._line.close()
 
     def _power_up(self) -> None:
         super()._power_up()
@@ -81,24 +259,22 @@ class RobotousSerial(Robotous):
         self._line.write(frame if fault == "crc" else frame[:9])
 
 
-class RobotousCan(Robotous):
+class RobotousCanEmulator(RobotousEmulator):
     """An RFT on CAN.
 
-    Besides the faults of every ``Robotous``: ``busoff``, an error frame says that the controller is
-    off the bus, then nothing is heard or said, and at the end another says that it was started
-    again, and the sensor has gone on; ``unplug``: the same without a word, but its supply is gone,
-    too, and it has to be asked again.
+    More faults: ``busoff``: an error frame says that the controller is off the bus, then nothing is
+    sent or received; at the end another one says that the controller was restarted, while the
+    sensor has continued; ``unplug``: line and supply are gone, and it is silent until a start
+    request.
 
     Args:
         source: The load.
         interface: python-can's kind of bus.
-        channel: The bus.
+        channel: Name of the bus.
         more: Model, serial number, drift.
     """
 
-    faults: ClassVar[frozenset[str]] = frozenset(
-        "cut junk lost repeated silence restart unplug overload stuck clock_drift busoff".split()
-    )
+    faults: ClassVar = FAULTS["robotous on CAN"]
 
     def __init__(
         self,
@@ -149,7 +325,7 @@ class RobotousCan(Robotous):
 
     def _spoil(self, fault: str, data: bytes) -> None:
         if fault == "junk":
-            # Frames of others, and one of a wrong length with an identifier of ours.
+            # A frame of another device, and one of a wrong length with our identifier.
             self._put(self._random.randint(0x100, 0x7FF), self._random.randbytes(8))
             self._put(self.ids[1], self._random.randbytes(self._random.randint(0, 7)))
         else:

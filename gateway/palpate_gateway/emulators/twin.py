@@ -1,12 +1,13 @@
-"""The digital twin as what emulated devices measure: counts of fingers, wrenches on them.
+"""The digital twin as the source of emulated devices: counts, wrench and indenter pose of fingers.
 
-Each finger has a loop of presses, computed at the start by the virtual finger (``virtual.tape``)
-with the same options and therefore the same counts, and from then on only looked up. A loop is
-played by the host's clock: its place at an instant is the time since an epoch, modulo its length.
-So emulators that were started at different times, in several processes, on hosts whose clocks
-agree, play the same press: whoever has a finger's seed and trajectories has its wrench.
+Each finger has a loop of indentations. The virtual finger (``virtual.tape``) computes it once at
+the start, with the same options and therefore the same counts; from then on it is only looked up.
+The host's clock plays a loop: the position in it is the time since an epoch, modulo its length. So
+emulators in several processes, started at different times on hosts whose clocks agree, play the
+same
+scene: two that have the same seed and trajectories measure the same finger.
 
-Between two frames everything runs straight; PAC has the nearest of its own 2200 instants a second.
+Between two frames everything is linear; PAC takes the nearest of its own 2200 instants per second.
 """
 
 from __future__ import annotations
@@ -21,39 +22,44 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.files.tape import read_tape
-from palpate.messages import PAC_SAMPLES
+from palpate.messages import PAC_SAMPLES, Pose
+from palpate.rigid import Quaternion, Vector, normalised
 from palpate_gateway.emulators.biotac_slots import CHANNELS, Counts, CountTrack, Indices, Times
 from palpate_gateway.emulators.emulator import HostTimed, Wrench
-from palpate_gateway.readings import ElectrodeReading, WrenchReading
-from palpate_gateway.virtual.options import VirtualOptions
-from palpate_gateway.virtual.tape import Twin, find_tape
+from palpate_gateway.readings import ElectrodeReading, PoseReading, WrenchReading
+from palpate_gateway.virtual.model import VirtualOptions
+from palpate_gateway.virtual.tape import TapeModel, find_tape
 
-PRESSES = 10
-"""Presses of a loop: 20 to 40 s."""
+INDENTATIONS = 10
+"""Indentations of a loop, which last 20 to 40 s."""
 
 UNTOUCHED_S = 2.0
-"""How long a finger is left alone where its loop begins [s]."""
+"""Time without contact at the start of a loop [s]."""
 
 RATE_HZ = 100.0
 """Frames of a loop each second."""
 
-Told = Callable[[float], None]
+Progress = Callable[[float], None]
 """Takes the share of the work that is done."""
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
-    """One finger for a while.
+class TwinLoop:
+    """One finger and its indenter for a while. The first frame is repeated at the end.
 
     Attributes:
-        frames: E1..E19, PDC, TAC, TDC at each frame and at the first again, shape ``(N + 1, 22)``.
-        pac: PAC, 22 of each frame, shape ``(22 N,)``.
-        wrench: Force [N] and torque [N m] on the BioTac at the same instants, ``N + 1`` of them.
+        frames: E1..E19, PDC, TAC, TDC at each frame, shape ``(N + 1, 22)``.
+        pac: PAC, 22 values of each frame, shape ``(22 N,)``.
+        wrench: Force [N] and torque [N m] on the BioTac at each frame, ``N + 1`` of them.
+        tips: Pose of the indenter in the sensor frame at each frame, ``N + 1`` of them.
+        indenters: Names of the indenters, in order of their first contact.
     """
 
     frames: npt.NDArray[np.float64]
     pac: npt.NDArray[np.int64]
     wrench: Sequence[Wrench]
+    tips: Sequence[Pose]
+    indenters: tuple[str, ...]
 
     @property
     def duration_s(self) -> float:
@@ -64,13 +70,14 @@ class Loop:
 def loop_options(
     finger: int = 0, *, unit: int | str = 0, trajectories: Sequence[str] = (), seed: int = 0
 ) -> VirtualOptions:
-    """The virtual finger that a loop is made of.
+    """Options of the virtual finger that computes a loop.
 
     Args:
-        finger: Which of several, from 0: it is the first finger of the seed that is so much higher.
-        unit: Unit of the tape, by name or number from 1; 0 = by the seed, so that fingers differ.
-        trajectories: Ids of those that are played; () = all.
-        seed: Of the first finger.
+        finger: Which of several fingers, from 0; its seed is ``seed + finger``.
+        unit: Specimen of the tape, by name or number from 1; 0 = chosen by the seed, so that
+            fingers differ.
+        trajectories: Ids of the trajectories to play; () = all.
+        seed: Seed of the first finger.
 
     Raises:
         ConfigError: No tape ships.
@@ -85,21 +92,23 @@ def loop_options(
         rate_hz=RATE_HZ,
         untouched_s=UNTOUCHED_S,
         field_rate_hz=0.0,
-        episodes=PRESSES,
+        episodes=INDENTATIONS,
         realtime=False,
     )
 
 
-def make_loop(options: VirtualOptions, told: Told = lambda _: None) -> Loop:
+def make_loop(options: VirtualOptions, progress: Progress = lambda _: None) -> TwinLoop:
     """Compute a loop.
 
     Raises:
-        ConfigError: No tape ships, or it has no such unit or trajectory.
+        ConfigError: No tape ships, or it has no such specimen or trajectory.
     """
     frames: list[list[int]] = []
     pac: list[npt.NDArray[np.uint16]] = []
     wrench: list[Wrench] = []
-    for block in Twin(options, _tape()).run():
+    tips: list[Pose] = []
+    indenters: dict[str, None] = {}
+    for block in TapeModel(options, _tape()).run():
         for reading in (reading for group in block for reading in group):
             if isinstance(reading, ElectrodeReading):
                 slow = (reading.pdc, reading.tac, reading.tdc)
@@ -109,11 +118,19 @@ def make_loop(options: VirtualOptions, told: Told = lambda _: None) -> Loop:
                 fx, fy, fz = reading.force.tolist()
                 tx, ty, tz = reading.torque.tolist()
                 wrench.append((fx, fy, fz, tx, ty, tz))
-        told(min(len(frames) / RATE_HZ / (3.0 * PRESSES), 1.0))
-    return Loop(
+            elif isinstance(reading, PoseReading):
+                x, y, z = reading.position.tolist()
+                w, qx, qy, qz = reading.orientation.tolist()
+                tips.append(Pose((x, y, z), (w, qx, qy, qz)))
+                indenters[reading.indenter] = None
+        # An indentation lasts about 3 s.
+        progress(min(len(frames) / RATE_HZ / (3.0 * max(options.episodes, 1)), 1.0))
+    return TwinLoop(
         np.array([*frames, frames[0]], np.float64),
         np.concatenate(pac).astype(np.int64),
         [*wrench, wrench[0]],
+        [*tips, tips[0]],
+        tuple(indenters),
     )
 
 
@@ -124,33 +141,44 @@ def _tape() -> Path:
     return path
 
 
-class _Played(HostTimed):
-    """Where a loop is.
+class _LoopPlayer(HostTimed):
+    """A source that plays a loop by the host's clock.
 
     Args:
-        epoch_s: A host's time at which every loop begins [s since 1970].
+        epoch_s: Host time at which every loop begins [s since 1970].
     """
 
     def __init__(self, epoch_s: float) -> None:
-        # Once: a clock that is set while this runs must not make the finger jump.
+        # Read once: a host clock that is set while this runs must not make the finger jump.
         self._since_epoch_s = time.time() - time.monotonic() - epoch_s
 
     @property
     def _ahead_s(self) -> float:
-        """Time since the epoch less the emulator's own [s]."""
+        """Time since the epoch less the emulator's own time [s]."""
         return self._since_epoch_s + self.lead_s
 
+    def _between(self, t: float, frames: int) -> tuple[int, float]:
+        """The frame before a time of the emulator's own [s], and the share of the way to the next.
 
-class TwinCounts(CountTrack, _Played):
+        Args:
+            t: The time [s].
+            frames: Frames of the loop, with the repeated one at its end.
+        """
+        at = (t + self._ahead_s) % ((frames - 1) / RATE_HZ) * RATE_HZ
+        lower = min(int(at), frames - 2)
+        return lower, at - lower
+
+
+class TwinCounts(CountTrack, _LoopPlayer):
     """Counts of several fingers.
 
     Args:
-        loops: Of each finger.
-        epoch_s: See ``_Played``.
+        loops: The loop of each finger.
+        epoch_s: Host time at which every loop begins [s since 1970].
     """
 
-    def __init__(self, loops: Sequence[Loop], epoch_s: float = 0.0) -> None:
-        _Played.__init__(self, epoch_s)
+    def __init__(self, loops: Sequence[TwinLoop], epoch_s: float = 0.0) -> None:
+        _LoopPlayer.__init__(self, epoch_s)
         self._loops = loops
 
     def slots(self, times_s: Times, places: Indices, finger: int) -> Counts:
@@ -166,23 +194,50 @@ class TwinCounts(CountTrack, _Played):
         return np.where(dynamic, loop.pac[nearest], frame)
 
 
-class TwinWrench(_Played):
+class TwinWrench(_LoopPlayer):
     """The wrench on one finger; a ``WrenchSource``.
 
     Args:
-        loop: Of that finger.
-        epoch_s: See ``_Played``.
+        loop: The loop of that finger.
+        epoch_s: Host time at which every loop begins [s since 1970].
     """
 
-    def __init__(self, loop: Loop, epoch_s: float = 0.0) -> None:
+    def __init__(self, loop: TwinLoop, epoch_s: float = 0.0) -> None:
         super().__init__(epoch_s)
-        self._wrench, self._duration_s = loop.wrench, loop.duration_s
+        self._wrench = loop.wrench
 
     def __call__(self, t: float) -> Wrench:
         """The wrench at a time of the emulator's own [s]."""
-        at = (t + self._ahead_s) % self._duration_s * RATE_HZ
-        lower = min(int(at), len(self._wrench) - 2)
-        share = at - lower
+        lower, share = self._between(t, len(self._wrench))
         a, b = self._wrench[lower], self._wrench[lower + 1]
         mixed = [one + share * (other - one) for one, other in zip(a, b, strict=True)]
         return (mixed[0], mixed[1], mixed[2], mixed[3], mixed[4], mixed[5])
+
+
+class TwinTip(_LoopPlayer):
+    """The pose of the indenter on one finger, for an emulated robot; a ``TipSource``.
+
+    Args:
+        tips: Poses of that finger's loop.
+        epoch_s: Host time at which every loop begins [s since 1970].
+    """
+
+    def __init__(self, tips: Sequence[Pose], epoch_s: float = 0.0) -> None:
+        super().__init__(epoch_s)
+        self._tips = tips
+
+    def __call__(self, t: float) -> Pose:
+        """The pose in the sensor frame at a time of the emulator's own [s]."""
+        lower, share = self._between(t, len(self._tips))
+        a, b = self._tips[lower], self._tips[lower + 1]
+        ax, ay, az = a.position
+        bx, by, bz = b.position
+        position: Vector = (ax + share * (bx - ax), ay + share * (by - ay), az + share * (bz - az))
+        # A quaternion and its negative are the same rotation; the nearer one is taken.
+        near = sum(p * q for p, q in zip(a.orientation, b.orientation, strict=True)) >= 0.0
+        sign = share if near else -share
+        w, x, y, z = (
+            (1.0 - share) * p + sign * q for p, q in zip(a.orientation, b.orientation, strict=True)
+        )
+        turn: Quaternion = (w, x, y, z)
+        return normalised(Pose(position, turn))

@@ -1,1 +1,1 @@
-"""Poses of the indenter from a user's robot: how its frames hang together, live and from files."""
+"""Poses of the indenter from a robot, live and from files."""

@@ -1,4 +1,8 @@
-"""Poses of the indenter from recorded poses of a robot: a CSV file, or a palpate record."""
+"""Poses of the indenter from recorded robot poses: a CSV file (``table``), or a palpate record.
+
+A record may also hold poses of the indenter, as they were published; the driver ``record`` replays
+those. This driver computes them again from the robot's poses, e.g. with a better ``base_sensor``.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,119 @@ from pathlib import Path
 
 from pydantic import Field
 
-from palpate.bus.topics import POSE
-from palpate.errors import RecordingError
-from palpate.messages import Origin
+from palpate.bus.topics import POSE, ROBOT_POSE
+from palpate.errors import ConfigError, RecordingError, WireError
+from palpate.files.record import RecordItem, read_record
+from palpate.messages import Origin, RobotPoseFrame
 from palpate.names import Name
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.pose.placement import Placement, PlacementOptions
-from palpate_gateway.pose.recorded import RecordedPoses
-from palpate_gateway.pose.rows import PoseSource, Row
-from palpate_gateway.pose.table import PoseTable
+from palpate_gateway.pose.table import PoseRow, PoseSource, PoseTable
+from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import Reading
 
 _BATCH = 64
-"""Readings in one answer of ``read``."""
+"""Largest number of readings in one answer of ``read``."""
+
+
+class RecordedPoses:
+    """Poses of one robot in a record; can be read once.
+
+    Args:
+        path: ``NAME.mcap``.
+        robot: Name of the robot; empty = the only one.
+
+    Raises:
+        RecordingError: Not a record, or without poses of this robot.
+        ConfigError: It has poses of several robots, and the option ``robot`` is missing.
+    """
+
+    def __init__(self, path: Path, robot: str) -> None:
+        self._path = path
+        self._track = PoseTrack()
+        self._restarts = 0
+        self._robot = robot or self._only_robot()
+        self.start_wall_ns: int | None = None
+        """Wall clock at the first pose [ns]; known once that has been read."""
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Lost and dropped poses, and ``restarts`` of the robot's program."""
+        return {**self._track.counters, "restarts": self._restarts}
+
+    def close(self) -> None:
+        """Do nothing: the record is closed after each reading."""
+
+    def rows(self) -> Iterator[PoseRow]:
+        """Poses in order of time.
+
+        Raises:
+            RecordingError: The record is damaged, or has no pose of this robot.
+        """
+        began_ns: int | None = None  # first time of this run of the program, by its own clock
+        since_s = last_s = 0.0
+        first_log_ns = 0
+        for item in self._items():
+            frame = self._decoded(item)
+            verdict = self._track.take(frame)
+            if verdict is PoseVerdict.RESTARTED:
+                # Only the recorder's clock spans both runs; its times include the delay of the bus.
+                self._restarts += 1
+                since_s = max((item.log_time_ns - first_log_ns) * 1e-9, last_s)
+                began_ns = None
+                self._track.restart()
+                verdict = self._track.take(frame)
+            if verdict is not PoseVerdict.NEW:
+                continue
+            if self.start_wall_ns is None:
+                self.start_wall_ns = frame.wall_ns or item.log_time_ns
+                first_log_ns = item.log_time_ns
+            if began_ns is None:
+                began_ns = frame.time_ns
+            last_s = since_s + (frame.time_ns - began_ns) * 1e-9
+            yield PoseRow(frame.sequence, last_s, frame.pose_base_flange, self._track.missed_before)
+        if self.start_wall_ns is None:
+            raise self._no_poses()
+
+    def _items(self) -> Iterator[RecordItem]:
+        for item in read_record(self._path):
+            if item.address.topic == ROBOT_POSE.name and item.address.sensor == self._robot:
+                yield item
+
+    def _decoded(self, item: RecordItem) -> RobotPoseFrame:
+        try:
+            return ROBOT_POSE.codec.decode(item.payload)
+        except WireError as error:
+            raise RecordingError(
+                f"{self._path}: a pose of robot {self._robot!r} is damaged: {error.problem}",
+                remedy="replay another record; this one broke the contract when written",
+            ) from error
+
+    def _only_robot(self) -> str:
+        robots: set[str] = set()
+        try:
+            for item in read_record(self._path):
+                if item.address.topic == ROBOT_POSE.name:
+                    robots.add(item.address.sensor)
+        except RecordingError:
+            # The readings before the damage are delivered, and the error comes after them.
+            if not robots:
+                raise
+        if len(robots) > 1:
+            raise ConfigError(
+                f"{self._path} holds {len(robots)} robots: {', '.join(sorted(robots))}",
+                remedy="choose one with the option robot",
+            )
+        if not robots:
+            raise self._no_poses()
+        return robots.pop()
+
+    def _no_poses(self) -> RecordingError:
+        return RecordingError(
+            f"{self._path} holds no poses of a robot",
+            remedy="record while the robot's program publishes them; the driver record replays "
+            "poses of the indenter",
+        )
 
 
 class PoseFileOptions(PlacementOptions):
@@ -28,9 +132,9 @@ class PoseFileOptions(PlacementOptions):
 
     Attributes:
         path: A CSV file, or a palpate record ``NAME.mcap``.
-        robot: Of a record: which robot; None = the only one.
-        start_wall_ns: Wall clock at the first pose [ns since the Unix epoch]; None = as the file
-            tells, else not known.
+        robot: Name of the robot in a record; None = the only one.
+        start_wall_ns: Wall clock at the first pose [ns since the Unix epoch]; None = from the
+            file, else unknown.
     """
 
     path: Path
@@ -39,7 +143,7 @@ class PoseFileOptions(PlacementOptions):
 
 
 class PoseFile(Device):
-    """A file of robot poses as a finite device; it delivers as fast as it is read."""
+    """A file of robot poses as a finite device, which delivers as fast as it is read."""
 
     options_class = PoseFileOptions
 
@@ -58,14 +162,14 @@ class PoseFile(Device):
         self._options = options
         self._placement = Placement(options)
         self._source: PoseSource | None = None
-        self._rows: Iterator[Row] = iter(())
+        self._rows: Iterator[PoseRow] = iter(())
         self._damage: RecordingError | None = None
         self._counts: Mapping[str, int] = {}
         self._samples = 0
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Poses that became readings, and those left out, by reason."""
+        """Poses that became readings, and dropped poses by reason."""
         more = self._counts if self._source is None else self._source.counters
         return {"samples": self._samples, **more}
 
@@ -79,16 +183,16 @@ class PoseFile(Device):
         )
         try:
             rows = self._source.rows()
-            # The first row has the wall clock; and a file without any good row is not opened.
+            # The first row has the wall clock, and a file without a valid row must fail here.
             self._rows = chain([next(rows)], rows)
         except BaseException:
             self._close()
             raise
-        told_ns = self._source.start_wall_ns
+        file_wall_ns = self._source.start_wall_ns
         return DeviceIdentity(
             serial=options.robot or options.path.name,
             slot_period_s=1.0 / self.info.rate_hz,
-            start_wall_ns=told_ns if options.start_wall_ns is None else options.start_wall_ns,
+            start_wall_ns=file_wall_ns if options.start_wall_ns is None else options.start_wall_ns,
         )
 
     def _close(self) -> None:

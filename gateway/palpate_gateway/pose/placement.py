@@ -1,12 +1,12 @@
-"""How robot, BioTac and indenter hang together: from poses of the flange to poses of the tip.
+"""The transformation from poses of a robot's flange to poses of the indenter's tip.
 
 ::
 
     carries = "indenter"   pose_sensor_indenter = base_sensor^-1  *  base_flange  *  flange_indenter
     carries = "biotac"     pose_sensor_indenter = (base_flange * flange_sensor)^-1  *  base_indenter
 
-``base_flange`` is what the robot tells; the others do not move and are options. The indenter's
-frame has its origin in the tip, and presses along its +z.
+The robot publishes ``base_flange``; the other poses are constant and are options. The indenter's
+frame has its origin in the tip, and indents along its +z.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _NEEDED = {
 
 
 class PoseOptions(StrictConfig):
-    """A pose that does not change; its key says of what and in what.
+    """A constant pose; its key names the two frames.
 
     Attributes:
         position_m: Origin of the second frame in the first [m].
@@ -53,7 +53,7 @@ class PoseOptions(StrictConfig):
 
     @property
     def pose(self) -> Pose:
-        """The same as a value."""
+        """The pose as a value."""
         return normalised(Pose(self.position_m, self.orientation_wxyz))
 
 
@@ -64,15 +64,15 @@ def _check_indenter(name: str) -> str:
 
 
 class PlacementOptions(StrictConfig):
-    """What every driver of robot poses has to know.
+    """Options of every driver of robot poses.
 
     Attributes:
         indenter: Standard name, e.g. ``"sphere_7mm"``.
         carries: What is fixed to the flange; the other one does not move.
-        base_sensor: BioTac's sensor frame in the robot's base; the robot carries the indenter.
-        flange_indenter: Indenter, origin at its tip, in the flange; the same.
-        flange_sensor: BioTac's sensor frame in the flange; the robot carries the BioTac.
-        base_indenter: Indenter in the robot's base; the same.
+        base_sensor: BioTac's sensor frame in the robot's base, if the robot carries the indenter.
+        flange_indenter: Indenter, origin at its tip, in the flange, in the same case.
+        flange_sensor: BioTac's sensor frame in the flange, if the robot carries the BioTac.
+        base_indenter: Indenter in the robot's base, in the same case.
     """
 
     indenter: Annotated[str, AfterValidator(_check_indenter)]
@@ -89,7 +89,7 @@ class PlacementOptions(StrictConfig):
         for name in sorted({name for pair in _NEEDED.values() for name in pair}):
             given = getattr(self, name) is not None
             if given is not (name in needed):
-                raise ValueError(f"{name} is {'of no use' if given else 'missing'}: {both}")
+                raise ValueError(f"{name} is {'not used' if given else 'missing'}: {both}")
         return self
 
 
@@ -107,8 +107,8 @@ class Placement:
         """Pose of the indenter in the sensor frame.
 
         Args:
-            base_flange: Of the flange in the robot's base; finite, with a unit quaternion but for
-                rounding.
+            base_flange: Pose of the flange in the robot's base; finite, with a unit quaternion up
+                to rounding.
         """
         moving = normalised(base_flange)
         if self._robot_moves_sensor:
@@ -124,7 +124,7 @@ class Placement:
         missed_before: int = 0,
         observed: ClockObservation | None = None,
     ) -> PoseReading:
-        """A reading of the tip; whether it touches is not known."""
+        """A reading of the tip; contact is not known."""
         tip = self.tip(base_flange)
         return PoseReading(
             tick=tick,

@@ -1,4 +1,4 @@
-"""Poses of the indenter from a user's robot, whose program tells its flange over Zenoh."""
+"""Poses of the indenter from a robot whose program publishes its flange over Zenoh."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from palpate.messages import Origin, RobotPoseFrame
 from palpate.names import Name
 from palpate_gateway.device import BusDevice, DeviceIdentity, DeviceInfo
 from palpate_gateway.pose.placement import Placement, PlacementOptions
-from palpate_gateway.pose.track import PoseTrack, Verdict
+from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import ClockObservation, PoseReading, Reading
 
 _BATCH = 64
-"""Most readings in one answer of ``read``."""
+"""Largest number of readings in one answer of ``read``."""
 
 
 class PoseZenohOptions(PlacementOptions):
@@ -27,11 +27,11 @@ class PoseZenohOptions(PlacementOptions):
 
     Attributes:
         robot: Name under which the robot's program publishes.
-        rate_hz: How often it does [Hz]; three periods without a pose, and 50 ms, are a silence.
+        rate_hz: Rate of its poses [Hz]; a gap of three periods and 50 ms is a silence.
         station: Station on which it publishes; empty = the gateway's own.
         connect: Endpoint of the router; empty = the gateway's own.
         tls: Certificates for that router.
-        timeout_s: How long joining the bus may take [s].
+        timeout_s: Longest time to join the bus [s].
     """
 
     robot: Name
@@ -56,7 +56,7 @@ class PoseZenohOptions(PlacementOptions):
 
 
 class PoseZenoh(BusDevice):
-    """One robot's poses as a live device with a place of its own on the bus."""
+    """The poses of one robot as a live device, with a bus session of its own."""
 
     options_class = PoseZenohOptions
 
@@ -85,7 +85,7 @@ class PoseZenoh(BusDevice):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Poses that became readings, those that did not by reason, and those that were lost."""
+        """Poses that became readings, rejected poses by reason, and lost poses."""
         subscriber = self._subscriber  # another thread may close it meanwhile
         heard = self._heard if subscriber is None else subscriber.counters
         refused = {name: n for name, n in heard.items() if name.startswith("rejected_")}
@@ -93,7 +93,7 @@ class PoseZenoh(BusDevice):
         return {**self._counts, **self._track.counters, **overflow, **refused}
 
     def join(self, link: LinkConfig, station: str) -> None:
-        """See ``BusDevice``; what the options say goes before."""
+        """See ``BusDevice``; the options take precedence."""
         options = self._options
         own = LinkConfig()
         changes: dict[str, object] = {"wait_for_router_s": options.timeout_s, "listen": own.listen}
@@ -136,7 +136,7 @@ class PoseZenoh(BusDevice):
                 if readings:
                     break
                 raise DeviceTimeout(
-                    f"robot {self._options.robot!r} told no new pose within {timeout_s:g} s",
+                    f"robot {self._options.robot!r} published no new pose within {timeout_s:g} s",
                     remedy="check that its program runs, and its name, station and router: "
                     "palpate topic list",
                 ) from error
@@ -145,26 +145,26 @@ class PoseZenoh(BusDevice):
                 readings.append(reading)
         if not readings:
             raise DeviceLost(
-                f"the program of robot {self._options.robot!r} began anew",
-                remedy="nothing, if it was restarted; if not, two programs use this name",
+                f"the program of robot {self._options.robot!r} has restarted",
+                remedy="nothing, if that is right; if not, two programs use this name",
             )
         self._counts["samples"] += len(readings)
         return readings
 
     def _reading(self, received: Received[RobotPoseFrame]) -> PoseReading | None:
-        """The tip; None, and counted, where a pose is out of place."""
+        """The tip; None, and counted, if the pose is rejected."""
         frame = received.message
         if frame.robot != self._options.robot:
             self._counts["wrong_robot"] += 1
             return None
         verdict = self._track.take(frame)
-        if verdict is not Verdict.NEW:
-            # Its clock may be another one now: the host's map of it has to begin anew, too.
-            self._restarted = verdict is Verdict.RESTARTED
+        if verdict is not PoseVerdict.NEW:
+            # Its clock may have restarted, too, so the map of the clock must start again.
+            self._restarted = verdict is PoseVerdict.RESTARTED
             return None
         if self._began_ns is None:
             self._began_ns = frame.time_ns
-        # Since the first pose: a clock that counts from 1970 has no digits to spare.
+        # Relative to the first pose: a clock that counts from 1970 would lose digits.
         time_s = (frame.time_ns - self._began_ns) * 1e-9
         return self._placement.reading(
             frame.pose_base_flange,

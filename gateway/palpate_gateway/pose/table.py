@@ -1,43 +1,83 @@
-"""Robot poses in a CSV file: a header that names columns and units, then a row for each pose.
+"""Robot poses in a CSV file: a header that names columns and units, then one row for each pose.
 
-``time_s``, ``x_m y_m z_m`` or ``x_mm y_mm z_mm``, ``qw qx qy qz``, and where it is known
-``wall_ns``, in any order; other columns are left alone. The file is streamed, and what is broken is
-told with its line and column after all rows before it.
+Columns: ``time_s``, ``x_m y_m z_m`` or ``x_mm y_mm z_mm``, ``qw qx qy qz``, and optionally
+``wall_ns``, in any order; others are ignored. The file is streamed. An error names line and column,
+and comes after all rows before it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol
 
 from palpate.errors import RecordingError
 from palpate.messages import Pose
 from palpate.rigid import is_rotation, quaternion_length
-from palpate_gateway.pose.rows import Row
+
+
+@dataclass(frozen=True, slots=True)
+class PoseRow:
+    """One pose of the flange in the robot's base.
+
+    Attributes:
+        tick: Number of the row, or the sequence number of the robot's program.
+        time_s: Time of the pose [s], from any origin.
+        pose: Position [m] and unit quaternion w x y z, up to rounding.
+        missed_before: Poses that were lost directly before this one.
+    """
+
+    tick: int
+    time_s: float
+    pose: Pose
+    missed_before: int = 0
+
+
+class PoseSource(Protocol):
+    """An open file of robot poses."""
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Dropped poses by reason."""
+        ...
+
+    @property
+    def start_wall_ns(self) -> int | None:
+        """Wall clock at the first row [ns], if the file has it; known once that has been read."""
+        ...
+
+    def rows(self) -> Iterator[PoseRow]:
+        """Poses in order of time; raises ``RecordingError`` where the file is broken."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
 
 _LINE_LIMIT = 1 << 16
 """A longer line is not a line of such a file [bytes]."""
 
 _FAR = 1e6
-"""Nothing is further away, be it in m or in mm: a larger number is damage."""
+"""Largest valid coordinate, in m or in mm; a larger number is damage."""
 
 _WALL_DIGITS = 19
 _TIME, _WALL = "time_s", "wall_ns"
 _POSITIONS = {("x_m", "y_m", "z_m"): 1.0, ("x_mm", "y_mm", "z_mm"): 1e-3}
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _COLUMNS = (
-    "name the columns time_s, x_m y_m z_m (or x_mm y_mm z_mm), qw qx qy qz, and if you like "
+    "name the columns time_s, x_m y_m z_m (or x_mm y_mm z_mm), qw qx qy qz, and optionally "
     "wall_ns, separated by commas"
 )
-_REPAIR = "repair or leave out the line; all rows before it were delivered"
+_REPAIR = "repair or delete the line; all rows before it were delivered"
 
 
 class PoseTable:
-    """Rows of one file; used once.
+    """Rows of one file; can be read once.
 
-    ``counters``: ``repeated_poses`` of the same time as the row before, left out.
+    ``counters``: ``repeated_poses``: dropped rows with the time of the row before.
 
     Args:
         path: The file.
@@ -49,7 +89,7 @@ class PoseTable:
     def __init__(self, path: Path) -> None:
         self.counters = {"repeated_poses": 0}
         self.start_wall_ns: int | None = None
-        """Wall clock at the first row [ns], where the file tells; set when that has been read."""
+        """See ``PoseSource``."""
         self._path = path
         self._line = 0
         try:
@@ -63,10 +103,10 @@ class PoseTable:
             raise
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
-    def rows(self) -> Iterator[Row]:
+    def rows(self) -> Iterator[PoseRow]:
         """Poses in order of time.
 
         Raises:
@@ -123,7 +163,7 @@ class PoseTable:
         self._quaternion = [(names.index(name), name) for name in _QUATERNION]
         self._wall = names.index(_WALL) if _WALL in names else None
 
-    def _row(self, cells: list[str], tick: int) -> Row:
+    def _row(self, cells: list[str], tick: int) -> PoseRow:
         if len(cells) != self._width:
             raise self._wrong(f"{len(cells)} columns, the header has {self._width}")
         time_s = self._value(cells, self._time, _TIME)
@@ -139,10 +179,10 @@ class PoseTable:
             whole = text.isdecimal() and text.isascii() and len(text) <= _WALL_DIGITS
             if not (whole and int(text) >> 63 == 0):
                 raise self._wrong(
-                    f"column {_WALL!r}: {text[:40]!r} is no whole number of ns since 1970"
+                    f"column {_WALL!r}: {text[:40]!r} is not a whole number of ns since 1970"
                 )
             self.start_wall_ns = int(text)
-        return Row(tick, time_s, Pose((x, y, z), (w, qx, qy, qz)))
+        return PoseRow(tick, time_s, Pose((x, y, z), (w, qx, qy, qz)))
 
     def _length(self, cells: list[str], at: int, name: str) -> float:
         value = self._value(cells, at, name)
@@ -153,7 +193,7 @@ class PoseTable:
     def _value(self, cells: list[str], at: int, name: str) -> float:
         value = _number(cells[at])
         if value is None:
-            raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is no number")
+            raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is not a number")
         if not math.isfinite(value):
             raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is not finite")
         return value
@@ -171,18 +211,18 @@ class PoseTable:
             if not line.endswith(b"\n"):
                 if len(line) == _LINE_LIMIT:
                     raise self._wrong("the line is too long for a table of poses", _COLUMNS)
-                # Half a number is a number, too: nobody can tell whether such a line is whole.
+                # Half a number is a number, too, so such a line may be incomplete.
                 raise self._wrong(
                     f"the last line is cut: {line[-40:].decode('latin-1')!r} has no line end",
                     "the file is truncated: copy it again (all rows before the cut were "
                     "delivered); if the line is whole, end it",
                 )
             try:
-                # A byte order mark is what some spreadsheets write first.
+                # Some spreadsheets write a byte order mark first.
                 text = line.decode("utf-8-sig" if self._line == 1 else "utf-8")
             except UnicodeDecodeError as error:
                 raise self._wrong(
-                    f"byte {error.start + 1} of the line is no text", "give a CSV file in UTF-8"
+                    f"byte {error.start + 1} of the line is not text", "give a CSV file in UTF-8"
                 ) from error
             if text.strip():
                 return [cell.strip(' \t\r\n"') for cell in text.split(",")]

@@ -1,1 +1,1 @@
-"""Files that play as devices."""
+"""Recordings as devices: palpate records and text logs of the vendor."""

@@ -1,7 +1,7 @@
-"""Replay of a palpate record (MCAP): one sensor's readings, byte for byte as they were recorded.
+"""Replay of a palpate record (MCAP): the readings of one sensor, byte for byte as recorded.
 
-Frames, wrenches, poses, true fields and tares are published again unchanged, stamps and tare ids
-included, so whatever is computed from them comes out bit-identical. Recorded estimates are not
+Frames, wrenches, poses, true fields and tares are published again unchanged, with their stamps and
+tare ids, so everything that is computed from them is bit-identical. Recorded estimates are not
 published again.
 """
 
@@ -21,7 +21,7 @@ from palpate_gateway.readings import Reading, RecordedMessage
 
 _REPLAYED = frozenset(topic.name for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE))
 _BATCH = 64
-"""Messages in one answer of ``read``."""
+"""Largest number of messages in one answer of ``read``."""
 
 
 class RecordOptions(StrictConfig):
@@ -29,7 +29,7 @@ class RecordOptions(StrictConfig):
 
     Attributes:
         path: The record, ``NAME.mcap``.
-        sensor: Which recorded sensor; empty = the only one.
+        sensor: Name of the recorded sensor; empty = the only one.
     """
 
     path: Path
@@ -40,13 +40,13 @@ def recorded_sensors(path: Path) -> list[str]:
     """Names of the sensors whose electrodes are in a record.
 
     Raises:
-        RecordingError: It is no record, or damaged.
+        RecordingError: The file is not a record, or it is damaged.
     """
     found = {item.address.sensor for item in read_record(path) if _is_electrodes(item)}
     return sorted(found)
 
 
-class Record(Device):
+class RecordReplay(Device):
     """One sensor of a palpate record as a finite device."""
 
     options_class = RecordOptions
@@ -72,7 +72,7 @@ class Record(Device):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Messages read, and slots of the frames among them."""
+        """Messages, and slots of the electrode frames among them."""
         return dict(self._counters)
 
     def _open(self) -> DeviceIdentity:
@@ -119,7 +119,7 @@ class Record(Device):
                 if _is_electrodes(item):
                     sensors.add(item.address.sensor)
         except RecordingError:
-            # A damaged record still delivers what comes before the damage, and then says so.
+            # The messages before the damage are delivered, and the error comes after them.
             if not sensors:
                 raise
         if len(sensors) > 1:

@@ -1,7 +1,7 @@
 """Replay of a vendor text log (SynTouch GUI or Cheetah library), plain or gzip, as a device.
 
-The file is streamed. Damage is reported with its line, after every whole frame before it has been
-delivered. Slots with a bad parity flag make their channel invalid and are counted.
+The file is streamed. An error names the line of the damage, and comes after all whole frames before
+it. Slots with a bad parity flag make their channel invalid and are counted.
 """
 
 from __future__ import annotations
@@ -21,9 +21,13 @@ from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading, Reading
-from palpate_gateway.recordings.text_log_bytes import LineBlocks
-from palpate_gateway.recordings.text_log_header import LogHeader, split_header
-from palpate_gateway.recordings.text_log_rows import count_columns, parse_rows
+from palpate_gateway.recordings.text_log_format import (
+    LineBlocks,
+    LogHeader,
+    count_columns,
+    parse_rows,
+    split_header,
+)
 
 
 class TextLogOptions(StrictConfig):
@@ -31,8 +35,8 @@ class TextLogOptions(StrictConfig):
 
     Attributes:
         path: The log, plain or gzip.
-        port: Port of the finger, from 1; 0 = the only one that carries data.
-        serial: Serial number to publish; empty = the header's.
+        port: Port of the finger, from 1; 0 = the only one with data.
+        serial: Serial number to publish; empty = that of the header.
     """
 
     path: Path
@@ -45,19 +49,19 @@ class TextLogReader:
 
     Args:
         path: The log.
-        port: Port of the finger, from 1; 0 = the only one that carries data.
-        block_bytes: Least size of the blocks it is read in [bytes].
+        port: Port of the finger, from 1; 0 = the only one with data.
+        block_bytes: Smallest size of the blocks in which it is read [bytes].
 
     Raises:
-        RecordingError: The file cannot be read, is empty, or is not a log of a BioTac with 19
-            electrodes or 24; or the port carries no data.
-        ConfigError: Several ports carry data and none was chosen.
+        RecordingError: The file cannot be read, is empty, or is not a log of a BioTac with 19 or 24
+            electrodes; or the port has no data.
+        ConfigError: Several ports have data and none was chosen.
     """
 
     def __init__(self, path: Path, *, port: int = 0, block_bytes: int = 1 << 18) -> None:
         self.path = path
         self.damage: RecordingError | None = None
-        """Why the rows ended early, if they did; set when ``blocks`` is exhausted."""
+        """Error that ended the rows early; known once ``blocks`` is exhausted."""
         self._lines = LineBlocks(path, block_bytes=block_bytes)
         self._blocks = iter(self._lines)
         first = next(self._blocks, b"") or self._lines.unfinished
@@ -68,7 +72,7 @@ class TextLogReader:
         self.header, offset = split_header(str(path), first)
         self._line = 1 + self.header.lines
         rows = first[offset:]
-        # A header may fill the first block, and the only row may lack its line end.
+        # The header may fill the first block, and the only row may lack its line end.
         rows = rows or next(self._blocks, b"") or self._lines.unfinished
         if not rows.strip():
             raise self._lines.damage or RecordingError(
@@ -86,7 +90,7 @@ class TextLogReader:
         self._rebuild_time = len(self._pending) > 1 and not self._pending[:, 0].any()
         self.port = self._choose_port(port)
         self.sensor_type = self._find_type()
-        """Kind of sensor, by the channels that were sampled."""
+        """Kind of sensor, from the sampled channels."""
 
     @property
     def slot_period_s(self) -> float:
@@ -95,11 +99,11 @@ class TextLogReader:
 
     @property
     def timed(self) -> bool:
-        """Whether the log tells times; else they are made by counting slots."""
+        """Whether the log has times; else they are made from the number of slots."""
         return not self._rebuild_time
 
     def blocks(self) -> Iterator[SlotBlock]:
-        """Slots in order; afterwards ``damage`` says whether the log was whole."""
+        """Slots in order; afterwards ``damage`` says whether the log was complete."""
         if len(self._pending):
             yield self._slots(self._pending)
         while self.damage is None:
@@ -121,13 +125,13 @@ class TextLogReader:
         return rows.table
 
     def _end(self) -> npt.NDArray[np.float64]:
-        """The last line where it has no line end, and what the end of the file says."""
+        """The last line if it lacks its line end, and the state of the file's end."""
         nothing = np.empty((0, self._columns))
         rest, self._lines.unfinished = self._lines.unfinished, b""
         self.damage = self._lines.damage
         if self.damage is not None or not rest.strip():
             return nothing
-        # The last column is one digit, so a line with all its columns is whole.
+        # The last column has one digit, so a line with all columns is complete.
         if len(rest.split()) == self._columns:
             return self._parse(rest + b"\n")
         shown = rest[:40].decode("latin-1")
@@ -155,7 +159,7 @@ class TextLogReader:
         )
 
     def _rebuilt_time(self, frame: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-        """Times on the slot grid, with room for the frames that the counter says are missing."""
+        """Times on the grid of slots, with gaps for the frames that the counter shows as missing."""
         before = frame[0] if self._frame_before is None else self._frame_before
         missing = np.maximum(np.diff(frame, prepend=before) - 1, 0)
         index = self._slots_before + np.arange(len(frame))
@@ -170,12 +174,12 @@ class TextLogReader:
         if port > self._ports:
             raise RecordingError(
                 f"{self.path}: the log has no port {port}, it has {self._ports}",
-                remedy=f"ports that carry data: {carrying}",
+                remedy=f"ports with data: {carrying}",
             )
         if port and port not in good:
             raise RecordingError(
                 f"{self.path}: every slot of port {port} has wrong parity, so no sensor was there",
-                remedy=f"ports that carry data: {carrying}",
+                remedy=f"ports with data: {carrying}",
             )
         if not good:
             raise RecordingError(
@@ -190,7 +194,7 @@ class TextLogReader:
         return port or good[0]
 
     def _find_type(self) -> SensorType:
-        """Judge the number of electrodes by the rows: neither header nor serial tells it.
+        """Kind of sensor by the electrodes in the rows; header and serial number do not tell it.
 
         The public capture has a serial that starts with BTSP (24 electrodes) and the 19-electrode
         layout, so the layout decides what kind of sensor it is.
@@ -203,7 +207,7 @@ class TextLogReader:
         if last >= ch.FIRST_ELECTRODE + ch.ELECTRODES:
             kind = SensorType.BIOTAC_SP
         if frames == 1 and len(self._pending) < kind.layout.slots:
-            return kind  # cut inside its first frame, which is reported as such
+            return kind  # the log ends inside its first frame; that error comes later
         wanted = {c for c in ch.channels_of(kind.layout) if c >= ch.FIRST_ELECTRODE}
         if seen == wanted:
             return kind
@@ -217,7 +221,7 @@ class TextLogReader:
 
 
 class TextLog(Device):
-    """A vendor text log as a finite device; it delivers as fast as it is read."""
+    """A vendor text log as a finite device, which delivers as fast as it is read."""
 
     options_class = TextLogOptions
 
@@ -281,7 +285,7 @@ class TextLog(Device):
         return list(self._last_frames())
 
     def _last_frames(self) -> list[ElectrodeReading]:
-        """What is left at the end of the file; damage is raised once, then the source has ended."""
+        """The last frames of the file; damage is raised once, then the source has ended."""
         if self._reader is None:
             return []
         damage, self._reader.damage = self._reader.damage, None

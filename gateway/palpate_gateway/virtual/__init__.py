@@ -1,1 +1,1 @@
-"""A finger in software."""
+"""A virtual BioTac with ground truth: from a tape of simulated indentations, or by a formula."""

@@ -1,22 +1,22 @@
-"""What goes wrong with a finger, on demand: faults as they show on a real one's wire.
+"""Faults of the virtual finger at chosen times, with the symptoms that they have on a real wire.
 
-A fault acts on finished readings, so the finger itself goes on: what is lost is lost, and the truth
-(wrench, pose, field) stays true. Times count from the opening of the device; a restart does not
-stop them.
+A fault changes finished readings, while the model runs on: lost frames stay lost, and the ground
+truth (wrench, pose, field) stays correct. Times count from the opening of the device; a restart
+does not stop them.
 
 ========= =========================================== ==================================
-kind      what is seen                                ``value``
+kind      symptom                                     ``value``
 ========= =========================================== ==================================
-stuck     electrodes repeat what they last read
+stuck     electrodes repeat their last counts
 saturated electrodes read 4095
 dead      electrodes read 0
 invalid   parity errors: one bit wrong, validity off
 noise     more noise on electrodes                    standard deviation [counts], 50
-jump      electrodes read a constant more             that constant [counts], 100
+jump      a constant is added to electrodes           that constant [counts], 100
 lost      electrode frames are lost                   share of them, 1
 silence   nothing comes; ``read`` times out
 restart   ``DeviceLost``; opened again, the device
-          counts from 0 and the play goes on
+          counts from 0 and the model runs on
 ========= =========================================== ==================================
 """
 
@@ -45,16 +45,16 @@ _WHOLE_DEVICE = ("lost", "silence", "restart")
 _ADC_BITS = 12
 
 
-class Fault(StrictConfig):
+class VirtualFault(StrictConfig):
     """One fault.
 
     Attributes:
-        kind: What happens; see the table above.
-        at_s: When it begins, from the opening of the device [s].
-        for_s: How long it lasts [s]; 0 = for ever. Of a restart: how long the device is away, 0 =
-            it is back at once.
+        kind: Kind; see the table above.
+        at_s: Begin, from the opening of the device [s].
+        for_s: Duration [s]; 0 = for ever. Of a restart: how long the device is away, 0 = it is back
+            at once.
         electrode: Which electrode, 1..19; None = all 19.
-        value: Size; None = the one of the table.
+        value: Size; None = the default of the table.
     """
 
     kind: Kind
@@ -64,7 +64,7 @@ class Fault(StrictConfig):
     value: float | None = Field(default=None, allow_inf_nan=False)
 
     @model_validator(mode="after")
-    def _makes_sense(self) -> Fault:
+    def _makes_sense(self) -> VirtualFault:
         if self.electrode is not None and self.kind in _WHOLE_DEVICE:
             raise ValueError(
                 f"a fault {self.kind!r} has no electrode: it concerns the whole device"
@@ -79,10 +79,10 @@ class Fault(StrictConfig):
         return self
 
 
-class _Acting:
-    """One fault as it goes along."""
+class _ActiveFault:
+    """State of one fault during a run."""
 
-    def __init__(self, fault: Fault, rate_hz: float, seed: list[int]) -> None:
+    def __init__(self, fault: VirtualFault, rate_hz: float, seed: list[int]) -> None:
         self.kind = fault.kind
         self.first = math.ceil(fault.at_s * rate_hz - 1e-6)
         frames = max(1, round(fault.for_s * rate_hz)) if fault.for_s else None
@@ -101,7 +101,7 @@ class _Acting:
     def change(self, reading: ElectrodeReading) -> ElectrodeReading:
         """The reading with this fault of its electrodes."""
         counts = reading.electrodes.copy()
-        part = counts[self._which]  # a view
+        part = counts[self._which]  # a view: what is written to it changes counts
         validity = reading.validity
         if self.kind == "stuck":
             if self._held is None:
@@ -126,31 +126,31 @@ class _Acting:
         return replace(reading, electrodes=counts, validity=validity)
 
 
-class FaultLine:
+class FaultPlan:
     """All faults of one run; takes the readings in order of time.
 
     Args:
         faults: The faults; on one frame they act in this order.
         rate_hz: Frames per second [Hz].
-        seed: Of what is random in them.
+        seed: Seed of their random numbers.
     """
 
-    def __init__(self, faults: Sequence[Fault], rate_hz: float, seed: int) -> None:
-        acting = [_Acting(fault, rate_hz, [seed, 4, k]) for k, fault in enumerate(faults)]
+    def __init__(self, faults: Sequence[VirtualFault], rate_hz: float, seed: int) -> None:
+        acting = [_ActiveFault(fault, rate_hz, [seed, 4, k]) for k, fault in enumerate(faults)]
         self._restarts = [one for one in acting if one.kind == "restart"]
         self._silences = [one for one in acting if one.kind == "silence"]
         self._others = [one for one in acting if one.kind not in ("restart", "silence")]
         self.counters = {f"fault_{fault.kind}_frames": 0 for fault in faults}
-        """Frames that each kind of fault has touched; a restart counts once."""
+        """Frames that each kind of fault has changed; a restart counts once."""
         if any(one.kind == "invalid" for one in acting):
             self.counters["parity_errors"] = 0
 
     def clear_counters(self) -> None:
-        """Count from 0 again, as a device that was opened again does."""
+        """Set all counters to 0, as at a new opening of a device."""
         self.counters = dict.fromkeys(self.counters, 0)
 
     def restart(self, tick: int) -> int | None:
-        """Whether the device restarts at this frame: frames it is then away, or None."""
+        """Frames for which the device is away if it restarts at this frame; else None."""
         for one in self._restarts:
             if tick >= one.first:
                 self._restarts.remove(one)
@@ -166,7 +166,7 @@ class FaultLine:
         return False
 
     def apply(self, tick: int, group: tuple[Reading, ...]) -> tuple[Reading, ...]:
-        """The readings of one instant as they come out; lost electrodes are left out."""
+        """The readings of one instant with their faults, without lost electrode frames."""
         now = [one for one in self._others if one.on(tick)]
         if not now:
             return group
@@ -179,9 +179,11 @@ class FaultLine:
                 out.append(changed)
         return tuple(out)
 
-    def _changed(self, reading: ElectrodeReading, now: list[_Acting]) -> ElectrodeReading | None:
+    def _changed(
+        self, reading: ElectrodeReading, active: list[_ActiveFault]
+    ) -> ElectrodeReading | None:
         lost = False
-        for one in now:
+        for one in active:
             if one.kind == "lost":
                 hit = one.random.random() < one.value
                 lost |= hit

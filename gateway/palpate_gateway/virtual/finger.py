@@ -1,9 +1,10 @@
 """The virtual finger: a deterministic BioTac with ground truth, for work without hardware.
 
-Same options, same counts, at any pace. It yields what an experiment yields: electrodes, the wrench
-on the finger, the pose of the indenter, and if it plays a tape the displacement of the skin. The
-first second (at least 50 frames) is untouched, so that a tare succeeds. What moves it is a model
-(``virtual_tape``, ``virtual_formula``); this file paces it, ends it, and lets it go wrong.
+The same options give the same counts, at any pace. It yields the readings of an experiment:
+electrodes, the wrench on the finger, the pose of the indenter and, from a tape, the displacement of
+the skin. The first second (at least 50 frames) is untouched, so that a tare succeeds. The readings
+come from a model (``virtual.tape``, ``virtual.formula``); this module paces them, ends them, and
+applies the faults.
 """
 
 from __future__ import annotations
@@ -20,29 +21,28 @@ from palpate.messages import COUNTS_MAX, Origin, SensorType
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading, Reading, RecordedMessage
-from palpate_gateway.virtual.faults import FaultLine
-from palpate_gateway.virtual.formula import Formula
-from palpate_gateway.virtual.options import Group, Model, VirtualOptions
-from palpate_gateway.virtual.tape import Twin, find_tape
+from palpate_gateway.virtual.faults import FaultPlan
+from palpate_gateway.virtual.formula import FormulaModel
+from palpate_gateway.virtual.model import FingerModel, Group, VirtualOptions
+from palpate_gateway.virtual.tape import TapeModel, find_tape
 
 _RESYNC_S = 1.0
-"""A host that lags more than this has slept: the frames meanwhile are lost, not late [s]."""
-
+"""A host that lags more has slept; the frames in that time are lost, not late [s]."""
 
 _EVENTS = ("frames", "samples", "missing_frames", "saturated_samples")
 
 
-def make_model(options: VirtualOptions) -> Model:
-    """What the options say moves the finger.
+def make_model(options: VirtualOptions) -> FingerModel:
+    """The model that the options choose.
 
     Raises:
-        ConfigError: There is no such tape, unit, trajectory or indenter, or options of one model
-            come with the other.
+        ConfigError: There is no such tape, specimen, trajectory or indenter, or options of one
+            model come with the other.
         DatasetError: The tape is damaged.
     """
     path = None if options.model == "formula" else find_tape(options.tape)
     if path is not None:
-        return Twin(options, path)
+        return TapeModel(options, path)
     if options.model == "tape":
         raise ConfigError("no tape ships with this palpate", remedy="name one with the option tape")
     if options.tape or options.trajectories:
@@ -51,14 +51,14 @@ def make_model(options: VirtualOptions) -> Model:
             f"option {name!r} is of the model 'tape', and the virtual finger is the formula",
             remedy=f"leave {name!r} out, or give model = 'tape' and a tape",
         )
-    return Formula(options)
+    return FormulaModel(options)
 
 
-class Virtual(Device):
+class VirtualFinger(Device):
     """A virtual BioTac with ground truth.
 
-    After a fault ``restart`` the next opening goes on with the play, with ticks from 0; any other
-    begins anew.
+    After a fault ``restart`` the next opening continues the model's run, with ticks from 0; any
+    other opening starts the run again.
     """
 
     options_class = VirtualOptions
@@ -79,18 +79,19 @@ class Virtual(Device):
         self._options = options
         self._groups: Iterator[Group] = iter(())
         self._group: Group | None = None
-        self._faults = FaultLine((), options.rate_hz, options.seed)
+        self._faults = FaultPlan((), options.rate_hz, options.seed)
         self._events: dict[str, int] = {}
         self._restarted = False
         self._begun_s = 0.0
-        # Number of the next group in the play; where in the play the device's ticks began; and
-        # frames lost because the host slept: the device went on, the play waited.
+        # Three numbers: of the next group in the model's run; of the group at which the device's
+        # ticks began; and of frames lost because the host slept (the device's clock went on, the
+        # model's run waited).
         self._now = self._origin = self._skipped = 0
         self._last_tick = -1
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Frames, slots in them, frames lost, samples at the converter's ends, and faults."""
+        """Frames, slots in them, lost frames, saturated samples, and frames with faults."""
         return {**self._events, **self._faults.counters}
 
     def _open(self) -> DeviceIdentity:
@@ -100,7 +101,7 @@ class Virtual(Device):
             self._restarted = False
             self._faults.clear_counters()
         else:
-            self._faults = FaultLine(options.faults, options.rate_hz, options.seed)
+            self._faults = FaultPlan(options.faults, options.rate_hz, options.seed)
             blocks = self._model.run()
             self._groups = islice((group for block in blocks for group in block), self._limit())
             self._group = None
@@ -133,7 +134,7 @@ class Virtual(Device):
         until_s = time.monotonic() + timeout_s
         quiet = 0
         while True:
-            # The next frame is computed while there is time to wait, not when it is due.
+            # The next frame is computed before the wait, not when it is due.
             if self._group is None:
                 self._group = next(self._groups, None)
             if self._group is None:
@@ -151,13 +152,13 @@ class Virtual(Device):
             self._now += 1
             if readings:
                 return readings
-            # Without a clock, the time that is waited in silence is the finger's own.
+            # Without the host's clock, silent frames are what uses up the timeout.
             quiet += 1
             if not options.realtime and quiet >= timeout_s * options.rate_hz - 1e-6:
                 raise self._timeout(timeout_s)
 
     def _wait(self, until_s: float, timeout_s: float) -> None:
-        """Sleep until the next frame is due; deadlines are absolute, so errors do not add up."""
+        """Sleep until the next frame is due; due times are absolute, so errors do not add up."""
         rate_hz = self._options.rate_hz
         due_s = self._begun_s + (self._now - self._origin + self._skipped) / rate_hz
         now_s = time.monotonic()
@@ -170,14 +171,14 @@ class Virtual(Device):
             self._skipped += int((now_s - due_s) * rate_hz)
 
     def _readings(self, group: Group) -> list[Reading]:
-        """The group as the device delivers it: with its faults, in the device's own ticks."""
+        """Readings of a group with faults and in the device's own ticks."""
         shift = self._skipped - self._origin
         tick = self._now + shift
         time_s = tick / self._options.rate_hz
         out: list[Reading] = []
         for reading in self._faults.apply(self._now, group):
             if isinstance(reading, RecordedMessage):
-                continue  # a model makes none
+                continue  # no model makes these
             if isinstance(reading, ElectrodeReading):
                 missed = tick - self._last_tick - 1
                 self._last_tick = tick
@@ -193,11 +194,11 @@ class Virtual(Device):
         events["samples"] += ch.SLOTS_PER_FRAME
         events["missing_frames"] += missed
         for counts in (reading.electrodes, reading.pac):
-            # 0 and 4095 are the only multiples of 4095 in 12 bits.
+            # In 12 bits only 0 and 4095, the ends of the converter's range, are multiples of 4095.
             events["saturated_samples"] += int(np.count_nonzero(counts % COUNTS_MAX == 0))
 
     def _pass_over(self, groups: int) -> None:
-        """Let the play go on while the device is away."""
+        """Skip the groups of the time in which the device is away."""
         for _ in range(groups):
             self._group = next(self._groups, None)
         self._now += groups

@@ -1,4 +1,7 @@
-"""The virtual finger by closed formulas: spheres that press, shear and let go anywhere."""
+"""The formula: a virtual finger that spheres indent, shear and leave at random places.
+
+Its physics is in ``formula_physics``; this module draws the indentations and makes readings.
+"""
 
 from __future__ import annotations
 
@@ -8,41 +11,58 @@ from collections.abc import Iterator
 import numpy as np
 
 from palpate.errors import ConfigError
+from palpate.messages import PAC_SAMPLES
 from palpate.rigid import shortest_turn
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading, PoseReading, WrenchReading
-from palpate_gateway.virtual.options import BLOCK_FRAMES, UNTOUCHED_FRAMES, Group, VirtualOptions
-from palpate_gateway.virtual.physics import (
+from palpate_gateway.virtual.formula_physics import (
     INDENTER_RADII_M,
-    Contact,
-    Unit,
+    FormulaContact,
+    FormulaSpecimen,
+    Touch,
     contact,
     electrode_counts,
     films,
+    pause,
+    random_touch,
 )
-from palpate_gateway.virtual.signals import (
-    ELECTRODE_NOISE,
-    PAC_NOISE,
-    SLOW_NOISE,
+from palpate_gateway.virtual.model import (
+    BLOCK_FRAMES,
+    UNTOUCHED_FRAMES,
     WRENCH_SERIAL,
-    converted,
-    pac,
-    slow_channels,
-    warmth,
+    Array,
+    Group,
+    VirtualOptions,
 )
-from palpate_gateway.virtual.trajectory import Episode, pause, touch
+from palpate_gateway.virtual.sensor import (
+    PAC_HIGH_PASS_S,
+    PAC_NOISE,
+    PAC_PA_PER_COUNT,
+    PDC_PA_PER_COUNT,
+    SLOW_NOISE,
+    converted,
+)
 
 _INDENTER = "sphere_14mm"
 
+_ELECTRODE_NOISE = 0.5
+"""Settled sensor at 100 Hz: 0.3-0.6 counts, sd (learning reference 4.5)."""
 
-class Formula:
-    """The closed-formula finger; see ``Model``.
+_PAC_REST = 2040.0
+_TAC_REST = 2050.0
+_TDC_REST = 1900.0
+_TDC_WARM_UP = 60.0
+_WARM_UP_S = 600.0
+
+
+class FormulaModel:
+    """The finger by closed formulas; see ``FingerModel``.
 
     Args:
-        options: The driver's.
+        options: Options of the driver.
 
     Raises:
-        ConfigError: Unit or indenter are none of this model's.
+        ConfigError: The formula has no such specimen or indenter.
     """
 
     def __init__(self, options: VirtualOptions) -> None:
@@ -51,54 +71,56 @@ class Formula:
         if self._indenter not in INDENTER_RADII_M:
             raise ConfigError(
                 f"the formula has no indenter {self._indenter!r}",
-                remedy=f"take one of {', '.join(INDENTER_RADII_M)}",
+                remedy=f"choose one of {', '.join(INDENTER_RADII_M)}",
             )
         if isinstance(options.unit, str) or options.unit < 0:
             raise ConfigError(
-                f"unit = {options.unit!r} is no number from 0", remedy="number the formula's units"
+                f"unit = {options.unit!r} is not a number from 0",
+                remedy="the formula's specimens are numbered: give a number",
             )
         self._radius_m = INDENTER_RADII_M[self._indenter]
-        self._unit = Unit.number(options.unit)
+        self._specimen = FormulaSpecimen.number(options.unit)
 
     @property
     def line(self) -> str:
-        """See ``Model``."""
+        """See ``FingerModel``."""
         return f"virtual finger, {self._indenter}"
 
     @property
     def serial(self) -> str:
-        """See ``Model``."""
+        """See ``FingerModel``."""
         return f"VIRTUAL-U{self._options.unit}-S{self._options.seed}"
 
     def run(self) -> Iterator[list[Group]]:
-        """See ``Model``."""
+        """See ``FingerModel``."""
         random = np.random.default_rng([self._options.seed, 2])
         first = 0
-        for episode in self._episodes():
-            length = max(1, math.ceil(episode.duration_s * self._options.rate_hz - 1e-9))
+        for touch in self._touches():
+            length = max(1, math.ceil(touch.duration_s * self._options.rate_hz - 1e-9))
             for start in range(0, length, BLOCK_FRAMES):
                 count = min(BLOCK_FRAMES, length - start)
-                yield self._block(episode, start, first + start, count, random)
+                yield self._block(touch, start, first + start, count, random)
             first += length
 
-    def _episodes(self) -> Iterator[Episode]:
+    def _touches(self) -> Iterator[Touch]:
         options = self._options
         yield pause(max(options.untouched_s, UNTOUCHED_FRAMES / options.rate_hz))
         number = 0
         while not options.episodes or number < options.episodes:
-            yield touch(options.seed, number)
+            yield random_touch(options.seed, number)
             number += 1
 
     def _block(
-        self, episode: Episode, start: int, tick: int, count: int, random: np.random.Generator
+        self, touch: Touch, start: int, tick: int, count: int, random: np.random.Generator
     ) -> list[Group]:
-        """Frames ``start`` to ``start + count - 1`` of an episode, the first of which is ``tick``.
+        """``count`` frames of an indentation from frame ``start`` on, which has tick ``tick``.
 
-        One more instant than frames, because PAC follows the pressure until the next frame.
+        The contact is computed for two more instants, because PAC follows the rate of pressure up
+        to the frame after the block.
         """
         rate_hz = self._options.rate_hz
-        ahead = contact(episode, np.arange(start, start + count + 2) / rate_hz, self._radius_m)
-        state = Contact(
+        ahead = contact(touch, np.arange(start, start + count + 2) / rate_hz, self._radius_m)
+        state = FormulaContact(
             ahead.depth[:count],
             ahead.tip[:count],
             ahead.normal_force[:count],
@@ -107,18 +129,18 @@ class Formula:
             ahead.pressure[:count],
         )
         times_s = np.arange(tick, tick + count) / rate_hz
-        drift = 1.0 + 0.004 * warmth(times_s) + 0.001 * np.sin(times_s * (2.0 * math.pi / 180.0))
+        drift = 1.0 + 0.004 * _warmth(times_s) + 0.001 * np.sin(times_s * (2.0 * math.pi / 180.0))
 
-        clean = electrode_counts(films(episode, state, self._radius_m), self._unit, drift)
-        electrodes = converted(clean + random.normal(0.0, ELECTRODE_NOISE, clean.shape))
-        moving = pac(ahead.pressure, rate_hz)
+        clean = electrode_counts(films(touch, state, self._radius_m), self._specimen, drift)
+        electrodes = converted(clean + random.normal(0.0, _ELECTRODE_NOISE, clean.shape))
+        moving = _pac(ahead.pressure, rate_hz)
         dynamic = converted(moving + random.normal(0.0, PAC_NOISE, moving.shape))
-        slow = slow_channels(state.pressure, self._unit.pdc_rest, times_s)
+        slow = _slow_channels(state.pressure, self._specimen.pdc_rest, times_s)
         pdc, tac, tdc = converted(slow + random.normal(0.0, SLOW_NOISE, slow.shape)).T.tolist()
         torque = np.cross(state.tip, state.force).astype(np.float32)
         force = state.force.astype(np.float32)
         in_contact = (state.depth > 0.0).tolist()
-        orientation = shortest_turn(-episode.place.normal)
+        orientation = shortest_turn(-touch.place.normal)
         ticks, times = range(tick, tick + count), times_s.tolist()
         return [
             (
@@ -145,3 +167,27 @@ class Formula:
             )
             for k in range(count)
         ]
+
+
+def _warmth(time_s: Array) -> Array:
+    """Share of the warm-up since power-on that is complete, 0 to 1."""
+    return 1.0 - np.exp(-time_s / _WARM_UP_S)
+
+
+def _pac(pressure: Array, rate_hz: float) -> Array:
+    """Noise-free PAC [counts], shape ``(N, 22)``, from the pressure at N + 2 frame starts [Pa]."""
+    speed = np.diff(pressure) * (rate_hz * PAC_HIGH_PASS_S / PAC_PA_PER_COUNT)
+    share = np.arange(PAC_SAMPLES) / PAC_SAMPLES
+    return _PAC_REST + speed[:-1, None] * (1.0 - share) + speed[1:, None] * share
+
+
+def _slow_channels(pressure: Array, pdc_rest: float, time_s: Array) -> Array:
+    """Noise-free PDC, TAC, TDC [counts], shape ``(N, 3)``."""
+    return np.stack(
+        [
+            pdc_rest + pressure / PDC_PA_PER_COUNT,
+            np.full(len(time_s), _TAC_REST),
+            _TDC_REST + _TDC_WARM_UP * _warmth(time_s),
+        ],
+        axis=1,
+    )

@@ -1,13 +1,16 @@
-"""What a simulated unit's converter makes of ideal counts and pressure: warmth, creep, noise, PAC.
+"""The virtual finger's converter: from ideal counts and pressure to the counts of all channels.
 
-Formulas and constants are those of the twin's electrodes (learning notes, sections 4.5 and 4.6).
-Conductivity follows the core's temperature, which its own electronics raise with one time constant;
-a share of every change comes late; PDC is 36.5 Pa a count, PAC, a first-order high-pass at 10 Hz,
-0.37 Pa; TDC is a thermistor, TAC its amplified rate. Left out: low-passes above the rate at which a
-channel is read, and the converter's gain and offset errors in the small effect of warmth.
+It adds temperature, creep and noise, and makes PDC, PAC, TDC and TAC. Formulas and constants are
+those of the twin's electrodes (learning notes, sections 4.5 and 4.6):
 
-Every state is advanced frame by frame and exactly, so the counts do not depend on how many frames
-are computed at once.
+* conductivity follows the core's temperature, which its own electronics raise with one time
+  constant;
+* creep: a share of every change of an electrode comes late, with one time constant;
+* PDC is 36.5 Pa per count; PAC, a first-order high-pass at 10 Hz, 0.37 Pa per count;
+* TDC is a thermistor, TAC its amplified rate of change.
+
+Left out: low-pass filters above the rate at which a channel is read, and the converter's gain and
+offset errors in the small effect of temperature.
 """
 
 from __future__ import annotations
@@ -20,15 +23,19 @@ import numpy as np
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.files.tape import TapeUnit
 from palpate.messages import COUNTS_MAX, PAC_SAMPLES, CountArray
-from palpate_gateway.virtual.geometry import Array
-from palpate_gateway.virtual.signals import (
-    PAC_HIGH_PASS_S,
-    PAC_NOISE,
-    PAC_PA_PER_COUNT,
-    PDC_PA_PER_COUNT,
-    SLOW_NOISE,
-    converted,
-)
+from palpate_gateway.virtual.model import Array
+
+PAC_NOISE = 2.0
+"""Noise of PAC [counts], sd; idle sensors of public captures show about 5 counts peak."""
+
+SLOW_NOISE = 0.5
+"""Noise of PDC, TAC and TDC [counts], sd."""
+
+PAC_PA_PER_COUNT = 0.37
+PAC_HIGH_PASS_S = 1.0 / (2.0 * math.pi * 10.0)
+"""Time constant of PAC's high-pass at 10 Hz [s]: for slow changes PAC is this times the rate."""
+
+PDC_PA_PER_COUNT = 36.5
 
 _KELVIN = 273.15
 # Thermistor 0.6444 exp(4025 / T) Ohm against 30 kOhm, as the maker writes the result.
@@ -38,8 +45,8 @@ _TAC_HIGH_PASS_S = 1.0 / (2.0 * math.pi * 0.45)
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
-    """N frames as the converter gives them.
+class SampledFrames:
+    """N frames of counts.
 
     Attributes:
         electrodes: Shape ``(N, 19)``.
@@ -52,19 +59,27 @@ class Sampled:
     slow: CountArray
 
 
+def converted(values: Array) -> CountArray:
+    """Values [counts] as 12-bit counts: rounded and limited to 0..4095."""
+    return np.clip(np.rint(values), 0, COUNTS_MAX).astype(np.uint16)
+
+
 def tdc_of(temperature_c: Array) -> Array:
     """TDC [counts] of a core temperature [degrees C], any shape; not rounded."""
     return COUNTS_MAX * _UPPER / (np.exp(_BETA_K / (temperature_c + _KELVIN)) + _LOWER)
 
 
 class TwinSensor:
-    """One unit of a tape over time.
+    """One specimen of a tape over time.
+
+    Its states (creep, PAC) are advanced frame by frame and exactly, so the counts do not depend on
+    how many frames are computed at once.
 
     Args:
-        unit: The unit.
+        unit: The specimen.
         rate_hz: Frames per second [Hz].
-        on_for_s: How long it has been switched on at its first frame [s].
-        seed: Of noise and of where the core is warmer.
+        on_for_s: Time since power-on at its first frame [s].
+        seed: Seed of noise and of the temperature gradient over the core.
     """
 
     def __init__(self, unit: TapeUnit, *, rate_hz: float, on_for_s: float, seed: int) -> None:
@@ -81,22 +96,22 @@ class TwinSensor:
         slots = np.arange(PAC_SAMPLES + 1) / PAC_SAMPLES
         self._pac_kept: Array = np.exp(-slots / (rate_hz * PAC_HIGH_PASS_S))
 
-    def sample(self, ideal: Array, pressure_pa: Array, tick: int) -> Sampled:
-        """The next N frames.
+    def sample(self, ideal: Array, pressure_pa: Array, tick: int) -> SampledFrames:
+        """Counts of the next N frames.
 
         Args:
             ideal: Ideal counts of the warm sensor, shape ``(N, 19)``.
             pressure_pa: Fluid pressure at the frames' starts and at the one after them [Pa], shape
                 ``(N + 1,)``.
-            tick: Number of the first.
+            tick: Tick of the first frame.
         """
         count = len(ideal)
         temperature_c, per_s = self._temperature(tick, count)
-        # One draw a frame for all its channels, so that blocks of any size get the same numbers.
+        # One draw per frame for all channels: blocks of any size get the same random numbers.
         noise = self._random.standard_normal((count, ideal.shape[1] + PAC_SAMPLES + 3))
         e_noise, p_noise, s_noise = np.split(noise, [ideal.shape[1], -3], axis=1)
         electrodes = self._warmed(self._crept(ideal), temperature_c)
-        # Warming up is slow against the band, so the band-pass is a rate.
+        # Warming up is slow compared with TAC's passband, so the band-pass acts as a derivative.
         tac = _TAC_GAIN * _TAC_HIGH_PASS_S * per_s
         slow = np.stack(
             [
@@ -106,7 +121,7 @@ class TwinSensor:
             ],
             axis=1,
         )
-        return Sampled(
+        return SampledFrames(
             converted(electrodes + self._unit.noise_counts * e_noise),
             converted(self._pac(pressure_pa) + PAC_NOISE * p_noise),
             converted(slow + SLOW_NOISE * s_noise),
@@ -122,7 +137,7 @@ class TwinSensor:
         return temperature_c, (tdc_of(later_c) - tdc_of(temperature_c)) * self._rate_hz
 
     def _crept(self, ideal: Array) -> Array:
-        """Counts of which a share comes late."""
+        """Counts with creep: a share of every change decays in with one time constant."""
         late = self._unit.creep_share * (ideal - self._rest)
         crept = np.empty_like(ideal)
         for k in range(len(ideal)):
@@ -138,7 +153,7 @@ class TwinSensor:
         unit = self._unit
         below_k = temperature_c - unit.reference_c
         warmth = 1.0 + below_k / unit.heating_k if unit.heating_k else np.ones_like(below_k)
-        # The spatial modes count from the warm sensor, whose counts the tape holds.
+        # The spatial modes are relative to the warm sensor, whose counts the tape holds.
         shift = unit.temperature_coefficient * below_k[:, None] + self._modes * (
             warmth[:, None] - 1
         )
@@ -148,8 +163,8 @@ class TwinSensor:
         return warmed
 
     def _pac(self, pressure_pa: Array) -> Array:
-        """Noise-free PAC, shape ``(N, 22)``; the pressure runs straight from frame to frame."""
-        # High-passed, a straight line of slope s tends to s times the time constant.
+        """Noise-free PAC [counts], shape ``(N, 22)``; pressure is linear between frames."""
+        # The high-pass of a ramp with slope s tends to s times the time constant.
         steady = np.diff(pressure_pa) * (self._rate_hz * PAC_HIGH_PASS_S)
         at_start = np.empty_like(steady)
         for k, towards in enumerate(steady.tolist()):
@@ -164,7 +179,7 @@ class TwinSensor:
 def _spatial_modes() -> Array:
     """Two smooth modes over the electrodes, along the finger and to the sides, shape ``(2, 19)``.
 
-    Of zero mean and unit mean square, so that ``gradient_sd`` is what an electrode sees.
+    They have zero mean and unit mean square, so ``gradient_sd`` is the deviation of an electrode.
     """
     raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
     raw = raw - raw.mean(axis=1, keepdims=True)

@@ -1,1 +1,1 @@
-"""Force/torque sensors: where they sit, and a driver for each protocol."""
+"""Force/torque sensors: the base of all, and a driver for each protocol."""

@@ -1,7 +1,7 @@
 """Bota SensONE and Rokubi over a serial line (hardware reference 3.6).
 
-The sensor streams by itself once it has booted; it is told to stop for its settings only. It
-numbers nothing, so samples are counted, and restarts seen, by its clock.
+The sensor streams by itself once it has booted; the driver stops it only for settings. Its samples
+have no numbers: lost samples and restarts are found by its clock.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
 _ANSWER_S = 1.0
 _CALLS, _CALL_S = 3, 0.2
-"""How often to call at a speed before the next, and how long to wait each time [s]."""
+"""Requests at one speed before the next one is tried, and the wait after each [s]."""
 
 _QUIET_S = 0.03
 _SILENCE_S = 0.3
-"""Silence after which the sensor is taken to have restarted [s]."""
+"""Silence that is taken as a restart [s]."""
 
 _BITS_PER_BYTE = 10
 _WRAP_US = 1 << 32
@@ -42,13 +42,13 @@ class BotaOptions(WrenchOptions):
 
     Attributes:
         port: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
-        baud: As the sensor is set [bit/s]; 0 = try 460800, then 230400.
+        baud: Speed that is set in the sensor [bit/s]; 0 = try 460800, then 230400.
         rate_hz: Samples each second: 100, 200, 250, 400, 800 or 1000 (nominal).
         chop: The sensor's chopping.
         fast: Its fast settling.
         fir: Its FIR filter.
-        temperature_compensation: Corrected for temperature in the sensor.
-        boot_s: How long it may take to boot [s].
+        temperature_compensation: The sensor corrects for temperature.
+        boot_s: Longest time that it takes to boot [s].
     """
 
     port: str = Field(min_length=1)
@@ -76,7 +76,7 @@ class BotaOptions(WrenchOptions):
 
 
 def sinc_of(rate_hz: float) -> int:
-    """The filter's length whose rate is nearest."""
+    """Filter length with the nearest rate."""
     return min(ask.SINC_LENGTHS, key=lambda sinc: abs(math.log(rate_hz * ask.period_s(sinc))))
 
 
@@ -100,7 +100,7 @@ class WrenchBota(WrenchDevice):
         self._begin()
 
     def _begin(self) -> None:
-        """Forget what an earlier connection told."""
+        """Reset the state of an earlier connection."""
         self._decoder = BotaDecoder()
         self._boot = ask.BotaTextWait(ask.BOOT_TEXT)
         self._early = b""
@@ -109,8 +109,8 @@ class WrenchBota(WrenchDevice):
     def zero(self) -> None:
         """See ``WrenchDevice``; the stream pauses for it.
 
-        Offsets are added to what the sensor measures, and those that it has cannot be asked for: so
-        they are cleared first. That they were taken the right way is seen in the samples after it.
+        The sensor adds offsets to its measurement. It cannot be asked for its present offsets, so
+        they are cleared first. The samples afterwards show whether the sign was right.
         """
         self._set_offsets(_NO_OFFSETS)
         before, noise = self._mean()
@@ -120,7 +120,7 @@ class WrenchBota(WrenchDevice):
         if left.any():
             self._set_offsets(_NO_OFFSETS)
             raise DeviceError(
-                f"{self.info.model}: after taking zero it still tells {np.round(after, 4)}",
+                f"{self.info.model}: after taking zero it still reads {np.round(after, 4)}",
                 remedy="leave the load unchanged while zero is taken",
             )
 
@@ -146,12 +146,12 @@ class WrenchBota(WrenchDevice):
         return options.port
 
     def _find(self) -> int:
-        """Open the port at the sensor's baud and bring it into its configuration."""
+        """Open the port at the sensor's speed and enter its configuration mode; the speed."""
         bauds = (self._options.baud,) if self._options.baud else ask.BAUDS_TO_PROBE
         began_s = time.monotonic()
         until = began_s + self._options.boot_s
         while True:
-            # A sensor that comes back is at the speed at which it was; probing others takes time.
+            # A sensor that comes back has the same speed as before; to try others takes time.
             known = self._baud if time.monotonic() - began_s < self._options.boot_s / 2 else 0
             for baud in (known,) if known else bauds:
                 self._port.close()
@@ -171,7 +171,7 @@ class WrenchBota(WrenchDevice):
 
     def _configure(self, within_s: float = _ANSWER_S) -> None:
         self._ask(ask.bare_request(BotaCommand.CONFIG), within_s)
-        # Answers to earlier calls, and what was on its way of the stream.
+        # Discard answers to earlier requests and the rest of the stream.
         settle(self._port, _QUIET_S, _ANSWER_S)
 
     def _run(self) -> None:
@@ -182,7 +182,7 @@ class WrenchBota(WrenchDevice):
         self._silent_since = None
 
     def _close(self) -> None:
-        # It streams on, as it does by itself after power came: nothing has to be told.
+        # The stream is left running, as after power-up.
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -197,14 +197,14 @@ class WrenchBota(WrenchDevice):
         return self._decoder.feed(data)
 
     def _take(self, frame: BotaFrame) -> WrenchReading | None:
-        """The reading of a frame, if it is a new one that can be trusted."""
+        """The reading of a frame; None if the frame is not new or not valid."""
         verdict = self._clock.take(frame.device_time_us, time.monotonic())
         if verdict is SampleVerdict.RESTARTED:
             raise self._restarted("its clock began anew")
         if verdict is not SampleVerdict.NEW:
             return None
-        if told := frame.status & ~ask.OVERRANGE:
-            for name in ask.status_names(told):
+        if status := frame.status & ~ask.OVERRANGE:
+            for name in ask.status_names(status):
                 self._counts["status_" + name.replace(" ", "_")] += 1
         if frame.status & (ask.INVALID | _RAW):
             self._counts["invalid_samples"] += 1
@@ -220,11 +220,11 @@ class WrenchBota(WrenchDevice):
         self._counts["restarts"] += 1
         return DeviceLost(
             f"{self.info.model}: it has restarted: {how}",
-            remedy="check its power; it is set up and started again by itself",
+            remedy="check its power; it is set up and started again automatically",
         )
 
     def _mean(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and scatter of the next samples."""
+        """Mean and standard deviation of the next samples."""
         count = max(8, round(_ZERO_S * self.info.rate_hz))
         frames: list[BotaFrame] = []
         until = time.monotonic() + 2.0 + count / self.info.rate_hz
@@ -233,7 +233,8 @@ class WrenchBota(WrenchDevice):
         values = np.array([frame.wrench for frame in frames], np.float64)
         if any(frame.status for frame in frames) or not np.isfinite(values).all():
             raise DeviceError(
-                f"{self.info.model}: its samples cannot be trusted now", remedy="see its status"
+                f"{self.info.model}: its samples are not valid now",
+                remedy="see its status counters",
             )
         return values.mean(axis=0), values.std(axis=0)
 
@@ -243,11 +244,11 @@ class WrenchBota(WrenchDevice):
         self._run()
 
     def _ask(self, request: bytes, within_s: float = _ANSWER_S) -> bytes:
-        """What came after the reply to a request.
+        """Send a request and wait for its reply; the bytes that came after the reply.
 
         Raises:
-            DeviceTimeout: None came.
-            DeviceError: It refuses.
+            DeviceTimeout: No reply came.
+            DeviceError: The sensor refuses.
         """
         self._port.write(request)
         what = f"{self.info.model}: command {request.decode('ascii')!r}"
@@ -265,7 +266,8 @@ class WrenchBota(WrenchDevice):
                         remedy="choose another rate or filter that this model has",
                     )
         raise DeviceTimeout(
-            f"{what} was not answered; came: {wait.heard[-40:]!r}", remedy="check cable and baud"
+            f"{what} was not answered; it sent: {wait.heard[-40:]!r}",
+            remedy="check cable and baud",
         )
 
     def _protocol_counters(self) -> Mapping[str, int]:

@@ -1,4 +1,9 @@
-"""What all force/torque sensors share: a mount, a zero, the meaning of their status."""
+"""The base of all force/torque sensors: where one is mounted, its zero, its readings.
+
+A sensor under the BioTac measures the load on the BioTac; one that carries the indenter measures
+the reaction. In both cases the frames that leave the gateway hold the wrench *on the BioTac*, in
+the sensor frame, about the origin of the sensor frame (docs/conventions.md).
+"""
 
 from __future__ import annotations
 
@@ -7,37 +12,99 @@ import time
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
-from pydantic import Field
+import numpy.typing as npt
+from pydantic import Field, model_validator
 
 from palpate.config import StrictConfig
 from palpate.errors import DeviceLost, DeviceTimeout
-from palpate.messages import Origin
+from palpate.messages import FloatArray, Origin
 from palpate_gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import ClockObservation, Reading, WrenchReading
-from palpate_gateway.wrench.mount import Mount, MountOptions
 
+Floats = npt.NDArray[np.float64]
 Sample = TypeVar("Sample")
 
 _PROMPT_EACH_S = 0.1
-"""How often a sample is read as it comes, though others wait for one another [s]."""
+"""Time between two samples that are read without gathering others [s]."""
+
+
+class MountOptions(StrictConfig):
+    """How a force/torque sensor is mounted.
+
+    Attributes:
+        carries: What is fixed to its measuring side; ``indenter`` reverses the sign of the wrench.
+        orientation_wxyz: Unit quaternion of the force/torque sensor's frame in the sensor frame.
+        origin_m: Origin of the force/torque sensor's frame in the sensor frame [m].
+    """
+
+    carries: Literal["biotac", "indenter"] = "biotac"
+    orientation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _is_rotation(self) -> MountOptions:
+        size = math.sqrt(sum(part * part for part in self.orientation_wxyz))
+        if not abs(size - 1.0) < 1e-3:
+            raise ValueError(
+                f"orientation_wxyz {self.orientation_wxyz} has length {size:.4g}, not 1: give a "
+                "unit quaternion w x y z"
+            )
+        if not all(math.isfinite(part) for part in self.origin_m):
+            raise ValueError(f"origin_m {self.origin_m} is not finite")
+        return self
+
+
+class Mount:
+    """The transformation that `MountOptions` describe."""
+
+    def __init__(self, options: MountOptions) -> None:
+        w, x, y, z = np.array(options.orientation_wxyz) / np.linalg.norm(options.orientation_wxyz)
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        x, y, z = options.origin_m
+        arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        sign = 1.0 if options.carries == "biotac" else -1.0
+        zero = np.zeros((3, 3))
+        # One matrix product per sample: some sensors send 7000 samples per second.
+        self._matrix = sign * np.block([[rotation, zero], [arm @ rotation, rotation]])
+        self._plain = bool((self._matrix == np.eye(6)).all())
+
+    def on_biotac(self, wrench: Floats) -> tuple[FloatArray, FloatArray]:
+        """Wrench on the BioTac in the sensor frame.
+
+        Args:
+            wrench: As measured: force [N] and torque about the force/torque sensor's own origin
+                [N m], shape (6,).
+
+        Returns:
+            Force [N] and torque about the sensor frame's origin [N m], float32, shape (3,).
+        """
+        turned = (wrench if self._plain else self._matrix @ wrench).astype(np.float32)
+        return turned[:3], turned[3:]
 
 
 class WrenchOptions(StrictConfig):
     """Options of every force/torque driver.
 
     Attributes:
-        mount: Where the sensor sits.
+        mount: How the sensor is mounted.
         serial: Serial number to publish; empty = the device's own, or its address.
-        zero_at_start: Take the load at the first opening as zero; only if nothing touches the
-            BioTac then. A sensor that was lost and comes back is not zeroed: it may be pressed.
-        zero_max_sd_n: A force that varies more is not taken as zero on request [N].
-        zero_max_sd_nm: A torque that varies more is not taken as zero on request [N m].
-        gather_s: How long samples may wait for one another [s]: who wakes for each of 1000 a second
-            spends more on waking than on them. 0 = none waits, e.g. where a robot is controlled by
-            them. Their times are as good either way.
+        zero_at_start: Take the load at the first opening as zero; choose it only if nothing
+            touches the BioTac then. A sensor that was lost and comes back is not zeroed, because it
+            may be loaded.
+        zero_max_sd_n: Standard deviation of a force above which no zero is taken on request [N].
+        zero_max_sd_nm: The same of a torque [N m].
+        gather_s: How long samples may wait for one another [s]: to wake for each of 1000 samples
+            per second costs more than to process them. 0 = no sample waits, e.g. when they control
+            a robot. Their time stamps are equally good.
     """
 
     mount: MountOptions = MountOptions()
@@ -49,11 +116,11 @@ class WrenchOptions(StrictConfig):
 
 
 class WrenchDevice(Device):
-    """A live force/torque sensor. Subclasses speak its protocol.
+    """A live force/torque sensor. Subclasses implement its protocol.
 
     Args:
         driver: Name in the driver table.
-        model: One line for people.
+        model: Description in one line.
         rate_hz: Nominal rate [Hz].
         options: Mount, serial, zero.
     """
@@ -74,9 +141,9 @@ class WrenchDevice(Device):
         self._counts: Counter[str] = Counter()
         self._serial = options.serial
         self.zero_limits = options
-        """What varies more is not taken as zero."""
+        """Limits of the standard deviation for a zero on request."""
         self.zero_lost = False
-        """Whether the zero it had may be gone: it was opened again and does not tell."""
+        """Whether its zero may be lost: it was opened again and does not report a zero."""
         self._has_zero = False
         self._zero_at_start = options.zero_at_start
         self._gather_s = options.gather_s
@@ -84,38 +151,38 @@ class WrenchDevice(Device):
         self._tick = 0
         self._silent_since: float | None = None
         self._tells_time = True
-        """Whether its readings have the device's time; known at the latest when it is connected."""
+        """Whether its readings have the device's time; final once it is connected."""
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Events since it was opened last; names of the protocol's own and of status bits."""
+        """Events since the last opening; those of the protocol and of status bits, too."""
         return dict(self._counts) | dict(self._protocol_counters())
 
     @abstractmethod
     def zero(self) -> None:
-        """Take the present load as zero, in the device; belongs to the thread that reads.
+        """Take the present load as zero, in the device; only for the thread that reads.
 
         Raises:
             DeviceError: The device is not open, refuses, or cannot do it.
         """
 
     def take_zero(self) -> None:
-        """``zero``, and remember that it has one."""
+        """Take a zero with ``zero``, and count it."""
         self.zero()
         self._has_zero, self.zero_lost = True, False
         self._counts["zeros"] += 1
 
     def _keeps_zero(self) -> bool:
-        """Whether the device, connected again, says that it still has its zero."""
+        """Whether the device reports, when it is connected again, that it still has its zero."""
         return False
 
     @abstractmethod
     def _connect(self) -> str:
-        """Open ports, ask who it is, set it up, start the stream; its serial number or address."""
+        """Open ports, set up the sensor, start the stream; its serial number or its address."""
 
     @abstractmethod
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
-        """Readings that came; may be none, e.g. half a frame."""
+        """Readings that came; may be none, e.g. from half a frame."""
 
     @abstractmethod
     def _protocol_counters(self) -> Mapping[str, int]: ...
@@ -125,19 +192,19 @@ class WrenchDevice(Device):
         self._tick = 0
         self._silent_since = None
         try:
-            told = self._connect()
+            serial = self._connect()
             if self._zero_at_start:
                 self.take_zero()
                 self._zero_at_start = False
             elif self._has_zero and not self._keeps_zero():
-                # No product at hand stores a zero; who was without power has lost it.
+                # No known product stores its zero: a sensor that was without power has lost it.
                 self._has_zero, self.zero_lost = False, True
                 self._counts["zero_lost"] += 1
         except BaseException:
             self._close()
             raise
         return DeviceIdentity(
-            self._serial or told,
+            self._serial or serial,
             slot_period_s=1.0 / self.info.rate_hz,
             tells_time=self._tells_time,
         )
@@ -145,13 +212,13 @@ class WrenchDevice(Device):
     def _read(self, timeout_s: float) -> list[Reading]:
         until = time.monotonic() + timeout_s
         if self._gather_s and time.monotonic() >= self._prompt_s:
-            # A sample that never waits tells its clock: what is read at even times would come
-            # late by the same for minutes.
+            # The map of the device's clock needs samples that were read as soon as they came: if
+            # all were read at regular times, their delay would hide in the clock for minutes.
             self._prompt_s = time.monotonic() + _PROMPT_EACH_S
         elif self._gather_s:
             time.sleep(min(self._gather_s, timeout_s))
         while True:
-            # Half a frame is not a reading, and [] would mean the end of the source.
+            # Half a frame is not a reading, and an empty list would mean the end of the source.
             left_s = until - time.monotonic()
             readings = self._receive(max(left_s, 0.0))
             if readings:
@@ -166,17 +233,17 @@ class WrenchDevice(Device):
     def _unless_silent(
         self, take: Callable[[float], Sequence[Sample]], timeout_s: float, silence_s: float
     ) -> Sequence[Sample]:
-        """Samples of a sensor that streams by itself, and says nothing when it restarts.
+        """Samples of a sensor that streams by itself and does not report its restarts.
 
         Args:
-            take: Takes what comes within a time [s]; may give none, e.g. half a frame.
+            take: Reads samples within a time [s]; may give none, e.g. from half a frame.
             timeout_s: How long to wait [s].
-            silence_s: Silence after which it is taken to have restarted [s].
+            silence_s: Silence that is taken as a restart [s].
 
         Raises:
             DeviceTimeout: None came yet.
-            DeviceLost: None came for too long. Others on a bus may talk on, so that a timeout of
-                the port alone would not tell.
+            DeviceLost: None came for too long. A timeout of the port would not show it on a bus
+                where other devices continue.
         """
         since_s = self._silent_since = self._silent_since or time.monotonic()
         left_s = max(since_s + silence_s - time.monotonic(), 0.0)
@@ -206,14 +273,14 @@ class WrenchDevice(Device):
         tick: int | None = None,
         overload: bool = False,
     ) -> WrenchReading | None:
-        """A reading on the BioTac; None, and counted, where the device tells no numbers.
+        """A reading on the BioTac; None, and counted, if a value is not finite.
 
         Args:
             wrench: Fx Fy Fz [N] Tx Ty Tz [N m] in the force/torque sensor's frame.
-            time_s: The device's time [s]; None = it tells none, the host's time of arrival.
-            arrival_ns: Host monotonic clock when it arrived [ns]; None = now.
-            tick: The device's unwrapped counter; None = it has none, ours.
-            overload: Its range is exceeded.
+            time_s: The device's time [s]; None = use the host's time of arrival.
+            arrival_ns: Host's monotonic clock at arrival [ns]; None = now.
+            tick: The device's unwrapped counter; None = use a count of our own.
+            overload: Whether the range is exceeded.
         """
         if not all(map(math.isfinite, wrench)):
             self._counts["not_finite"] += 1

@@ -1,8 +1,8 @@
 """Weiss Robotics KMS 40: text over TCP (hardware reference 3.1).
 
-Samples hold no counter and no usable time, so the host's time counts, and a lost sample cannot be
-told from one that came late. Neither do they say whether they can be trusted: the device is asked
-for its flags now and then, while it streams.
+Samples have no number and no usable time: they get the host's time, and a lost sample looks like a
+late one. They do not say whether they are valid, so the driver asks for the device's flags from
+time to time, while it streams.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ANSWER_S = 2.0
 _GREET_S = 0.25
 _GOODBYE_S = 0.3
 _PATIENCE_S = 0.25
-"""Silence after which the stream is started again, unless it is that slow by itself [s]."""
+"""Silence after which the stream is started again; longer at low rates [s]."""
 
 _EXPECTED = (
     KmsFlags.CALIBRATION_VALID
@@ -56,8 +56,8 @@ class Kms40Options(WrenchOptions):
         host: Address; two factory settings are known, 192.168.1.30 and 192.168.0.30.
         port: TCP port.
         rate_hz: Samples each second, 500 divided by a whole number.
-        filter_number: Number in the device's table of filters; None = as it is set.
-        flags_every_s: How often to ask for overload and faults [s]; 0 = never. Samples that come
+        filter_number: Number in the device's table of filters; None = leave its setting.
+        flags_every_s: Time between two requests for overload and faults [s]; 0 = never. Samples
             between a fault and the next answer are published.
     """
 
@@ -98,10 +98,10 @@ class WrenchKms40(WrenchDevice):
         self._begin()
 
     def _begin(self) -> None:
-        """Forget what an earlier connection told."""
+        """Reset the state of an earlier connection."""
         self._decoder = KmsDecoder()
         self._flags = KmsFlags(0)
-        # What the flags mean for a sample: asked 500 times a second, told once.
+        # Meaning of the flags for samples, computed once and used 500 times per second.
         self._faulty = self._over_range = False
         self._flags_due_s = 0.0
         self._flags_asked = False
@@ -109,7 +109,7 @@ class WrenchKms40(WrenchDevice):
         self._arrivals.begin()
 
     def zero(self) -> None:
-        """See ``WrenchDevice``; the stream pauses for it, and what it held is thrown away."""
+        """See ``WrenchDevice``; the stream pauses, and the samples before it are discarded."""
         self._ask(ask.stop_request(), "L0")
         try:
             self._ask(ask.tare_request(), "TARE", "1")
@@ -128,7 +128,7 @@ class WrenchKms40(WrenchDevice):
         serial = self._ask(ask.query_request(ask.KmsQuery.SERIAL_NUMBER), "SN")
         if not serial:
             raise DeviceError(
-                f"{self.info.model}: it tells no serial number",
+                f"{self.info.model}: it gives no serial number",
                 remedy="check that this is a KMS 40",
             )
         self._ask(ask.mask_request(), "LMASK", "{1,1,1,1,1,1}")
@@ -142,7 +142,7 @@ class WrenchKms40(WrenchDevice):
         return serial
 
     def _greet(self) -> None:
-        """Stop what it streams to whom it streamed before; a device that is busy may not hear."""
+        """Stop the stream of an earlier client; a busy device may ignore the first requests."""
         until = time.monotonic() + _ANSWER_S
         while True:
             left_s = until - time.monotonic()
@@ -159,12 +159,12 @@ class WrenchKms40(WrenchDevice):
         if faults:
             raise DeviceError(
                 f"{self.info.model}: it reports {', '.join(flag_names(faults))}",
-                remedy="its forces cannot be trusted: see to supply, temperature and calibration",
+                remedy="its forces are not valid: check supply, temperature and calibration",
             )
         self._flags_due_s = time.monotonic() + self._flags_every_s
 
     def _close(self) -> None:
-        # Waiting for the echo: a socket closed with unread input would take the request back.
+        # Wait for the echo: a socket that is closed with unread input cancels the request.
         with contextlib.suppress(DeviceError):
             self._ask(ask.stop_request(), "L0", within_s=_GOODBYE_S)
         self._port.close()
@@ -209,7 +209,7 @@ class WrenchKms40(WrenchDevice):
         return readings
 
     def _keep_going(self) -> None:
-        """Ask for the stream if there is none, and for the flags if it is time."""
+        """Request the stream if it has stopped, and the flags if they are due."""
         now_s = time.monotonic()
         if now_s - self._heard_s >= self._patience_s:
             self._heard_s = now_s
@@ -239,11 +239,11 @@ class WrenchKms40(WrenchDevice):
     def _ask(
         self, request: bytes, name: str, wanted: str | None = None, *, within_s: float = _ANSWER_S
     ) -> str:
-        """The value that a request is answered with; samples that come before it are thrown away.
+        """The value in the answer to a request; samples before the answer are discarded.
 
         Raises:
             DeviceTimeout: No answer came.
-            DeviceError: It refuses, or answers with another value than wanted.
+            DeviceError: The device refuses, or answers with a value other than ``wanted``.
         """
         self._port.write(request)
         asked = f"{self.info.model}: {request.decode('ascii').strip()}"
@@ -267,14 +267,14 @@ class WrenchKms40(WrenchDevice):
                     return self._checked(record.value, wanted, asked)
         raise DeviceTimeout(
             f"{asked} was not answered within {within_s:g} s",
-            remedy="check that this is a KMS 40 and that nobody else is connected to it",
+            remedy="check that this is a KMS 40 and that no other client is connected to it",
         )
 
     def _checked(self, value: str, wanted: str | None, asked: str) -> str:
         if wanted is not None and value.replace(" ", "") != wanted:
             raise DeviceError(
                 f"{asked} was answered with {value[:40]!r} instead of {wanted!r}",
-                remedy="the device cannot be set so: choose another rate or filter",
+                remedy="the device does not accept this setting: choose another rate or filter",
             )
         return value
 

@@ -1,7 +1,7 @@
 """Sensors that speak RDT over UDP (hardware reference 3.2, 3.3).
 
-ATI Net F/T, ATI Ethernet Axia, Schunk FTN-AXIA, and OnRobot HEX with its Ethernet converter. No
-request is ever confirmed: what is asked for is looked for in the records, and asked for again.
+ATI Net F/T, ATI Ethernet Axia, Schunk FTN-AXIA, and OnRobot HEX with its Ethernet converter. The
+devices never confirm a request: the driver looks for its effect in the records, and repeats it.
 """
 
 from __future__ import annotations
@@ -11,17 +11,21 @@ import logging
 import re
 import time
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, model_validator
 
-from palpate.errors import DeviceError, DeviceTimeout
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.ports.port import silent
 from palpate_gateway.ports.sockets import ReceivedBytes, UdpPort, read_page
 from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
 from palpate_gateway.protocols.rdt import (
     HEX,
+    HEX_FILTERS_HZ,
+    HEX_PERIOD_MAX_MS,
+    PORT,
     PROFILES,
     RdtDecoder,
     RdtRecord,
@@ -30,29 +34,172 @@ from palpate_gateway.protocols.rdt import (
     hex_filter_request,
     hex_period_request,
     hex_sensor_number,
+    unwrap,
 )
 from palpate_gateway.readings import WrenchReading
-from palpate_gateway.wrench.device import WrenchDevice
-from palpate_gateway.wrench.rdt_clock import CounterClock
-from palpate_gateway.wrench.rdt_options import PRODUCTS, RdtOptions
+from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
+
+PRODUCTS = {
+    "ati_net_ft": "ATI Net F/T",
+    "ati_axia": "ATI Ethernet Axia",
+    "schunk_ftn": "Schunk FTN-AXIA",
+    "onrobot_hex": "OnRobot HEX",
+}
+"""Common name of each product."""
+
+
+class RdtOptions(WrenchOptions):
+    """Options of the ``wrench_rdt`` driver.
+
+    Attributes:
+        product: The product; it decides the meaning of the status word.
+        host: Address; the factory setting of all products is the default.
+        port: UDP port of the records.
+        http_port: TCP port of the web page with the scale.
+        rate_hz: Records each second. A HEX is set to it, 1000 divided by a whole number; the
+            others are set on their own web page, and this value must be the same.
+        counts_per_n: Counts per newton, instead of the device's own value; give both.
+        counts_per_n_m: Counts per newton metre.
+        counter_hz: Rate of the device's own counter, its clock; None = that of the product or of
+            the web page, 0 = use the host's clock.
+        filter_code: Low-pass filter of a HEX (0 none, 1 500 Hz, 2 150, 3 50, 4 15, 5 5, 6 1.5);
+            None = leave its setting.
+        sensor: Number of the sensor at a HEX converter that has several; None = there is one.
+    """
+
+    product: Literal["ati_net_ft", "ati_axia", "schunk_ftn", "onrobot_hex"]
+    host: str = Field(default="192.168.1.1", min_length=1)
+    port: int = Field(default=PORT, ge=1, le=65535)
+    http_port: int = Field(default=80, ge=1, le=65535)
+    rate_hz: float = Field(default=1000.0, ge=1.0, le=8000.0)
+    counts_per_n: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    counts_per_n_m: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    counter_hz: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
+    filter_code: int | None = Field(default=None, ge=0, le=max(HEX_FILTERS_HZ))
+    sensor: int | None = Field(default=None, ge=0, le=7)
+
+    @property
+    def period_ms(self) -> int:
+        """Time from record to record in the request to a HEX [ms]."""
+        return round(1000.0 / self.rate_hz)
+
+    def scale(self) -> RdtScale | None:
+        """Scale of counts; None = from the device or the product."""
+        if self.counts_per_n is None or self.counts_per_n_m is None:
+            return None
+        return RdtScale(self.counts_per_n, self.counts_per_n_m)
+
+    @model_validator(mode="after")
+    def _fits_product(self) -> RdtOptions:
+        if (self.counts_per_n is None) != (self.counts_per_n_m is None):
+            raise ValueError("counts_per_n and counts_per_n_m must be given together")
+        if self.product == "onrobot_hex":
+            period_ms = self.period_ms
+            fits = 1 <= period_ms <= HEX_PERIOD_MAX_MS
+            if not fits or abs(self.rate_hz * period_ms / 1000.0 - 1.0) > 1e-3:
+                raise ValueError(
+                    f"rate_hz {self.rate_hz:g} of a HEX is not 1000 divided by a whole number "
+                    f"from 1 to {HEX_PERIOD_MAX_MS}"
+                )
+        elif self.filter_code is not None or self.sensor is not None:
+            raise ValueError("filter_code and sensor are options of the onrobot_hex only")
+        return self
+
+
+CHECK_S = 10.0
+"""Time over which the rate of the counter is measured [s]."""
+
+_TOLERANCE = 0.03
+"""Relative tolerance of the rate: products differ by more, late arrivals change it by less."""
+
+_RESTART_S = 0.5
+"""If the two clocks differ by more over a gap in the stream, the device was off [s]."""
+
+
+class CounterClock:
+    """The counter of a sensor as a clock, and a check of its rate; unwraps 32 bits into seconds.
+
+    Args:
+        rate_hz: Rate of the counter; None = unknown, it only shows whether the device restarted.
+        name: Name of the device, for errors.
+    """
+
+    def __init__(self, rate_hz: float | None, name: str) -> None:
+        self.wrong = False
+        """Whether the counter runs at another rate."""
+        self._rate_hz, self._name = rate_hz, name
+        self._last: tuple[int, float] | None = None
+        self._first: tuple[int, float] | None = None
+        self._suspect_hz = 0.0
+
+    def follow(self, raw: int, arrival_s: float, *, new_epoch: bool) -> float | None:
+        """The device's time [s]; None if the rate is unknown.
+
+        Args:
+            raw: The counter as sent.
+            arrival_s: Host time when it arrived [s].
+            new_epoch: The record is the first after a start request.
+
+        Raises:
+            DeviceLost: The device was restarted, or the counter runs at another rate.
+        """
+        if self._last is None or self._first is None:
+            self._first = self._last = raw, arrival_s
+        counter = unwrap(raw, self._last[0])
+        if new_epoch:
+            self._check_restart(counter - self._last[0], arrival_s - self._last[1])
+        self._last = counter, arrival_s
+        if self._rate_hz is None:
+            return None
+        waited_s = arrival_s - self._first[1]
+        if waited_s >= CHECK_S:
+            self._check_rate((counter - self._first[0]) / waited_s, self._rate_hz)
+            self._first = self._last
+        return counter / self._rate_hz
+
+    def _check_restart(self, gained: int, waited_s: float) -> None:
+        went_on = gained >= 0
+        if self._rate_hz is not None:
+            went_on = went_on and abs(gained / self._rate_hz - waited_s) <= _RESTART_S
+        if not went_on:
+            raise DeviceLost(
+                f"{self._name}: its counter did not continue: it was restarted",
+                remedy="it is opened again automatically; its zero is gone, take it again",
+            )
+
+    def _check_rate(self, measured_hz: float, rate_hz: float) -> None:
+        if abs(measured_hz / rate_hz - 1.0) <= _TOLERANCE:
+            self._suspect_hz = 0.0
+            return
+        # A pause of this process looks like a slow counter and then like a fast one, so one wrong
+        # measurement is not enough.
+        again = abs(self._suspect_hz / measured_hz - 1.0) <= _TOLERANCE if measured_hz else False
+        self._suspect_hz = measured_hz
+        if again:
+            self.wrong = True
+            raise DeviceLost(
+                f"{self._name}: its counter runs at {measured_hz:.0f} Hz, not {rate_hz:g} Hz",
+                remedy="it is opened again with the host's clock; give the option counter_hz",
+            )
+
 
 _log = logging.getLogger(__name__)
 
 _PATIENCE_S = 0.1
-"""Silence after which the start request is repeated, unless it is that slow by itself [s]."""
+"""Silence after which the start request is repeated; longer at low rates [s]."""
 _STARTS = 10
 _ZEROS = 3
 _ZERO_RECORDS = 5
 _PAGE_S = 3.0
 _AT_ONCE = 256
-"""Most datagrams read before readings are handed over."""
+"""Most datagrams in one answer of ``read``."""
 
 _SUMMARY = 1 << 31
 _SEVERAL_SENSORS = 1 << 3
 
 
 class _Record(NamedTuple):
-    """A new record, its number over all starts, the device's time [s] and its arrival [ns]."""
+    """A new record, its number over all starts, the device's time [s] and the arrival [ns]."""
 
     raw: RdtRecord
     tick: int
@@ -78,29 +225,29 @@ class WrenchRdt(WrenchDevice):
         self._begin()
 
     def _begin(self) -> None:
-        """Forget what an earlier connection told."""
+        """Reset the state of an earlier connection."""
         self._decoder, self._sequence = RdtDecoder(), RdtSequence()
         self._early: list[_Record] = []
         self._heard_s = time.monotonic()
 
     def zero(self) -> None:
-        """See ``WrenchDevice``; asked for again until the records show it."""
+        """See ``WrenchDevice``; the request is repeated until the records show its effect."""
         before, spread_before = self._load()
         for _ in range(_ZEROS):
             self._port.write(self._profile.bias_request())
             after, spread = self._load()
-            # Only a request that was lost leaves a load where it was.
+            # Only a lost request leaves the load unchanged.
             if np.all(abs(after) <= 0.5 * abs(before) + spread_before + spread + 2.0):
                 return
         raise DeviceError(
-            f"{self.info.model}: {_ZEROS} bias requests did not change what it tells",
+            f"{self.info.model}: {_ZEROS} bias requests did not change its readings",
             remedy="keep the load still and try again",
         )
 
     def _load(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Mean and spread of the next valid records [counts], shape ``(6,)`` each."""
         period_s = 1.0 / self.info.rate_hz
-        # What was under way when it was asked for is of before.
+        # Records that were under way at the request are older than its effect.
         from_s = time.monotonic() + max(0.05, 2.0 * period_s)
         until = from_s + 2.0 + 10.0 * period_s
         counts: list[Sequence[int]] = []
@@ -137,7 +284,7 @@ class WrenchRdt(WrenchDevice):
         return serial or self._port.name
 
     def _learn(self) -> str:
-        """Find out what a count and a tick are worth; the serial number if it tells one."""
+        """Get the scale of counts and the counter's rate; the serial number if there is one."""
         options, profile, serial = self._options, self._profile, ""
         scale, counter_hz = options.scale() or profile.scale, profile.ft_rate_hz
         if scale is None:
@@ -157,7 +304,7 @@ class WrenchRdt(WrenchDevice):
         if options.counter_hz is not None:
             counter_hz = options.counter_hz or None
         if self._clock.wrong:
-            # Kept over connections: the next one would only find the same.
+            # Remembered over connections: a new one would measure the same wrong rate.
             self._counts["counter_rate_wrong"] += 1
             counter_hz = None
         wrong, self._clock = self._clock.wrong, CounterClock(counter_hz, self.info.model)
@@ -174,8 +321,8 @@ class WrenchRdt(WrenchDevice):
                 return
         raise DeviceTimeout(
             f"{self.info.model}: no record came after {_STARTS} start requests",
-            remedy="check the address, that RDT is enabled in the device, and that nobody else "
-            "reads from it",
+            remedy="check the address, that RDT is enabled in the device, and that no other "
+            "client reads from it",
         )
 
     def _close(self) -> None:
@@ -202,7 +349,7 @@ class WrenchRdt(WrenchDevice):
         return [reading for reading in readings if reading is not None]
 
     def _listen(self, timeout_s: float) -> list[_Record]:
-        """New records; may be none, if what came was not any."""
+        """New records; may be none, if the datagrams held none."""
         records, self._early = self._early, []
         until = time.monotonic() + timeout_s
         while not records:
@@ -221,7 +368,7 @@ class WrenchRdt(WrenchDevice):
         return records
 
     def _keep_going(self) -> None:
-        """Ask for the stream again if there is none."""
+        """Repeat the start request if the stream has stopped."""
         now_s = time.monotonic()
         if now_s - self._heard_s >= self._patience_s:
             self._heard_s = now_s
@@ -229,7 +376,7 @@ class WrenchRdt(WrenchDevice):
             self._port.write(self._profile.start_request())
 
     def _fresh(self, datagram: ReceivedBytes) -> list[_Record]:
-        """Records of a datagram that are neither repeated nor late."""
+        """Records of a datagram, without repeated and late ones."""
         records = []
         for raw in self._decoder.feed(datagram.data):
             self._heard_s = time.monotonic()
@@ -242,7 +389,7 @@ class WrenchRdt(WrenchDevice):
         return records
 
     def _overload(self, raw: RdtRecord) -> bool | None:
-        """Whether the range is exceeded; None, and counted, if the record is not to be used."""
+        """Whether the range is exceeded; None, and counted, if the record is not valid."""
         profile, status = self._profile, raw.status
         if self._is_hex and self._options.sensor not in (None, hex_sensor_number(status)):
             self._counts["other_sensors"] += 1
@@ -251,7 +398,8 @@ class WrenchRdt(WrenchDevice):
             self._counts["status_" + re.sub("[^a-z0-9]+", "_", name.lower())] += 1
         overload = profile.overloaded(status)
         if overload:
-            # Saturation is flagged, not dropped (hardware reference 4.3); it sets the summary too.
+            # A saturated sample is published with a flag (hardware reference 4.3). Saturation also
+            # sets the summary bit.
             status &= ~(profile.overload | _SUMMARY)
         if profile.valid(status):
             return overload

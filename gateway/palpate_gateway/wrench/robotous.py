@@ -1,13 +1,14 @@
 """Robotous RFT over a serial line or CAN (hardware reference 3.5).
 
-Samples hold neither counter nor time, so the host's time counts, and a lost sample cannot be told
-from one that came late. The sensor says nothing when it restarts: it falls silent.
+Samples have neither number nor time: they get the host's time, and a lost sample looks like a late
+one. The sensor does not report a restart: it falls silent.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 from pydantic import Field, model_validator
@@ -15,6 +16,7 @@ from pydantic import Field, model_validator
 from palpate.errors import DeviceError, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.can_bus import CanBus
+from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import robotous as ask
 from palpate_gateway.protocols.robotous import (
     FIRST_ID,
@@ -24,21 +26,151 @@ from palpate_gateway.protocols.robotous import (
     RobotousCommand,
     RobotousData,
     RobotousRecord,
+    RobotousSerialDecoder,
+    serial_frame,
 )
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
-from palpate_gateway.wrench.robotous_line import RobotousCanLine, RobotousLine, RobotousSerialLine
+
+_APART = 0.75
+"""Halves that are further apart belong to two samples [periods]."""
+
+
+class RobotousLine(ABC):
+    """A line to one sensor: requests go out, the data bytes of answers come in.
+
+    Attributes:
+        name: Name for messages to the user.
+    """
+
+    name: str
+
+    @property
+    @abstractmethod
+    def counters(self) -> Mapping[str, int]:
+        """Events since the last opening."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect; raises the errors of the port."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect; never raises."""
+
+    @abstractmethod
+    def send(self, request: bytes) -> None:
+        """Send the data bytes of a request."""
+
+    @abstractmethod
+    def read(self, timeout_s: float) -> list[bytes]:
+        """Data bytes of the answers that are now complete; may be none, e.g. from half a frame.
+
+        Raises:
+            DeviceTimeout: Nothing came.
+            DeviceLost: The line is gone.
+        """
+
+
+class RobotousSerialLine(RobotousLine):
+    """A serial line.
+
+    Args:
+        port: Its name.
+        baud: Its rate [bit/s].
+    """
+
+    def __init__(self, port: str, baud: int) -> None:
+        self.name = f"{port} at {baud} bit/s"
+        self._port = SerialPort(port, baud)
+        self._decoder = RobotousSerialDecoder()
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See ``RobotousLine``."""
+        return self._decoder.counters
+
+    def open(self) -> None:
+        """See ``RobotousLine``."""
+        self._decoder = RobotousSerialDecoder()
+        self._port.open()
+
+    def close(self) -> None:
+        """See ``RobotousLine``."""
+        self._port.close()
+
+    def send(self, request: bytes) -> None:
+        """See ``RobotousLine``."""
+        self._port.write(serial_frame(request))
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        """See ``RobotousLine``."""
+        return self._decoder.feed(self._port.read(timeout_s))
+
+
+class RobotousCanLine(RobotousLine):
+    """A CAN bus, which other devices may use, too.
+
+    Args:
+        bus: The bus, closed.
+        request_id: Identifier of requests.
+        first_id: Identifier of the first half of an answer.
+        second_id: Identifier of the second half.
+        period_s: Time between two samples [s].
+    """
+
+    def __init__(
+        self, bus: CanBus, *, request_id: int, first_id: int, second_id: int, period_s: float
+    ) -> None:
+        self.name = bus.name
+        self._bus = bus
+        self._request_id, self._ids = request_id, (first_id, second_id)
+        self._apart_ns = round(1e9 * _APART * period_s)
+        self._first_ns = 0
+        self._decoder = RobotousCanDecoder(*self._ids)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See ``RobotousLine``."""
+        return {**self._decoder.counters, **self._bus.counters}
+
+    def open(self) -> None:
+        """See ``RobotousLine``."""
+        self._decoder = RobotousCanDecoder(*self._ids)
+        self._bus.counters.update(dict.fromkeys(self._bus.counters, 0))
+        self._bus.open()
+
+    def close(self) -> None:
+        """See ``RobotousLine``."""
+        self._bus.close()
+
+    def send(self, request: bytes) -> None:
+        """See ``RobotousLine``."""
+        self._bus.write(self._request_id, request)
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        """See ``RobotousLine``."""
+        out = []
+        for can_id, data, arrival_ns in self._bus.read(timeout_s).messages():
+            # Samples have no numbers: only the times show that two halves do not belong together.
+            if self._decoder.pending and arrival_ns - self._first_ns > self._apart_ns:
+                self._decoder.reset()
+            if can_id == self._ids[0]:
+                self._first_ns = arrival_ns
+            out += self._decoder.feed(can_id, data)
+        return out
+
 
 _ANSWER_S = 0.3
 _ATTEMPTS = 3
 _QUIET_S = 0.03
 _DRAIN_S = 0.3
 _SILENCE_S = 0.3
-"""Silence after which the sensor has restarted, unless it is that slow by itself [s]."""
+"""Silence that is taken as a restart; longer at low rates [s]."""
 
 _ZERO_SAMPLES = 5
 _NEAR_ZERO = 20.0
-"""Noise that a zero may leave [counts]."""
+"""Largest mean after a zero [counts]; the rest is noise."""
 
 
 class RobotousOptions(WrenchOptions):
@@ -46,17 +178,17 @@ class RobotousOptions(WrenchOptions):
 
     Attributes:
         port: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
-        baud: Its rate as the sensor is set [bit/s].
+        baud: Speed that is set in the sensor [bit/s].
         interface: python-can's name of the kind of bus, e.g. ``socketcan``.
         channel: Its name, e.g. ``can0``.
-        bitrate: Of the bus [bit/s]; 0 = as it is set up.
+        bitrate: Bit rate of the bus [bit/s]; 0 = leave its setting.
         request_id: CAN identifier of requests.
         first_id: CAN identifier of the first half of an answer.
         second_id: CAN identifier of the second half.
         rate_hz: Samples each second; a serial line must be fast enough for it.
-        cutoff_hz: Of the sensor's low-pass [Hz]; 0 = none.
-        filter_order: How the sensor numbers cutoffs; confirm it by the noise.
-        model: E.g. ``RFT64-SB01``; empty = as the sensor tells.
+        cutoff_hz: Cutoff of the sensor's low-pass [Hz]; 0 = none.
+        filter_order: Order in which the sensor numbers its cutoffs; check it by the noise.
+        model: E.g. ``RFT64-SB01``; empty = as the sensor reports.
         torque_divisor: Counts per N m; None = by the model.
     """
 
@@ -144,9 +276,9 @@ class WrenchRobotous(WrenchDevice):
         with contextlib.suppress(DeviceTimeout):
             while time.monotonic() < until:
                 self._line.read(_QUIET_S)
-        told = self._text(RobotousCommand.MODEL)
+        reported = self._text(RobotousCommand.MODEL)
         serial = self._text(RobotousCommand.SERIAL)
-        self._scale = self._scale_of(told)
+        self._scale = self._scale_of(reported)
         cutoff_hz = self._options.cutoff_hz or None
         self._set(ask.filter_request(cutoff_hz, order=self._options.filter_order))
         self._set(ask.rate_request(self._options.rate_hz))
@@ -154,8 +286,8 @@ class WrenchRobotous(WrenchDevice):
         self._arrivals.begin()
         return serial or self._line.name
 
-    def _scale_of(self, told: str) -> ask.RobotousScale:
-        model, divisor = self._options.model or told, self._options.torque_divisor
+    def _scale_of(self, reported: str) -> ask.RobotousScale:
+        model, divisor = self._options.model or reported, self._options.torque_divisor
         try:
             scale = ask.scale_of(model, torque_divisor=divisor)
         except ValueError as error:
@@ -163,9 +295,9 @@ class WrenchRobotous(WrenchDevice):
                 f"{self.info.model}: {error}", remedy="set model or torque_divisor (its manual)"
             ) from error
         with contextlib.suppress(ValueError):
-            if divisor is None and ask.scale_of(told) != scale:
+            if divisor is None and ask.scale_of(reported) != scale:
                 raise DeviceError(
-                    f"{self.info.model}: it says that it is a {told}, not a {model}",
+                    f"{self.info.model}: it says that it is a {reported}, not a {model}",
                     remedy="correct model, or set torque_divisor",
                 )
         return scale
@@ -224,14 +356,14 @@ class WrenchRobotous(WrenchDevice):
             )
 
     def _answer(self, request: bytes, command: RobotousCommand) -> RobotousRecord:
-        """The first answer to a request, which is sent again if none comes.
+        """The first answer to a request; the request is repeated if none comes.
 
         Raises:
             DeviceTimeout: None came.
         """
         patience_s = _ANSWER_S + 2.0 / self.info.rate_hz
         for attempt in range(_ATTEMPTS):
-            if attempt:  # while it streams it hears nothing else
+            if attempt:  # while it streams it ignores most requests
                 self._line.send(ask.stop_request())
             self._line.send(request)
             until = time.monotonic() + patience_s
@@ -242,7 +374,7 @@ class WrenchRobotous(WrenchDevice):
                             return ask.decode(payload)
         came = ", ".join(f"{count} {name}" for name, count in self._line.counters.items() if count)
         raise DeviceTimeout(
-            f"{self.info.model}: {_name(request)} was not answered; came: {came or 'nothing'}",
+            f"{self.info.model}: {_name(request)} was not answered; it sent: {came or 'nothing'}",
             remedy="check power, wiring, terminators, and baud or CAN identifiers",
         )
 

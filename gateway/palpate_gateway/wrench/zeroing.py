@@ -1,4 +1,4 @@
-"""Taking the zero of a force/torque sensor when somebody asks, in the thread that reads it."""
+"""The zero of a force/torque sensor on request, taken in the thread that reads the sensor."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _COUNT_MIN, _COUNT_MAX = 5, 20_000
 _Wrenches = npt.NDArray[np.float64]
 
 
-class _Asked:
-    """One request: readings before, the zero, readings after."""
+class _ZeroRequest:
+    """One request: mean of readings before, the zero, mean of readings after."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -33,7 +33,7 @@ class _Asked:
 
 
 class Zeroing:
-    """Serves requests, one after the other.
+    """Serves requests for a zero, one after the other.
 
     Args:
         name: The sensor's name.
@@ -43,77 +43,77 @@ class Zeroing:
     def __init__(self, name: str, device: WrenchDevice) -> None:
         self._name, self._device = name, device
         self._lock = threading.Lock()
-        self._asked: list[_Asked] = []
+        self._requests: list[_ZeroRequest] = []
 
     def count(self, readings: int) -> int:
-        """Readings in each mean, if so many are asked for; 0 = half a second's."""
+        """Readings in each mean for a request of ``readings``; 0 = those of half a second."""
         wanted = readings or round(_MEAN_S * self._device.info.rate_hz)
         return min(max(wanted, _COUNT_MIN), _COUNT_MAX)
 
     def ask(self, count: int) -> Future[WrenchZero]:
-        """Take the load as zero; from any thread."""
-        asked = _Asked(count)
+        """Request a zero; from any thread."""
+        request = _ZeroRequest(count)
         with self._lock:
-            self._asked.append(asked)
-        return asked.future
+            self._requests.append(request)
+        return request.future
 
     def follow(self, readings: Sequence[Reading]) -> None:
-        """Take what was read; this thread takes the zero when it is time.
+        """Add readings; when there are enough, take the zero in this thread.
 
         Raises:
             DeviceLost: The device is gone.
         """
-        if not self._asked:
+        if not self._requests:
             return
-        asked = self._asked[0]
-        if asked.future.cancelled():
-            self._done(asked)
+        request = self._requests[0]
+        if request.future.cancelled():
+            self._done(request)
             return
-        asked.readings += (one for one in readings if isinstance(one, WrenchReading))
-        if len(asked.readings) < asked.count:
+        request.readings += (one for one in readings if isinstance(one, WrenchReading))
+        if len(request.readings) < request.count:
             return
         try:
-            self._go_on(asked)
+            self._go_on(request)
         except DeviceError as error:
-            self._done(asked)
-            if asked.future.set_running_or_notify_cancel():
-                asked.future.set_exception(error)
+            self._done(request)
+            if request.future.set_running_or_notify_cancel():
+                request.future.set_exception(error)
             if isinstance(error, DeviceLost):
                 raise
 
     def give_up(self, why: str) -> None:
-        """The device is gone."""
+        """Fail all requests, because the device is lost."""
         with self._lock:
-            asked, self._asked = self._asked, []
-        for one in asked:
+            request, self._requests = self._requests, []
+        for one in request:
             if one.future.set_running_or_notify_cancel():
                 one.future.set_exception(
                     DeviceError(
                         f"sensor {self._name!r} took no zero: {why}",
-                        remedy="look at palpate status; tare when it is back",
+                        remedy="see palpate status, and tare again when it is back",
                     )
                 )
 
-    def _go_on(self, asked: _Asked) -> None:
-        asked.readings = asked.readings[-asked.count :]
-        wrenches = np.array([(*one.force, *one.torque) for one in asked.readings], np.float64)
-        if asked.before is None:
-            self._check_still(wrenches, asked.readings)
-            asked.before = wrenches.mean(axis=0)
-            asked.readings = []
+    def _go_on(self, request: _ZeroRequest) -> None:
+        request.readings = request.readings[-request.count :]
+        wrenches = np.array([(*one.force, *one.torque) for one in request.readings], np.float64)
+        if request.before is None:
+            self._check_still(wrenches, request.readings)
+            request.before = wrenches.mean(axis=0)
+            request.readings = []
             self._device.take_zero()
-            asked.taken_ns = time.monotonic_ns(), time.time_ns()
+            request.taken_ns = time.monotonic_ns(), time.time_ns()
             return
-        self._done(asked)
-        if asked.future.set_running_or_notify_cancel():
+        self._done(request)
+        if request.future.set_running_or_notify_cancel():
             before, after = (
-                mean.astype(np.float32) for mean in (asked.before, wrenches.mean(axis=0))
+                mean.astype(np.float32) for mean in (request.before, wrenches.mean(axis=0))
             )
-            asked.future.set_result(
+            request.future.set_result(
                 WrenchZero(
-                    asked.readings[-1].serial,
+                    request.readings[-1].serial,
                     self._device.info.model,
-                    *asked.taken_ns,
+                    *request.taken_ns,
                     before[:3],
                     before[3:],
                     after[:3],
@@ -139,10 +139,10 @@ class Zeroing:
                 raise DeviceError(
                     f"cannot zero {self._name!r}: {axis} varies by {worst:.3g} {unit} (sd) over "
                     f"{len(wrenches)} readings, at most {most:g} are allowed",
-                    remedy="let go of the sensor and of the BioTac, and ask again",
+                    remedy="leave the sensor and the BioTac untouched, and try again",
                 )
 
-    def _done(self, asked: _Asked) -> None:
+    def _done(self, request: _ZeroRequest) -> None:
         with self._lock:
-            if asked in self._asked:
-                self._asked.remove(asked)
+            if request in self._requests:
+                self._requests.remove(request)

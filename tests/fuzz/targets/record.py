@@ -16,7 +16,7 @@ from palpate.files.record import descriptor_set, summarise
 from palpate_gateway.clock.stamps import FileClock
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import RecordedMessage
-from palpate_gateway.recordings.record import Record, RecordOptions
+from palpate_gateway.recordings.record import RecordOptions, RecordReplay
 from palpate_gateway.service.pipeline import Pipeline
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-record-")
@@ -31,7 +31,7 @@ def check(data: bytes) -> None:
         assert all(count > 0 for count in summary.counts.values())
     except RecordingError as error:
         has_remedy(error)
-    device = Record(RecordOptions(path=_PATH))
+    device = RecordReplay(RecordOptions(path=_PATH))
     try:
         device.open()
     except (RecordingError, ConfigError) as error:

@@ -8,8 +8,12 @@ from tests.fuzz.streams import has_remedy
 from palpate.errors import RecordingError
 from palpate.messages import COUNTS_MAX
 from palpate_gateway.protocols.channels import CHANNEL_NAMES
-from palpate_gateway.recordings.text_log_header import split_header
-from palpate_gateway.recordings.text_log_rows import Rows, count_columns, parse_rows
+from palpate_gateway.recordings.text_log_format import (
+    LogRows,
+    count_columns,
+    parse_rows,
+    split_header,
+)
 
 NAME = "a.log"
 
@@ -42,14 +46,14 @@ def check(data: bytes) -> None:
     assert at_once.damage is not None or len(at_once.table) == len(lines)
 
 
-def _line_by_line(rows: bytes, columns: int) -> Rows:
+def _line_by_line(rows: bytes, columns: int) -> LogRows:
     tables = [np.empty((0, columns))]
     for number, line in enumerate(rows.split(b"\n")[:-1], 1):
         one = parse_rows(NAME, line + b"\n", columns, number)
         tables.append(one.table)
         if one.damage is not None:
-            return Rows(np.concatenate(tables), one.damage)
-    return Rows(np.concatenate(tables), None)
+            return LogRows(np.concatenate(tables), one.damage)
+    return LogRows(np.concatenate(tables), None)
 
 
 def _check_values(table: np.ndarray[tuple[int, ...], np.dtype[np.float64]], columns: int) -> None:

@@ -13,8 +13,9 @@ from tests.gateway.reading_devices import PATIENCE_S, open_again, read_frames
 from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.biotac.bridge import BiotacBridge, BridgeOptions
-from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
-from palpate_gateway.emulators.biotac_can import idle_counts
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, stuffed
+from palpate_gateway.emulators.biotac_slots import idle_counts
+from palpate_gateway.emulators.lines import crc16_x25
 from palpate_gateway.protocols.channels import ALL_VALID
 from palpate_gateway.readings import ElectrodeReading
 

@@ -11,7 +11,8 @@ import pytest
 from tests.gateway.reading_devices import PATIENCE_S, read_frames
 
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
-from palpate_gateway.emulators.biotac_can import BiotacCanEmulator, idle_counts
+from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
+from palpate_gateway.emulators.biotac_slots import idle_counts
 from palpate_gateway.protocols.channels import ALL_VALID
 from palpate_gateway.readings import ElectrodeReading
 

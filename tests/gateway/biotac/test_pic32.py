@@ -12,8 +12,8 @@ from tests.gateway.reading_devices import Follower
 from palpate.config import parse_config
 from palpate.errors import DeviceError
 from palpate_gateway.biotac.pic32 import VALIDITY, BiotacPic32, Pic32Options
-from palpate_gateway.emulators.biotac_can import idle_counts
 from palpate_gateway.emulators.biotac_pic32 import BiotacPic32Emulator
+from palpate_gateway.emulators.biotac_slots import idle_counts
 from palpate_gateway.readings import ElectrodeReading
 
 pytest.importorskip("serial")

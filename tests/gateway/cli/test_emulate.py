@@ -206,7 +206,7 @@ def test_an_emulator_ends_by_itself(emulate: Emulate) -> None:
     [
         (["kms40", "--fault", "fire@1"], "its faults: clock_drift, cut, error, junk"),
         (["biotac-bridge", "--baud", "7"], "one of 50, 75, 110"),
-        (["biotac-can", "--unit", "none"], "take a number from 1 to 3"),
+        (["biotac-can", "--unit", "none"], "choose a number from 1 to 3"),
         (["bota", "--trajectory", "cube/00/norml"], "did you mean 'cube/00/normal'"),
         (["bota", "--baud", "1"], "one of 57600, 115200"),
         (["robotous", "--model", "RFT"], "one of RFT40-SA01"),
@@ -231,10 +231,10 @@ def test_an_address_that_is_taken() -> None:
         port = str(taken.getsockname()[1])
         result = CliRunner().invoke(app, ["emulate", "kms40", "--port", port])
     assert result.exit_code == 1
-    assert "no device can be put there" in result.stderr
+    assert "the emulator cannot start there" in result.stderr
     result = CliRunner().invoke(app, ["emulate", "biotac-can", "--interface", "nonsense"])
     assert result.exit_code == 1
-    assert "no device can be put there" in result.stderr
+    assert "the emulator cannot start there" in result.stderr
 
 
 def test_an_emulator_that_dies_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

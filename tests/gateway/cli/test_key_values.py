@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import ConfigError
-from palpate_gateway.cli.faults import Fault, parse_faults
+from palpate_gateway.cli.emulate_run import ScheduledFault, parse_faults
 from palpate_gateway.cli.key_values import (
     command_words,
     parse_key_values,
@@ -97,8 +97,8 @@ def test_command_words_are_read_back() -> None:
 def test_faults_on_a_time_table() -> None:
     texts = ["lost@5", "silence@1.5+3"]
     assert parse_faults(texts, {"lost", "silence"}) == [
-        Fault(1.5, "silence", 3.0),
-        Fault(5.0, "lost", 0.0),
+        ScheduledFault(1.5, "silence", 3.0),
+        ScheduledFault(5.0, "lost", 0.0),
     ]
 
 

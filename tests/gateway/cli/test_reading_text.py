@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
-from palpate_gateway.cli.reading_text import text_of, values_of
+from palpate_gateway.cli.streams import text_of, values_of
 from palpate_gateway.readings import ElectrodeReading
 
 

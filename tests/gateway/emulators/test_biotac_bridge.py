@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
-from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, crc16_x25, stuffed
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, stuffed
 from palpate_gateway.emulators.biotac_slots import idle_counts, word
+from palpate_gateway.emulators.lines import crc16_x25
 
 serial = pytest.importorskip("serial")
 wires: Any = importlib.import_module("bridge_wire")

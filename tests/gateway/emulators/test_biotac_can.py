@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from palpate_gateway.emulators.biotac_can import BiotacCanEmulator, idle_counts
-from palpate_gateway.emulators.biotac_slots import press_counts, round_of, word
+from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
+from palpate_gateway.emulators.biotac_slots import idle_counts, press_counts, round_of, word
 
 can = pytest.importorskip("can")
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from palpate_gateway.emulators.bota import SINCS, Bota, crc16_x25
+from palpate_gateway.emulators.bota import SINCS, BotaEmulator
+from palpate_gateway.emulators.lines import crc16_x25
 
 serial = pytest.importorskip("serial")
 
@@ -21,14 +22,14 @@ VECTOR = bytes.fromhex(
 
 
 @pytest.fixture
-def sensor() -> Iterator[Bota]:
+def sensor() -> Iterator[BotaEmulator]:
     # The first sample has the time of the vector, 123456 us.
-    with Bota(lambda _: LOAD, clock_us=123456 - 10000) as emulator:
+    with BotaEmulator(lambda _: LOAD, clock_us=123456 - 10000) as emulator:
         yield emulator
 
 
 @pytest.fixture
-def line(sensor: Bota) -> Iterator[Any]:
+def line(sensor: BotaEmulator) -> Iterator[Any]:
     with serial.Serial(sensor.address, 460800, timeout=5.0) as opened:
         yield opened
 
@@ -62,7 +63,7 @@ def test_it_boots_and_streams_the_vector(line: Any) -> None:
     assert line.read(37) == VECTOR
 
 
-def test_the_dialogue_of_the_page(line: Any, sensor: Bota) -> None:
+def test_the_dialogue_of_the_page(line: Any, sensor: BotaEmulator) -> None:
     until(line, b"App Init")
     config(line)
     for command in (b"c,0,1,0,4", b"f,51,0,0,1", b"b,1,2,3,0,0,0\n", b"m0,1,0,0,0,0,0\n"):
@@ -77,7 +78,7 @@ def test_the_dialogue_of_the_page(line: Any, sensor: Bota) -> None:
 
 
 @pytest.mark.parametrize("sinc", SINCS)
-def test_rates_are_those_of_the_page(line: Any, sensor: Bota, sinc: int) -> None:
+def test_rates_are_those_of_the_page(line: Any, sensor: BotaEmulator, sinc: int) -> None:
     until(line, b"App Init")
     config(line)
     line.write(b"f,%d,0,0,1" % sinc)
@@ -99,7 +100,7 @@ def test_what_is_out_of_range_is_refused(line: Any, command: bytes) -> None:
     until(line, b"r,0,z,1")
 
 
-def test_settings_are_lost_unless_saved(line: Any, sensor: Bota) -> None:
+def test_settings_are_lost_unless_saved(line: Any, sensor: BotaEmulator) -> None:
     until(line, b"App Init")
     for reset, rate_hz in ((b"#", 100.0), (b"sI", 200.0)):
         config(line)
@@ -108,7 +109,7 @@ def test_settings_are_lost_unless_saved(line: Any, sensor: Bota) -> None:
         assert round(sensor.rate_hz) == rate_hz
 
 
-def test_another_speed_is_noise(sensor: Bota) -> None:
+def test_another_speed_is_noise(sensor: BotaEmulator) -> None:
     with serial.Serial(sensor.address, 230400, timeout=0.3) as line:
         line.write(b"C")
         got = line.read(1000)
@@ -128,21 +129,21 @@ def test_raw_samples_say_so(line: Any) -> None:
 @pytest.mark.parametrize(
     ("fault", "status"), [("late", 1), ("overload", 2), ("error", 4), ("raw", 8)]
 )
-def test_status_bits(line: Any, sensor: Bota, fault: str, status: int) -> None:
+def test_status_bits(line: Any, sensor: BotaEmulator, fault: str, status: int) -> None:
     until(line, b"App Init")
     sensor.inject(fault, 10.0)
     line.read(74)
     assert frame(line)[0] == status
 
 
-def test_a_sample_may_be_no_number(line: Any, sensor: Bota) -> None:
+def test_a_sample_may_be_no_number(line: Any, sensor: BotaEmulator) -> None:
     until(line, b"App Init")
     sensor.inject("nan", 10.0)
     line.read(74)
     assert math.isnan(frame(line)[3])
 
 
-def test_a_clock_that_runs_fast(line: Any, sensor: Bota) -> None:
+def test_a_clock_that_runs_fast(line: Any, sensor: BotaEmulator) -> None:
     until(line, b"App Init\r\n")
     sensor.inject("clock_drift", 60.0)
     times = [frame(line)[7] for _ in range(21)]
@@ -150,7 +151,7 @@ def test_a_clock_that_runs_fast(line: Any, sensor: Bota) -> None:
     assert times[20] - times[0] == pytest.approx(400_000 * 1.0002, abs=8.0)
 
 
-def test_a_restart_begins_again(line: Any, sensor: Bota) -> None:
+def test_a_restart_begins_again(line: Any, sensor: BotaEmulator) -> None:
     until(line, b"App Init\r\n")
     line.read(37)
     sensor.inject("restart", 0.1)
@@ -160,7 +161,7 @@ def test_a_restart_begins_again(line: Any, sensor: Bota) -> None:
 
 def test_it_may_wait_to_be_asked() -> None:
     with (
-        Bota(lambda _: LOAD, runs_after_boot=False) as sensor,
+        BotaEmulator(lambda _: LOAD, runs_after_boot=False) as sensor,
         serial.Serial(sensor.address, 460800, timeout=5.0) as line,
     ):
         until(line, b"App Init\r\n")
@@ -170,7 +171,7 @@ def test_it_may_wait_to_be_asked() -> None:
 
 
 @pytest.mark.parametrize("fault", ["crc", "cut", "junk", "lost", "repeated", "silence"])
-def test_faults_pass(line: Any, sensor: Bota, fault: str) -> None:
+def test_faults_pass(line: Any, sensor: BotaEmulator, fault: str) -> None:
     until(line, b"App Init\r\n")
     sensor.inject(fault)
     line.read(37 * 8)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from palpate_gateway.emulators.robotous import RobotousCan, RobotousSerial
+from palpate_gateway.emulators.robotous import RobotousCanEmulator, RobotousSerialEmulator
 
 serial = pytest.importorskip("serial")
 can = pytest.importorskip("can")
@@ -33,13 +33,13 @@ def answer(*values: int) -> bytes:
 
 
 @pytest.fixture
-def sensor() -> Iterator[RobotousSerial]:
-    with RobotousSerial(lambda _: LOAD) as emulator:
+def sensor() -> Iterator[RobotousSerialEmulator]:
+    with RobotousSerialEmulator(lambda _: LOAD) as emulator:
         yield emulator
 
 
 @pytest.fixture
-def line(sensor: RobotousSerial) -> Iterator[Any]:
+def line(sensor: RobotousSerialEmulator) -> Iterator[Any]:
     with serial.Serial(sensor.address, 115200, timeout=5.0) as opened:
         yield opened
 
@@ -78,7 +78,7 @@ def test_it_tells_who_it_is(line: Any) -> None:
     assert ask(line, request(5)) == answer(5, 0x64, 1, 2)
 
 
-def test_settings_are_taken_within_their_ranges(line: Any, sensor: RobotousSerial) -> None:
+def test_settings_are_taken_within_their_ranges(line: Any, sensor: RobotousSerialEmulator) -> None:
     assert ask(line, RATE_200) == answer(15, 1)
     assert ask(line, request(16)) == answer(16, 5)
     assert ask(line, request(15, 9)) == answer(15, 0, 2)
@@ -100,7 +100,7 @@ def test_bias_is_set_and_cleared_without_an_answer(line: Any) -> None:
     assert ask(line, request(10))[2:17] == DATA[2:17]
 
 
-def test_overload_is_told_and_counted(line: Any, sensor: RobotousSerial) -> None:
+def test_overload_is_told_and_counted(line: Any, sensor: RobotousSerialEmulator) -> None:
     sensor.inject("overload")
     assert ask(line, request(10))[14] == 0b100000
     assert ask(line, request(18)) == answer(18, 1)
@@ -120,7 +120,7 @@ def test_a_wrong_sum_is_not_heard(line: Any) -> None:
 
 
 def test_speed_changes_at_the_restart_and_another_speed_is_noise(
-    line: Any, sensor: RobotousSerial
+    line: Any, sensor: RobotousSerialEmulator
 ) -> None:
     assert ask(line, request(6, 1)) == answer(6, 1)
     assert ask(line, request(16)) == answer(16, 0)
@@ -132,7 +132,9 @@ def test_speed_changes_at_the_restart_and_another_speed_is_noise(
     assert ask(line, request(15, 8)) == answer(15, 1)
 
 
-def test_a_restart_ends_the_stream_and_forgets_the_bias(line: Any, sensor: RobotousSerial) -> None:
+def test_a_restart_ends_the_stream_and_forgets_the_bias(
+    line: Any, sensor: RobotousSerialEmulator
+) -> None:
     line.write(BIAS + START)
     assert line.read(19)[2:14] == bytes(12)
     sensor.inject("restart")
@@ -143,7 +145,7 @@ def test_a_restart_ends_the_stream_and_forgets_the_bias(line: Any, sensor: Robot
 
 
 def test_unplugging_takes_the_line_away_and_gives_it_back(
-    line: Any, sensor: RobotousSerial
+    line: Any, sensor: RobotousSerialEmulator
 ) -> None:
     sensor.inject("unplug", 0.2)
     with pytest.raises((serial.SerialException, OSError)):
@@ -157,7 +159,9 @@ def test_unplugging_takes_the_line_away_and_gives_it_back(
 
 
 @pytest.mark.parametrize("fault", ["crc", "cut", "junk", "lost", "repeated", "silence"])
-def test_faults_spoil_the_stream_and_pass(line: Any, sensor: RobotousSerial, fault: str) -> None:
+def test_faults_spoil_the_stream_and_pass(
+    line: Any, sensor: RobotousSerialEmulator, fault: str
+) -> None:
     line.write(START)
     assert line.read(19) == DATA
     sensor.inject(fault)
@@ -166,7 +170,7 @@ def test_faults_spoil_the_stream_and_pass(line: Any, sensor: RobotousSerial, fau
     assert got[: 5 * 19] == DATA * 5
 
 
-def test_unknown_faults_are_refused(sensor: RobotousSerial) -> None:
+def test_unknown_faults_are_refused(sensor: RobotousSerialEmulator) -> None:
     with pytest.raises(ValueError, match="nan"):
         sensor.inject("nan")
 
@@ -178,8 +182,8 @@ def bus(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 @pytest.fixture
-def on_can(request: pytest.FixtureRequest, bus: Any) -> Iterator[RobotousCan]:
-    with RobotousCan(lambda _: LOAD, channel=request.node.name) as emulator:
+def on_can(request: pytest.FixtureRequest, bus: Any) -> Iterator[RobotousCanEmulator]:
+    with RobotousCanEmulator(lambda _: LOAD, channel=request.node.name) as emulator:
         yield emulator
 
 
@@ -193,7 +197,7 @@ def halves(bus: Any) -> list[tuple[int, bytes]]:
     return [(m.arbitration_id, bytes(m.data)) for m in pair]
 
 
-def test_on_can_an_answer_has_two_halves(bus: Any, on_can: RobotousCan) -> None:
+def test_on_can_an_answer_has_two_halves(bus: Any, on_can: RobotousCanEmulator) -> None:
     put(bus, 1)
     assert halves(bus) == [(1, b"\x01RFT64-S"), (2, b"B01\0\0\0\0\0")]
     put(bus, 15, 8)
@@ -203,7 +207,7 @@ def test_on_can_an_answer_has_two_halves(bus: Any, on_can: RobotousCan) -> None:
     put(bus, 12)
 
 
-def test_identifiers_change_at_the_restart(bus: Any, on_can: RobotousCan) -> None:
+def test_identifiers_change_at_the_restart(bus: Any, on_can: RobotousCanEmulator) -> None:
     put(bus, 4, 0x65, 3, 4)
     assert halves(bus)[0] == (1, bytes([4, 1, 0, 0, 0, 0, 0, 0]))
     on_can.inject("restart")
@@ -214,7 +218,7 @@ def test_identifiers_change_at_the_restart(bus: Any, on_can: RobotousCan) -> Non
     assert halves(bus)[0] == (3, bytes([5, 0x65, 3, 4, 0, 0, 0, 0]))
 
 
-def test_bus_off_is_an_error_frame(bus: Any, on_can: RobotousCan) -> None:
+def test_bus_off_is_an_error_frame(bus: Any, on_can: RobotousCanEmulator) -> None:
     put(bus, 11)
     halves(bus)
     on_can.inject("busoff")

@@ -16,8 +16,8 @@ from palpate_gateway.drivers import make_device
 from palpate_gateway.emulators.biotac_slots import CHANNELS, SlotBlocks, idle_counts, round_of
 from palpate_gateway.emulators.twin import (
     RATE_HZ,
-    Loop,
     TwinCounts,
+    TwinLoop,
     TwinWrench,
     loop_options,
     make_loop,
@@ -28,7 +28,7 @@ PAC = CHANNELS - 1
 
 
 @pytest.fixture(scope="module")
-def loop() -> Loop:
+def loop() -> TwinLoop:
     return make_loop(loop_options(seed=4))
 
 
@@ -37,7 +37,7 @@ def begins_now() -> float:
     return time.time() - time.monotonic()
 
 
-def test_the_same_seed_has_the_same_counts(loop: Loop) -> None:
+def test_the_same_seed_has_the_same_counts(loop: TwinLoop) -> None:
     again, other = make_loop(loop_options(seed=4)), make_loop(loop_options(1, seed=4))
     for name in ("frames", "pac", "wrench"):
         np.testing.assert_array_equal(getattr(again, name), getattr(loop, name))
@@ -46,7 +46,7 @@ def test_the_same_seed_has_the_same_counts(loop: Loop) -> None:
     np.testing.assert_array_equal(make_loop(loop_options(seed=5)).frames, other.frames)
 
 
-def test_the_counts_are_those_of_the_virtual_finger(loop: Loop) -> None:
+def test_the_counts_are_those_of_the_virtual_finger(loop: TwinLoop) -> None:
     options = loop_options(seed=4).model_dump()
     source, felt = TwinCounts([loop], begins_now()), TwinWrench(loop, begins_now())
     frames, readings = 0, []
@@ -71,7 +71,7 @@ def test_the_counts_are_those_of_the_virtual_finger(loop: Loop) -> None:
     assert frames == round(loop.duration_s * RATE_HZ)
 
 
-def test_between_two_frames_it_runs_straight_and_after_the_last_anew(loop: Loop) -> None:
+def test_between_two_frames_it_runs_straight_and_after_the_last_anew(loop: TwinLoop) -> None:
     source = TwinCounts([loop], begins_now())
     times = np.arange(0.0, loop.duration_s, 1.7e-3)
     for place in (0, 18, 19, 21):
@@ -84,7 +84,7 @@ def test_between_two_frames_it_runs_straight_and_after_the_last_anew(loop: Loop)
 
 
 def test_electrodes_and_wrench_are_of_one_instant_whatever_the_emulators_clocks(
-    loop: Loop,
+    loop: TwinLoop,
 ) -> None:
     source, felt = TwinCounts([loop]), TwinWrench(loop)
     source.lead_s, felt.lead_s = 1000.0, -50.0
@@ -101,7 +101,7 @@ def test_electrodes_and_wrench_are_of_one_instant_whatever_the_emulators_clocks(
     assert shifts[int(np.argmax(alike))] == 0
 
 
-def test_another_process_plays_the_same_scene(loop: Loop) -> None:
+def test_another_process_plays_the_same_scene(loop: TwinLoop) -> None:
     walls = [time.time() + 0.37 * k for k in range(60)]
     program = (
         "import json, sys, time\n"
@@ -124,7 +124,7 @@ def test_another_process_plays_the_same_scene(loop: Loop) -> None:
     np.testing.assert_allclose(json.loads(ran.stdout), here, atol=0.02)
 
 
-def test_an_epoch_moves_the_scene(loop: Loop) -> None:
+def test_an_epoch_moves_the_scene(loop: TwinLoop) -> None:
     here, later = TwinWrench(loop), TwinWrench(loop, 7.5)
     for t in np.arange(0.0, 20.0, 0.5).tolist():
         np.testing.assert_allclose(later(t + 7.5), here(t), atol=5e-3)
@@ -144,7 +144,7 @@ def test_one_trajectory_can_be_played_alone() -> None:
 @pytest.mark.parametrize("electrodes", [19, 24])
 @pytest.mark.parametrize("pac_first", [False, True])
 def test_prepared_slots_are_those_of_single_instants(
-    loop: Loop, electrodes: int, pac_first: bool
+    loop: TwinLoop, electrodes: int, pac_first: bool
 ) -> None:
     order = round_of(electrodes, pac_first=pac_first)
     for source in (TwinCounts([loop, loop], begins_now()), idle_counts):

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from palpate_gateway.emulators.bota import Bota, crc16_x25
+from palpate_gateway.emulators.bota import BotaEmulator
 from palpate_gateway.emulators.emulator import Emulator, HostTimed, no_load, slow_press
 from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.lines import crc16_x25
 from palpate_gateway.emulators.rdt import RdtEmulator
-from palpate_gateway.emulators.robotous import RobotousCan, RobotousSerial
+from palpate_gateway.emulators.robotous import RobotousCanEmulator, RobotousSerialEmulator
 
 serial = pytest.importorskip("serial")
 can = pytest.importorskip("can")
@@ -97,7 +98,7 @@ def kms40(**options: Any) -> Iterator[tuple[Emulator, Line, float]]:
 
 @contextmanager
 def bota(**options: Any) -> Iterator[tuple[Emulator, Line, float]]:
-    with Bota(HostClock(), **options) as emulator:
+    with BotaEmulator(HostClock(), **options) as emulator:
         with serial.Serial(emulator.address, 460800, timeout=PATIENCE_S) as line:
             assert line.read_until(b"App Init\r\n").endswith(b"Init\r\n")
 
@@ -120,7 +121,7 @@ def bota(**options: Any) -> Iterator[tuple[Emulator, Line, float]]:
 
 @contextmanager
 def robotous_serial(**options: Any) -> Iterator[tuple[Emulator, Line, float]]:
-    with RobotousSerial(HostClock(), **options) as emulator:
+    with RobotousSerialEmulator(HostClock(), **options) as emulator:
         with serial.Serial(emulator.address, 115200, timeout=PATIENCE_S) as line:
             line.write(bytes.fromhex("55 0B 00 00 00 00 00 00 00 0B AA"))
 
@@ -143,7 +144,7 @@ def robotous_can(**options: Any) -> Iterator[tuple[Emulator, Line, float]]:
     channel = f"wrench-faults-{time.monotonic_ns()}"
     with (
         can.Bus(interface="virtual", channel=channel) as bus,
-        RobotousCan(HostClock(), channel=channel, **options) as emulator,
+        RobotousCanEmulator(HostClock(), channel=channel, **options) as emulator,
     ):
         start = can.Message(arbitration_id=0x64, data=b"\x0b" + bytes(7), is_extended_id=False)
         bus.send(start)

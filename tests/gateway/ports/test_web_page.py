@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from palpate.errors import DeviceError
-from palpate_gateway.emulators.web_page import WebPage
+from palpate_gateway.emulators.rdt import WebPage
 from palpate_gateway.ports.sockets import read_page
 
 

@@ -25,8 +25,7 @@ from palpate_gateway.emulators.robot import (
     RobotEmulator,
     slow_approach,
 )
-from palpate_gateway.emulators.twin import RATE_HZ, loop_options
-from palpate_gateway.emulators.twin_tip import TipLoop, TwinTip, tip_loop
+from palpate_gateway.emulators.twin import RATE_HZ, TwinTip, loop_options, make_loop
 from palpate_gateway.readings import PoseReading
 
 fakes: Any = importlib.import_module("pose_fakes")
@@ -180,7 +179,7 @@ def test_the_twins_tip_runs_straight_between_frames() -> None:
         Pose((0.002, 0.0, 0.004), (-half, 0.0, 0.0, -half)),  # the same turn, the other sign
         Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
     ]
-    tip = TwinTip(TipLoop(tips, ("cube",)))
+    tip = TwinTip(tips)
     tip._since_epoch_s = 0.0
     middle = tip(0.5 / RATE_HZ)
     assert middle.position == pytest.approx((0.001, 0.0, 0.002))
@@ -193,7 +192,7 @@ def test_the_twins_tip_runs_straight_between_frames() -> None:
 
 def test_the_twins_tip_is_that_of_the_virtual_finger() -> None:
     options = loop_options().model_copy(update={"episodes": 1})
-    loop = tip_loop(options)
+    loop = make_loop(options)
     with make_device("virtual", {**options.model_dump(), "realtime": False}) as device:
         truth: list[PoseReading] = []
         while got := device.read(1.0):

@@ -7,10 +7,10 @@ from itertools import count
 import pytest
 
 from palpate.messages import Pose, RobotPoseFrame
-from palpate_gateway.pose.track import PoseTrack, Verdict
+from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 
 HERE = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-NEW, DROPPED, RESTARTED = Verdict.NEW, Verdict.DROPPED, Verdict.RESTARTED
+NEW, DROPPED, RESTARTED = PoseVerdict.NEW, PoseVerdict.DROPPED, PoseVerdict.RESTARTED
 
 
 def frame(sequence: int, time_ms: int | None = None, run: int = 7) -> RobotPoseFrame:
@@ -18,7 +18,7 @@ def frame(sequence: int, time_ms: int | None = None, run: int = 7) -> RobotPoseF
     return RobotPoseFrame("arm", sequence, time_ns, HERE, run)
 
 
-def take(track: PoseTrack, *frames: RobotPoseFrame) -> list[Verdict]:
+def take(track: PoseTrack, *frames: RobotPoseFrame) -> list[PoseVerdict]:
     return [track.take(one) for one in frames]
 
 

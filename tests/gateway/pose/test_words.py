@@ -24,7 +24,7 @@ from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate_deploy.cli.app import app
 from palpate_gateway.cli.probe import device_of
-from palpate_gateway.cli.reading_text import text_of, values_of
+from palpate_gateway.cli.streams import text_of, values_of
 from palpate_gateway.readings import PoseReading
 
 fakes: Any = importlib.import_module("pose_fakes")

@@ -92,5 +92,5 @@ def test_a_row_that_ends_with_a_space_takes_the_fast_way(
     def slow(*_: object) -> Callable[..., Any]:
         raise AssertionError("line by line")
 
-    monkeypatch.setattr("palpate_gateway.recordings.text_log_rows._parse_slow", slow)
+    monkeypatch.setattr("palpate_gateway.recordings.text_log_format._parse_slow", slow)
     assert len(replay(path, 2)[0]) == FRAMES

@@ -13,8 +13,13 @@ from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
-from palpate_gateway.virtual.physics import Unit, contact, electrode_counts, films
-from palpate_gateway.virtual.trajectory import touch
+from palpate_gateway.virtual.formula_physics import (
+    FormulaSpecimen,
+    contact,
+    electrode_counts,
+    films,
+    random_touch,
+)
 
 
 def collect(**options: Any) -> dict[str, Any]:
@@ -133,11 +138,11 @@ def test_pressure_channels(run: dict[str, Any]) -> None:
 
 def test_shear_shows_in_the_electrodes() -> None:
     """Traction alone, at the same place and depth, moves the counts by far more than the noise."""
-    sheared = next(e for e in (touch(0, k) for k in range(50)) if e.shear_m > 0.5e-3)
+    sheared = next(e for e in (random_touch(0, k) for k in range(50)) if e.shear_m > 0.5e-3)
     state = contact(sheared, np.array([sheared.times_s[2]]), 7e-3)
     without = replace(state, traction=np.zeros(1))
     counts, plain = (
-        electrode_counts(films(sheared, s, 7e-3), Unit.number(1), np.ones(1))
+        electrode_counts(films(sheared, s, 7e-3), FormulaSpecimen.number(1), np.ones(1))
         for s in (state, without)
     )
     assert np.abs(counts - plain).max() > 50

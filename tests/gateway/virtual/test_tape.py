@@ -24,7 +24,7 @@ from palpate_gateway.readings import (
 )
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.virtual import tape as virtual_tape
-from palpate_gateway.virtual.press import between, order, poses
+from palpate_gateway.virtual.tape import between, order, poses
 
 fakes: Any = importlib.import_module("tape_fakes")
 
@@ -231,9 +231,9 @@ def test_between_is_exact_at_the_steps() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"unit": 3}, "no unit 3 -> take a number from 1 to 2 or one of unit1, unit2"),
-        ({"unit": 0}, "no unit 0"),
-        ({"unit": "unit9"}, "no unit 'unit9'"),
+        ({"unit": 3}, "no specimen 3 -> choose a number from 1 to 2 or one of unit1, unit2"),
+        ({"unit": 0}, "no specimen 0"),
+        ({"unit": "unit9"}, "no specimen 'unit9'"),
         ({"trajectories": ["ball/0/norml"]}, "did you mean 'ball/0/normal'"),
         ({"indenter": "ring"}, "its indenters are ball, cube"),
         ({"trajectories": [fakes.IDS[0]], "indenter": "cube"}, "no such trajectory"),
@@ -264,7 +264,7 @@ def test_default_is_the_shipped_tape_or_else_the_formula(
         model = make_device("virtual", options).info.model
         assert model == "digital twin unit1, 3 presses of twin"
     assert "virtual finger" in make_device("virtual", {"model": "formula"}).info.model
-    with pytest.raises(ConfigError, match="no tape 'twn' ships with palpate -> take one of twin"):
+    with pytest.raises(ConfigError, match="no tape 'twn' ships with palpate -> choose one of twin"):
         make_device("virtual", {"tape": "twn"})
 
 

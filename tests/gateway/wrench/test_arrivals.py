@@ -10,8 +10,7 @@ from palpate_gateway.emulators.rdt import RdtEmulator
 from palpate_gateway.ports.sockets import ReceivedBytes
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.kms40 import Kms40Options, WrenchKms40
-from palpate_gateway.wrench.rdt import WrenchRdt
-from palpate_gateway.wrench.rdt_options import RdtOptions
+from palpate_gateway.wrench.rdt import RdtOptions, WrenchRdt
 
 MS = 1_000_000
 LINE = b"F={1.0,0,0,0,0,0},4\n"

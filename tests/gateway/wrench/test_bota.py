@@ -12,8 +12,8 @@ from tests.gateway.reading_devices import PATIENCE_S, Follower
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError, DeviceTimeout
-from palpate_gateway.emulators.bota import Bota
-from palpate_gateway.emulators.serial_line import SerialLine
+from palpate_gateway.emulators.bota import BotaEmulator
+from palpate_gateway.emulators.lines import SerialLine
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.bota import BotaOptions, WrenchBota
 
@@ -34,19 +34,19 @@ def is_of_sweep(reading: WrenchReading) -> bool:
     return all(near) and 0.99 < told[0] < 10.2
 
 
-def make(sensor: Bota, **options: Any) -> WrenchBota:
+def make(sensor: BotaEmulator, **options: Any) -> WrenchBota:
     values = {"port": sensor.address} | options
     return WrenchBota(parse_config(BotaOptions, values, where="test"))
 
 
 @pytest.fixture
-def sensor() -> Iterator[Bota]:
-    with Bota(sweep) as made:
+def sensor() -> Iterator[BotaEmulator]:
+    with BotaEmulator(sweep) as made:
         booted(made)
         yield made
 
 
-def booted(sensor: Bota) -> None:
+def booted(sensor: BotaEmulator) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while sensor.mode == "boot":
         assert time.monotonic() < deadline
@@ -54,7 +54,7 @@ def booted(sensor: Bota) -> None:
 
 
 @pytest.fixture
-def follower(sensor: Bota) -> Iterator[Follower[WrenchReading]]:
+def follower(sensor: BotaEmulator) -> Iterator[Follower[WrenchReading]]:
     with make(sensor, rate_hz=800) as device:
         yield Follower(device, WrenchReading)
 
@@ -62,7 +62,7 @@ def follower(sensor: Bota) -> Iterator[Follower[WrenchReading]]:
 @pytest.mark.parametrize(
     ("rate_hz", "sinc"), [(1000, 51), (800, 64), (400, 128), (250, 205), (200, 256), (100, 512)]
 )
-def test_it_sets_up_the_sensor_and_reads_it(sensor: Bota, rate_hz: int, sinc: int) -> None:
+def test_it_sets_up_the_sensor_and_reads_it(sensor: BotaEmulator, rate_hz: int, sinc: int) -> None:
     with make(sensor, rate_hz=rate_hz, temperature_compensation=True) as device:
         assert device.info.rate_hz == pytest.approx(rate_hz, rel=0.005)
         assert (sensor.settings.sinc, sensor.settings.compensated) == (sinc, True)
@@ -80,7 +80,7 @@ def test_values_are_those_of_the_sensor_on_the_mount() -> None:
         "orientation_wxyz": (0.5**0.5, 0.0, 0.0, 0.5**0.5),
         "origin_m": (0.0, 0.0, 0.02),
     }
-    with Bota(lambda _: LOAD) as sensor:
+    with BotaEmulator(lambda _: LOAD) as sensor:
         booted(sensor)
         with make(sensor, mount=mount, serial="ours") as device:
             reading = Follower(device, WrenchReading).more(1)[0]
@@ -93,7 +93,7 @@ def test_values_are_those_of_the_sensor_on_the_mount() -> None:
     assert reading.serial == "ours"
 
 
-def test_each_value_has_the_time_that_the_sensor_gave_it(sensor: Bota) -> None:
+def test_each_value_has_the_time_that_the_sensor_gave_it(sensor: BotaEmulator) -> None:
     # The emulator's clock begins with the source's.
     with make(sensor) as device:
         readings = Follower(device, WrenchReading).more(100)
@@ -104,7 +104,7 @@ def test_each_value_has_the_time_that_the_sensor_gave_it(sensor: Bota) -> None:
 
 @pytest.mark.parametrize(("baud", "given"), [(460800, 0), (230400, 0), (115200, 115200)])
 def test_the_speed_is_found_or_given(baud: int, given: int) -> None:
-    with Bota(sweep, baud=baud) as sensor:
+    with BotaEmulator(sweep, baud=baud) as sensor:
         booted(sensor)
         with make(sensor, baud=given, rate_hz=200) as device:
             assert all(map(is_of_sweep, Follower(device, WrenchReading).more()))
@@ -114,7 +114,7 @@ def test_the_speed_is_found_or_given(baud: int, given: int) -> None:
 @pytest.mark.parametrize("runs_after_boot", [True, False])
 def test_a_sensor_that_is_booting_is_waited_for(runs_after_boot: bool) -> None:
     with (
-        Bota(sweep, boot_s=0.4, runs_after_boot=runs_after_boot) as sensor,
+        BotaEmulator(sweep, boot_s=0.4, runs_after_boot=runs_after_boot) as sensor,
         make(sensor, baud=460800) as device,
     ):
         assert all(map(is_of_sweep, Follower(device, WrenchReading).more()))
@@ -122,7 +122,7 @@ def test_a_sensor_that_is_booting_is_waited_for(runs_after_boot: bool) -> None:
 
 def test_zero_is_taken_in_the_sensor() -> None:
     # What the sensor was left with must not spoil its zero.
-    with Bota(lambda _: LOAD) as sensor:
+    with BotaEmulator(lambda _: LOAD) as sensor:
         booted(sensor)
         with make(sensor) as device:
             follower = Follower(device, WrenchReading)
@@ -142,7 +142,7 @@ def test_zero_is_taken_in_the_sensor() -> None:
 
 
 def test_offsets_that_work_otherwise_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    with Bota(lambda _: LOAD) as sensor, make(sensor) as device:
+    with BotaEmulator(lambda _: LOAD) as sensor, make(sensor) as device:
         take = sensor._take
 
         def turned(command: str, values: str) -> None:
@@ -175,7 +175,11 @@ FAULTS = [
 
 @pytest.mark.parametrize(("fault", "duration_s", "shown"), FAULTS)
 def test_faults_are_found_named_and_survived(
-    sensor: Bota, follower: Follower[WrenchReading], fault: str, duration_s: float, shown: str
+    sensor: BotaEmulator,
+    follower: Follower[WrenchReading],
+    fault: str,
+    duration_s: float,
+    shown: str,
 ) -> None:
     follower.more()
     sensor.inject(fault, duration_s)
@@ -192,7 +196,9 @@ def test_faults_are_found_named_and_survived(
     assert sensor.settings.sinc == 64
 
 
-def test_a_clock_that_drifts_loses_nothing(sensor: Bota, follower: Follower[WrenchReading]) -> None:
+def test_a_clock_that_drifts_loses_nothing(
+    sensor: BotaEmulator, follower: Follower[WrenchReading]
+) -> None:
     sensor.inject("clock_drift", 60.0)
     follower.more(200)
     if not follower.errors:
@@ -202,7 +208,7 @@ def test_a_clock_that_drifts_loses_nothing(sensor: Bota, follower: Follower[Wren
 
 def test_the_clock_may_wrap() -> None:
     # Its clock stands still until it runs.
-    with Bota(sweep, runs_after_boot=False) as sensor:
+    with BotaEmulator(sweep, runs_after_boot=False) as sensor:
         booted(sensor)
         sensor._clock_us = 2.0**32 - 100_000.0
         with make(sensor) as device:
@@ -215,7 +221,7 @@ def test_the_clock_may_wrap() -> None:
 
 
 def test_a_clock_that_begins_anew_without_a_word_is_a_restart(
-    sensor: Bota, follower: Follower[WrenchReading]
+    sensor: BotaEmulator, follower: Follower[WrenchReading]
 ) -> None:
     follower.more()
     sensor._clock_us = 10_000.0
@@ -236,14 +242,14 @@ def test_nobody_there_is_told_with_the_command() -> None:
         WrenchBota(options).open()
 
 
-def test_a_refused_setting_is_told(sensor: Bota, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_setting_is_told(sensor: BotaEmulator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensor, "_set", lambda command, _: command != "f")
     with pytest.raises(DeviceError, match=r"command 'f,128,0,0,1' was refused \(code 1\)"):
         make(sensor).open()
 
 
 def test_a_speed_too_slow_for_the_rate_is_told() -> None:
-    with Bota(sweep, baud=230400) as sensor:
+    with BotaEmulator(sweep, baud=230400) as sensor:
         booted(sensor)
         with pytest.raises(DeviceError, match=r"230400 bit/s carry 623 samples/s, not 800"):
             make(sensor, rate_hz=800).open()

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError
-from palpate_gateway.wrench.mount import Mount, MountOptions
+from palpate_gateway.wrench.device import Mount, MountOptions
 
 FORCE, TORQUE = np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3])
 

@@ -15,8 +15,7 @@ from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError
 from palpate_gateway.emulators.emulator import Wrench
 from palpate_gateway.emulators.rdt import RdtEmulator
-from palpate_gateway.wrench.rdt import WrenchRdt
-from palpate_gateway.wrench.rdt_options import RdtOptions
+from palpate_gateway.wrench.rdt import RdtOptions, WrenchRdt
 
 fakes: Any = importlib.import_module("wrench_fakes")
 PRODUCTS = {"ati_net_ft": "netft", "ati_axia": "axia", "schunk_ftn": "axia", "onrobot_hex": "hex"}

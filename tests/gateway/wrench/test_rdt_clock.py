@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from palpate.errors import DeviceLost
-from palpate_gateway.wrench.rdt_clock import CHECK_S, CounterClock
+from palpate_gateway.wrench.rdt import CHECK_S, CounterClock
 
 
 def test_goes_on_over_its_end() -> None:

@@ -16,8 +16,7 @@ from palpate.config import parse_config
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.emulators.emulator import Wrench
 from palpate_gateway.emulators.rdt import RdtEmulator
-from palpate_gateway.wrench.rdt import WrenchRdt
-from palpate_gateway.wrench.rdt_options import RdtOptions
+from palpate_gateway.wrench.rdt import RdtOptions, WrenchRdt
 
 fakes: Any = importlib.import_module("wrench_fakes")
 PRODUCTS = {"ati_net_ft": "netft", "ati_axia": "axia", "schunk_ftn": "axia", "onrobot_hex": "hex"}
@@ -176,7 +175,7 @@ def test_of_several_sensors_one_must_be_named() -> None:
 def test_with_a_wrong_rate_it_is_opened_with_the_hosts_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("palpate_gateway.wrench.rdt_clock.CHECK_S", 0.2)
+    monkeypatch.setattr("palpate_gateway.wrench.rdt.CHECK_S", 0.2)
     with (
         RdtEmulator("netft", fakes.wave, counter_hz=3500.0) as emulator,
         device_at(emulator) as device,

@@ -12,8 +12,12 @@ from tests.gateway.reading_devices import PATIENCE_S, Follower
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError, DeviceTimeout
-from palpate_gateway.emulators.robotous import Robotous, RobotousCan, RobotousSerial
-from palpate_gateway.emulators.serial_line import SerialLine
+from palpate_gateway.emulators.lines import SerialLine
+from palpate_gateway.emulators.robotous import (
+    RobotousCanEmulator,
+    RobotousEmulator,
+    RobotousSerialEmulator,
+)
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.robotous import RobotousOptions, WrenchRobotous
 
@@ -51,30 +55,30 @@ def make(options: dict[str, Any]) -> WrenchRobotous:
 
 
 @pytest.fixture(params=["serial", "can"])
-def sensor(request: pytest.FixtureRequest) -> Iterator[Robotous]:
-    made: Robotous
+def sensor(request: pytest.FixtureRequest) -> Iterator[RobotousEmulator]:
+    made: RobotousEmulator
     if request.param == "serial":
-        made = RobotousSerial(sweep, baud=921600)
+        made = RobotousSerialEmulator(sweep, baud=921600)
     else:
-        made = RobotousCan(sweep, channel=request.node.name)
+        made = RobotousCanEmulator(sweep, channel=request.node.name)
     with made:
         yield made
 
 
-def line_of(sensor: Robotous) -> dict[str, Any]:
-    if isinstance(sensor, RobotousSerial):
+def line_of(sensor: RobotousEmulator) -> dict[str, Any]:
+    if isinstance(sensor, RobotousSerialEmulator):
         return {"port": sensor.address, "baud": 921600}
     interface, _, channel = sensor.address.partition(":")
     return {"interface": interface, "channel": channel}
 
 
 @pytest.fixture
-def follower(sensor: Robotous) -> Iterator[Follower[WrenchReading]]:
+def follower(sensor: RobotousEmulator) -> Iterator[Follower[WrenchReading]]:
     with make(line_of(sensor) | {"rate_hz": 500}) as device:
         yield Follower(device, WrenchReading)
 
 
-def test_it_sets_up_the_sensor_and_reads_it(sensor: Robotous) -> None:
+def test_it_sets_up_the_sensor_and_reads_it(sensor: RobotousEmulator) -> None:
     options = line_of(sensor) | {"rate_hz": 1000, "cutoff_hz": 100}
     with make(options) as device:
         assert (device.identity.serial, device.info.rate_hz) == ("RFT-1", 1000.0)
@@ -99,7 +103,7 @@ def test_values_follow_model_and_mount(model: str, divisor: float) -> None:
         "orientation_wxyz": (0.5**0.5, 0.0, 0.0, 0.5**0.5),
         "origin_m": (0.0, 0.0, 0.02),
     }
-    with RobotousSerial(lambda _: LOAD, model=model) as sensor:
+    with RobotousSerialEmulator(lambda _: LOAD, model=model) as sensor:
         with make({"port": sensor.address, "mount": mount, "serial": "ours"}) as device:
             reading = Follower(device, WrenchReading).more(1)[0]
     fx, fy, fz, tx, ty, tz = LOAD
@@ -112,20 +116,20 @@ def test_values_follow_model_and_mount(model: str, divisor: float) -> None:
 
 
 def test_a_torque_divisor_outdoes_the_model() -> None:
-    with RobotousSerial(lambda _: LOAD) as sensor:
+    with RobotousSerialEmulator(lambda _: LOAD) as sensor:
         with make({"port": sensor.address, "torque_divisor": 1000.0}) as device:
             reading = Follower(device, WrenchReading).more(1)[0]
     assert reading.torque == pytest.approx([2.0 * value for value in LOAD[3:]], abs=1e-6)
 
 
-def test_an_old_stream_is_stopped_first(sensor: Robotous) -> None:
+def test_an_old_stream_is_stopped_first(sensor: RobotousEmulator) -> None:
     sensor.running = True
     with make(line_of(sensor) | {"rate_hz": 500}) as device:
         assert all(map(is_of_sweep, Follower(device, WrenchReading).more(50)))
         assert sensor.rate_hz == 500.0
 
 
-def test_zero_is_taken_in_the_sensor(sensor: Robotous) -> None:
+def test_zero_is_taken_in_the_sensor(sensor: RobotousEmulator) -> None:
     sensor._source = lambda _: LOAD
     with make(line_of(sensor) | {"zero_at_start": True}) as device:
         follower = Follower(device, WrenchReading)
@@ -137,7 +141,7 @@ def test_zero_is_taken_in_the_sensor(sensor: Robotous) -> None:
 
 
 def test_a_zero_that_is_not_taken_is_told(
-    sensor: Robotous, monkeypatch: pytest.MonkeyPatch
+    sensor: RobotousEmulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor._source = lambda _: LOAD
     answer = sensor._answer
@@ -161,11 +165,15 @@ FAULTS = [
 
 @pytest.mark.parametrize(("fault", "duration_s", "shown"), FAULTS)
 def test_faults_are_found_named_and_survived(
-    sensor: Robotous, follower: Follower[WrenchReading], fault: str, duration_s: float, shown: str
+    sensor: RobotousEmulator,
+    follower: Follower[WrenchReading],
+    fault: str,
+    duration_s: float,
+    shown: str,
 ) -> None:
     if fault not in sensor.faults:
         pytest.skip("this line has no such fault")
-    if fault == "unplug" and isinstance(sensor, RobotousCan):
+    if fault == "unplug" and isinstance(sensor, RobotousCanEmulator):
         shown = "no sample came for 0.3 s"  # the bus stays; the plug has taken its supply
     follower.more()
     sensor.inject(fault, duration_s)
@@ -184,7 +192,7 @@ def test_faults_are_found_named_and_survived(
     assert flagged == follower.counts()["overloads"]
 
 
-def test_a_restart_is_followed_by_the_same_settings(sensor: Robotous) -> None:
+def test_a_restart_is_followed_by_the_same_settings(sensor: RobotousEmulator) -> None:
     with make(line_of(sensor) | {"rate_hz": 500, "cutoff_hz": 50}) as device:
         follower = Follower(device, WrenchReading)
         follower.more()
@@ -196,10 +204,10 @@ def test_a_restart_is_followed_by_the_same_settings(sensor: Robotous) -> None:
 
 @pytest.mark.parametrize("sensor", ["can"], indirect=True)
 def test_bus_off_is_found_and_survived(
-    sensor: Robotous, follower: Follower[WrenchReading], monkeypatch: pytest.MonkeyPatch
+    sensor: RobotousEmulator, follower: Follower[WrenchReading], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     follower.more()
-    assert isinstance(sensor, RobotousCan)
+    assert isinstance(sensor, RobotousCanEmulator)
     kind = type(sensor._bus)
     with monkeypatch.context() as patch:
         patch.setattr(kind, "state", property(lambda _: can.BusState.ERROR))
@@ -211,7 +219,7 @@ def test_bus_off_is_found_and_survived(
 
 @pytest.mark.parametrize("sensor", ["can"], indirect=True)
 def test_halves_far_apart_are_not_joined(
-    sensor: Robotous, follower: Follower[WrenchReading]
+    sensor: RobotousEmulator, follower: Follower[WrenchReading]
 ) -> None:
     with can.Bus(interface="virtual", channel=sensor.address.partition(":")[2]) as bus:
         follower.more()
@@ -229,7 +237,7 @@ def test_halves_far_apart_are_not_joined(
 def test_others_on_the_bus_do_not_hide_silence(request: pytest.FixtureRequest) -> None:
     channel = request.node.name
     with (
-        RobotousCan(sweep, channel=channel) as sensor,
+        RobotousCanEmulator(sweep, channel=channel) as sensor,
         can.Bus(interface="virtual", channel=channel) as bus,
         make({"interface": "virtual", "channel": channel}) as device,
     ):
@@ -255,7 +263,7 @@ def test_nobody_there_is_told_with_the_request() -> None:
 
 
 def test_another_speed_is_told_by_what_came() -> None:
-    with RobotousSerial(sweep, baud=921600) as sensor:
+    with RobotousSerialEmulator(sweep, baud=921600) as sensor:
         sensor.running = True
         with pytest.raises(DeviceTimeout, match=r"came: \d+ junk_bytes.*-> check .* baud"):
             make({"port": sensor.address}).open()
@@ -263,7 +271,7 @@ def test_another_speed_is_told_by_what_came() -> None:
 
 @pytest.mark.parametrize("serial_line", [True, False])
 def test_an_unknown_model_needs_a_divisor(serial_line: bool) -> None:
-    with RobotousSerial(lambda _: LOAD) as sensor:
+    with RobotousSerialEmulator(lambda _: LOAD) as sensor:
         sensor._model = "RFT99-XX"
         with pytest.raises(DeviceError, match=r"'RFT99-XX' is not in .*-> set model or torque_div"):
             make({"port": sensor.address}).open()
@@ -272,13 +280,13 @@ def test_an_unknown_model_needs_a_divisor(serial_line: bool) -> None:
 
 
 def test_a_model_that_is_another_one_is_refused() -> None:
-    with RobotousSerial(lambda _: LOAD) as sensor:
+    with RobotousSerialEmulator(lambda _: LOAD) as sensor:
         with pytest.raises(DeviceError, match="it says that it is a RFT64-SB01, not a RFT80-6A01"):
             make({"port": sensor.address, "model": "RFT80-6A01"}).open()
 
 
 def test_a_refused_setting_is_told() -> None:
-    with RobotousSerial(lambda _: LOAD) as sensor:
+    with RobotousSerialEmulator(lambda _: LOAD) as sensor:
         sensor._most_hz = 100
         with pytest.raises(DeviceError, match=r"request 15 \(set_rate\) was refused: out of range"):
             make({"port": sensor.address}).open()

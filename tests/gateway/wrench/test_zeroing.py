@@ -20,9 +20,9 @@ from palpate.messages import (
     WrenchZeroRequest,
 )
 from palpate_deploy.station.tare import take_tare
-from palpate_gateway.emulators.bota import Bota
+from palpate_gateway.emulators.bota import BotaEmulator
 from palpate_gateway.emulators.kms40 import Kms40Emulator
-from palpate_gateway.emulators.robotous import RobotousSerial
+from palpate_gateway.emulators.robotous import RobotousSerialEmulator
 
 fakes: Any = importlib.import_module("wrench_fakes")
 
@@ -151,8 +151,8 @@ def test_a_sensor_without_a_zero_loses_none(bus: Any) -> None:
 @pytest.mark.parametrize(
     ("make", "driver", "options"),
     [
-        (lambda: Bota(fakes.constant), "wrench_bota", {"rate_hz": 400.0}),
-        (lambda: RobotousSerial(fakes.constant), "wrench_robotous", {"rate_hz": 200}),
+        (lambda: BotaEmulator(fakes.constant), "wrench_bota", {"rate_hz": 400.0}),
+        (lambda: RobotousSerialEmulator(fakes.constant), "wrench_robotous", {"rate_hz": 200}),
     ],
     ids=["bota", "robotous"],
 )

@@ -1,7 +1,7 @@
-"""The device's end of a serial line: a pseudo terminal behind a name that survives unplugging.
+"""Lines of emulated devices: a serial line as a pseudo terminal, its checksum, CAN error frames.
 
-A pseudo terminal has no speed, but it knows which one the host has set; a host with another one
-reads noise and is not heard, as on a wire.
+A pseudo terminal has no speed, but it knows the speed that the host has set: at another speed the
+host reads noise and its requests are lost, as on a wire.
 """
 
 from __future__ import annotations
@@ -16,6 +16,12 @@ import termios
 import time
 import tty
 from pathlib import Path
+from typing import Any
+
+from palpate_gateway.emulators.emulator import Emulator
+
+BUS_ERROR, BUS_OFF, RESTARTED = 0x080, 0x040, 0x100
+"""Classes of CAN error frames: bits of the identifier (linux/can/error.h)."""
 
 _AT_ONCE = 4096
 
@@ -24,7 +30,17 @@ _SPEEDS = {
     for name in dir(termios)
     if name.startswith("B") and name[1:].isdigit()
 }
-"""Speeds [bit/s] by the code that a terminal's settings hold."""
+"""Speeds [bit/s] by their codes in the settings of a terminal."""
+
+
+def _crc_of_byte(byte: int) -> int:
+    """Remainder of one byte, bit by bit: lowest bit first, polynomial 1021 reflected."""
+    for _ in range(8):
+        byte = byte >> 1 ^ (0x8408 if byte & 1 else 0)
+    return byte
+
+
+_CRC_OF_BYTE = [_crc_of_byte(byte) for byte in range(256)]
 
 
 def speeds() -> list[int]:
@@ -37,14 +53,14 @@ class SerialLine:
 
     Args:
         baud: The device's speed [bit/s].
-        path: Name of the line; "" = one in a new folder that goes with the line.
+        path: Name of the line; "" = one in a new folder, which is removed with the line.
     """
 
     def __init__(self, baud: int, path: str = "") -> None:
         self.baud = baud
         self.path = path
         self.overrun = 0
-        """Bytes that the host was too slow to take; a wire would have lost them too."""
+        """Bytes that the host was too slow to read; a wire would lose them too."""
         self._folder = ""
         self._device = self._host = -1
         self._noise = random.Random(baud)
@@ -62,7 +78,8 @@ class SerialLine:
             self._folder = tempfile.mkdtemp(prefix="palpate-line-")
             self.path = str(Path(self._folder) / "tty")
         self._device, self._host = os.openpty()
-        # The host's end stays open here as well: else its settings are lost and reading fails.
+        # The host's end stays open here as well, or its settings would be lost and reads would
+        # fail.
         tty.setraw(self._device)
         tty.setraw(self._host)
         os.set_blocking(self._device, False)
@@ -70,7 +87,7 @@ class SerialLine:
         Path(self.path).symlink_to(os.ttyname(self._host))
 
     def unplug(self) -> None:
-        """Take the line away, as by pulling an adapter; the name stays reserved."""
+        """Remove the line, as if its adapter were pulled; the name stays reserved."""
         if self.plugged:
             Path(self.path).unlink(missing_ok=True)
             os.close(self._device)
@@ -78,7 +95,7 @@ class SerialLine:
             self._device = self._host = -1
 
     def keep_plugged(self, plugged: bool) -> None:
-        """Plug or unplug where it is not so."""
+        """Plug or unplug the line, if it is not in this state yet."""
         if plugged:
             self.plug()
         else:
@@ -92,7 +109,7 @@ class SerialLine:
             self._folder = self.path = ""
 
     def read(self, timeout_s: float) -> bytes:
-        """What the host sent; nothing if nothing came, or at another speed."""
+        """Bytes from the host; none if none came, or if its speed is another one."""
         if not self.plugged:
             time.sleep(timeout_s)
             return b""
@@ -104,7 +121,7 @@ class SerialLine:
         return data if self._same_speed() else b""
 
     def write(self, data: bytes | bytearray) -> None:
-        """Send to the host, if there is one; noise if its speed is another."""
+        """Send to the host, if the line is plugged; noise if the host's speed is another one."""
         if not self.plugged:
             return
         if not self._same_speed():
@@ -117,5 +134,45 @@ class SerialLine:
 
     def _same_speed(self) -> bool:
         set_by_host = _SPEEDS.get(termios.tcgetattr(self._host)[5])
-        # 38400 is what a new terminal has before any host has opened it.
+        # 38400 is the speed of a new terminal before a host has opened it.
         return set_by_host in (self.baud, 38400)
+
+
+class SerialEmulator(Emulator):
+    """An emulator on a serial line."""
+
+    _line: SerialLine
+
+    @property
+    def address(self) -> str:
+        """Name of the line."""
+        return self._line.path
+
+    def _listen(self) -> None:
+        self._line.plug()
+
+    def _hang_up(self) -> None:
+        self._line.close()
+
+
+def crc16_x25(data: bytes | bytearray) -> int:
+    """CRC-16/X-25, computed apart from the decoders' own; "123456789" gives 906E."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _CRC_OF_BYTE[(crc ^ byte) & 0xFF]
+    return crc ^ 0xFFFF
+
+
+def error_frame(can: Any, kind: int) -> Any:
+    """An error frame as SocketCAN hands it to the listeners of a controller.
+
+    Error frames never travel on a real bus: the receiver's own controller makes them. python-can's
+    buses in software carry them like any frame.
+
+    Args:
+        can: The module python-can.
+        kind: Class of the error.
+    """
+    return can.Message(
+        arbitration_id=kind, is_error_frame=True, is_extended_id=False, data=bytes(8)
+    )

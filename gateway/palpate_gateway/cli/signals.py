@@ -1,4 +1,4 @@
-"""Ctrl-C and ``SIGTERM`` end a command that runs until it is told."""
+"""Ctrl-C and ``SIGTERM`` as the normal end of a command."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def until_told() -> Iterator[None]:
-    """A block that either signal ends, quietly; what it holds open is closed on the way out."""
+def until_signal() -> Iterator[None]:
+    """A block that either signal ends without an error; its ``finally`` clauses run."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
     try:

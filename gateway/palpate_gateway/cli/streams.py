@@ -1,13 +1,18 @@
-"""Readings for people and for JSON: the name of their stream, and their values."""
+"""Streams of a device: the readings of each, their rates, and their values as text and JSON."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from palpate.errors import DeviceTimeout
 from palpate.messages import FrameLayout
+from palpate_gateway.device import Device
 from palpate_gateway.readings import (
     ElectrodeReading,
     FieldReading,
@@ -19,10 +24,11 @@ from palpate_gateway.readings import (
 
 _A_LINE = 10
 _NAMED = 6
+_READ_S = 0.2
 
 
 def stream_of(reading: Reading) -> str:
-    """Name of the stream that a reading becomes."""
+    """Name of the stream of a reading."""
     if isinstance(reading, RecordedMessage):
         return reading.topic
     return {
@@ -34,7 +40,7 @@ def stream_of(reading: Reading) -> str:
 
 
 def values_of(reading: Reading) -> dict[str, Any]:
-    """Its values as JSON has them: raw counts, and SI units."""
+    """Values for JSON: raw counts, and SI units."""
     if isinstance(reading, RecordedMessage):
         return {"bytes": len(reading.payload), "time_s": reading.time_s}
     place: dict[str, Any] = {"tick": reading.tick, "time_s": reading.time_s}
@@ -65,7 +71,7 @@ def values_of(reading: Reading) -> dict[str, Any]:
 
 
 def text_of(reading: Reading) -> list[str]:
-    """Its values in lines."""
+    """Values as lines of text."""
     values = values_of(reading)
     if isinstance(reading, ElectrodeReading):
         return _electrode_lines(reading)
@@ -82,7 +88,7 @@ def text_of(reading: Reading) -> list[str]:
 
 
 def _electrode_lines(reading: ElectrodeReading) -> list[str]:
-    """Ten electrodes a line, the other channels, and which of all are not valid."""
+    """Electrodes, ten on each line, the other channels, and the names of channels not valid."""
     counts = reading.electrodes.tolist()
     layout = FrameLayout(len(counts))
     lines = []
@@ -106,7 +112,7 @@ def _electrode_lines(reading: ElectrodeReading) -> list[str]:
 
 
 def _pose_lines(reading: PoseReading) -> list[str]:
-    """Where the tip is, in the words of the sensor frame, and where the indenter presses."""
+    """Position of the tip and direction of the indenter in the sensor frame."""
     x, y, z = (1e3 * float(value) for value in reading.position)
     along = "distal" if x >= 0.0 else "proximal"
     above = "dorsal" if z >= 0.0 else "ventral"
@@ -127,5 +133,94 @@ def _pose_lines(reading: PoseReading) -> list[str]:
 
 
 def _rounded(values: Any) -> list[float]:
-    """Plain numbers without the tail that 32 bits leave."""
+    """Numbers without the rounding errors of 32-bit floats."""
     return [round(float(value), 7) for value in values]
+
+
+@dataclass(slots=True)
+class DeviceStream:
+    """One kind of reading.
+
+    Attributes:
+        first: The first reading.
+        last: The last reading.
+        readings: Number of readings.
+        last_s: Time of the last reading, by the host's monotonic clock [s].
+        shown_hz: Rate before the last ``restart`` [Hz]; None = not known.
+    """
+
+    first: Reading
+    last: Reading
+    readings: int
+    last_s: float
+    _since_s: float
+    _counted: int = 0
+    shown_hz: float | None = None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Readings each second since ``restart``; None = not known."""
+        passed_s = self.last_s - self._since_s
+        # The first readings are not counted: they came after a wait of unknown length.
+        return self._counted / passed_s if self._counted and passed_s > 0.0 else None
+
+    def add(self, reading: Reading, now_s: float) -> None:
+        """Count a reading."""
+        self.last = reading
+        self.readings += 1
+        if now_s > self._since_s:
+            self._counted += 1
+        self.last_s = now_s
+
+    def restart(self) -> None:
+        """Start a new measurement of the rate, from the last reading on."""
+        self.shown_hz = self.rate_hz
+        self._since_s, self._counted = self.last_s, 0
+
+
+class DeviceStreams:
+    """All streams of a device."""
+
+    def __init__(self) -> None:
+        self.by_name: dict[str, DeviceStream] = {}
+
+    def add(self, readings: Sequence[Reading], now_s: float) -> None:
+        """Count readings that came together."""
+        for reading in readings:
+            stream = self.by_name.get(stream_of(reading))
+            if stream is None:
+                new = DeviceStream(reading, reading, 1, now_s, now_s)
+                self.by_name[stream_of(reading)] = new
+            else:
+                stream.add(reading, now_s)
+
+    def restart(self) -> None:
+        """Start a new measurement of all rates."""
+        for stream in self.by_name.values():
+            stream.restart()
+
+
+def measure(device: Device, seconds: float) -> DeviceStreams:
+    """Read an open device for a time, or until it ends.
+
+    Raises:
+        DeviceError: It is lost, or gives no reading.
+    """
+    streams = DeviceStreams()
+    until = time.monotonic() + seconds
+    silence: DeviceTimeout | None = None
+    while (left_s := until - time.monotonic()) > 0.0:
+        try:
+            readings = device.read(min(left_s, _READ_S))
+        except DeviceTimeout as error:
+            silence = error
+            continue
+        if not readings:
+            break
+        streams.add(readings, time.monotonic())
+    if not streams.by_name and silence is not None:
+        raise DeviceTimeout(
+            f"{device.info.model}: opened, but no reading came within {seconds:g} s",
+            remedy=silence.remedy,
+        ) from silence
+    return streams
