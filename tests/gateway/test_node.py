@@ -146,7 +146,7 @@ def test_damaged_recording_does_not_end_the_other_sensor(bus: Any, tmp_path: Pat
         assert now.counters["broken.frames_published"] == 0
 
 
-class Flaky(virtual.Virtual):
+class Flaky(virtual.VirtualFinger):
     """A virtual finger whose cable comes loose after 30 frames, and that cannot be opened once."""
 
     opened = 0

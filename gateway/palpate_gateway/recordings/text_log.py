@@ -159,7 +159,7 @@ class TextLogReader:
         )
 
     def _rebuilt_time(self, frame: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-        """Times on the grid of slots, with gaps for the frames that the counter shows as missing."""
+        """Times on the grid of slots, with gaps for frames that are missing by their counter."""
         before = frame[0] if self._frame_before is None else self._frame_before
         missing = np.maximum(np.diff(frame, prepend=before) - 1, 0)
         index = self._slots_before + np.arange(len(frame))

@@ -132,8 +132,8 @@ def _cell(row: int, column: int, text: str) -> Any:
         (_cell(90, 2, "nan"), r"line 91: column 'y_m': 'nan' is not finite"),
         (_cell(90, 0, "inf"), r"line 91: column 'time_s': 'inf' is not finite"),
         (_cell(90, 3, "1e308"), r"line 91: column 'z_m': '1e308' is out of any robot's reach"),
-        (_cell(90, 4, ""), r"line 91: column 'qw': '' is no number"),
-        (_cell(90, 1, "0.4 m"), r"line 91: column 'x_m': '0.4 m' is no number"),
+        (_cell(90, 4, ""), r"line 91: column 'qw': '' is not a number"),
+        (_cell(90, 1, "0.4 m"), r"line 91: column 'x_m': '0.4 m' is not a number"),
         (_cell(90, 4, "0"), r"line 91: columns qw qx qy qz: the quaternion has length 0\.\d+, not"),
         (_cell(90, 0, "0.1"), r"line 91: column 'time_s': time goes back from 0.356 to 0.1 s"),
         (lambda lines: [*lines[:90], lines[90] + ",1", *lines[91:]], "line 91: 9 columns, the h"),
@@ -169,7 +169,7 @@ def test_a_cut_last_line_is_named(tmp_path: Path, cut: int) -> None:
 
 def test_what_is_no_text_or_not_there(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"time_s,\xff\xfe\n1,2\n")
-    with pytest.raises(RecordingError, match="line 1: byte 8 of the line is no text"):
+    with pytest.raises(RecordingError, match="line 1: byte 8 of the line is not text"):
         device_of(tmp_path / "a.csv").open()
     with pytest.raises(RecordingError, match=r"nowhere\.csv: cannot be read \(No such file"):
         device_of(tmp_path / "nowhere.csv").open()
@@ -178,7 +178,9 @@ def test_what_is_no_text_or_not_there(tmp_path: Path) -> None:
     lines = [
         line + ",wall_ns" if k == 0 else line + ",now" for k, line in enumerate(fakes.csv_lines(3))
     ]
-    with pytest.raises(RecordingError, match="line 2: column 'wall_ns': 'now' is no whole number"):
+    with pytest.raises(
+        RecordingError, match="line 2: column 'wall_ns': 'now' is not a whole number"
+    ):
         device_of(fakes.write_csv(tmp_path / "b.csv", lines)).open()
 
 

@@ -105,7 +105,7 @@ GOOD = {
         ({"indenter": None}, "indenter"),
         ({"indenter": ""}, "1-64 printable ASCII"),
         ({"base_sensor": None}, "base_sensor is missing: where the robot carries the indenter"),
-        ({"flange_sensor": GOOD["base_sensor"]}, "flange_sensor is of no use"),
+        ({"flange_sensor": GOOD["base_sensor"]}, "flange_sensor is not used"),
         ({"carries": "biotac"}, "give flange_sensor and base_indenter"),
         ({"carries": "finger"}, "carries"),
         ({"base_sensor": {"position_m": [0, 0, 0]}}, "base_sensor.orientation_wxyz' is missing"),

@@ -90,7 +90,7 @@ def test_one_of_several_robots(tmp_path: Path) -> None:
 def test_a_record_of_something_else(tmp_path: Path) -> None:
     with RecordWriter(tmp_path / "a.mcap") as writer:
         writer.write("palpate/@v1/lab/x/tare", "palpate.v1.Tare", b"", log_time_ns=1)
-    with pytest.raises(RecordingError, match="played by the driver record"):
+    with pytest.raises(RecordingError, match="the driver record replays poses"):
         drain(tmp_path / "a.mcap")
     (tmp_path / "b.mcap").write_bytes(b"no record")
     with pytest.raises(RecordingError, match="damaged"):

@@ -90,7 +90,9 @@ def test_a_large_clock_keeps_its_microseconds(device: BusDevice, told: Publisher
 
 
 def test_silence_is_a_timeout_and_ends(device: BusDevice, told: Publisher[Any]) -> None:
-    with pytest.raises(DeviceTimeout, match=r"'arm' told no new pose within 0\.05 s") as caught:
+    with pytest.raises(
+        DeviceTimeout, match=r"'arm' published no new pose within 0\.05 s"
+    ) as caught:
         device.read(0.05)
     assert "palpate topic list" in caught.value.remedy
     told.put(fakes.frame(1))
@@ -144,7 +146,7 @@ def test_a_program_that_began_anew_is_another_device(
     told.put(fakes.frame(1, run_id=8, time_ns=5))
     assert fakes.numbers(fakes.take(device, 2)) == [1, 2]
     for _ in range(2):
-        with pytest.raises(DeviceLost, match="the program of robot 'arm' began anew"):
+        with pytest.raises(DeviceLost, match="the program of robot 'arm' has restarted"):
             device.read(PATIENCE_S)
     device.close()
     fakes.until(lambda: not told.matched())

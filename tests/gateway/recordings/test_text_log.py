@@ -266,8 +266,8 @@ def test_wrong_parity_invalidates_its_channel_and_is_counted(
 def test_port_without_sensor(log: Callable[..., Any], tmp_path: Path) -> None:
     path = log().write(tmp_path / "a.btd")
     _, _, error = replay(path, port=2)
-    check(error, RecordingError, "every slot of port 2 has wrong parity", "carry data: 3")
-    check(replay(path, port=5)[2], RecordingError, "no port 5, it has 3", "carry data: 3")
+    check(error, RecordingError, "every slot of port 2 has wrong parity", "with data: 3")
+    check(replay(path, port=5)[2], RecordingError, "no port 5, it has 3", "with data: 3")
 
 
 def test_no_sensor_at_all(log: Callable[..., Any], tmp_path: Path) -> None:
@@ -315,4 +315,4 @@ def test_real_capture(shared_data: Path) -> None:
 
 def test_real_capture_has_nothing_at_port_1(shared_data: Path) -> None:
     path = shared_data / "syntouch_btd_raw" / "data.btd.gz"
-    check(replay(path, port=1)[2], RecordingError, "port 1", "ports that carry data: 3")
+    check(replay(path, port=1)[2], RecordingError, "port 1", "ports with data: 3")

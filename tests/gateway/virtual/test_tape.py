@@ -255,7 +255,7 @@ def test_default_is_the_shipped_tape_or_else_the_formula(
         make_device("virtual", {"trajectories": ["a"]})
     with pytest.raises(ConfigError, match="'tape' is of the model 'tape'"):
         make_device("virtual", {"model": "formula", "tape": str(quiet)})
-    with pytest.raises(ConfigError, match="unit = 'unit1' is no number"):
+    with pytest.raises(ConfigError, match="unit = 'unit1' is not a number"):
         make_device("virtual", {"unit": "unit1"})
 
     (tmp_path / "tapes").mkdir()

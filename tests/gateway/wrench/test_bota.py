@@ -149,7 +149,7 @@ def test_offsets_that_work_otherwise_are_found(monkeypatch: pytest.MonkeyPatch) 
             take(command, "".join(f",{-float(value)}" for value in values.split(",")[1:]))
 
         monkeypatch.setattr(sensor, "_take", turned)
-        with pytest.raises(DeviceError, match="after taking zero it still tells"):
+        with pytest.raises(DeviceError, match="after taking zero it still reads"):
             device.zero()
         assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(LOAD[:3])
 

@@ -198,7 +198,7 @@ def test_with_a_fault_nothing_is_published(emulator: Kms40Emulator, device: Wren
 
 def test_with_a_fault_it_is_not_opened(emulator: Kms40Emulator) -> None:
     emulator.inject("error", 100.0)
-    with pytest.raises(DeviceError, match=r"reports calibration fault -> its forces cannot"):
+    with pytest.raises(DeviceError, match=r"reports calibration fault -> its forces are not valid"):
         device_at(emulator).open()
     # Whoever does not ask does not know.
     with device_at(emulator, flags_every_s=0.0) as device:
@@ -222,7 +222,7 @@ class Contrary(Kms40Emulator):
     ("request_line", "reply", "message"),
     [
         ("SN()", "ERROR(14)", r"SN\(\) was refused: unknown command \(error 14\)"),
-        ("SN()", 'SN=""', "tells no serial number"),
+        ("SN()", 'SN=""', "gives no serial number"),
         ("LDIV(1)", "LDIV=2", r"LDIV\(1\) was answered with '2' instead of '1'"),
         ("L1()", "", r"L1\(\) was not answered within 2 s"),
     ],

@@ -255,7 +255,9 @@ def test_others_on_the_bus_do_not_hide_silence(request: pytest.FixtureRequest) -
 def test_nobody_there_is_told_with_the_request() -> None:
     line = SerialLine(115200)
     line.plug()
-    with pytest.raises(DeviceTimeout, match=r"request 1 \(model\) was not answered; came: nothing"):
+    with pytest.raises(
+        DeviceTimeout, match=r"request 1 \(model\) was not answered; it sent: nothing"
+    ):
         make({"port": line.path}).open()
     line.close()
     with pytest.raises(DeviceError, match=r"cannot be opened.*-> plug it in"):
@@ -265,7 +267,7 @@ def test_nobody_there_is_told_with_the_request() -> None:
 def test_another_speed_is_told_by_what_came() -> None:
     with RobotousSerialEmulator(sweep, baud=921600) as sensor:
         sensor.running = True
-        with pytest.raises(DeviceTimeout, match=r"came: \d+ junk_bytes.*-> check .* baud"):
+        with pytest.raises(DeviceTimeout, match=r"it sent: \d+ junk_bytes.*-> check .* baud"):
             make({"port": sensor.address}).open()
 
 

@@ -86,7 +86,7 @@ def test_a_load_that_moves_is_not_taken(bus: Any) -> None:
     ):
         sensor(bus, SensorState.LIVE)
         with pytest.raises(
-            RemoteError, match=r"cannot zero 'ft': Fx varies by 2\.\d+ N .*let go of the sensor"
+            RemoteError, match=r"cannot zero 'ft': Fx varies by 2\.\d+ N .*leave the sensor"
         ) as caught:
             ask_zero(bus, readings=250)
         assert caught.value.code is ErrorCode.DEVICE
