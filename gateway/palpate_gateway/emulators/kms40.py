@@ -145,8 +145,8 @@ class Kms40Emulator(Emulator):
         """Lose power: reset the connection and forget all settings."""
         if self._client is not None:
             self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        self._drop_client()
         self._power_up()
+        self._drop_client()
 
     def _serve_client(self) -> None:
         if self._client is None:
