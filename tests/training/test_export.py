@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -16,13 +17,18 @@ from palpate.files.bundle import read_bundle
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.datasets.features_file import write_dataset
 from palpate_training.learning import export
-from palpate_training.learning.export import FeaturesGraph, check_parity, export_features, to_onnx
-from palpate_training.learning.fit import TrainConfig
-from palpate_training.learning.networks import Mlp
+from palpate_training.learning.export import (
+    check_parity,
+    export_features,
+    features_scale,
+    onnx_bytes,
+)
+from palpate_training.learning.fit import FeaturesConfig
+from palpate_training.learning.networks import FeaturesGraph, Mlp
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
-QUICK = TrainConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
+QUICK = FeaturesConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
 
 
 def make_graph(*, location: bool = True) -> FeaturesGraph:
@@ -38,6 +44,18 @@ def make_graph(*, location: bool = True) -> FeaturesGraph:
         if location
         else FeaturesGraph(nets[0], sd)
     )
+
+
+def to_onnx(graph: FeaturesGraph) -> bytes:
+    names = [tensor.name for tensor in graph.outputs]
+    return onnx_bytes(graph, "electrodes", torch.zeros(4, 19), names)
+
+
+def parity(
+    graph: FeaturesGraph, model: bytes, inputs: np.ndarray[Any, np.dtype[np.float32]]
+) -> float:
+    names = [tensor.name for tensor in graph.outputs]
+    return check_parity(graph, model, "electrodes", names, inputs, features_scale(graph))
 
 
 def rows(count: int = 16) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
@@ -90,8 +108,8 @@ def test_a_model_that_differs_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
         next(iter(other.force.layers.parameters()))[0, 0] += 0.05
     wrong = to_onnx(other)
     with pytest.raises(BundleError, match=r"differs from torch by .* in force"):
-        check_parity(graph, wrong, rows())
-    monkeypatch.setattr(export, "to_onnx", lambda _: wrong)
+        parity(graph, wrong, rows())
+    monkeypatch.setattr(export, "onnx_bytes", lambda *_: wrong)
     with pytest.raises(BundleError):
         write(tmp_path / "b", graph)
     assert not list(tmp_path.iterdir())
@@ -99,7 +117,7 @@ def test_a_model_that_differs_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_model_that_is_not_one_is_refused() -> None:
     with pytest.raises(BundleError, match="ONNX Runtime refuses"):
-        check_parity(make_graph(), b"not a model", rows())
+        parity(make_graph(), b"not a model", rows())
 
 
 def test_nan_is_refused() -> None:
@@ -108,7 +126,7 @@ def test_nan_is_refused() -> None:
     bad = rows()
     bad[3, 3] = np.nan
     with pytest.raises(BundleError, match="differs"):
-        check_parity(graph, model, bad)
+        parity(graph, model, bad)
 
 
 def test_train_features(press_data: MakeData, tmp_path: Path) -> None:

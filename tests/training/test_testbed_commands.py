@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_training.cli.__init__ import data_app
+from palpate_training.cli import data_app
 from palpate_training.datasets.trials import RawTrial, read_contents, read_trials
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.clearance import plate_holes

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from palpate_training.datasets.features import FeatureDataset
-from palpate_training.learning.fit import TrainConfig, drift, train
+from palpate_training.learning.fit import FeaturesConfig, drift, fit_quantity
 from palpate_training.learning.networks import Mlp, predict
 from palpate_training.learning.splits import by_group
 
 MakeData = Callable[..., FeatureDataset]
-QUICK = TrainConfig(widths=(32, 32), epochs=30, batch_rows=64)
+QUICK = FeaturesConfig(widths=(32, 32), epochs=30, batch_rows=64)
 
 
 def test_the_papers_network_has_54915_parameters() -> None:
@@ -38,11 +38,10 @@ def test_training_learns_repeats_and_uses_train_rows_only(press_data: MakeData) 
     x, y = data.tared_counts, data.force
 
     def run(seed: int) -> Mlp:
-        return train(
+        return fit_quantity(
             x[split.train],
             y[split.train],
-            x[split.validation],
-            y[split.validation],
+            (x[split.validation], y[split.validation]),
             config=QUICK,
             seed=seed,
         ).net
@@ -60,12 +59,13 @@ def test_patience_stops_and_the_best_weights_are_kept(press_data: MakeData) -> N
     data = press_data(presses=4)
     x, y = data.tared_counts, data.force
     shuffled = np.random.default_rng(0).permutation(y)  # nothing to learn
-    config = TrainConfig(widths=(16,), epochs=60, patience=3, batch_rows=64)
-    trained = train(x, shuffled, x, y, config=config)
-    assert trained.epochs < 60
-    assert trained.best_epoch <= trained.epochs - 3
+    config = FeaturesConfig(widths=(16,), epochs=60, patience=3, batch_rows=64)
+    trained = fit_quantity(x, shuffled, (x, y), config=config)
+    outcome = trained.outcome
+    assert outcome.epochs < 60
+    assert outcome.best_epoch <= outcome.epochs - 3
     error = np.median(np.linalg.norm(predict(trained.net, x) - y, axis=1))
-    assert error == pytest.approx(trained.validation_median, rel=1e-5)
+    assert error == pytest.approx(outcome.score, rel=1e-5)
 
 
 def test_drift_is_a_common_factor_of_the_impedances() -> None:
@@ -84,4 +84,4 @@ def test_drift_needs_the_baseline(press_data: MakeData) -> None:
     data = press_data(presses=3)
     x, y = data.tared_counts, data.force
     with pytest.raises(ValueError, match="baseline"):
-        train(x, y, x, y, config=TrainConfig(drift_sd=0.1))
+        fit_quantity(x, y, (x, y), config=FeaturesConfig(drift_sd=0.1))

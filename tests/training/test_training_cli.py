@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate_training.cli.__init__ import data_app, train_app
+from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 from palpate_training.datasets.features_file import write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
-from palpate_training.learning.fit import TrainConfig
+from palpate_training.learning.fit import FeaturesConfig
 from palpate_training.tasks.force_real import (
     experiment_count,
     run_force_real,
@@ -26,7 +26,7 @@ MakeData = Callable[..., FeatureDataset]
 MAGNITUDE, ANGLE = "force_magnitude_median_n", "force_angle_median_rad"
 TARGET_MAGNITUDE_N = 0.13
 TARGET_ANGLE_RAD = 0.06
-SHORT = TrainConfig(epochs=25, batch_rows=512)
+SHORT = FeaturesConfig(epochs=25, batch_rows=512)
 SHORT_ALLOWANCE = 1.25
 """What a single, short training may be worse than the mean of five full ones."""
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
@@ -73,7 +73,7 @@ def test_experiment_reports_every_model_beside_the_baselines(
         nonlocal count
         count += 1
 
-    config = TrainConfig(widths=(16,), epochs=3, batch_rows=256)
+    config = FeaturesConfig(widths=(16,), epochs=3, batch_rows=256)
     report = run_force_real(
         two_sensors, seeds=2, config=config, other_blocks=(20,), draws=50, on_network=tick
     )

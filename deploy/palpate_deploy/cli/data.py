@@ -88,7 +88,7 @@ def _app(room: str) -> typer.Typer:
         MissingExtraError: The training extra is not installed.
     """
     try:
-        from palpate_training.cli.__init__ import data_app, train_app
+        from palpate_training.cli import data_app, train_app
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
         if missing in EXTRA_MODULES:

@@ -16,7 +16,7 @@ from palpate_training.datasets.experiment import (
     SkinMesh,
 )
 from palpate_training.datasets.features import Provenance
-from palpate_training.tasks.field_fit import FitConfig
+from palpate_training.tasks.fields import FieldConfig
 
 Floats = npt.NDArray[np.float64]
 
@@ -140,6 +140,6 @@ def mixed(make_mixed: Callable[..., MixedDataset]) -> MixedDataset:
 
 
 @pytest.fixture(scope="session")
-def quick() -> FitConfig:
+def quick() -> FieldConfig:
     """Short trainings of narrow networks."""
-    return FitConfig(widths=(48, 48), epochs=40, patience=40, batch_rows=64)
+    return FieldConfig(widths=(48, 48), epochs=40, patience=40, batch_rows=64)

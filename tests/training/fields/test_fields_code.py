@@ -19,7 +19,7 @@ from palpate_training.learning.field_code import (
     pooling,
 )
 from palpate_training.learning.splits import Split, by_trajectory
-from palpate_training.tasks.field_fit import synthesis_features
+from palpate_training.tasks.synthesis import synthesis_features
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.files.bundle import read_bundle
-from palpate_training.cli.__init__ import train_app
+from palpate_training.cli import train_app
 from palpate_training.cli.train import EPOCHS
 from palpate_training.datasets.experiment import MixedDataset, write_experiment, write_mixed
 from palpate_training.learning.baselines import constant, ridge, zero
-from palpate_training.learning.fit import TrainConfig
+from palpate_training.learning.fit import FeaturesConfig
 from palpate_training.tasks.features import evaluate_features, features_networks
-from palpate_training.tasks.field_fit import FitConfig
-from palpate_training.tasks.fields import evaluate_field
+from palpate_training.tasks.fields import FieldConfig, evaluate_field
 from palpate_training.tasks.report import (
     by_force,
     headline_table,
@@ -25,18 +24,27 @@ from palpate_training.tasks.report import (
     ventral_faces,
     write_report,
 )
-from palpate_training.tasks.results import ALL, MEAN, OWN, RIDGE, ZERO, Result, TaskReport, typical
+from palpate_training.tasks.results import (
+    ALL,
+    MEAN,
+    OWN,
+    RIDGE,
+    ZERO,
+    ModelResult,
+    TaskReport,
+    typical,
+)
 from palpate_training.tasks.synthesis import evaluate_synthesis
 
-SHORT = TrainConfig(widths=(32,), epochs=15, batch_rows=64)
+SHORT = FeaturesConfig(widths=(32,), epochs=15, batch_rows=64)
 
 
-def by_model(report: TaskReport, test: str) -> dict[str, Result]:
+def by_model(report: TaskReport, test: str) -> dict[str, ModelResult]:
     return {result.model: result for result in report.results if result.test == test}
 
 
 @pytest.fixture(scope="module")
-def reports(mixed: MixedDataset, quick: FitConfig) -> list[TaskReport]:
+def reports(mixed: MixedDataset, quick: FieldConfig) -> list[TaskReport]:
     trained: list[int] = []
 
     def tick() -> None:
@@ -144,7 +152,7 @@ def test_one_command_writes_the_table(mixed: MixedDataset, tmp_path: Path) -> No
 
 
 def test_the_commands_train_as_long_as_the_library() -> None:
-    assert FitConfig().epochs == EPOCHS
+    assert FieldConfig().epochs == EPOCHS
 
 
 def test_typical_row_is_the_median_of_the_harder_half() -> None:

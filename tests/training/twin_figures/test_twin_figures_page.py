@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_training.cli.__init__ import data_app
+from palpate_training.cli import data_app
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,

@@ -1,7 +1,8 @@
-"""Train one network for one quantity: a plain loop, read from top to bottom.
+"""The training loop of every network: read it from top to bottom.
 
-Adam, learning rate 3e-3 down to 1e-5 along a cosine, smooth-L1 on standardised targets, the weights
-of the epoch with the best validation median are kept.
+Adam, a learning rate that falls along a cosine, the weights of the epoch with the best validation
+score are kept. What differs from task to task is passed in: the loss, the score, and what is done
+to a batch before the network sees it.
 """
 
 from __future__ import annotations
@@ -20,98 +21,81 @@ from torch import Tensor, nn
 from palpate.messages import COUNTS_MAX
 from palpate_training.learning.networks import PAPER_WIDTHS, Activation, Mlp, predict
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
-Progress = Callable[[], None]
+OnEpoch = Callable[[], None]
 
 
-@dataclass(frozen=True, slots=True)
-class TrainConfig:
-    """Settings of one training.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitConfig:
+    """Settings of the loop.
 
     Attributes:
         widths: Hidden layers.
-        activation: After each hidden layer.
         epochs: Passes over the training rows at most.
-        patience: Stop after so many epochs without a better validation median.
+        patience: Stop after so many epochs without a better validation score.
         batch_rows: Rows in one step.
         learning_rate: At the start.
         learning_rate_end: At the end of the cosine.
         weight_decay: L2 penalty of Adam.
-        huber_beta: Where smooth-L1 turns from square to straight, in standard deviations.
-        drift_sd: Standard deviation of the common factor that multiplies all impedances of a
-            training row, as warming of the fluid does; 0 = none.
         threads: Threads of torch; small networks are fastest with one.
     """
 
     widths: Sequence[int] = PAPER_WIDTHS
-    activation: Activation = "silu"
     epochs: int = 50
     patience: int = 50
     batch_rows: int = 256
     learning_rate: float = 3e-3
     learning_rate_end: float = 1e-5
     weight_decay: float = 1e-5
-    huber_beta: float = 0.1
-    drift_sd: float = 0.0
     threads: int = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Trained:
-    """A trained network.
+class FitOutcome:
+    """How a training went.
 
     Attributes:
-        net: The weights of the best epoch.
-        best_epoch: Which one that was, from 1.
+        best_epoch: Epoch whose weights the network has, from 1.
         epochs: How many were run.
-        validation_median: Median norm of the validation error at the best epoch, in the unit of
-            the target; NaN without validation rows.
+        score: Validation score of the best epoch; NaN without validation rows.
     """
 
-    net: Mlp
     best_epoch: int
     epochs: int
-    validation_median: float
+    score: float
 
 
-def train(
+def fit(
+    net: nn.Module,
     inputs: FloatArray,
     targets: FloatArray,
-    validation_inputs: FloatArray | None = None,
-    validation_targets: FloatArray | None = None,
     *,
-    baseline: FloatArray | None = None,
-    config: TrainConfig | None = None,
-    seed: int = 0,
-    on_epoch: Progress | None = None,
-) -> Trained:
-    """Fit the network; what it is standardised by comes from the training rows alone.
+    loss_of: Callable[[Tensor, Tensor], Tensor],
+    score_of: Callable[[nn.Module], float] | None,
+    config: FitConfig,
+    augment: Callable[[Tensor, Tensor], Tensor] = lambda batch, rows: batch,
+    on_epoch: OnEpoch | None = None,
+) -> FitOutcome:
+    """Train a network in place.
+
+    The caller seeds torch before it makes the network: weights, order of rows and augmentation all
+    come from torch's one generator, so the same seed gives the same weights.
 
     Args:
-        inputs: Tared counts [counts], shape ``(N, 19)``.
-        targets: The quantity, shape ``(N, 3)``.
-        validation_inputs: Rows to stop on, shape ``(M, 19)``; None = all epochs are run and the
-            last weights kept.
-        validation_targets: Their truth, shape ``(M, 3)``.
-        baseline: Untouched counts of the training rows [counts], shape ``(N, 19)``; needed where
-            ``config.drift_sd`` is not 0.
+        net: With its constants set from the training rows.
+        inputs: Training rows, shape ``(N, I)``.
+        targets: Their truth, shape ``(N, O)``.
+        loss_of: Estimates ``(B, O)`` and truth ``(B, O)`` -> loss.
+        score_of: Validation score of the network, smaller is better; None = all epochs are run and
+            the last weights are kept.
         config: Settings.
-        seed: Seed of the first weights, the order of the rows and the drift.
+        augment: Inputs of a batch and the numbers of its rows -> inputs that the network sees.
         on_epoch: Called after each epoch, for a progress bar.
     """
-    config = config or TrainConfig()
     torch.set_num_threads(config.threads)
-    torch.manual_seed(seed)
-
-    net = Mlp(config.widths, inputs.shape[1], config.activation)
-    net.normalise_from(inputs, targets)
     x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
-    if config.drift_sd > 0 and baseline is None:
-        raise ValueError("drift_sd needs the baseline of the training rows")
-    rest = torch.from_numpy(baseline) if baseline is not None and config.drift_sd > 0 else None
-    loss_of = nn.SmoothL1Loss(beta=config.huber_beta)
     optimiser = torch.optim.Adam(
         net.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
@@ -119,39 +103,115 @@ def train(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimiser, T_max=config.epochs * steps_per_epoch, eta_min=config.learning_rate_end
     )
-
-    best = Trained(net, 0, 0, math.inf)
-    weights = copy.deepcopy(net.state_dict())
+    best_score, best_epoch, weights = math.inf, 0, copy.deepcopy(net.state_dict())
     epoch = 0
     for epoch in range(1, config.epochs + 1):
         net.train()
         for rows in torch.split(torch.randperm(len(x)), config.batch_rows):
-            batch = x[rows]  # (B, 19)
-            if rest is not None:
-                batch = drift(batch, rest[rows], config.drift_sd)
-            # Both in standard deviations of the target, so that beta means the same for N and m.
-            loss = loss_of(net(batch) / net.output_sd, y[rows] / net.output_sd)
+            loss = loss_of(net(augment(x[rows], rows)), y[rows])
             optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             schedule.step()
         if on_epoch is not None:
             on_epoch()
-        if validation_inputs is None or validation_targets is None:
+        if score_of is None:
             continue
-        residual = predict(net, validation_inputs) - validation_targets
-        median = float(np.median(np.linalg.norm(residual, axis=1)))
-        if median < best.validation_median:
-            best = Trained(net, epoch, epoch, median)
-            weights = copy.deepcopy(net.state_dict())
-        if epoch - best.best_epoch >= config.patience:
+        net.eval()
+        score = score_of(net)
+        if score < best_score:
+            best_score, best_epoch, weights = score, epoch, copy.deepcopy(net.state_dict())
+        if epoch - best_epoch >= config.patience:
             break
     net.eval()
-    if validation_inputs is None:
-        return Trained(net, epoch, epoch, math.nan)
+    if score_of is None:
+        return FitOutcome(epoch, epoch, math.nan)
     net.load_state_dict(weights)
-    logger.debug("best epoch %d of %d, median %.4g", best.best_epoch, epoch, best.validation_median)
-    return Trained(net, best.best_epoch, epoch, best.validation_median)
+    _log.debug("best epoch %d of %d, score %.4g", best_epoch, epoch, best_score)
+    return FitOutcome(best_epoch, epoch, best_score)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeaturesConfig(FitConfig):
+    """Settings of a training of one quantity from tared counts.
+
+    Attributes:
+        activation: After each hidden layer.
+        huber_beta: Where smooth-L1 turns from square to straight, in standard deviations.
+        drift_sd: Standard deviation of the common factor that multiplies all impedances of a
+            training row, as warming of the fluid does; 0 = none.
+    """
+
+    activation: Activation = "silu"
+    huber_beta: float = 0.1
+    drift_sd: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class FittedMlp:
+    """A trained network, and how its training went; the score is the median error's norm."""
+
+    net: Mlp
+    outcome: FitOutcome
+
+
+def fit_quantity(
+    inputs: FloatArray,
+    targets: FloatArray,
+    validation: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    baseline: FloatArray | None = None,
+    config: FeaturesConfig | None = None,
+    seed: int = 0,
+    on_epoch: OnEpoch | None = None,
+) -> FittedMlp:
+    """Fit the paper's network to one quantity: smooth-L1 on standardised targets.
+
+    Args:
+        inputs: Tared counts [counts], shape ``(N, 19)``.
+        targets: The quantity, shape ``(N, 3)``.
+        validation: Rows to stop on, ``(M, 19)`` and ``(M, 3)``; None = all epochs are run and the
+            last weights kept.
+        baseline: Untouched counts of the training rows [counts], shape ``(N, 19)``; needed where
+            ``config.drift_sd`` is not 0.
+        config: Settings.
+        seed: Seed of the first weights, the order of the rows and the drift.
+        on_epoch: Called after each epoch, for a progress bar.
+    """
+    config = config or FeaturesConfig()
+    if config.drift_sd > 0 and baseline is None:
+        raise ValueError("drift_sd needs the baseline of the training rows")
+    torch.manual_seed(seed)
+    net = Mlp(config.widths, inputs.shape[1], config.activation)
+    net.normalise_from(inputs, targets)
+    smooth_l1 = nn.SmoothL1Loss(beta=config.huber_beta)
+
+    def loss_of(estimate: Tensor, truth: Tensor) -> Tensor:
+        # Both in standard deviations of the target, so that beta means the same for N and m.
+        loss: Tensor = smooth_l1(estimate / net.output_sd, truth / net.output_sd)
+        return loss
+
+    def median_error(net: nn.Module) -> float:
+        assert validation is not None
+        residual = predict(net, validation[0]) - validation[1]
+        return float(np.median(np.linalg.norm(residual, axis=1)))
+
+    rest = torch.from_numpy(baseline) if baseline is not None and config.drift_sd > 0 else None
+
+    def warm(batch: Tensor, rows: Tensor) -> Tensor:
+        return batch if rest is None else drift(batch, rest[rows], config.drift_sd)
+
+    outcome = fit(
+        net,
+        inputs,
+        targets,
+        loss_of=loss_of,
+        score_of=None if validation is None else median_error,
+        config=config,
+        augment=warm,
+        on_epoch=on_epoch,
+    )
+    return FittedMlp(net, outcome)
 
 
 def drift(tared: Tensor, baseline: Tensor, sd: float) -> Tensor:

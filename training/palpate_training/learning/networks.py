@@ -16,6 +16,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from palpate.files.tasks import TASKS
+from palpate.messages import TensorInfo
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning.field_code import FieldCode, Pooling
 
@@ -106,6 +108,53 @@ THINNEST_FILM = 0.02
 SMALLEST_MODE = 0.1
 """Modes that vary less than this share of the first are not blown up to unit variance: they hold
 little but the rounding and the peculiarities of single trajectories."""
+
+
+class FeaturesGraph(nn.Module):
+    """The ``features`` task: one network for each quantity, and constant standard deviations.
+
+    Args:
+        force: Tared counts -> force [N].
+        force_sd: Residual standard deviation per axis on validation rows [N], shape ``(3,)``.
+        location: Tared counts -> contact location [m], or None.
+        location_sd: Likewise [m], shape ``(3,)``, or None.
+    """
+
+    # Not named as the outputs are: ONNX wants every name once.
+    force_spread: Tensor
+    location_spread: Tensor
+
+    def __init__(
+        self,
+        force: Mlp,
+        force_sd: FloatArray,
+        location: Mlp | None = None,
+        location_sd: FloatArray | None = None,
+    ) -> None:
+        super().__init__()
+        self.force = force
+        self.location = location
+        self.register_buffer("force_spread", torch.from_numpy(force_sd.astype(np.float32)))
+        if (location is None) != (location_sd is None):
+            raise ValueError("give location and location_sd, or neither")
+        if location_sd is not None:
+            self.register_buffer(
+                "location_spread", torch.from_numpy(location_sd.astype(np.float32))
+            )
+
+    def forward(self, electrodes: Tensor) -> tuple[Tensor, ...]:
+        """Tared counts ``(N, 19)`` -> the task's outputs in order, each ``(N, 3)``."""
+        rows = electrodes.shape[0]
+        outputs = [self.force(electrodes), self.force_spread.expand(rows, 3)]
+        if self.location is not None:
+            outputs += [self.location(electrodes), self.location_spread.expand(rows, 3)]
+        return tuple(outputs)
+
+    @property
+    def outputs(self) -> tuple[TensorInfo, ...]:
+        """What it gives, as the contract names it."""
+        contract = TASKS["features"]
+        return contract.outputs + (contract.optional if self.location is not None else ())
 
 
 class FieldGraph(nn.Module):

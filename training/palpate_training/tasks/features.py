@@ -26,8 +26,8 @@ from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.datasets.features_file import open_dataset
 from palpate_training.learning import baselines
-from palpate_training.learning.export import FeaturesGraph, export_features
-from palpate_training.learning.fit import TrainConfig, Trained, train
+from palpate_training.learning.export import export_features
+from palpate_training.learning.fit import FeaturesConfig, FittedMlp, fit_quantity
 from palpate_training.learning.metrics import (
     cluster_bootstrap,
     force_errors,
@@ -36,7 +36,7 @@ from palpate_training.learning.metrics import (
     location_metrics,
     rms,
 )
-from palpate_training.learning.networks import Mlp, predict
+from palpate_training.learning.networks import FeaturesGraph, Mlp, predict
 from palpate_training.learning.splits import (
     Rows,
     Split,
@@ -51,8 +51,8 @@ from palpate_training.tasks.results import (
     OWN,
     RIDGE,
     ZERO,
+    ModelResult,
     OnNetwork,
-    Result,
     TaskReport,
     averaged,
     label_of,
@@ -65,7 +65,7 @@ FloatArray = npt.NDArray[np.float32]
 OnEpoch = Callable[[str, int, int], None]
 """Called with the quantity, the epoch and the number of epochs at most."""
 
-FEATURES_CONFIG = TrainConfig(epochs=40, patience=12, batch_rows=512)
+FEATURES_CONFIG = FeaturesConfig(epochs=40, patience=12, batch_rows=512)
 """Under two minutes for 100,000 rows on one core."""
 
 FALSE_CONTACT_SHARE = 0.001
@@ -98,7 +98,7 @@ def train_features(
     *,
     name: str = "features",
     version: int = 1,
-    config: TrainConfig = FEATURES_CONFIG,
+    config: FeaturesConfig = FEATURES_CONFIG,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FeaturesReport:
@@ -125,7 +125,7 @@ def train_features(
     split = by_group(data.group, seed=seed)
     x = data.tared_counts
 
-    def fit(quantity: str, targets: FloatArray, fit_on: Rows, stop_on: Rows) -> Trained:
+    def fit(quantity: str, targets: FloatArray, fit_on: Rows, stop_on: Rows) -> FittedMlp:
         done = 0
 
         def tick() -> None:
@@ -134,11 +134,10 @@ def train_features(
             if on_epoch is not None:
                 on_epoch(quantity, done, config.epochs)
 
-        return train(
+        return fit_quantity(
             x[fit_on],
             targets[fit_on],
-            x[stop_on],
-            targets[stop_on],
+            (x[stop_on], targets[stop_on]),
             baseline=data.baseline[fit_on],
             config=config,
             seed=seed,
@@ -265,7 +264,7 @@ def _location_report(
 
 Floating = npt.NDArray[np.floating]
 
-PAPER_CONFIG = TrainConfig(epochs=60, patience=20)
+PAPER_CONFIG = FeaturesConfig(epochs=60, patience=20)
 """The paper's layers; epochs at most."""
 
 Metrics = Callable[[Floating, Floating], dict[str, float]]
@@ -286,7 +285,7 @@ def evaluate_features(
     *,
     seeds: int = 3,
     split_seed: int = 0,
-    config: TrainConfig = PAPER_CONFIG,
+    config: FeaturesConfig = PAPER_CONFIG,
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> list[TaskReport]:
@@ -309,14 +308,14 @@ def evaluate_features(
     reports = []
     for quantity, (metrics_of, errors_of, headlines) in _QUANTITIES.items():
         y: FloatArray = getattr(data, quantity)
-        results: list[Result] = []
+        results: list[ModelResult] = []
         nets: dict[tuple[str, ...], list[Mlp]] = {}
         held = {units: of_units(data, split, units).split for units in sets}
         for units, fold in held.items():
             nets[units] = []
             for seed in range(seeds):
-                sides = (x[fold.train], y[fold.train], x[fold.validation], y[fold.validation])
-                nets[units].append(train(*sides, config=config, seed=seed).net)
+                sides = x[fold.train], y[fold.train], (x[fold.validation], y[fold.validation])
+                nets[units].append(fit_quantity(*sides, config=config, seed=seed).net)
                 tick(on_network)
         for units, fold in held.items():
             seen, test = x[fold.train], x[fold.test]

@@ -1,22 +1,38 @@
-"""Electrodes -> field on the held-out trajectories of each unit.
+"""Electrodes -> displacement field of the skin: train, test on held-out trajectories, ship.
 
-Every unit has a network of its own; where there are several, one more is trained on all of them and
-tested on each, because electrode values differ from unit to unit.
+Every specimen has a network of its own; where there are several, one more is trained on all of them
+and tested on each, because electrode values differ from specimen to specimen. The network that
+ships is by default the one for all, since a finger that a robot asks about is none of them. What is
+reported was measured with exactly the weights that are shipped.
+
+Networks are trained on coefficients of modes, never on whole fields. Modes are orthonormal, so the
+root mean square error over the nodes is the norm of the coefficients' error over the root of the
+number of nodes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor, nn
 
-from palpate_training.datasets.experiment import MixedDataset
+from palpate.errors import BundleError
+from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.experiment import MixedDataset, content_sha256
+from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
+from palpate_training.learning.export import export_fields
 from palpate_training.learning.field_code import FieldCode, fit_code
+from palpate_training.learning.fit import FitConfig, OnEpoch, fit
 from palpate_training.learning.metrics import field_errors, field_summary, join
-from palpate_training.learning.splits import Rows, by_trajectory, of_units, unit_sets
-from palpate_training.tasks.field_fit import FitConfig, fit_field, tared_counts
+from palpate_training.learning.networks import FieldGraph, Mlp, predict
+from palpate_training.learning.splits import Held, Rows, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.results import (
     ALL,
     MEAN,
@@ -24,9 +40,9 @@ from palpate_training.tasks.results import (
     RIDGE,
     ZERO,
     Errors,
+    ModelResult,
     OnNetwork,
     Picture,
-    Result,
     TaskReport,
     facts_of,
     label_of,
@@ -39,7 +55,133 @@ from palpate_training.tasks.results import (
 FloatArray = npt.NDArray[np.float32]
 Estimate = Callable[[Rows], FloatArray]
 
+PARITY_ROWS = 24
+"""Held-out rows of the parity check, spread over the test trajectories."""
+
 _CHUNK_ROWS = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldConfig(FitConfig):
+    """Settings of a training of a field or synthesis network.
+
+    Attributes:
+        rest_share: Untouched rows added to the training rows, as a share of them. The data set
+            starts at 0.5 N; without them an untouched finger would be an extrapolation.
+        rest_noise_counts: Standard deviation of the electrodes of such a row [counts].
+    """
+
+    widths: Sequence[int] = (256, 256, 128)
+    epochs: int = 150
+    patience: int = 30
+    rest_share: float = 0.05
+    rest_noise_counts: float = 3.0
+
+    def rest_rows(self, train: Rows) -> int:
+        """How many untouched rows are added to some training rows."""
+        return math.ceil(self.rest_share * len(train))
+
+
+@dataclass(frozen=True, slots=True)
+class FieldModel:
+    """Electrodes -> field.
+
+    Attributes:
+        net: Tared counts (N, 19) -> coefficients (N, K) [m].
+        code: What they are coefficients of.
+    """
+
+    net: Mlp
+    code: FieldCode
+
+    def coefficients(self, tared_counts: FloatArray) -> FloatArray:
+        """Coefficients [m], shape (N, K), of tared counts (N, 19)."""
+        return predict(self.net, tared_counts)
+
+
+def tared_counts(data: MixedDataset) -> FloatArray:
+    """Tared electrodes of all rows [counts], shape (N, 19)."""
+    return np.asarray(data.experiment.tared * np.float32(COUNTS_MAX), np.float32)
+
+
+def fit_field(
+    data: MixedDataset,
+    held: Held,
+    *,
+    code: FieldCode | None = None,
+    config: FieldConfig | None = None,
+    seed: int = 0,
+    on_epoch: OnEpoch | None = None,
+) -> FieldModel:
+    """Train electrodes -> field on the training rows of some units.
+
+    Args:
+        data: The mixed data set.
+        held: Rows to train and to stop on.
+        code: Modes to use; None = those of the training rows.
+        config: Settings.
+        seed: Seed of weights, order of rows and noise of the untouched rows.
+        on_epoch: Called after each epoch.
+    """
+    config = config or FieldConfig()
+    split = held.split
+    code = code or fit_code(data, split.train, split.validation)
+    x, y = tared_counts(data), code.encode(data.coefficients)
+    zero = code.project(np.zeros((1, len(code.mean)), np.float32))
+
+    torch.manual_seed(seed)
+    net = Mlp(config.widths, ELECTRODES, outputs=code.size)
+    net.normalise_from(x[split.train], y[split.train])
+    rest = config.rest_rows(split.train)
+    noise = np.random.default_rng(seed).normal(0, config.rest_noise_counts, (rest, ELECTRODES))
+    fit_on_norms(
+        net,
+        np.vstack([x[split.train], noise.astype(np.float32)]),
+        np.vstack([y[split.train], np.repeat(zero, rest, axis=0)]),
+        (x[split.validation], y[split.validation]),
+        scale=1e3 / math.sqrt(code.nodes),
+        floor=0.01,
+        config=config,
+        on_epoch=on_epoch,
+    )
+    return FieldModel(net, code)
+
+
+def fit_on_norms(
+    net: nn.Module,
+    inputs: FloatArray,
+    targets: FloatArray,
+    validation: tuple[FloatArray, FloatArray],
+    *,
+    scale: float,
+    floor: float,
+    config: FieldConfig,
+    on_epoch: OnEpoch | None,
+) -> None:
+    """Train in place on the norm of each row's error.
+
+    The loss of a row is ``sqrt((scale |error|)^2 + floor^2)``: an L2 norm, smooth at zero. The
+    validation rows are scored by the same loss.
+    """
+    seen, truth = (torch.from_numpy(part) for part in validation)
+
+    def loss_of(estimate: Tensor, wanted: Tensor) -> Tensor:
+        squares = torch.sum(torch.square(scale * (estimate - wanted)), dim=1)
+        return torch.sqrt(squares + floor**2).mean()
+
+    def score_of(net: nn.Module) -> float:
+        with torch.inference_mode():
+            return float(loss_of(net(seen), truth))
+
+    fit(
+        net,
+        inputs,
+        targets,
+        loss_of=loss_of,
+        score_of=score_of,
+        config=config,
+        on_epoch=on_epoch,
+    )
 
 
 def evaluate_field(
@@ -47,7 +189,7 @@ def evaluate_field(
     *,
     seeds: int = 3,
     split_seed: int = 0,
-    config: FitConfig | None = None,
+    config: FieldConfig | None = None,
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> TaskReport:
@@ -88,7 +230,7 @@ def evaluate_field(
             OWN: [_estimate(model.coefficients, code, counts) for model in nets],
         }
 
-    results: list[Result] = []
+    results: list[ModelResult] = []
     force_n, error = {}, {}
     picture = None
     for units in sets:
@@ -111,7 +253,12 @@ def evaluate_field(
         picture = Picture(
             force_n, error, name_of(data, int(row)), truth, fitted[units][OWN][0](row[None])[0]
         )
-    return TaskReport("field", results, {"modes": modes, **facts_of(data, seeds, config)}, picture)
+    return TaskReport(
+        "field",
+        results,
+        {"modes": modes, **facts_of(data, seeds, config or FieldConfig())},
+        picture,
+    )
 
 
 def field_row_errors(
@@ -146,3 +293,118 @@ def _estimate(
 
 def _still(data: MixedDataset) -> Estimate:
     return lambda rows: np.zeros((len(rows), *data.mesh.nodes.shape), np.float32)
+
+
+def field_bundle(
+    data: MixedDataset,
+    folder: Path,
+    *,
+    units: Sequence[str] = (),
+    name: str = "field",
+    version: int = 1,
+    config: FieldConfig | None = None,
+    seed: int = 0,
+    on_epoch: OnEpoch | None = None,
+) -> dict[str, float]:
+    """Electrodes -> field, as a bundle.
+
+    Args:
+        data: The mixed data set.
+        folder: Folder of the bundle; must not exist.
+        units: Units to train and to test on; empty = all.
+        name: Name of the bundle.
+        version: Its version, from 1.
+        config: Settings of the training.
+        seed: Seed of split and weights.
+        on_epoch: Called after each epoch.
+
+    Returns:
+        The held-out metrics in the manifest.
+
+    Raises:
+        DatasetError: A unit is not known, or too few trajectories are left.
+        BundleError: The folder exists, or parity fails; nothing is left on disk.
+    """
+    refuse_existing(folder)
+    split = by_trajectory(data.experiment, seed=seed)
+    held = of_units(data.experiment, split, units or unit_sets(data.experiment)[-1])
+    model = fit_field(data, held, config=config, seed=seed, on_epoch=on_epoch)
+    code, counts = model.code, tared_counts(data)
+
+    def estimate(rows: Rows) -> FloatArray:
+        return code.decode(model.coefficients(counts[rows]))
+
+    errors = field_row_errors(
+        data,
+        held.split.test,
+        {
+            "zero": [lambda rows: np.zeros((len(rows), *data.mesh.nodes.shape), np.float32)],
+            "net": [estimate],
+        },
+    )
+    metrics = field_summary(errors["net"][0], errors["zero"][0])
+    metrics["zero_nodal_subset_m"] = float(errors["zero"][0]["subset_m"].mean())
+    untouched = code.decode(model.coefficients(np.zeros((1, counts.shape[1]), np.float32)))
+    metrics["untouched_nodal_all_m"] = float(np.linalg.norm(untouched, axis=2).mean())
+    metrics |= truncation_metrics(code)
+    export_fields(
+        folder,
+        FieldGraph(model.net, code, _node_sd(data, held.split.validation, estimate)),
+        counts[spread_rows(held.split.test)],
+        data.mesh,
+        name=name,
+        version=version,
+        training_data_sha256=content_sha256(data),
+        trained_on=trained_on_line(data, held),
+        metrics=metrics,
+        normalisation={
+            "electrodes": "standardised by the training rows, inside the graph",
+            "displacement": f"{code.size} modes of the training rows, half precision in the graph",
+            "displacement_sd": "constant per node: rms length of the error on validation rows",
+        },
+    )
+    return metrics
+
+
+def refuse_existing(folder: Path) -> None:
+    """Refuse to train for a bundle that cannot be written.
+
+    Raises:
+        BundleError: The folder exists.
+    """
+    if folder.exists():  # say so before minutes of training, not after
+        raise BundleError(
+            f"{folder} exists and bundles are immutable", remedy="write the next version"
+        )
+
+
+def truncation_metrics(code: FieldCode) -> dict[str, float]:
+    """Number of modes, and what they lose, for a manifest."""
+    return {"modes": float(code.size), "truncation_nodal_all_m": code.truncation_m[code.size]}
+
+
+def spread_rows(rows: Rows) -> Rows:
+    """Rows over the whole test set; at most as many as the parity check takes."""
+    chosen: Rows = rows[np.unique(np.linspace(0, len(rows) - 1, PARITY_ROWS).astype(int))]
+    return chosen
+
+
+def _node_sd(data: MixedDataset, rows: Rows, estimate: Callable[[Rows], FloatArray]) -> FloatArray:
+    total = np.zeros(len(data.mesh.nodes))
+    for start in range(0, len(rows), _CHUNK_ROWS):
+        part = rows[start : start + _CHUNK_ROWS]
+        total += np.square(estimate(part) - data.displacement(part)).sum(axis=(0, 2))
+    return np.asarray(np.sqrt(total / len(rows)), np.float32)
+
+
+def trained_on_line(data: MixedDataset, held: Held) -> str:
+    """What a network was trained and tested on, one line for people."""
+
+    def presses(rows: Rows) -> int:
+        return len(np.unique(data.experiment.row_trajectory[rows]))
+
+    split = held.split
+    return (
+        f"{data.experiment.provenance.source}: {', '.join(held.units)}; {len(split.train)} rows of"
+        f" {presses(split.train)} trajectories, tested on {presses(split.test)} others"
+    )

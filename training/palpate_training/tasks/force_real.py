@@ -24,14 +24,14 @@ from palpate.errors import DatasetError
 from palpate.extras import require
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 from palpate_training.learning import baselines
-from palpate_training.learning.fit import TrainConfig, train
+from palpate_training.learning.fit import FeaturesConfig, fit_quantity
 from palpate_training.learning.networks import predict
 from palpate_training.learning.splits import Split, contiguous_folds, unseen_sensor
-from palpate_training.tasks.results import Result, force_result, markdown_table, write_json
+from palpate_training.tasks.results import ModelResult, force_result, markdown_table, write_json
 
 FloatArray = npt.NDArray[np.float32]
 
-FORCE_CONFIG = TrainConfig()
+FORCE_CONFIG = FeaturesConfig()
 """Chosen on validation blocks only; training/LOG.md has what was tried."""
 
 OTHER_BLOCKS = (10, 40)
@@ -46,7 +46,7 @@ GUARD_ROWS = 100
 class ForceReport:
     """Results of the experiment, and truth against the averaged networks for the figure."""
 
-    results: list[Result]
+    results: list[ModelResult]
     panels: list[Panel]
     facts: dict[str, object]
 
@@ -63,7 +63,7 @@ def run_force_real(
     data: FeatureDataset,
     *,
     seeds: int = 5,
-    config: TrainConfig = FORCE_CONFIG,
+    config: FeaturesConfig = FORCE_CONFIG,
     unseen: bool = True,
     other_blocks: Sequence[int] = OTHER_BLOCKS,
     draws: int = 2000,
@@ -80,7 +80,7 @@ def run_force_real(
         draws: Draws of the bootstrap.
         on_network: Called after each training, for a progress bar.
     """
-    results: list[Result] = []
+    results: list[ModelResult] = []
     panels: list[Panel] = []
 
     def compare(source: FeatureDataset, test: str, folds: list[Split], networks: int) -> None:
@@ -128,10 +128,10 @@ def _compare(
     test: str,
     folds: Sequence[Split],
     networks: int,
-    config: TrainConfig,
+    config: FeaturesConfig,
     draws: int,
     on_network: Callable[[], None] | None,
-) -> tuple[list[Result], Panel]:
+) -> tuple[list[ModelResult], Panel]:
     """Constant, line, single networks and their mean on the pooled test rows of all folds."""
     x, y = data.tared_counts, data.force
     tested = np.sort(np.concatenate([split.test for split in folds]))
@@ -146,7 +146,7 @@ def _compare(
         constant[split.test] = baselines.constant(x[known], y[known]).predict(x[split.test])
         linear[split.test] = baselines.linear(x[known], y[known]).predict(x[split.test])
         for seed in range(networks):
-            trained = train(
+            trained = fit_quantity(
                 x[known], y[known], baseline=data.baseline[known], config=config, seed=seed
             )
             estimates[seed, split.test] = predict(trained.net, x[split.test])

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from palpate.extras import require
 from palpate_training.datasets.experiment import SkinMesh
 from palpate_training.datasets.features import ELECTRODES
-from palpate_training.tasks.results import Picture, Result, TaskReport, write_json
+from palpate_training.tasks.results import ModelResult, Picture, TaskReport, write_json
 
 TWIN_LABEL, PAPER_LABEL = "twin", "paper (real)"
 
@@ -186,7 +186,7 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _cell(result: Result, column: Column) -> str:
+def _cell(result: ModelResult, column: Column) -> str:
     text = _known(result.metrics[column.metric], column)
     if column.interval in result.interval:
         low, high = (_known(end, column) for end in result.interval[column.interval])
@@ -237,7 +237,7 @@ PAPER: Mapping[str, Mapping[str, Mapping[str, float]]] = {
         ALL_UNITS: {"location_distance_median_m": 2.0e-3, "location_distance_mean_m": 2.2e-3},
     },
 }
-"""Task -> unit -> metric of ``palpate_training.tasks.results.Result``, SI and counts."""
+"""Task -> unit -> metric of ``palpate_training.tasks.results.ModelResult``, SI and counts."""
 
 
 FORCE_BINS_N = (0.0, 2.0, 8.0, np.inf)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from rich.table import Table
 
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
+from palpate_training.learning.fit import FitConfig
 from palpate_training.learning.metrics import (
     Rows64,
     cluster_bootstrap,
@@ -23,7 +24,6 @@ from palpate_training.learning.metrics import (
     root_mean,
 )
 from palpate_training.learning.splits import Rows, unit_sets
-from palpate_training.tasks.field_fit import FitConfig
 
 Labels = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class ModelResult:
     """One model on one test.
 
     Attributes:
@@ -57,7 +57,7 @@ def force_result(
     cluster: Labels,
     *,
     draws: int = 2000,
-) -> Result:
+) -> ModelResult:
     """Metrics of one model, from the estimates of each of its seeds.
 
     Args:
@@ -74,7 +74,7 @@ def force_result(
         name: np.stack([one[name] for one in errors], axis=1)
         for name in ("magnitude_n", "angle_rad", "vector_n")
     }
-    return Result(
+    return ModelResult(
         test=test,
         model=model,
         metrics={name: float(np.mean([one[name] for one in each])) for name in each[0]},
@@ -110,7 +110,7 @@ FORCE_COLUMNS = (
 )
 
 
-def _cells(result: Result, columns: Sequence[Column]) -> list[str]:
+def _cells(result: ModelResult, columns: Sequence[Column]) -> list[str]:
     cells = []
     for column in columns:
         text = f"{result.metrics[column.metric]:.{column.digits}f}"
@@ -121,7 +121,7 @@ def _cells(result: Result, columns: Sequence[Column]) -> list[str]:
     return cells
 
 
-def rich_table(results: Sequence[Result], title: str) -> Table:
+def rich_table(results: Sequence[ModelResult], title: str) -> Table:
     """The main columns for a terminal; the Markdown and the JSON hold them all."""
     columns = [column for column in FORCE_COLUMNS if column.interval or column.digits == 4]
     table = Table(title=title)
@@ -136,7 +136,7 @@ def rich_table(results: Sequence[Result], title: str) -> Table:
     return table
 
 
-def markdown_table(results: Sequence[Result]) -> str:
+def markdown_table(results: Sequence[ModelResult]) -> str:
     """All columns as a Markdown table."""
     headings = ["held out", "model", *(column.heading for column in FORCE_COLUMNS)]
     lines = ["| " + " | ".join(headings) + " |", "|---|---|" + "---:|" * len(FORCE_COLUMNS)]
@@ -147,7 +147,7 @@ def markdown_table(results: Sequence[Result]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_json(path: Path, results: Sequence[Result], facts: dict[str, object]) -> None:
+def write_json(path: Path, results: Sequence[ModelResult], facts: dict[str, object]) -> None:
     """Write every metric with six digits, and what produced it."""
     rows = [
         {
@@ -206,7 +206,7 @@ class TaskReport:
     """
 
     task: str
-    results: list[Result]
+    results: list[ModelResult]
     facts: dict[str, object] = field(default_factory=dict)
     picture: Picture | None = None
 
@@ -258,7 +258,7 @@ def result_of(
     rows: Rows,
     draws: int,
     summary: Callable[[Errors, Errors], dict[str, float]],
-) -> Result:
+) -> ModelResult:
     """One row of the table, averaged over seeds.
 
     Args:
@@ -280,7 +280,7 @@ def averaged(
     model: str,
     seeds: Sequence[dict[str, float]],
     interval: dict[str, tuple[float, float]],
-) -> Result:
+) -> ModelResult:
     """Metrics averaged over seeds, with their standard deviation where there are several.
 
     Args:
@@ -290,7 +290,7 @@ def averaged(
         interval: 95 % intervals by name.
     """
     values = {name: [one[name] for one in seeds] for name in seeds[0]}
-    return Result(
+    return ModelResult(
         test,
         model,
         {name: float(np.mean(each)) for name, each in values.items()},
@@ -319,9 +319,8 @@ def name_of(data: MixedDataset, row: int) -> str:
     return f"{data.experiment.trial_name(trial)}, {force:.1f} N"
 
 
-def facts_of(data: MixedDataset, seeds: int, config: FitConfig | None) -> dict[str, object]:
+def facts_of(data: MixedDataset, seeds: int, config: FitConfig) -> dict[str, object]:
     """What produced the results of a task."""
-    config = config or FitConfig()
     return {
         "source": data.experiment.provenance.source,
         "rows": len(data),
@@ -329,5 +328,5 @@ def facts_of(data: MixedDataset, seeds: int, config: FitConfig | None) -> dict[s
         "seeds": seeds,
         "nodes": len(data.mesh.nodes),
         "basis_loss_mean_m": data.basis.loss_mean_m,
-        "config": {key: getattr(config, key) for key in FitConfig.__slots__},
+        "config": asdict(config),
     }

@@ -1,33 +1,46 @@
-"""Field -> electrodes on the held-out trajectories of each unit, one network for each.
+"""Displacement field of the skin -> electrodes of one specimen: train, test, ship.
 
-The bundle's contract takes a field and nothing else, and units differ, so there is no network of
-all units.
+The bundle's contract takes a field and nothing else, and specimens differ, so there is one network
+for each and none for all. The network sees the coefficients of the field's modes and the film under
+the skin near each electrode, both linear in the field.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from palpate_training.datasets.experiment import MixedDataset
+from palpate_training.datasets.experiment import MixedDataset, content_sha256
+from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
-from palpate_training.learning.field_code import fit_code, pooling
-from palpate_training.learning.metrics import electrode_errors, electrode_summary
-from palpate_training.learning.splits import by_trajectory, of_units, unit_sets
-from palpate_training.tasks.field_fit import (
-    FitConfig,
-    fit_synthesis,
-    synthesis_features,
+from palpate_training.learning.export import export_fields
+from palpate_training.learning.field_code import FieldCode, Pooling, fit_code, pooling
+from palpate_training.learning.fit import OnEpoch
+from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
+from palpate_training.learning.networks import FilmNet, Mlp, SynthesisGraph, predict
+from palpate_training.learning.splits import Held, by_trajectory, of_units, unit_sets
+from palpate_training.tasks.fields import (
+    FieldConfig,
+    fit_on_norms,
+    refuse_existing,
+    spread_rows,
     tared_counts,
+    trained_on_line,
+    truncation_metrics,
 )
 from palpate_training.tasks.results import (
     MEAN,
     OWN,
     RIDGE,
     ZERO,
+    ModelResult,
     OnNetwork,
     Picture,
-    Result,
     TaskReport,
     facts_of,
     name_of,
@@ -36,13 +49,93 @@ from palpate_training.tasks.results import (
     typical,
 )
 
+FloatArray = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class SynthesisModel:
+    """Field -> electrodes.
+
+    Attributes:
+        net: Coefficients and pooled film (N, K + P) -> tared counts (N, 19).
+        code: What they are coefficients of.
+        pooling: How the film is pooled.
+    """
+
+    net: FilmNet
+    code: FieldCode
+    pooling: Pooling
+
+    def counts(self, features: FloatArray) -> FloatArray:
+        """Tared counts (N, 19) of features (N, K + P) from ``synthesis_features``."""
+        return predict(self.net, features)
+
+
+def synthesis_features(data: MixedDataset, code: FieldCode, film: Pooling) -> FloatArray:
+    """What the shipped graph computes from the field of every row, without making the fields.
+
+    Projection and pooling are linear in the field and the field is linear in the data set's
+    coefficients, so two small matrices do.
+
+    Args:
+        data: Rows with the coefficients of their fields.
+        code: Modes to project on.
+        film: How the film is pooled.
+
+    Returns:
+        Coefficients and pooled change of the film [m], shape (N, K + P).
+    """
+    modes, mean = data.basis.modes, data.basis.mean[None]
+    lead = _features(np.concatenate([modes + mean, mean]), code, film)
+    return np.asarray(data.coefficients @ (lead[:-1] - lead[-1]) + lead[-1], np.float32)
+
+
+def _features(displacement: FloatArray, code: FieldCode, film: Pooling) -> FloatArray:
+    flat = displacement.reshape(len(displacement), -1)
+    return np.hstack([code.project(flat), film.pool(displacement)])
+
+
+def fit_synthesis(
+    data: MixedDataset,
+    held: Held,
+    *,
+    code: FieldCode | None = None,
+    config: FieldConfig | None = None,
+    seed: int = 0,
+    on_epoch: OnEpoch | None = None,
+) -> SynthesisModel:
+    """Train field -> electrodes; the arguments are those of ``fit_field``."""
+    config = config or FieldConfig()
+    split = held.split
+    code = code or fit_code(data, split.train, split.validation)
+    film = pooling(data.mesh)
+    x, y = synthesis_features(data, code, film), tared_counts(data)
+    zero = _features(np.zeros((1, *data.mesh.nodes.shape), np.float32), code, film)
+
+    torch.manual_seed(seed)
+    width = code.size + 2 * len(film.rest_m)
+    net = FilmNet(Mlp(config.widths, width, outputs=ELECTRODES), code.size, film.rest_m)
+    net.normalise_from(x[split.train], y[split.train])
+    rest = config.rest_rows(split.train)
+    fit_on_norms(
+        net,
+        np.vstack([x[split.train], np.repeat(zero, rest, axis=0)]),
+        np.vstack([y[split.train], np.zeros((rest, ELECTRODES), np.float32)]),
+        (x[split.validation], y[split.validation]),
+        scale=1.0 / math.sqrt(ELECTRODES),
+        floor=1.0,
+        config=config,
+        on_epoch=on_epoch,
+    )
+    return SynthesisModel(net, code, film)
+
 
 def evaluate_synthesis(
     data: MixedDataset,
     *,
     seeds: int = 3,
     split_seed: int = 0,
-    config: FitConfig | None = None,
+    config: FieldConfig | None = None,
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> TaskReport:
@@ -50,7 +143,7 @@ def evaluate_synthesis(
     split = by_trajectory(data.experiment, seed=split_seed)
     counts = tared_counts(data)
     film = pooling(data.mesh)
-    results: list[Result] = []
+    results: list[ModelResult] = []
     force_n, error = {}, {}
     picture = None
     for units in unit_sets(data.experiment):
@@ -93,4 +186,51 @@ def evaluate_synthesis(
             counts[rows[at]],
             np.asarray(estimates[OWN][0][at], np.float32),
         )
-    return TaskReport("synthesis", results, facts_of(data, seeds, config), picture)
+    return TaskReport("synthesis", results, facts_of(data, seeds, config or FieldConfig()), picture)
+
+
+def synthesis_bundle(
+    data: MixedDataset,
+    folder: Path,
+    *,
+    unit: str,
+    name: str = "synthesis",
+    version: int = 1,
+    config: FieldConfig | None = None,
+    seed: int = 0,
+    on_epoch: OnEpoch | None = None,
+) -> dict[str, float]:
+    """Field -> electrodes of one unit, as a bundle; the arguments are those of ``field_bundle``."""
+    refuse_existing(folder)
+    held = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), [unit])
+    model = fit_synthesis(data, held, config=config, seed=seed, on_epoch=on_epoch)
+    counts = tared_counts(data)
+    features = synthesis_features(data, model.code, model.pooling)
+    test, validation = held.split.test, held.split.validation
+    zero = electrode_errors(np.zeros_like(counts[test]), counts[test])
+    metrics = electrode_summary(electrode_errors(model.counts(features[test]), counts[test]), zero)
+    residual = model.counts(features[validation]) - counts[validation]
+    sd = np.asarray(rms(residual), np.float32)
+    graph = SynthesisGraph(model.net, model.code, model.pooling, sd)
+    with torch.inference_mode():
+        untouched = graph(torch.zeros(1, 3 * model.code.nodes))[0].numpy()
+    metrics["untouched_max_counts"] = float(np.abs(untouched).max())
+    metrics |= truncation_metrics(model.code)
+    rows = spread_rows(test)
+    export_fields(
+        folder,
+        graph,
+        data.displacement(rows).reshape(len(rows), -1),
+        data.mesh,
+        name=name,
+        version=version,
+        training_data_sha256=content_sha256(data),
+        trained_on=trained_on_line(data, held),
+        metrics=metrics,
+        normalisation={
+            "displacement": f"projected on {model.code.size} modes and pooled near 23 electrodes,"
+            " inside the graph",
+            "tared_counts_sd": "constant per electrode: rms residual on validation rows",
+        },
+    )
+    return metrics
