@@ -14,7 +14,7 @@ PATIENCE_S = 20.0
 HELLO, SLOTS, STATUS = 1, 2, 3
 
 
-class CobsPacket(NamedTuple):
+class Packet(NamedTuple):
     kind: int
     sequence: int
     time_us: int
@@ -45,18 +45,18 @@ class Wire:
         assert got.endswith(b"\0"), "nothing came"
         return bytes(got[:-1])
 
-    def packet(self) -> CobsPacket | None:
+    def packet(self) -> Packet | None:
         """The next one, None where its sum is wrong."""
         data = unstuffed(self.raw())
         if len(data) < 12 or crc16_x25(data[:-2]).to_bytes(2, "little") != data[-2:]:
             return None
         version, kind, _source, flags, sequence, time_us = struct.unpack_from("<4BHI", data)
         assert (version, flags) == (1, 0)
-        return CobsPacket(kind, sequence, time_us, data[10:-2])
+        return Packet(kind, sequence, time_us, data[10:-2])
 
-    def packets(self, count: int, kind: int = SLOTS) -> list[CobsPacket]:
+    def packets(self, count: int, kind: int = SLOTS) -> list[Packet]:
         """The next good ones of a kind."""
-        out: list[CobsPacket] = []
+        out: list[Packet] = []
         deadline = time.monotonic() + PATIENCE_S
         while len(out) < count:
             assert time.monotonic() < deadline
@@ -66,7 +66,7 @@ class Wire:
         return out
 
 
-def slots(packet: CobsPacket) -> list[bytes]:
+def slots(packet: Packet) -> list[bytes]:
     count, fingers = packet.body[:2]
     width = 1 + 2 * fingers
     assert len(packet.body) == 2 + count * width

@@ -55,31 +55,17 @@ def _is_good(frame: bytes) -> bool:
     return crc16_x25(frame[1:-2]) == int.from_bytes(frame[-2:], "little")
 
 
-class BotaDecoder:
+class BotaDecoder(FrameFinder[BotaFrame]):
     """Frames out of a serial line; the text before them is junk to it.
 
     ``counters["not_finite"]`` counts good frames with a value that is no number; they are returned.
     """
 
     def __init__(self) -> None:
-        self._finder = FrameFinder({_HEAD: FRAME_BYTES}, _is_good)
-        self.counters = self._finder.counters
+        super().__init__({_HEAD: FRAME_BYTES}, _is_good, self._frame)
         self.counters["not_finite"] = 0
 
-    @property
-    def pending(self) -> int:
-        """Bytes of a frame that has begun."""
-        return self._finder.pending
-
-    def reset(self) -> None:
-        """A new connection: partial bytes are counted as junk, counters are kept."""
-        self._finder.reset()
-
-    def feed(self, data: bytes) -> list[BotaFrame]:
-        """Take bytes as they come; return the frames that are now whole."""
-        return [self._read(frame) for frame in self._finder.feed(data)]
-
-    def _read(self, frame: bytes) -> BotaFrame:
+    def _frame(self, frame: bytes) -> BotaFrame:
         status, *wrench, time_us, temperature_c = _FIELDS.unpack_from(frame, 1)
         finite = all(map(math.isfinite, (*wrench, temperature_c)))
         self.counters["not_finite"] += not finite

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from palpate_gateway.protocols.can_slots import FINGERS_MAX
-from palpate_gateway.protocols.framing import CobsPacket, PacketSplitter, crc16_x25, encode_packet
+from palpate_gateway.protocols.framing import CobsPacket, PacketSplitter, crc16_x25
 from palpate_gateway.protocols.spi import printable_prefix
 
 VERSION = 1
@@ -132,60 +132,6 @@ class BridgeRecord:
     lost_before: int
     epoch: int
     time_us: int
-
-
-def encode(header: BridgeHeader, body: BridgeBody) -> bytes:
-    """A packet as it goes over the wire, with its delimiter.
-
-    Raises:
-        ValueError: A field does not fit; names it and its range.
-    """
-    kind, tail = _encode_body(body)
-    head = _HEADER.pack(
-        VERSION,
-        kind,
-        _within("source", header.source, 0xFF),
-        _within("flags", header.flags, 0xFF),
-        _within("sequence", header.sequence, 0xFFFF),
-        _within("device_time_us", header.device_time_us, 0xFFFFFFFF),
-    )
-    data = head + tail
-    return encode_packet(data + _CRC.pack(crc16_x25(data)))
-
-
-def _encode_body(body: BridgeBody) -> tuple[BridgePacketType, bytes]:
-    if isinstance(body, BridgeHello):
-        count = _within("fingers", len(body.fingers), FINGERS_MAX, least=1)
-        rate_hz = _within("slot_rate_hz", body.slot_rate_hz, 0xFFFF)
-        slots = _within("slots_per_frame", body.slots_per_frame, 0xFF)
-        fingers = [
-            _FINGER.pack(_text("serial", one.serial, 16), _text("firmware", one.firmware, 4))
-            for one in body.fingers
-        ]
-        return BridgePacketType.HELLO, _HELLO.pack(count, rate_hz, slots) + b"".join(fingers)
-    if isinstance(body, BridgeSlots):
-        count = _within("fingers", body.fingers, FINGERS_MAX, least=1)
-        slots = _within("number of payloads", len(body.payloads), SLOTS_MAX)
-        for payload in body.payloads:
-            _within("length of a payload", len(payload), 1 + 2 * count, least=1 + 2 * count)
-        return BridgePacketType.SLOTS, _SLOTS.pack(slots, count) + b"".join(body.payloads)
-    count = _within("fingers", len(body.parity_errors), FINGERS_MAX, least=1)
-    counters = (*body.parity_errors, body.error_words, body.overruns)
-    for counter in counters:
-        _within("counter", counter, 0xFFFFFFFF)
-    return BridgePacketType.STATUS, struct.pack(f"<B{count + 2}I", count, *counters)
-
-
-def _within(name: str, value: int, most: int, *, least: int = 0) -> int:
-    if not least <= value <= most:
-        raise ValueError(f"{name} {value} is not in {least}..{most}")
-    return value
-
-
-def _text(name: str, text: str, size: int) -> bytes:
-    if not text.isascii() or len(text) > size:
-        raise ValueError(f"{name} {text!r} is not 0..{size} ASCII characters")
-    return text.encode("ascii")
 
 
 def decode_body(kind: int, data: bytes) -> BridgeBody | None:

@@ -1,17 +1,7 @@
-"""Consistent overhead byte stuffing: packets of any bytes, ended by the byte 0.
+"""Frames and packets out of a byte stream, and their checksums.
 
-A packet is cut before each zero; each piece is sent behind a byte that says how far the next zero
-is. No zero is left inside, so a receiver that lost its place finds it at the next zero.
-
-
-Frames out of a byte stream that may begin anywhere and hold junk.
-
-One search for all serial devices whose frames have a fixed head, a length known from the head and a
-check: a head alone is never trusted (hardware reference 4.3), and after a failed check one byte is
-dropped, because the true head may stand inside what looked like a frame.
-
-
-Checksums of the serial devices (hardware reference 2.6, 3.4, 3.5, 3.6).
+Two ways to find a frame: COBS packets end with a zero that occurs nowhere inside; other serial
+devices send a fixed head, a length known from the head, and a check (hardware reference 4.3).
 """
 
 from __future__ import annotations
@@ -19,22 +9,27 @@ from __future__ import annotations
 import binascii
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from cobs import cobs
 
 DELIMITER = b"\x00"
 
-_LONGEST_PIECE = 254
-"""Bytes behind the code 0xFF, the one code that stands for no zero."""
+_LONGEST_RUN = 254
+"""COBS puts a code byte before each run of at most so many bytes."""
+
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True, slots=True)
 class CobsPacket:
-    """One packet as it came out of the stuffing.
+    """One packet without its stuffing.
 
     Attributes:
         data: The packet.
-        wire_bytes: What it took on the wire, with its delimiter.
-        first: It is the first since connecting, so its beginning may be missing: whoever checks a
-            checksum drops it without calling it an error.
+        wire_bytes: Length on the wire, with stuffing and delimiter.
+        first: It is the first since connecting, so its beginning may be missing: a wrong checksum
+            is then no error.
     """
 
     data: bytes
@@ -42,62 +37,33 @@ class CobsPacket:
     first: bool
 
 
-def encode(data: bytes) -> bytes:
-    """Stuff a packet; the result has no zero and no delimiter."""
-    out = bytearray()
-    pieces = data.split(DELIMITER)
-    for number, piece in enumerate(pieces):
-        while len(piece) >= _LONGEST_PIECE:
-            out.append(0xFF)
-            out += piece[:_LONGEST_PIECE]
-            piece = piece[_LONGEST_PIECE:]
-            if not piece and number == len(pieces) - 1:
-                return bytes(out)  # the end needs no code of its own
-        out.append(len(piece) + 1)
-        out += piece
-    return bytes(out)
-
-
-def encode_packet(data: bytes) -> bytes:
-    """Stuff a packet and end it with the delimiter."""
-    return encode(data) + DELIMITER
-
-
-def decode(block: bytes) -> bytes | None:
-    """The packet in a block without its delimiter; None if a code points beyond the end."""
-    if not block or 0 in block:
+def unstuffed(block: bytes) -> bytes | None:
+    """The packet in a block without its delimiter; None if the block is no COBS."""
+    if not block:
         return None
-    out = bytearray()
-    at = 0
-    while at < len(block):
-        code = block[at]
-        end = at + code
-        if end > len(block):
-            return None
-        out += block[at + 1 : end]
-        at = end
-        if code <= _LONGEST_PIECE and at < len(block):
-            out.append(0)
-    return bytes(out)
+    try:
+        return bytes(cobs.decode(block))
+    except cobs.DecodeError:
+        return None
 
 
 class PacketSplitter:
-    """Cuts a stream into packets.
+    """Cuts a stream of COBS packets at the zeros that end them, and removes the stuffing.
 
-    What comes before the first delimiter may lack its beginning: if it does not decode it is junk,
-    but no error. A delimiter that ends nothing is junk too. Bytes counted as junk and the wire
-    bytes of the packets, with those ``pending``, are all bytes fed.
+    Bytes before the first zero may be the end of a packet: if they do not decode they are junk, but
+    no error. A zero that ends nothing is junk too. Bytes counted as junk, the wire bytes of the
+    packets and those ``pending`` add up to all bytes fed.
 
     Args:
-        max_packet_bytes: Longest packet, unstuffed; longer ones are dropped as they come [bytes].
+        max_packet_bytes: Longest packet without stuffing; longer ones are dropped early [bytes].
     """
 
     def __init__(self, max_packet_bytes: int) -> None:
         if max_packet_bytes < 1:
             raise ValueError(f"longest packet of {max_packet_bytes} bytes is not at least 1")
         self._longest = max_packet_bytes
-        # One code for each full piece and one for the rest, which may be empty.
-        self._longest_block = max_packet_bytes + max_packet_bytes // _LONGEST_PIECE + 1
+        # One code for each full run of 254 bytes, and one for the rest, which may be empty.
+        self._longest_block = max_packet_bytes + max_packet_bytes // _LONGEST_RUN + 1
         self._block = bytearray()
         self._dropping = False
         self._first = True
@@ -122,7 +88,7 @@ class PacketSplitter:
         return packets
 
     def reset(self) -> None:
-        """Forget the packet that has begun: the connection is new."""
+        """A new connection: the packet that has begun will not go on, its bytes are junk."""
         self.counters["junk_bytes"] += len(self._block)
         self._block.clear()
         self._dropping = False
@@ -147,7 +113,7 @@ class PacketSplitter:
             self._dropping = False
             self.counters["junk_bytes"] += 1
             return None
-        data = decode(block)
+        data = unstuffed(block)
         if data is not None and len(data) <= self._longest:
             return CobsPacket(data, len(block) + 1, self._first)
         self.counters["junk_bytes"] += len(block) + 1
@@ -158,25 +124,32 @@ class PacketSplitter:
         return None
 
 
-class FrameFinder:
+class FrameFinder(Generic[Record]):
     """Finds the frames that begin with a known head and pass their check.
 
-    Every byte is accounted for: bytes of returned frames, ``counters["junk_bytes"]``, ``pending``.
-    ``counters["failed_checks"]`` counts heads whose frame failed; many of them are chance heads in
-    the data that follows one damaged frame.
+    After a failed check only one byte is dropped, because the true head may stand inside what
+    looked like a frame. Every byte is accounted for: bytes of returned frames,
+    ``counters["junk_bytes"]``, ``pending``. ``counters["failed_checks"]`` counts heads whose frame
+    failed; many of them are heads by chance in the data that follows one damaged frame.
 
     Args:
-        lengths: Head to length of its whole frame [bytes]. All heads begin with the same byte and
-            none begins with another.
+        lengths: Head to length of its whole frame [bytes]. All heads begin with the same byte, and
+            no head is the beginning of another.
         is_good: Whether a whole frame passes its check.
+        read: Makes the record of a good frame.
     """
 
-    def __init__(self, lengths: Mapping[bytes, int], is_good: Callable[[bytes], bool]) -> None:
+    def __init__(
+        self,
+        lengths: Mapping[bytes, int],
+        is_good: Callable[[bytes], bool],
+        read: Callable[[bytes], Record],
+    ) -> None:
         self._lengths = dict(lengths)
         self._first = next(iter(lengths))[:1]
         if not self._first or any(head[:1] != self._first for head in lengths):
             raise ValueError("the heads do not begin with the same byte")
-        self._is_good = is_good
+        self._is_good, self._read = is_good, read
         self._buffer = bytearray()
         self.counters: dict[str, int] = {"junk_bytes": 0, "failed_checks": 0}
 
@@ -186,15 +159,15 @@ class FrameFinder:
         return len(self._buffer)
 
     def reset(self) -> None:
-        """A new connection: the frame that has begun will not go on, its bytes are junk."""
+        """A new connection: the frame that has begun is junk; counters are kept."""
         self.counters["junk_bytes"] += len(self._buffer)
         self._buffer.clear()
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes as they come; return the frames that are now whole."""
+    def feed(self, data: bytes) -> list[Record]:
+        """Take bytes as they come; return the records of the frames that are now whole."""
         buffer = self._buffer
         buffer += data
-        frames: list[bytes] = []
+        records: list[Record] = []
         at = junk = 0
         while (head := buffer.find(self._first, at)) >= 0:
             junk += head - at
@@ -204,7 +177,7 @@ class FrameFinder:
                 break
             frame = bytes(buffer[at : at + length])
             if length and self._is_good(frame):
-                frames.append(frame)
+                records.append(self._read(frame))
                 at += length
             else:
                 self.counters["failed_checks"] += length > 0
@@ -215,10 +188,10 @@ class FrameFinder:
             at = len(buffer)
         del buffer[:at]
         self.counters["junk_bytes"] += junk
-        return frames
+        return records
 
     def _length_at(self, at: int) -> int:
-        """Bytes that are needed to go on from here; 0 where no frame begins."""
+        """Length of the frame or head that begins here; 0 where none does."""
         for head, length in self._lengths.items():
             begun = bytes(self._buffer[at : at + len(head)])
             if begun == head:

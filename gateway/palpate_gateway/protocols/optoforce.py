@@ -123,30 +123,16 @@ def _is_good(frame: bytes) -> bool:
     return sum16(frame[:-2]) == int.from_bytes(frame[-2:], "big")
 
 
-class OptoForceDecoder:
-    """Samples and replies out of the byte stream."""
-
-    def __init__(self) -> None:
-        self._finder = FrameFinder(_LENGTHS, _is_good)
-        self.counters = self._finder.counters
-
-    @property
-    def pending(self) -> int:
-        """Bytes of a frame that has begun."""
-        return self._finder.pending
-
-    def reset(self) -> None:
-        """A new connection: partial bytes are counted as junk, counters are kept."""
-        self._finder.reset()
-
-    def feed(self, data: bytes) -> list[OptoForceRecord]:
-        """Take bytes as they come; return the records that are now whole."""
-        return [_read(frame) for frame in self._finder.feed(data)]
-
-
 def _read(frame: bytes) -> OptoForceRecord:
     values = _DATA_VALUES.get(frame[:_HEAD_BYTES])
     if values is None:
         return OptoForceReply(frame[_HEAD_BYTES])
     count, status, *counts = struct.unpack_from(f">HH{values}h", frame, _HEAD_BYTES)
     return OptoForceData(count, status, tuple(counts))
+
+
+class OptoForceDecoder(FrameFinder[OptoForceRecord]):
+    """Samples and replies out of the byte stream."""
+
+    def __init__(self) -> None:
+        super().__init__(_LENGTHS, _is_good, _read)

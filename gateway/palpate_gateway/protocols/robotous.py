@@ -336,7 +336,7 @@ def _is_good(frame: bytes) -> bool:
     return frame[-1] == _END and frame[-2] == sum8(frame[1:-2])
 
 
-class RobotousSerialDecoder:
+class RobotousSerialDecoder(FrameFinder[bytes]):
     """Data bytes out of a serial line.
 
     Args:
@@ -344,21 +344,7 @@ class RobotousSerialDecoder:
     """
 
     def __init__(self, data_bytes: int = REPLY_BYTES) -> None:
-        self._finder = FrameFinder({_HEAD: data_bytes + _EXTRA_BYTES}, _is_good)
-        self.counters = self._finder.counters
-
-    @property
-    def pending(self) -> int:
-        """Bytes of a frame that has begun."""
-        return self._finder.pending
-
-    def reset(self) -> None:
-        """A new connection: partial bytes are counted as junk, counters are kept."""
-        self._finder.reset()
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes as they come; return the data bytes of each good frame."""
-        return [frame[1:-2] for frame in self._finder.feed(data)]
+        super().__init__({_HEAD: data_bytes + _EXTRA_BYTES}, _is_good, lambda frame: frame[1:-2])
 
 
 def can_messages(

@@ -6,6 +6,7 @@ import itertools
 from collections import defaultdict
 
 from tests.fuzz.streams import all_counted, same_in_pieces, sealed
+from tests.gateway.bridge_packets import encode, sealed_packet
 
 from palpate_gateway.protocols.bridge import (
     SLOTS_MAX,
@@ -18,16 +19,15 @@ from palpate_gateway.protocols.bridge import (
     BridgeSlots,
     BridgeStatus,
     decode_body,
-    encode,
 )
-from palpate_gateway.protocols.framing import PacketSplitter, crc16_x25, decode, encode_packet
+from palpate_gateway.protocols.framing import PacketSplitter, unstuffed
 
 _LONGEST = 12 + 2 + SLOTS_MAX * 11
 _HELLO = BridgeHello(4400, 44, (BridgeFinger("BT1", "0602"),))
 
 
 def _seal(_: int, part: bytes) -> bytes:
-    return encode_packet(part + crc16_x25(part).to_bytes(2, "little"))
+    return sealed_packet(part)
 
 
 def check(data: bytes) -> None:
@@ -71,7 +71,7 @@ def _check_order(records: list[BridgeRecord], counters: dict[str, int]) -> None:
 def _check_body(record: BridgeRecord) -> None:
     """What was read can be sent again and says the same."""
     body = record.body
-    packet = decode(encode(record.header, body)[:-1])
+    packet = unstuffed(encode(record.header, body)[:-1])
     assert packet is not None
     assert decode_body(packet[1], packet[10:-2]) == body
     if isinstance(body, BridgeSlots):
@@ -90,7 +90,7 @@ def seeds() -> list[bytes]:
     late = encode(BridgeHeader(7, 0, 1, 10), _HELLO)
     wrap = [encode(BridgeHeader(8, 0, 65535 + n & 0xFFFF, 2**32 - 9 + 8 * n & 2**32 - 1), slots)
             for n in range(3)]  # fmt: skip
-    plain = [decode(one[:-1]) for one in (*wire, late, *wrap)]
+    plain = [unstuffed(one[:-1]) for one in (*wire, late, *wrap)]
     contents = b"".join(bytes([len(p) - 1, 1]) + p[:-2] for p in plain if p is not None)
     return [
         bytes([9, 0]) + b"\0" + b"".join(wire),

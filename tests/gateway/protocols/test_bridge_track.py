@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.gateway.bridge_packets import encode
 
 from palpate_gateway.protocols.bridge import (
     BridgeBody,
@@ -10,7 +11,6 @@ from palpate_gateway.protocols.bridge import (
     BridgeHello,
     BridgeSlots,
     BridgeStatus,
-    encode,
 )
 
 HELLO = BridgeHello(4400, 44, (BridgeFinger("BT00000000000123", "0205"),))

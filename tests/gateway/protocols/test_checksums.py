@@ -64,7 +64,7 @@ def first_good_wins(data: bytes) -> list[bytes]:
 def test_finder_finds_what_is_there_however_it_is_cut(small: list[int], cuts: list[int]) -> None:
     # Bytes 0..4 only, so that chance heads and chance sums are frequent.
     data = bytes(small) + bytes(6)
-    whole, cut = FrameFinder(LENGTHS, is_good), FrameFinder(LENGTHS, is_good)
+    whole, cut = FrameFinder(LENGTHS, is_good, bytes), FrameFinder(LENGTHS, is_good, bytes)
     frames = whole.feed(data)
     assert frames == first_good_wins(data)
     at, parts = 0, []
@@ -79,7 +79,7 @@ def test_finder_finds_what_is_there_however_it_is_cut(small: list[int], cuts: li
 
 
 def test_finder_keeps_a_head_that_is_cut() -> None:
-    finder = FrameFinder(LENGTHS, is_good)
+    finder = FrameFinder(LENGTHS, is_good, bytes)
     assert finder.feed(b"\x09\x01") == []
     assert (finder.pending, finder.counters["junk_bytes"]) == (1, 1)
     assert finder.feed(frame_of(b"\x01\x01\x07")[1:]) == [frame_of(b"\x01\x01\x07")]
@@ -87,7 +87,7 @@ def test_finder_keeps_a_head_that_is_cut() -> None:
 
 
 def test_finder_forgets_at_reset_and_counts_it() -> None:
-    finder = FrameFinder(LENGTHS, is_good)
+    finder = FrameFinder(LENGTHS, is_good, bytes)
     frame = frame_of(b"\x01\x02\x05\x06\x07")
     finder.feed(frame[:4])
     finder.reset()
@@ -98,4 +98,4 @@ def test_finder_forgets_at_reset_and_counts_it() -> None:
 
 def test_finder_wants_one_first_byte() -> None:
     with pytest.raises(ValueError, match="same byte"):
-        FrameFinder({b"\x01": 3, b"\x02": 3}, is_good)
+        FrameFinder({b"\x01": 3, b"\x02": 3}, is_good, bytes)
