@@ -22,7 +22,8 @@ class SensorConfig(StrictConfig):
         driver: Name in the driver table.
         options: The driver's own options, checked by the driver.
         of: The finger that this force/torque sensor or pose of the indenter belongs to: its
-            readings go out in that one's keys, where recordings look for them; None = in its own.
+            readings are published under the keys of that finger, where recordings expect them;
+            None = under its own.
     """
 
     name: Name = "finger"
@@ -40,26 +41,26 @@ class GatewayConfig(StrictConfig):
     """The gateway.
 
     Attributes:
-        sensors: What it serves.
+        sensors: The sensors.
         tare: When a finger is tared first: ``still`` = as soon as electrodes, PAC and PDC are
-            still; ``first`` = as soon as the electrodes do not vary, for recordings always, and for
-            a robot that shakes the finger; ``query`` = when somebody asks.
+            still; ``first`` = as soon as the electrodes are still, for a robot that shakes the
+            finger, and always for recordings; ``query`` = on request only.
         tare_frames: Frames averaged in a tare.
-        tare_max_sd_counts: An electrode that varies more is being touched [counts].
-        tare_max_pac_sd_counts: PAC that varies more is being touched [counts].
-        retare_after_s: Tare again without being asked once a finger has been untouched for this
-            long and its baseline has drifted [s]; None = never. A press that comes slowly and then
-            stays looks like drift: docs/tare-and-health.md.
-        retare_drift_counts: Drift of an electrode that calls for it [counts].
-        pace: Recordings at their own pace (stamps are now) or as fast as possible (stamps as
-            recorded, nothing is ever dropped).
+        tare_max_sd_counts: If an electrode varies more, the finger counts as touched [counts].
+        tare_max_pac_sd_counts: If PAC varies more, the finger counts as touched [counts].
+        retare_after_s: Tare again without a request once a finger has been untouched for this long
+            and its baseline has drifted [s]; None = never. A press that comes slowly and then stays
+            looks like drift: docs/tare-and-health.md.
+        retare_drift_counts: Drift of an electrode that causes this [counts].
+        pace: Recordings at their own pace (stamped with the present time) or as fast as possible
+            (stamps as recorded, nothing is ever dropped).
         wait_for: Services that must be ready before a fast recording starts.
         exit_at_end: End the process when every source has ended.
-        core: The processor core that the process stays on: its number, ``idlest`` = the one that
-            does least when it starts, or ``any`` = none. A recording as fast as possible stays on
-            none.
-        linger_s: Time between the end of the sources and that of the process [s], in which late
-            consumers still get their answers.
+        core: The processor core that the process is bound to: its number, ``idlest`` = the one with
+            the least load at the start, or ``any`` = not bound. A recording as fast as possible is
+            never bound.
+        linger_s: Time from the end of the sources to the end of the process [s], in which requests
+            are still answered.
     """
 
     sensors: tuple[SensorConfig, ...] = Field(default=(SensorConfig(),), min_length=1)

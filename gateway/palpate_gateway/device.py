@@ -1,4 +1,4 @@
-"""The contract of a device: anything that yields tactile readings.
+"""The contract of a device: any source of readings, live, simulated or recorded.
 
 ::
 
@@ -10,7 +10,7 @@ Rules of ``read``, the same for hardware, virtual fingers and files:
 * a list with at least one reading, in order of time;
 * ``[]`` if and only if a finite source has ended (and on every call after that);
 * ``DeviceTimeout`` if nothing came in time: try again;
-* ``DeviceLost`` if the device is gone: close, open again;
+* ``DeviceLost`` if the device is gone: close it and open it again;
 * ``RecordingError`` if a file is damaged, after all readings before the damage were delivered.
 """
 
@@ -33,13 +33,13 @@ class DeviceInfo:
 
     Attributes:
         driver: Name in the driver table.
-        sensor_type: Kind of tactile sensor, which fixes the number of electrodes; None = no tactile
-            sensor, but one of force and torque.
-        model: One line for people.
+        sensor_type: Kind of tactile sensor, which fixes the number of electrodes; None = another
+            kind of sensor, e.g. of force and torque.
+        model: One line that names the device.
         rate_hz: Nominal frame rate [Hz].
         live: The device sets the pace; False = a file or a simulation that waits for its reader.
-        finite: ``read`` ends one day.
-        origin: What the frames' stamps say of where they come from.
+        finite: The source has an end.
+        origin: Origin in the stamps of its frames.
     """
 
     driver: str
@@ -58,19 +58,19 @@ class DeviceIdentity:
     Attributes:
         serial: Serial number of the sensor; ``Device.open`` keeps the last 64 characters.
         slot_period_s: Time between two slots of a frame [s].
-        start_wall_ns: Wall clock at device time zero [ns since the Unix epoch], for recordings that
-            know it; None = not known or live.
-        sensor_type: Kind of tactile sensor where only the open device tells: it replaces that of
-            ``DeviceInfo``, and the nominal rate follows; None = as said there.
-        tells_time: Its readings' times are of a clock of its own; False = a live device that tells
-            none, they are the host's monotonic times of arrival.
+        start_wall_ns: Wall clock at device time zero of a recording [ns since the epoch]; None =
+            unknown, or live.
+        sensor_type: Kind of tactile sensor, if only the open device shows it; replaces that of
+            ``DeviceInfo``, and the nominal rate with it; None = as in ``DeviceInfo``.
+        has_clock: The device has a clock of its own, and its readings carry that time; False = a
+            live device without one: times are the host's monotonic times of arrival.
     """
 
     serial: str
     slot_period_s: float
     start_wall_ns: int | None = None
     sensor_type: SensorType | None = None
-    tells_time: bool = True
+    has_clock: bool = True
 
 
 SERIAL_MAX = 64
@@ -78,13 +78,13 @@ SERIAL_MAX = 64
 
 
 def _fit_for_wire(name: str) -> str:
-    """What stands for a serial number that is not told may be long, e.g. the path of a line."""
+    """A short printable name: what replaces an unknown serial number, e.g. a path, can be long."""
     printable = "".join(c if c.isascii() and c.isprintable() else "?" for c in name)
     return printable[-SERIAL_MAX:] or "unknown"
 
 
 class Device(ABC):
-    """A source of readings. Opening and closing twice is harmless; a closed one opens afresh.
+    """A source of readings. Opening or closing it twice is harmless; a closed one can be reopened.
 
     A driver is a subclass whose constructor takes one value of its ``options_class``.
     """
@@ -101,7 +101,7 @@ class Device(ABC):
 
     @property
     def info(self) -> DeviceInfo:
-        """What is known without opening the device, and once it has been opened, better."""
+        """What is known before the device is opened; corrected when it is opened."""
         return self._info
 
     @property
@@ -148,14 +148,13 @@ class Device(ABC):
         Args:
             timeout_s: How long to wait for the first reading [s].
         """
-        # Naming a closed device is worth one property access per call.
-        _ = self.identity
+        _ = self.identity  # raises if the device is closed
         return self._read(timeout_s)
 
     @property
     @abstractmethod
     def counters(self) -> Mapping[str, int]:
-        """Events since it was opened last, e.g. ``samples``, ``time_jumps``."""
+        """Numbers of events since it was last opened, e.g. ``samples``, ``time_jumps``."""
 
     @abstractmethod
     def _open(self) -> DeviceIdentity: ...
@@ -175,14 +174,14 @@ class Device(ABC):
 
 
 class BusDevice(Device):
-    """A device whose readings come over the bus: somebody else's program is the sensor.
+    """A device whose readings come over the bus, from another program.
 
-    It may start at any time and shall be heard at once, so opening again, which helps nobody while
-    it does not run, is rare.
+    That program may start at any time, and its first readings must not be missed; so the device
+    stays open for long while nothing comes.
     """
 
     gone_s = 30.0
 
     @abstractmethod
     def join(self, link: LinkConfig, station: str) -> None:
-        """How the gateway has joined the bus; told before the first opening, and only there."""
+        """How the gateway has joined the bus; called once, before the first opening."""

@@ -1,4 +1,4 @@
-"""The driver table: names to device classes, imported only when used.
+"""The driver table: names of drivers and their device classes, imported only when used.
 
 Other distributions add drivers through the entry-point group ``palpate.devices``; each names a
 subclass of ``Device``. A built-in name cannot be replaced.

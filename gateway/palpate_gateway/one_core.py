@@ -1,8 +1,8 @@
-"""Keeps the process on one processor core.
+"""Binds the process to one processor core.
 
-Python runs one thread at a time, wherever it is: a gateway of a dozen threads that is spread over
-cores spends a third more time on waking each other, and its slowest frames wait three times as long
-(``palpate bench hand``, ADR 17).
+Python runs one thread at a time, on whatever core. Spread over several cores, a gateway with a
+dozen threads spends a third more time on waking them, and its slowest frames wait three times as
+long (``palpate bench hand``, ADR 17).
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _TASKS = Path("/proc/self/task")
 
 
 def stay_on_one_core(choice: CoreChoice) -> int | None:
-    """Keep all threads of this process, and those to come, on one core.
+    """Bind all threads of this process, and those to come, to one core.
 
     Args:
-        choice: Number of the core; ``idlest`` = the one that does least now; ``any`` = do nothing.
+        choice: Number of the core; ``idlest`` = the one with the least load; ``any`` = do nothing.
 
     Returns:
-        The core; None if the system decides, because it was told to, has one only or knows no way.
+        The core; None if the system decides: by choice, with a single core, or without support.
 
     Raises:
         ConfigError: This process may not run on the core.
@@ -63,12 +63,12 @@ def _idlest(allowed: set[int]) -> int:
     before = _idle_ticks()
     time.sleep(_LOOK_S)
     after = _idle_ticks()
-    # Of equals the last: interrupts tend to be served by the first.
+    # Of equals the last one: interrupts tend to be served by the first.
     return max(sorted(allowed), key=lambda core: (after.get(core, 0) - before.get(core, 0), core))
 
 
 def _idle_ticks() -> dict[int, int]:
-    """Time that each core has been idle for [ticks]."""
+    """Idle time of each core [ticks]."""
     ticks = {}
     for line in _STAT.read_text(encoding="ascii").splitlines():
         name, _, rest = line.partition(" ")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import DeviceError, ErrorCode, RemoteError
-from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Stamp, Tare
-from palpate_gateway.protocols.channels import ALL_VALID, TDC_BIT
+from palpate.messages import BIOTAC_LAYOUT, NO_TARE, ElectrodeFrame, Origin, SensorType, Stamp, Tare
+from palpate_gateway.protocols.channels import ALL_VALID
 from palpate_gateway.tare import TareCollector, TareLedger
 
 
@@ -66,7 +66,7 @@ def test_bad_frames_are_left_out() -> None:
 
 def test_invalid_channel_is_named() -> None:
     collector = TareCollector(5)
-    bad = frame(1, validity=ALL_VALID & ~(1 << 6) & ~(1 << TDC_BIT))
+    bad = frame(1, validity=ALL_VALID & ~(1 << 6) & ~(1 << BIOTAC_LAYOUT.tdc_bit))
     for _ in range(4):
         assert collector.add(bad) is None
     with pytest.raises(DeviceError, match=r"cannot tare BT1: E7, TDC invalid \(5 frames refused\)"):

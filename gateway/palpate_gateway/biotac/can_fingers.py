@@ -19,7 +19,8 @@ from palpate_gateway.biotac.slots import LineSlots
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.protocols.can_slots import CAN_FINGERS_MAX, CanSlotDecoder
-from palpate_gateway.protocols.slot_clock import Floats, SlotClock
+from palpate_gateway.protocols.silences import Floats
+from palpate_gateway.protocols.slot_clock import SlotClock
 from palpate_gateway.readings import ClockObservation
 
 _LATE_S = 2e-4

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from palpate.messages import BIOTAC_LAYOUT, COUNTS_MAX, CountArray, FrameLayout
 from palpate_gateway.biotac.sampling_round import SURPLUS, UNPLACED, PacNumbers, holds_frame
-from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock, slot_block
+from palpate_gateway.biotac.slots import NO_SLOTS, UNKNOWN, SlotBlock
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading
 
@@ -19,7 +19,6 @@ _BELIEVABLE_LOSS = 1_000_000
 
 _KNOWN = np.zeros(256, np.bool_)
 _KNOWN[list(ch.CHANNEL_NAMES)] = True
-_NO_SLOTS = slot_block([])
 _COUNTERS = (
     "samples",
     "frames",
@@ -66,7 +65,7 @@ class FrameAssembler:
         self._positions = np.arange(layout.slots).tobytes()
         self._unknown = np.full(layout.slots, UNKNOWN).tobytes()
         self._pac_numbers = PacNumbers(layout, slot_period_s, timed=timed)
-        self._pending = _NO_SLOTS
+        self._pending = NO_SLOTS
         self._last_time_s: float | None = None
         self._last_key: tuple[int, int] | None = None
         self._last_ending: tuple[int, ...] | None = None
@@ -94,12 +93,12 @@ class FrameAssembler:
         if not len(block):
             return []
         self._count(block)
-        slots = self._pending.followed_by(block) if len(self._pending) else block
+        slots = SlotBlock.joined([self._pending, block])
         readings: list[ElectrodeReading] = []
         at = self._take_usual(slots, readings)
         slots = self._without_late(slots.part(at, len(slots)) if at else slots)
         if not len(slots):
-            self._pending = _NO_SLOTS
+            self._pending = NO_SLOTS
             return readings
         starts = _frame_starts(slots)
         tail = int(starts[-1])
@@ -112,13 +111,13 @@ class FrameAssembler:
 
     def finish(self) -> list[ElectrodeReading]:
         """Deliver the frame that has begun, whole or not."""
-        slots, self._pending = self._pending, _NO_SLOTS
+        slots, self._pending = self._pending, NO_SLOTS
         return self._assemble(slots, _frame_starts(slots)) if len(slots) else []
 
     def discard_pending(self) -> int:
         """Drop the frame that has begun; return how many slots it had."""
         dropped = len(self._pending)
-        self._pending = _NO_SLOTS
+        self._pending = NO_SLOTS
         return dropped
 
     def _count(self, block: SlotBlock) -> None:

@@ -1,42 +1,29 @@
-"""Slots, single and in blocks.
+"""Slots in blocks: of one finger, and of all fingers that share a line.
 
 Blocks are structures of arrays, so that a log of 10^5 slots is assembled by a few NumPy calls and a
 live bus by blocks of one frame.
-
-
-Slots of all fingers of a line, with their place in the stream.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from operator import attrgetter
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate_gateway.protocols.can_slots import SlotWords
-from palpate_gateway.protocols.slot_clock import Floats, Ints, SlotPlaces
+from palpate_gateway.protocols.silences import Floats
+from palpate_gateway.protocols.slot_clock import Ints, SlotPlaces
 from palpate_gateway.protocols.spi import WordKind
 
 UNKNOWN = -1
 """Position of a slot whose source tells channels and frames only, e.g. a text log."""
 
-
-class Slot(NamedTuple):
-    """One sampled channel: id, raw counts, parity good, device time [s], batch and frame index.
-
-    ``position`` is its place in the sampling round from 0; ``UNKNOWN`` if the source does not tell.
-    """
-
-    channel: int
-    value: int
-    good: bool
-    time_s: float
-    batch: int
-    frame: int
-    position: int = UNKNOWN
+_GOOD = WordKind.GOOD.value
+"""A plain number: looking up a member of an enum costs as much as the comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +38,8 @@ class SlotBlock:
         batch: Batch index, int64.
         frame: Frame index, int64.
         position: Place in the sampling round from 0, int64; ``UNKNOWN`` where the source does not
-            tell. Slots of one frame are either all told or all unknown. It places PAC, whose
-            samples look alike; all other channels are known by their id.
+            tell it. Within a frame either all positions are known or none. The position identifies
+            PAC samples, which look alike; all other channels are known by their id.
     """
 
     channel: npt.NDArray[np.int64]
@@ -69,19 +56,7 @@ class SlotBlock:
     def part(self, start: int, stop: int) -> SlotBlock:
         """Slots ``start`` to ``stop - 1`` as views."""
         cut = slice(start, stop)
-        return SlotBlock(
-            self.channel[cut],
-            self.value[cut],
-            self.good[cut],
-            self.time_s[cut],
-            self.batch[cut],
-            self.frame[cut],
-            self.position[cut],
-        )
-
-    def followed_by(self, other: SlotBlock) -> SlotBlock:
-        """These slots and then those of another block."""
-        return SlotBlock.joined([self, other])
+        return SlotBlock(*[column[cut] for column in _BLOCK_COLUMNS(self)])
 
     @staticmethod
     def joined(blocks: Sequence[SlotBlock]) -> SlotBlock:
@@ -89,33 +64,13 @@ class SlotBlock:
         blocks = [block for block in blocks if len(block)] or blocks[:1]
         if len(blocks) == 1:
             return blocks[0]
-        return SlotBlock(
-            np.concatenate([block.channel for block in blocks]),
-            np.concatenate([block.value for block in blocks]),
-            np.concatenate([block.good for block in blocks]),
-            np.concatenate([block.time_s for block in blocks]),
-            np.concatenate([block.batch for block in blocks]),
-            np.concatenate([block.frame for block in blocks]),
-            np.concatenate([block.position for block in blocks]),
-        )
+        columns = zip(*map(_BLOCK_COLUMNS, blocks), strict=True)
+        return SlotBlock(*map(np.concatenate, columns))
 
 
-def slot_block(slots: Sequence[Slot]) -> SlotBlock:
-    """Arrange single slots as a block."""
-    columns = list(zip(*slots, strict=True)) or [()] * 7
-    return SlotBlock(
-        np.array(columns[0], np.int64),
-        np.array(columns[1], np.uint16),
-        np.array(columns[2], np.bool_),
-        np.array(columns[3], np.float64),
-        np.array(columns[4], np.int64),
-        np.array(columns[5], np.int64),
-        np.array(columns[6], np.int64),
-    )
+_BLOCK_COLUMNS = attrgetter(*SlotBlock.__slots__)
 
-
-_GOOD = WordKind.GOOD.value
-"""Of an enum costs as much as the comparison."""
+NO_SLOTS = SlotBlock(*(np.zeros(0, kind) for kind in (int, np.uint16, bool, float, int, int, int)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +78,7 @@ class LineSlots:
     """Consecutive slots of a line; arrays of shape ``(N,)``, words ``(N, fingers)``.
 
     Attributes:
+        size: Slots of a frame.
         channel: Channel indices.
         value: Raw counts of each finger, 0 where not good, uint16.
         kind: ``WordKind`` numbers of each finger, uint8.
@@ -130,9 +86,9 @@ class LineSlots:
         frame: Frame numbers.
         position: Places in the sequence.
         time_s: When they were sampled [s].
-        size: Slots of a frame.
     """
 
+    size: int
     channel: Ints
     value: npt.NDArray[np.uint16]
     kind: npt.NDArray[np.uint8]
@@ -140,7 +96,6 @@ class LineSlots:
     frame: Ints
     position: Ints
     time_s: Floats
-    size: int
 
     @classmethod
     def placed(cls, words: SlotWords, places: SlotPlaces, size: int) -> Self | None:
@@ -155,6 +110,7 @@ class LineSlots:
             return None
         kept = places.kept
         return cls(
+            size,
             words.channel[kept],
             words.value[kept],
             words.kind[kept],
@@ -162,7 +118,6 @@ class LineSlots:
             places.frame,
             places.position,
             places.time_s,
-            size,
         )
 
     @classmethod
@@ -170,16 +125,8 @@ class LineSlots:
         """Consecutive parts, one at least, as one."""
         if len(parts) == 1:
             return parts[0]
-        return cls(
-            np.concatenate([part.channel for part in parts]),
-            np.concatenate([part.value for part in parts]),
-            np.concatenate([part.kind for part in parts]),
-            np.concatenate([part.run for part in parts]),
-            np.concatenate([part.frame for part in parts]),
-            np.concatenate([part.position for part in parts]),
-            np.concatenate([part.time_s for part in parts]),
-            parts[-1].size,
-        )
+        columns = zip(*map(_LINE_COLUMNS, parts), strict=True)
+        return cls(parts[-1].size, *map(np.concatenate, columns))
 
     def __len__(self) -> int:
         return len(self.channel)
@@ -187,19 +134,10 @@ class LineSlots:
     def part(self, start: int, stop: int) -> LineSlots:
         """Slots ``start`` to ``stop - 1`` as views."""
         cut = slice(start, stop)
-        return LineSlots(
-            self.channel[cut],
-            self.value[cut],
-            self.kind[cut],
-            self.run[cut],
-            self.frame[cut],
-            self.position[cut],
-            self.time_s[cut],
-            self.size,
-        )
+        return LineSlots(self.size, *[column[cut] for column in _LINE_COLUMNS(self)])
 
     def over(self) -> int:
-        """How many of the slots belong to frames that are over, as far as these slots tell."""
+        """How many of the slots belong to frames that have ended, as far as these slots show."""
         if self.position[-1] == self.size - 1:
             return len(self)
         earlier = np.flatnonzero((self.frame != self.frame[-1]) | (self.run != self.run[-1]))
@@ -211,13 +149,15 @@ class LineSlots:
 
     def of(self, finger: int) -> SlotBlock:
         """One finger's slots, by its index."""
-        good = self.kind[:, finger] == _GOOD
         return SlotBlock(
             self.channel,
             self.value[:, finger],
-            good,
+            self.kind[:, finger] == _GOOD,
             self.time_s,
             self.run,
             self.frame,
             self.position,
         )
+
+
+_LINE_COLUMNS = attrgetter(*LineSlots.__slots__[1:])

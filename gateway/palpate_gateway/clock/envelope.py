@@ -1,8 +1,9 @@
-"""The line under the arrivals: offset and drift of a clock that is only seen late.
+"""Offset and drift of a device's clock, from arrivals that are all late by an unknown delay.
 
-Delay only ever adds (hardware reference 5.2), so the clock is the highest line that has no reading
-above it early: the edge of the lower convex hull at the middle of the window. Bursts of late
-readings, clumps of an adapter and stalls of the host lie above it and change nothing.
+Delays are never negative (hardware reference 5.2). Plotted as arrival minus device time over device
+time, all readings lie on or above the line of the clock: its best estimate is the edge of their
+lower convex hull at the middle of the window. Bursts of late readings, clumps of an adapter and
+stalls of the host lie above that edge and do not move it.
 """
 
 from __future__ import annotations
@@ -13,37 +14,37 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 EnvelopePoint = tuple[float, float]
-"""Device time [s] and by how much later it arrived [ns], both since the first reading."""
+"""Device time [s], and arrival minus device time [ns]; both since the first reading."""
 
 PART_S = 0.25
-"""Of each part of the window only the reading that came soonest is kept [s]."""
+"""The window consists of parts of this length [s]; each keeps its reading with the least delay."""
 
 WINDOW_S = 16.0
-"""What is older than this is forgotten [s]: quartzes warm up by some ppm a minute."""
+"""Length of the window [s]; longer ones are wrong, for quartzes warm up by some ppm a minute."""
 
 SETTLED_S = 4.0
-"""From this span on the drift is believed whatever it is [s]."""
+"""Any drift up to ``_WILD_PPM`` is accepted once the readings span this time [s]."""
 
 _SLOPE_S = 1.0
-"""Over a shorter span delays that differ by a millisecond would look like any drift [s]."""
+"""Over a shorter span, delays that differ by a millisecond can look like any drift [s]."""
 
 _PPM = 1e3
 """A part in a million [ns/s]."""
 
 QUARTZ_PPM = 600.0
-"""Drift that is believed at once: quartzes differ by less than 100 ppm each, cheap resonators by
-500."""
+"""Largest drift that is accepted before that: quartzes are off by less than 100 ppm each, cheap
+resonators by 500."""
 
 _STEP_NS = 1e6
-"""A single reading that lowers the line by more is of a clock that has stepped [ns]: some devices'
-time is counted by us, and where we have miscounted there is no slope to be seen in it."""
+"""A single reading that is below the line by more shows that the clock has stepped [ns]. This
+happens where the gateway counts a device's time itself and has miscounted; no drift explains it."""
 
 _WILD_PPM = 50_000.0
-"""Beyond this, device time is not time [ppm]."""
+"""No clock drifts by more than this [ppm]."""
 
 
 class ClockEnvelope:
-    """Follows one clock: a few comparisons for each reading, a small fit each 0.25 s."""
+    """Follows one clock: a few comparisons for each reading, a small fit every 0.25 s."""
 
     def __init__(self) -> None:
         self._parts: deque[EnvelopePoint] = deque(maxlen=math.ceil(WINDOW_S / PART_S))
@@ -55,12 +56,12 @@ class ClockEnvelope:
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster than the host's the device's clock runs [ppm]; 0 while unknown."""
+        """By how much the device's clock runs faster than the host's [ppm]; 0 while unknown."""
         return -self._slope / _PPM
 
     @property
     def span_s(self) -> float:
-        """Device time that the line rests on [s]."""
+        """Device time that the readings of the line span [s]."""
         return self._parts[-1][0] - self._parts[0][0] if self._parts else 0.0
 
     def add(self, x_s: float, late_ns: float) -> None:
@@ -68,12 +69,12 @@ class ClockEnvelope:
 
         Args:
             x_s: Device time [s].
-            late_ns: Arrival less device time [ns]; any origin, the same for all.
+            late_ns: Arrival minus device time [ns]; any origin, the same for all.
         """
         above_ns = late_ns - self.at(x_s)
         if above_ns < self._low_ns:
             self._low_ns, self._lowest = above_ns, (x_s, late_ns)
-        if above_ns < 0.0:  # nothing comes before it was sent
+        if above_ns < 0.0:  # below the line: the line was too high, for no delay is negative
             if above_ns < -_STEP_NS - _WILD_PPM * _PPM * (x_s - self._last_s):
                 self._parts.clear()
                 self._base_ns, self._at_s, self._part_ends_s = late_ns, x_s, x_s + PART_S
@@ -98,20 +99,20 @@ class ClockEnvelope:
         points = tuple(parts)
         span_s = points[-1][0] - points[0][0]
         if span_s < _SLOPE_S:
-            self._lie_under(points, self._slope)  # after a long silence it is that of before
+            self._lie_under(points, self._slope)  # after a long silence the earlier slope stays
             return
         believed = _PPM * (_WILD_PPM if span_s >= SETTLED_S else QUARTZ_PPM)
         slope = middle_slope(points)
         if abs(slope) <= believed:
             self._lie_under(points, slope)
             return
-        # Not a clock as we know them: of its far past nothing can be concluded.
+        # No clock drifts like that, so its past is no guide: only the last second counts.
         recent = tuple(point for point in points if point[0] >= points[-1][0] - _SLOPE_S)
         self._lie_under(recent, math.copysign(believed, slope))
 
     def _lie_under(self, points: Sequence[EnvelopePoint], slope: float) -> None:
         at_s = points[-1][0]
-        # No clock is so slow: what is later has waited, and must not look as if it had not.
+        # Readings above this have waited; fitted to them alone, the line would hide their delay.
         highest_ns = self.at(at_s) + _PPM * _WILD_PPM * max(at_s - self._at_s, 0.0)
         base_ns = min(late_ns - slope * (x_s - at_s) for x_s, late_ns in points)
         self._base_ns = min(base_ns, highest_ns)
@@ -121,11 +122,11 @@ class ClockEnvelope:
 def middle_slope(points: Sequence[EnvelopePoint]) -> float:
     """Slope of the lower convex hull at the middle of the points [ns/s].
 
-    Of all lines with no point below them that one has the least sum of distances, if points are
-    evenly spread.
+    Of all lines with no point below them, it is the one with the smallest sum of distances, if the
+    points are evenly spread.
 
     Args:
-        points: In order of device time, at two different times at least.
+        points: In order of device time, of at least two different times.
     """
     hull: list[EnvelopePoint] = []
     for point in points:

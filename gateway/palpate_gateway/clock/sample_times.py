@@ -1,28 +1,22 @@
-"""Times of samples that tell none, from when they were read and how many came together.
-
-A sample that is read at once was taken now. One that waited, because this process or its host stood
-still, must not look as fresh: buffers keep what came first, so that it follows the last sample that
-was read before.
-
-
-The clock of a sensor that stamps its samples but does not number them.
-
-From steady stamps follows what was lost, what came twice, and that the sensor has restarted.
-"""
+"""Samples that lack a time or a number: each is derived from the other, and from the arrival."""
 
 from __future__ import annotations
 
 from enum import Enum
 
 _AWAKE_NS = 50_000_000
-"""Between two reads of a process that is awake passes less [ns]."""
+"""A process that is not stopped reads again within this time [ns]."""
 
 _CLUMP_NS = 10_000_000
-"""Adapters hand samples over in clumps of less than this [ns]."""
+"""Adapters deliver samples in clumps worth less than this [ns]."""
 
 
 class ArrivalTimes:
-    """Times the samples of one sensor.
+    """Times of samples that carry none, from their arrival and the sensor's rate.
+
+    A sample that is read at once was taken now. One that waited, because this process or its host
+    stood still, must not look as fresh: buffers keep the oldest samples, so it follows the last
+    sample before the pause.
 
     Args:
         period_s: Time between two samples [s].
@@ -34,7 +28,7 @@ class ArrivalTimes:
         self._last_ns = 0
 
     def begin(self) -> None:
-        """The stream begins anew: nothing waits that was not read away."""
+        """The stream starts again: all earlier samples were read or discarded."""
         self._read_ns = None
 
     def times_ns(self, count: int, now_ns: int) -> list[int]:
@@ -57,19 +51,19 @@ class ArrivalTimes:
         return times
 
     def _waited(self, worth_ns: int, since_ns: int) -> bool:
-        """Whether samples worth a time had waited, when this time has passed since the last."""
+        """Whether samples worth ``worth_ns`` had waited, ``since_ns`` after the read before."""
         more_than_came = worth_ns > 1.25 * since_ns and worth_ns - since_ns > _CLUMP_NS
-        # Some were lost on the way: those that are there came first.
+        # The buffer overflowed: it holds the oldest samples.
         overflown = since_ns > _AWAKE_NS and _CLUMP_NS < worth_ns < 0.8 * since_ns
         return more_than_came or overflown
 
 
 _BACKLOG_S = 2.0
-"""How far samples may run ahead of the host, which reads what had waited [s]."""
+"""How far sample times may run ahead of the host while it reads a backlog [s]."""
 
 
 class SampleVerdict(Enum):
-    """What a sample's time says of it."""
+    """Judgement of a sample by its time."""
 
     NEW = "new"
     REPEATED = "repeated"
@@ -78,10 +72,10 @@ class SampleVerdict(Enum):
 
 
 class SampleClock:
-    """Unwraps a clock and judges each sample by it.
+    """Unwraps the clock of a sensor that stamps its samples but does not number them.
 
-    ``counters``: ``lost_samples``, ``repeated_samples``, and ``wrong_times`` of samples whose time
-    cannot be and that must not be believed.
+    Steady stamps show lost and repeated samples, and that the sensor has restarted. ``counters``:
+    ``lost_samples``, ``repeated_samples``, and ``wrong_times`` of samples with impossible times.
 
     Args:
         period_us: Time between two samples [us].
@@ -91,60 +85,60 @@ class SampleClock:
     def __init__(self, period_us: float, wrap_us: int) -> None:
         self._period_us, self._wrap_us = period_us, wrap_us
         self.tick = 0
-        """Samples that the sensor took, lost ones too."""
+        """Number of samples that the sensor took, lost ones included."""
         self.time_s = 0.0
         """Unwrapped time of the last new sample [s]."""
         self._time_us = 0
-        self._told_us: int | None = None
-        self._heard_s = 0.0
+        self._stamp_us: int | None = None
+        self._arrived_s = 0.0
         self._suspect_us: int | None = None
         self._paused = False
         self.counters = dict.fromkeys(("lost_samples", "repeated_samples", "wrong_times"), 0)
 
     def pause(self) -> None:
-        """The sensor was told to stop for a while: what it does not take is not lost."""
+        """The sensor was stopped for a while: samples that it does not take are not lost."""
         self._paused = True
         self._suspect_us = None
 
-    def take(self, told_us: int, now_s: float) -> SampleVerdict:
+    def take(self, stamp_us: int, now_s: float) -> SampleVerdict:
         """Judge the next sample.
 
         Args:
-            told_us: Its time as told [us].
+            stamp_us: Its time as sent [us].
             now_s: The host's monotonic time [s].
         """
-        if self._told_us is None:
-            return self._accept(told_us, now_s, told_us, 1)
-        ahead_us = (told_us - self._told_us) % self._wrap_us
+        if self._stamp_us is None:
+            return self._accept(stamp_us, now_s, stamp_us, 1)
+        ahead_us = (stamp_us - self._stamp_us) % self._wrap_us
         if ahead_us == 0:
             self.counters["repeated_samples"] += 1
             return SampleVerdict.REPEATED
         steps = round(ahead_us / self._period_us)
-        host_us = round(1e6 * (now_s - self._heard_s))
+        host_us = round(1e6 * (now_s - self._arrived_s))
         if steps < 1 or ahead_us > host_us + 1e6 * _BACKLOG_S:
             if not self._paused:
-                return self._doubt(told_us)
-            # It may have set its clock back for the pause; the host's went on.
+                return self._doubt(stamp_us)
+            # It may have reset its clock in the pause; the host's clock went on.
             ahead_us = max(host_us, round(self._period_us))
             steps = round(ahead_us / self._period_us)
         if not self._paused:
             self.counters["lost_samples"] += steps - 1
-        return self._accept(told_us, now_s, ahead_us, steps)
+        return self._accept(stamp_us, now_s, ahead_us, steps)
 
-    def _accept(self, told_us: int, now_s: float, ahead_us: int, steps: int) -> SampleVerdict:
+    def _accept(self, stamp_us: int, now_s: float, ahead_us: int, steps: int) -> SampleVerdict:
         self.tick += steps
         self._time_us += ahead_us
         self.time_s = 1e-6 * self._time_us
-        self._told_us, self._heard_s = told_us, now_s
+        self._stamp_us, self._arrived_s = stamp_us, now_s
         self._suspect_us, self._paused = None, False
         return SampleVerdict.NEW
 
-    def _doubt(self, told_us: int) -> SampleVerdict:
-        """A time that cannot be: of a damaged sample if it is alone, else the clock began anew."""
+    def _doubt(self, stamp_us: int) -> SampleVerdict:
+        """An impossible time: one alone is a damaged sample, two in a row a restarted clock."""
         if self._suspect_us is not None:
-            ahead_us = (told_us - self._suspect_us) % self._wrap_us
+            ahead_us = (stamp_us - self._suspect_us) % self._wrap_us
             if 0 < ahead_us < 1e6 * _BACKLOG_S:
                 return SampleVerdict.RESTARTED
-        self._suspect_us = told_us
+        self._suspect_us = stamp_us
         self.counters["wrong_times"] += 1
         return SampleVerdict.DOUBTFUL

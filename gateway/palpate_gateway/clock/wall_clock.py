@@ -1,11 +1,8 @@
-"""The host's wall clock beside its monotonic one, and being told when somebody sets it.
+"""The host's wall clock: its steps, its relation to the monotonic clock, and its error.
 
-The kernel's receive stamps, which are wall times, as host monotonic times.
-
-What the kernel knows of the wall clock: whether something keeps it right, and how well.
-
-Whoever sets the clock by the network (chrony, ntpd, systemd-timesyncd, phc2sys) tells the kernel;
-anybody may ask it. Elsewhere than on Linux, and where a sandbox forbids to ask, it is not known.
+``WallClock`` gives each stamp its wall time and notices when the clock is set. ``KernelStamps``
+converts the kernel's receive stamps, which are wall times, to monotonic times. ``wall_discipline``
+asks the kernel how well the clock is kept.
 """
 
 from __future__ import annotations
@@ -28,19 +25,18 @@ LOOK_NS = 100_000_000
 """How often stamps look at the wall clock [ns]."""
 
 _TIGHT_NS = 20_000
-"""Two readings within this time are one instant [ns]."""
+"""Both clocks read within this time count as read at one instant [ns]."""
 _ATTEMPTS = 4
 
 _STEP_NS = 100_000
-"""A larger change that the readings do not explain is a step [ns]."""
+"""A change by more than this, beyond the error of reading, is a step [ns]."""
 
 _STEERED = 1e-3
-"""Where the monotonic clock is not steered as the wall clock is, as it is on Linux, they part by
-less than this."""
+"""Outside Linux only the wall clock is slewed: both clocks then drift apart by less than this."""
 
 
 class ClockPair(NamedTuple):
-    """Monotonic and wall clock read together [ns], and how far apart that may have been [ns]."""
+    """Monotonic and wall clock read together [ns], and the time between both readings [ns]."""
 
     monotonic_ns: int
     wall_ns: int
@@ -48,7 +44,7 @@ class ClockPair(NamedTuple):
 
 
 def read_pair() -> ClockPair:
-    """Both clocks of this host; read again if this thread was put aside between them."""
+    """Both clocks of this host; read again if this thread was interrupted between them."""
     best: ClockPair | None = None
     for _ in range(_ATTEMPTS):
         before_ns = time.monotonic_ns()
@@ -63,10 +59,10 @@ def read_pair() -> ClockPair:
 
 
 class WallClock:
-    """Turns monotonic times into wall times; one for all sensors of a process. Safe with threads.
+    """Turns monotonic times into wall times; one for all sensors of a process, from any thread.
 
-    Linux steers both clocks alike, so what lies between them changes only when somebody sets the
-    wall clock: a step. Stamps follow it within ``LOOK_NS``; monotonic times know nothing of it.
+    Linux slews both clocks alike, so the difference between them changes only when the wall clock
+    is set: a step. Wall times follow it within ``LOOK_NS``; monotonic times do not change.
 
     Args:
         read: Reads both clocks.
@@ -79,7 +75,7 @@ class WallClock:
         self._lock = threading.Lock()
         pair = read()
         self.offset_ns = pair.wall_ns - pair.monotonic_ns
-        """Wall less monotonic clock at the last look [ns]."""
+        """Wall clock minus monotonic clock at the last look [ns]."""
         self._apart_ns = pair.apart_ns
         self.looked_ns = pair.monotonic_ns
         """Monotonic time of the last look [ns]."""
@@ -88,8 +84,8 @@ class WallClock:
         """Wall time of a monotonic time [ns].
 
         Args:
-            monotonic_ns: Which instant [ns].
-            now_ns: The monotonic clock about now, to look again if the last look is old [ns].
+            monotonic_ns: The instant [ns].
+            now_ns: The monotonic clock about now [ns]; if the last look is old, it looks again.
         """
         if now_ns - self.looked_ns > LOOK_NS:
             self.look()
@@ -108,30 +104,30 @@ class WallClock:
                 self.steps += 1
                 _log.warning("the wall clock was set by %+.6f s", 1e-9 * change_ns)
             elif abs(change_ns) <= unsure_ns and pair.apart_ns >= self._apart_ns:
-                return  # the same, and it was read better before
+                return  # no change, and the earlier reading was more exact
             self.offset_ns, self._apart_ns = offset_ns, pair.apart_ns
 
 
 OLDEST_NS = 1_000_000_000
-"""Nothing waits longer in a receive queue that is read [ns], unless its reader stood still."""
+"""Longest wait in a receive queue [ns], unless the process that reads it stood still."""
 
 _PAUSE_NS = 100_000_000
-"""A longer one is remembered, until what waited meanwhile has been read [ns]."""
+"""A longer pause between two reads is taken into account until its backlog has been read [ns]."""
 
 _EARLY_NS = 100_000
-"""By how much the two clocks may seem out of order when they are read [ns]."""
+"""By how much a stamp may seem to lie in the future, by the error of reading both clocks [ns]."""
 
 
 class KernelStamps:
-    """When the kernel received what was read later; belongs to one thread.
+    """Monotonic times at which the kernel received what was read later; belongs to one thread.
 
-    A stamp that cannot be is not believed, and the time of arrival stands for it: none, one in the
-    future or more than a second old (another clock's, or another host's), or any that was made
-    within a second of a step of the wall clock, when it is not known on which side. After a pause
-    between two reads what is read may have waited for all of it: this process may have stood still.
+    An implausible stamp is replaced by the time of arrival: a missing one, one in the future or
+    more than a second old (of another clock, or another host), and any within a second of a step of
+    the wall clock, since it may be from before or after the step. After a pause of this process,
+    stamps may be older by the length of the pause.
 
     Args:
-        wall: The wall clock; None = one of its own.
+        wall: The wall clock; None = a new one.
     """
 
     def __init__(self, wall: WallClock | None = None) -> None:
@@ -141,13 +137,13 @@ class KernelStamps:
         self._read_ns: int | None = None
         self._paused_ns = self._paused_until_ns = 0
         self.refused = 0
-        """Stamps that were not believed."""
+        """Number of implausible stamps."""
 
     def monotonic_ns(self, stamp_s: float, arrival_ns: int) -> int:
         """Host monotonic time of a stamp [ns], not later than the arrival.
 
         Args:
-            stamp_s: As python-can tells it [s since the Unix epoch].
+            stamp_s: As python-can gives it [s since the Unix epoch].
             arrival_ns: Host monotonic clock when it had been read [ns].
         """
         if not math.isfinite(stamp_s):
@@ -169,10 +165,10 @@ class KernelStamps:
     def monotonic_of_all(
         self, stamps_ns: npt.NDArray[np.int64], arrival_ns: int
     ) -> npt.NDArray[np.int64]:
-        """As ``monotonic_of_ns``, for the stamps of what came in this order and was read at once.
+        """As ``monotonic_of_ns``, for the stamps of messages in order of arrival, read together.
 
-        None came later than what came after it: while the kernel's stamping is being switched on,
-        which takes it some milliseconds after a bus is opened, it stamps at reading.
+        In the first milliseconds after a bus is opened the kernel stamps when it is read; so each
+        time is limited by the times of the messages behind it.
         """
         if not self._trusted(arrival_ns):
             self.refused += len(stamps_ns)
@@ -185,7 +181,7 @@ class KernelStamps:
         return np.minimum.accumulate(came_ns[::-1])[::-1]
 
     def _oldest_ns(self, arrival_ns: int) -> int:
-        """How long what is read now may have waited [ns]."""
+        """Longest plausible wait of what is read now [ns]."""
         paused_ns = 0 if self._read_ns is None else arrival_ns - self._read_ns
         self._read_ns = arrival_ns
         if arrival_ns > self._paused_until_ns:
@@ -196,10 +192,10 @@ class KernelStamps:
         return OLDEST_NS + self._paused_ns
 
     def _trusted(self, arrival_ns: int) -> bool:
-        """Whether stamps that were read now can be on the right side of a step."""
+        """Whether no step of the wall clock can lie between the stamps and now."""
         wall = self._wall
         if arrival_ns >= wall.looked_ns:
-            # Looking after the stamp was made, a step can be told; once for all of a batch.
+            # A look after the stamps were made notices a step; one look is enough for a batch.
             wall.look()
         if wall.steps != self._steps:
             self._steps = wall.steps
@@ -208,15 +204,15 @@ class KernelStamps:
 
 
 _UNKNOWN_US = 16_000_000
-"""The kernel's largest error, which means that nothing has corrected the clock for long [us]. Its
-flag STA_UNSYNC would not do: chrony leaves it set unless it also keeps the hardware clock."""
+"""Largest error that the kernel states; it means that nothing corrects the clock [us]. The flag
+STA_UNSYNC is no substitute: chrony leaves it set unless it also keeps the hardware clock."""
 
 _STRUCT_BYTES = 512
 """More than struct timex has on any machine."""
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of struct timex, in which longs are as long as the machine's."""
+    """The beginning of the kernel's struct timex."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -227,12 +223,12 @@ class _Timex(ctypes.Structure):
 
 
 class WallDiscipline(NamedTuple):
-    """How the wall clock is kept.
+    """How well the wall clock is kept.
 
     Attributes:
-        synchronised: Whether something keeps it.
-        error_s: Largest error by the kernel's account [s], as chrony and ntpd tell it; others tell
-            0. It grows by 0.5 ms a second until the clock is corrected again.
+        synchronised: Whether a program corrects it.
+        error_s: Largest error that the kernel states [s], as chrony and ntpd report it; others
+            report 0. It grows by 0.5 ms a second until the next correction.
     """
 
     synchronised: bool
@@ -240,7 +236,11 @@ class WallDiscipline(NamedTuple):
 
 
 def wall_discipline() -> WallDiscipline | None:
-    """How the wall clock of this host is kept; None = not known here."""
+    """How well the wall clock of this host is kept; None = unknown.
+
+    Programs that correct the clock (chrony, ntpd, systemd-timesyncd, phc2sys) report to the kernel.
+    Outside Linux, and where a sandbox forbids the call, it is unknown.
+    """
     if not sys.platform.startswith("linux"):
         return None
     memory = ctypes.create_string_buffer(_STRUCT_BYTES)

@@ -1,15 +1,15 @@
-"""Channels that are not to be trusted: saturated, dead, stuck, odd.
+"""Faulty channels: saturated, dead, stuck, odd.
 
 * saturated: every sample of 0.2 s at an end of the converter's range. Strong presses do that.
 * dead: no valid word in most frames of a second; or at an end of the range for a second while the
-  other channels say that nothing touches the sensor.
-* stuck: an electrode without the least change for three seconds while the others vary; PAC without
-  any for a second (it always has noise); or every channel at once: then the line repeats old words.
-  An electrode stays stuck until it changes.
+  other channels show that nothing touches the sensor.
+* stuck: an electrode without any change for three seconds while the others vary; PAC without any
+  change for a second (it always has noise); or every channel at once: then the line repeats old
+  words. An electrode stays stuck until it changes.
 * odd: at rest, levels that an intact sensor does not have (hardware reference 1.9): one or two
-  electrodes far below the others are an air bubble; all of them low is a thin layer of fluid.
+  electrodes far below the others mean an air bubble, all of them low a thin layer of fluid.
 
-Over all real recordings at hand there is no false alarm: docs/tare-and-health.md.
+None of the real recordings raises a false alarm: docs/tare-and-health.md.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ WINDOW_BLOCKS = 5
 """A second."""
 
 STUCK_BLOCKS = 15
-"""Three seconds: electrodes of a quiet sensor stand still for up to 0.6 s in a minute and a half of
-real recordings, and each 0.07 s more is e times as rare."""
+"""Three seconds. In a minute and a half of real recordings, electrodes of a quiet sensor keep their
+value for up to 0.6 s; durations longer by 0.07 s are e times as rare."""
 
 INVALID_SHARE = 0.5
 OTHERS_VARY_COUNTS = 6
-"""Others vary if half of them change by this much within a block [counts]: a noisy sensor at rest
-does, a quiet one when it is touched."""
+"""The others vary if half of them change by this much within a block [counts]: a noisy sensor does
+so at rest, a quiet one when it is touched."""
 
 FAR_COUNTS = 1500.0
 """Intact electrodes are up to 930 counts below the median of all at rest (E11 of one sensor)."""
@@ -49,7 +49,7 @@ REMEDIES = {
     FaultKind.ODD: "far below the others: an air bubble, all low: too little fluid; refill the "
     "finger and tare again",
 }
-"""What to do about each kind."""
+"""Remedy for each kind of fault."""
 
 _SLOW = ("PDC", "TAC", "TDC")
 _GAUGES = {kind: f"{kind.name.lower()}_channels" for kind in REMEDIES}
@@ -57,7 +57,7 @@ _Flags = npt.NDArray[np.bool_]
 
 
 class ChannelHealth:
-    """Watches the channels of one sensor.
+    """Finds the faulty channels of one sensor.
 
     Args:
         electrodes: Number of electrodes.
@@ -65,26 +65,26 @@ class ChannelHealth:
 
     def __init__(self, electrodes: int) -> None:
         self._electrodes = electrodes
-        self._stuck: dict[int, int] = {}  # electrode, from 0: the value at which it stands
+        self._stuck: dict[int, int] = {}  # electrode, from 0, to the value that it keeps
         self._names: dict[FaultKind, tuple[str, ...]] = {}
         self.usable: _Flags = np.ones(electrodes, np.bool_)
-        """Electrodes whose level says something, bool, shape ``(E,)``."""
+        """Electrodes without a fault, bool, shape ``(E,)``."""
         self.counters: Counter[str] = Counter({_counter(kind): 0 for kind in REMEDIES})
-        """How often a channel was found saturated, dead, stuck, odd."""
+        """How often channels became saturated, dead, stuck or odd."""
         self.begin()
 
     @property
     def faults(self) -> tuple[ChannelFault, ...]:
-        """What is wrong now."""
+        """Present faults."""
         return tuple(ChannelFault(kind, names) for kind, names in self._names.items())
 
     def gauges(self) -> dict[str, float]:
-        """Number of channels that have each fault now."""
+        """Number of channels that have each fault at present."""
         return {name: float(len(self._names.get(kind, ()))) for kind, name in _GAUGES.items()}
 
     def begin(self) -> None:
-        """The device was opened again: judge by what comes from now on."""
-        # Blocks in a row: at an end of the range, without any change; the same of PAC.
+        """The device was opened again: judge by the frames from now on."""
+        # Numbers of blocks in a row: at an end of the range; without any change; the same for PAC.
         self._at_rail = np.zeros(self._electrodes, np.int64)
         self._standing = np.zeros(self._electrodes, np.int64)
         self._pac_standing = 0
@@ -97,7 +97,7 @@ class ChannelHealth:
 
         Args:
             block: The newest.
-            untouched: The level of the usable electrodes and of PDC says that nothing touches it.
+            untouched: The levels of usable electrodes and PDC show that nothing touches the sensor.
         """
         self._follow(block)
         names: dict[FaultKind, list[str]] = {}
@@ -118,7 +118,7 @@ class ChannelHealth:
             odd = _odd(block, self.usable)
             if odd:
                 names[FaultKind.ODD] = odd
-        self._tell({kind: tuple(found) for kind, found in names.items()})
+        self._note({kind: tuple(found) for kind, found in names.items()})
 
     def _follow(self, block: FrameBlock) -> None:
         last, self._last = self._last, block
@@ -142,7 +142,7 @@ class ChannelHealth:
         if len(self._recent) < WINDOW_BLOCKS:
             return dead
         few = INVALID_SHARE * self._recent[-1].frames * WINDOW_BLOCKS
-        # Most blocks are whole: their least count of valid words says so at once.
+        # In most blocks every word is valid, which the minimum shows at once.
         if min(int(block.seen.min()) for block in self._recent) < self._recent[-1].frames:
             dead = dead | (np.add.reduce([block.seen for block in self._recent]) < few)
         slow = [sum(seen) for seen in zip(*(b.slow_seen for b in self._recent), strict=True)]
@@ -182,7 +182,7 @@ class ChannelHealth:
         if kind is not None:
             names.setdefault(kind, []).append("PAC")
 
-    def _tell(self, found: dict[FaultKind, tuple[str, ...]]) -> None:
+    def _note(self, found: dict[FaultKind, tuple[str, ...]]) -> None:
         for kind, channels in found.items():
             new = len(set(channels) - set(self._names.get(kind, ())))
             self.counters[_counter(kind)] += new
@@ -190,7 +190,7 @@ class ChannelHealth:
 
 
 def describe(faults: Iterable[ChannelFault]) -> str:
-    """Faults for people, e.g. ``E7 stuck; E3, E9 saturated``; a long list is cut."""
+    """Faults in words, e.g. ``E7 stuck; E3, E9 saturated``; a long list is cut."""
     return "; ".join(f"{_listed(fault.channels)} {fault.kind.name.lower()}" for fault in faults)
 
 

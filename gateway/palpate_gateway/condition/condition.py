@@ -1,19 +1,10 @@
-"""The level of the untouched sensor, and how far it has drifted from the tare.
+"""The condition of one sensor, judged from its frames: untouched, warm, intact.
 
-Stillness alone does not tell: a constant press is still too. What tells is how the sensor got to
-where it rests. As long as nothing moves it stays untouched, and what its level does is drift. After
-a movement it is untouched again only if it rests where it rested before, give or take what heat and
-a relaxing skin do: they move all electrodes alike and the pressure little, a press moves some
-electrodes and the pressure much.
-
-
-Whether the core is still warming up: the slope of TDC while nothing touches the sensor.
-
-The core is heated; until it has settled the electrodes drift (hardware reference 4.3). What a count
-of TDC is in degrees differs from source to source (1.9), so that slopes are told in counts.
-
-
-The condition of one sensor, from its frames: what its gateway says of it beside them.
+Stillness alone does not show that a sensor is untouched, for a constant press is still too; the way
+to the present level does. As long as nothing moves, the sensor stays untouched and a change of its
+level is drift. After a movement it is untouched again only if it rests at its former level, apart
+from the effects of heat and of a relaxing skin: these change all electrodes alike and the pressure
+little, whereas a press changes some electrodes, and the pressure much.
 """
 
 from __future__ import annotations
@@ -37,18 +28,19 @@ from palpate_gateway.condition.stillness import (
 )
 
 EVEN_COUNTS, EVEN_SHARE = 25.0, 0.2
-"""Drift moves no electrode by more than this beside the median of all [counts], and this share of
-it: of real sensors that drifted by 169 counts in three minutes untouched none moved by more than 31
-beside it; a hand that held a finger lightly moved some by 230, and the median by 3."""
+"""Drift changes no electrode by more than the median change, give or take this many counts and this
+share of the median. Real untouched sensors drifted by 169 counts in three minutes, and no electrode
+differed from the median by more than 31; a hand that held a finger lightly changed some electrodes
+by 230 and the median by 3."""
 
 PDC_BAND_COUNTS = 40.0
-"""Drift moves PDC by less [counts]; a hand that held the finger lightly moved it by 330."""
+"""Drift changes PDC by less [counts]; a hand that held the finger lightly changed it by 330."""
 
 _Usable = npt.NDArray[np.bool_]
 
 
 class TouchState(Enum):
-    """What is known of touches."""
+    """Whether a sensor is touched, as far as is known."""
 
     UNKNOWN = "not tared yet"
     UNTOUCHED = "untouched"
@@ -57,7 +49,7 @@ class TouchState(Enum):
 
 
 class UntouchedLevel:
-    """Follows one sensor from block to block.
+    """The level of the untouched sensor, and how far it has drifted from the tare.
 
     Args:
         electrodes: Number of electrodes.
@@ -69,9 +61,9 @@ class UntouchedLevel:
         self._level: tuple[Floats, float] | None = None
         self._tare: tuple[Floats, float] | None = None
         self.drift_counts = 0.0
-        """Greatest distance of an electrode from the tare, when it was last untouched [counts]."""
+        """Largest difference of an electrode from the tare, when last untouched [counts]."""
         self.drift_electrode = 0
-        """Which one, from 0."""
+        """That electrode, from 0."""
 
     @property
     def known(self) -> bool:
@@ -79,7 +71,7 @@ class UntouchedLevel:
         return self._tare is not None
 
     def tared(self, tare: Tare) -> None:
-        """Somebody, or the gateway, took the present level for untouched."""
+        """A tare was taken: the present level is that of the untouched sensor."""
         self._tare = self._level = tare.electrodes.astype(np.float64), tare.pdc
         self.drift_counts = 0.0
 
@@ -94,7 +86,7 @@ class UntouchedLevel:
         Args:
             electrodes: Mean raw counts, shape ``(E,)``.
             pdc: Mean raw PDC [counts].
-            usable: Electrodes that are looked at, bool, shape ``(E,)``; at least one.
+            usable: Electrodes to be used, bool, shape ``(E,)``; at least one.
         """
         if self._level is None or self._tare is None:
             return
@@ -112,14 +104,14 @@ class UntouchedLevel:
 
 
 def is_drift(change: Floats, pdc_change: float, usable: _Usable) -> bool:
-    """Whether a change of level is one that an untouched sensor makes.
+    """Whether a change of level can be drift of an untouched sensor.
 
     Args:
-        change: Of the electrodes [counts], shape ``(E,)``.
-        pdc_change: Of PDC [counts].
-        usable: Electrodes that are looked at, bool, shape ``(E,)``.
+        change: Change of the electrodes [counts], shape ``(E,)``.
+        pdc_change: Change of PDC [counts].
+        usable: Electrodes to be used, bool, shape ``(E,)``.
     """
-    # In plain Python, which is faster for so few.
+    # Plain Python is faster than NumPy for so few numbers.
     looked_at = sorted(change[usable].tolist())
     common = looked_at[len(looked_at) // 2]
     uneven = max(looked_at[-1] - common, common - looked_at[0])
@@ -128,34 +120,38 @@ def is_drift(change: Floats, pdc_change: float, usable: _Usable) -> bool:
 
 
 WARMING_COUNTS_PER_MIN = 30.0
-"""Steeper is warming up: the settled sensor of the public capture rises by 7 untouched, and a
-sensor that warms by 10 degrees in half an hour begins with twice this."""
+"""A steeper slope is warming up: the settled sensor of the public capture has 7 untouched, and a
+sensor that warms by 10 degrees in half an hour starts with twice this."""
 
 SETTLED_COUNTS_PER_MIN = 15.0
-"""Flatter is settled; between both it stays what it was."""
+"""A flatter slope is settled; between both limits the state does not change."""
 
 WINDOW_S = 30.0
-"""TDC is followed over this time [s]."""
+"""The slope of TDC is taken over this time [s]."""
 
 _SPAN_MIN_S = 10.0
 _POINT_S = 1.0
 
 
 class WarmUp:
-    """Follows TDC of one sensor."""
+    """Whether the core is still warming up: the slope of TDC while nothing touches the sensor.
+
+    The core is heated; until its temperature has settled the electrodes drift (hardware reference
+    4.3). Sources disagree on degrees per count of TDC (1.9), so slopes are given in counts.
+    """
 
     def __init__(self) -> None:
         self.warming = False
-        """Whether it is warming up, as far as is known."""
+        """Whether it is warming up; keeps its value while the slope is unknown."""
         self.slope_counts_per_min: float | None = None
-        """Slope of TDC; None = not known yet."""
+        """Slope of TDC; None = unknown so far."""
         self._points: deque[tuple[float, float]] = deque()
         self._sum = 0.0
         self._count = 0
         self._since_s: float | None = None
 
     def begin(self) -> None:
-        """Begin anew: the sensor was touched, or was away. What is known stays."""
+        """Start a new slope: the sensor was touched or lost. The last judgement stays."""
         self._points.clear()
         self._sum, self._count, self._since_s = 0.0, 0, None
 
@@ -192,15 +188,15 @@ class WarmUp:
 
 
 DRIFT_COUNTS = 10.0
-"""A baseline that is further off is old [counts]: twice the noise of one frame."""
+"""A baseline that is off by more is outdated [counts]: twice the noise of one frame."""
 
-_UNTRUE = (FaultKind.DEAD, FaultKind.STUCK)
-"""Faults that make frames wrong without showing in the frames."""
+_WRONG = (FaultKind.DEAD, FaultKind.STUCK)
+"""Faults whose counts are wrong although they are marked valid."""
 
 
 @dataclass(frozen=True, slots=True)
 class RetareRules:
-    """When a gateway tares again by itself.
+    """When a sensor is tared again without a request.
 
     Attributes:
         after_s: The sensor has been untouched for this long [s].
@@ -212,13 +208,13 @@ class RetareRules:
 
 
 class Condition:
-    """Watches one sensor; belongs to the thread that reads it, but for ``gauges``.
+    """Judges one sensor. Belongs to the thread that reads it; only ``gauges`` is for any thread.
 
     Args:
-        layout: Of its frames.
+        layout: Layout of its frames.
         rate_hz: Frames per second [Hz].
-        limits: What a still sensor does not exceed.
-        retare: When to tare again without being asked; None = never.
+        limits: Noise up to which the sensor counts as still.
+        retare: When to tare again without a request; None = never.
     """
 
     def __init__(
@@ -239,36 +235,36 @@ class Condition:
         self._tared_s: float | None = None
         self._gauges: dict[str, float] = {}
         self.motion = "not enough frames yet"
-        """What speaks against a sensor that is still; empty = it is."""
+        """Why the sensor does not count as still; empty = it is still."""
 
     @property
     def touch(self) -> TouchState:
-        """What is known of touches."""
+        """Whether the sensor is touched, as far as is known."""
         return self._level.touch
 
     @property
     def warming(self) -> bool:
-        """Whether the core is warming up, as far as is known."""
+        """Whether the core is warming up."""
         return self._warm_up.warming
 
     @property
     def faults(self) -> tuple[ChannelFault, ...]:
-        """Channels that are not to be trusted."""
+        """Channels whose counts are not to be used."""
         return self._channels.faults
 
     @property
-    def untrue(self) -> bool:
-        """Whether a channel tells what is not so."""
-        return any(fault.kind in _UNTRUE for fault in self.faults)
+    def has_wrong_channel(self) -> bool:
+        """Whether a channel delivers wrong counts."""
+        return any(fault.kind in _WRONG for fault in self.faults)
 
     @property
     def counters(self) -> dict[str, int]:
-        """How often channels failed."""
+        """How often channels became faulty."""
         return dict(self._channels.counters)
 
     @property
     def wants_tare(self) -> bool:
-        """Whether the rules say to tare now, without being asked."""
+        """Whether the rules ask for a tare now."""
         rules, since_s = self._retare, self._untouched_since_s
         if rules is None or since_s is None:
             return False
@@ -280,7 +276,7 @@ class Condition:
 
     @property
     def message(self) -> str:
-        """One line for people; empty = nothing to say."""
+        """One line for the status; empty = all is well."""
         told = [describe(self.faults)] if self.faults else []
         if self.warming and self._warm_up.slope_counts_per_min is not None:
             told.append("warming up, so the baseline drifts: tare before you measure")
@@ -292,11 +288,11 @@ class Condition:
         return "; ".join(told)
 
     def gauges(self) -> dict[str, float]:
-        """Present values; from any thread."""
+        """Present values; may be called from any thread."""
         return dict(self._gauges)
 
     def begin(self) -> None:
-        """The device was opened, or opened again: what was between is not known."""
+        """The device was opened, or opened again: what happened in between is unknown."""
         self._blocks.begin()
         self._recent.clear()
         self._channels.begin()
@@ -311,7 +307,7 @@ class Condition:
         self._tell()
 
     def add(self, frame: ElectrodeFrame) -> bool:
-        """Take a frame; whether anything was judged anew."""
+        """Take a frame; whether a block was full, so that the condition was judged again."""
         block = self._blocks.add(frame)
         if block is None:
             return False

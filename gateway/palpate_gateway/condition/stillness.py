@@ -1,16 +1,12 @@
-"""Frames in blocks of a fifth of a second, so that watching them costs little.
+"""Whether a sensor is still: a sensor that moves is touched, or was touched just before.
 
-A frame is copied into a row; everything else is computed once a block. Invalid samples are left
-out.
+PAC is the dynamic part of the fluid's pressure: any touch of the skin disturbs it, even a hand that
+holds the finger. PDC changes slowly while skin and fluid relax. Electrodes vary and shift. A still
+sensor may be touched all the same: a stand can press with a constant force (see ``condition``).
 
-
-Whether a sensor is still: what moves is touched, or was just now.
-
-PAC is the dynamic part of the fluid's pressure: whoever touches the skin shakes it, even a hand
-that holds on. PDC creeps while skin and fluid relax. Electrodes vary and shift. What is still need
-not be untouched: a stand that presses is as still as nothing (see ``untouched``).
-
-Limits come from the real captures in docs/tare-and-health.md.
+Frames are collected in blocks of a fifth of a second, so that this costs little: a frame is copied
+into a row, everything else is computed once a block. Limits come from the real captures in
+docs/tare-and-health.md.
 """
 
 from __future__ import annotations
@@ -25,7 +21,7 @@ import numpy.typing as npt
 from palpate.messages import CountArray, ElectrodeFrame, FrameLayout
 
 BLOCK_S = 0.2
-"""Duration of a block [s], but never fewer frames than ``FRAMES_MIN``."""
+"""Duration of a block [s]; a block has at least ``FRAMES_MIN`` frames."""
 
 FRAMES_MIN = 10
 
@@ -37,21 +33,21 @@ _Valid = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class FrameBlock:
-    """Statistics of consecutive frames; of E electrodes, arrays have shape ``(E,)``.
+    """Statistics of consecutive frames without invalid samples; arrays have shape ``(E,)``.
 
     Attributes:
         time_s: Time of the last frame [s], by the frames' monotonic clock.
-        frames: How many.
-        seen: Valid samples of each electrode; 0 = its other numbers say nothing.
+        frames: Number of frames.
+        seen: Valid samples of each electrode; 0 = its other numbers mean nothing.
         mean: Mean [counts].
         variance: Variance [counts^2].
-        low: Least, uint16 [counts].
-        high: Greatest, uint16 [counts].
+        low: Minimum, uint16 [counts].
+        high: Maximum, uint16 [counts].
         pac_seen: Valid samples of PAC.
         pac_mean: Mean [counts].
         pac_variance: Variance [counts^2].
-        pac_low: Least [counts].
-        pac_high: Greatest [counts].
+        pac_low: Minimum [counts].
+        pac_high: Maximum [counts].
         slow_seen: Valid samples of PDC, TAC and TDC.
         pdc_mean: Mean [counts].
         pdc_variance: Variance [counts^2].
@@ -80,7 +76,7 @@ class FrameBlocks:
     """Collects frames of one sensor.
 
     Args:
-        layout: Of its frames.
+        layout: Layout of its frames.
         rate_hz: Frames per second [Hz].
     """
 
@@ -95,11 +91,11 @@ class FrameBlocks:
         self._bits = np.arange(layout.slots, dtype=np.uint64)
 
     def begin(self) -> None:
-        """Forget the block that has begun."""
+        """Drop the block that has begun."""
         self._count = 0
 
     def add(self, frame: ElectrodeFrame) -> FrameBlock | None:
-        """Take a frame; the block when it is full."""
+        """Take a frame; returns the block when it is full."""
         layout, at = self._layout, self._count
         row = self._rows[at]
         row[: layout.electrodes] = frame.electrodes
@@ -178,17 +174,17 @@ _SHIFT_NOISE = 2.0
 """Electrodes that shift by more than this much, and their noise this many times, are moving."""
 
 WINDOW_BLOCKS = 3
-"""Blocks that are looked at together: 0.6 s."""
+"""Number of blocks in a window: 0.6 s."""
 
 
 @dataclass(frozen=True, slots=True)
 class StillLimits:
-    """What a still sensor does not exceed.
+    """Noise up to which a sensor counts as still.
 
     Attributes:
         electrode_sd: Standard deviation of any electrode [counts].
-        pac_sd: Standard deviation of PAC [counts]; infinity = it is not looked at.
-        pdc_sd: Standard deviation of PDC [counts]; infinity = it is not looked at.
+        pac_sd: Standard deviation of PAC [counts]; infinity = PAC is ignored.
+        pdc_sd: Standard deviation of PDC [counts]; infinity = PDC is ignored.
     """
 
     electrode_sd: float = MAX_SD_COUNTS
@@ -198,15 +194,15 @@ class StillLimits:
 
 @dataclass(frozen=True, slots=True)
 class MotionEvidence:
-    """What speaks for a touch in a window of frames.
+    """Signs of a touch in a window of frames.
 
     Attributes:
         frames: Frames in the window.
         electrode: The electrode that varies most, from 0.
         electrode_sd: Its standard deviation [counts].
-        shift: How much the second half of the window differs from the first, as the root mean
-            square of all electrodes [counts].
-        noise: Shift that noise alone would give [counts].
+        shift: Difference between the means of the second and the first half of the window, root
+            mean square over the electrodes [counts].
+        noise: Shift that noise alone causes [counts].
         pac_sd: Standard deviation of PAC [counts].
         pdc_sd: Standard deviation of PDC [counts].
     """
@@ -220,7 +216,7 @@ class MotionEvidence:
     pdc_sd: float
 
     def motion(self, limits: StillLimits) -> str:
-        """What moves, for people; empty = the sensor is still."""
+        """A sentence about what moves; empty = the sensor is still."""
         over = f"over {self.frames} frames, at most"
         if self.electrode_sd > limits.electrode_sd:
             return (
@@ -236,7 +232,7 @@ class MotionEvidence:
                 f"PDC varies by {self.pdc_sd:.1f} counts (sd) {over} {limits.pdc_sd:g} are allowed"
             )
         most = _SHIFT_COUNTS + _SHIFT_NOISE * self.noise
-        # Who looks at the electrodes' variation only has asked for just that.
+        # With PDC ignored only the variation of electrodes counts, and a shift is accepted.
         if math.isfinite(limits.pdc_sd) and self.shift > most:
             return (
                 f"electrodes shift by {self.shift:.1f} counts (rms) {over} {most:.1f} are allowed"
@@ -265,7 +261,7 @@ def evidence_of_blocks(
 
     Args:
         blocks: At least two.
-        usable: Electrodes that are looked at, bool, shape ``(E,)``; at least one.
+        usable: Electrodes to be used, bool, shape ``(E,)``; at least one.
     """
     count, half, frames = len(blocks), len(blocks) // 2, blocks[0].frames
     means = np.array([block.mean for block in blocks])
@@ -284,7 +280,8 @@ def _evidence(
     frames: int, half: int, variance: Floats, step: Floats, pac_sd: float, pdc_sd: float
 ) -> MotionEvidence:
     worst = int(variance.argmax())
-    # Of two means of as many frames; what is left out has neither noise nor shift.
+    # Noise of the difference of two means over ``half`` frames each. Electrodes that are left out
+    # have variance and step 0: they lower noise and shift alike.
     noise = math.sqrt(2.0 * float(np.add.reduce(variance)) / len(variance) / half)
     shift = math.sqrt(float(step @ step) / len(step))
     return MotionEvidence(

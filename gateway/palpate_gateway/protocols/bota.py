@@ -1,8 +1,8 @@
 """Bota Systems SensONE and Rokubi on a serial line (hardware reference 3.6).
 
-The sensor speaks text until it is told to run, then it sends frames of 37 bytes. Commands have no
-line end. The letters, lists and defaults are the page's; the numbers' format of offsets and matrix
-rows is that of the maker's ROS 2 driver (one source).
+The sensor answers in text until the run command, then it sends frames of 37 bytes. Commands have no
+line end. Letters, lists and defaults come from the hardware reference; the number format of offsets
+and matrix rows from the maker's ROS 2 driver (one source).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class BotaFrame:
 
 
 def status_names(status: int) -> tuple[str, ...]:
-    """Names of the bits that are set; a bit without a meaning is called by its number."""
+    """Names of the bits that are set; ``bit 9`` where a bit has no known meaning."""
     names = dict(enumerate(STATUS_NAMES))
     return tuple(names.get(bit, f"bit {bit}") for bit in range(16) if status >> bit & 1)
 
@@ -56,7 +56,7 @@ def _is_good(frame: bytes) -> bool:
 
 
 class BotaDecoder(FrameFinder[BotaFrame]):
-    """Frames out of a serial line; the text before them is junk to it.
+    """Frames out of a serial line; the text before them counts as junk.
 
     ``counters["not_finite"]`` counts good frames with a value that is no number; they are returned.
     """
@@ -160,7 +160,7 @@ def matrix_row_request(row: int, values: Sequence[float]) -> bytes:
 
 
 def expected_reply(request: bytes) -> bytes | None:
-    """Reply that says the request was taken; None where the page names none."""
+    """Reply that confirms the request; None where the reference names none."""
     letter = request[:1]
     return b"r,0,%b,0" % letter if letter and letter[0] in _WITH_REPLY else None
 
@@ -179,13 +179,13 @@ class BotaAck:
 
 
 def find_ack(text: bytes) -> BotaAck | None:
-    """First reply in the text, so that a refusal can be told from silence."""
+    """First reply in the text, which tells a refusal from silence."""
     found = _ACK.search(text)
     return BotaAck(found[2].decode("ascii"), int(found[3])) if found else None
 
 
 class BotaTextWait:
-    """Waits for a text, and gives what follows it untouched: after ``R`` that is frames.
+    """Waits for a text, and returns the bytes that follow it: after ``R`` those are frames.
 
     Args:
         text: The text to wait for; not empty, at most 64 bytes.
@@ -196,15 +196,15 @@ class BotaTextWait:
             raise ValueError(f"a text of {len(text)} bytes is not in 1..64")
         self._text = text
         self._done = False
-        self.heard = b""
-        """Last bytes before the text came, at most 256: what to show when it does not come."""
+        self.before = b""
+        """Last bytes before the text, at most 256, for the error when it does not come."""
 
     def feed(self, data: bytes) -> bytes | None:
         """Take bytes as they come; None until the text has come, then the bytes after it."""
         if self._done:
             return bytes(data)
-        before, found, after = (self.heard + data).partition(self._text)
-        self.heard = before[-_REMEMBERED_BYTES:]
+        before, found, after = (self.before + data).partition(self._text)
+        self.before = before[-_REMEMBERED_BYTES:]
         self._done = bool(found)
         return after if found else None
 

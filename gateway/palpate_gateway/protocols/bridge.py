@@ -2,15 +2,12 @@
 
 A packet is a header, a body and CRC-16/X-25 over both, all little-endian, stuffed by COBS and ended
 by 0. The slots travel verbatim, as in format A, so that parity, error words and absence stay
-visible to the host. ``encode`` is what the reference firmware does; it should send one zero first.
+visible to the host. Firmware should send one zero before its first packet.
 
     header   u8 version, u8 type, u8 source, u8 flags, u16 sequence, u32 device time [us]
     HELLO    u8 fingers n, u16 slots per second, u8 slots per frame, n x (16 B serial, 4 B firmware)
     SLOTS    u8 count k, u8 fingers n, k x (command byte, n x 2 bytes)
     STATUS   u8 fingers n, n x u32 parity errors, u32 error words, u32 overruns
-
-
-Gaps, repetitions and starts of a bridge, from the numbers and times of its packets.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ from palpate_gateway.protocols.spi import printable_prefix
 VERSION = 1
 
 SLOTS_MAX = 255
-"""Slots that the count of a packet can tell; 22 to 44 are meant."""
+"""Most slots of a packet, by the size of its count; 22 to 44 are usual."""
 
 _HEADER = struct.Struct("<BBBBHI")
 _HELLO = struct.Struct("<BHB")
@@ -37,7 +34,7 @@ _LONGEST = _HEADER.size + _SLOTS.size + SLOTS_MAX * (1 + 2 * FINGERS_MAX) + _CRC
 
 
 class BridgePacketType(IntEnum):
-    """What the body of a packet is."""
+    """Kinds of packets."""
 
     HELLO = 1
     SLOTS = 2
@@ -49,7 +46,7 @@ class BridgeHeader:
     """Head of every packet.
 
     Attributes:
-        source: Which bridge, 0..255.
+        source: Id of the bridge, 0..255.
         flags: Not used yet, 0..255.
         sequence: Number of the packet modulo 65536, counted for each source over all types.
         device_time_us: Time of the first slot, or of sending where there is none, modulo 2**32.
@@ -63,7 +60,7 @@ class BridgeHeader:
 
 @dataclass(frozen=True, slots=True)
 class BridgeFinger:
-    """Who a finger is: serial (up to 16 ASCII) and firmware (up to 4); empty if unknown."""
+    """Identity of a finger: serial (up to 16 ASCII) and firmware (up to 4); empty if unknown."""
 
     serial: str
     firmware: str
@@ -71,7 +68,7 @@ class BridgeFinger:
 
 @dataclass(frozen=True, slots=True)
 class BridgeHello:
-    """What the bridge says of itself at start and every few seconds.
+    """What the bridge sends about itself at start and every few seconds.
 
     Attributes:
         slot_rate_hz: Slots per second, 0..65535.
@@ -122,8 +119,8 @@ class BridgeRecord:
     Attributes:
         header: Its header, raw.
         body: Its body.
-        lost_before: Packets of this source that are missing directly before.
-        epoch: Counts the starts of this source, and connections; times of two do not compare.
+        lost_before: Packets of this source that are missing directly before this one.
+        epoch: Number of the start of this source; times of two epochs do not compare.
         time_us: Unwrapped device time of this epoch [us].
     """
 
@@ -160,10 +157,10 @@ def decode_body(kind: int, data: bytes) -> BridgeBody | None:
 
 
 class BridgeDecoder:
-    """Good packets out of a stream, with what is missing between them.
+    """Good packets out of a stream, and the number of packets missing between them.
 
-    Bytes of the returned packets, ``counters["junk_bytes"]`` and ``pending`` are all bytes fed. The
-    slots of damaged packets are not guessed.
+    Bytes of the returned packets, ``counters["junk_bytes"]`` and ``pending`` add up to all bytes
+    fed.
     """
 
     def __init__(self) -> None:
@@ -184,7 +181,7 @@ class BridgeDecoder:
         return self._splitter.pending
 
     def reset(self) -> None:
-        """The connection is new: nothing is known of the bridges behind it."""
+        """The connection is new: forget the bridges of the old one."""
         self._splitter.reset()
         self._tracks.clear()
 
@@ -244,12 +241,12 @@ _SEQUENCES = 1 << 16
 _TIMES = 1 << 32
 
 _LATE_US = 1_000_000
-"""A HELLO has the time it is sent, the slots behind it that of the first, which is earlier [us]."""
+"""By how much slots sent after a HELLO may have been sampled before it [us]."""
 
 
 @dataclass(slots=True)
 class BridgePacketTrack:
-    """Where the packets of a bridge have got to since it started.
+    """Number and time of the last packet of a bridge since it started.
 
     Attributes:
         sequence: Number of its last packet, modulo 65536.
@@ -260,20 +257,21 @@ class BridgePacketTrack:
     time_us: int
 
     def has_restarted(self, sequence: int, time_us: int, *, hello: bool) -> bool:
-        """Whether the next packet is of another start.
+        """Whether the bridge has restarted before the next packet.
 
-        Its time goes back in a HELLO, or together with its number, or by more than slots are late.
+        Then the time goes back in a HELLO, or together with the packet number, or by more than
+        slots can be late.
         """
         step = _signed(sequence - self.sequence, _SEQUENCES)
         elapsed_us = _signed(time_us - self.time_us, _TIMES)
         if elapsed_us < 0 and (hello or step < 0 or elapsed_us < -_LATE_US):
             return True
-        # After more than 36 minutes a start looks like time that goes on over its wrap; but the
-        # first HELLO of all has number 0, out of its turn.
+        # After more than 36 minutes the time of a restarted bridge looks like one that has wrapped;
+        # but the first HELLO after a start has number 0, which is then out of sequence.
         return hello and sequence == 0 and step != 1 and time_us < self.time_us % _TIMES
 
     def follow(self, sequence: int, time_us: int) -> int | None:
-        """Go on to the next packet.
+        """Advance to the next packet.
 
         Args:
             sequence: Its number, modulo 65536.
@@ -291,6 +289,6 @@ class BridgePacketTrack:
 
 
 def _signed(difference: int, modulus: int) -> int:
-    """The shorter way around."""
+    """The difference of two counters that wrap, by the shorter way around."""
     half = modulus // 2
     return (difference + half) % modulus - half

@@ -66,10 +66,10 @@ class SlotWords:
 
 
 class SlotDecoder:
-    """Commands and words of slots, as CAN frames or the project's own bridge carry them.
+    """Decodes the command and the words of slots, which CAN frames and our own bridge carry alike.
 
-    ``counters`` counts slots and what was refused whole; ``finger_counters`` has one dictionary per
-    finger, in order of the ports, that counts words which are not good, and suspicious ones.
+    ``counters`` counts slots, and payloads that were dropped whole; ``finger_counters`` has one
+    dictionary for each finger, in order of the ports, with its bad and its suspicious words.
 
     Args:
         fingers: Words in each slot, 1..5.
@@ -88,7 +88,7 @@ class SlotDecoder:
         )
 
     def decode(self, payloads: Bytes, sizes: Ints) -> SlotWords:
-        """Decode slots, leaving out what is none; bytes behind the last finger's are ignored.
+        """Decode slots; drops payloads that are none, and ignores bytes behind the last finger's.
 
         Args:
             payloads: Command and words of each, zeros behind them, uint8, shape ``(N, M)``, M at
@@ -110,9 +110,9 @@ class SlotDecoder:
         counters["slots"] += len(index)
         if not len(index):  # then rows may be shorter than a slot
             payloads = np.zeros((0, self._size), np.uint8)
-        told = np.ascontiguousarray(payloads[:, 1 : self._size]).view(">u2")
-        # One look in a table instead of a dozen tests: a hand of five brings 22,000 words a second.
-        words = self._table[told.reshape(len(index), (self._size - 1) // 2)]
+        raw = np.ascontiguousarray(payloads[:, 1 : self._size]).view(">u2")
+        # One table look-up instead of a dozen tests: a hand of five sends 22,000 words a second.
+        words = self._table[raw.reshape(len(index), (self._size - 1) // 2)]
         if words.max(initial=0) >= 1 << _KIND_AT:
             self._count(words)
         return SlotWords(
@@ -132,9 +132,9 @@ class SlotDecoder:
 
 @cache
 def _word_table() -> npt.NDArray[np.uint32]:
-    """For each of 65,536 words: value, kind << 12, and which counter it raises << 14 (0 = none)."""
-    told = np.arange(1 << 16, dtype=np.uint16)
-    words = decode_words(np.stack([told >> 8, told & 0xFF], axis=1).astype(np.uint8))
+    """For each of 65,536 words: value, kind << 12, and number of its counter << 14 (0 = none)."""
+    raw = np.arange(1 << 16, dtype=np.uint16)
+    words = decode_words(np.stack([raw >> 8, raw & 0xFF], axis=1).astype(np.uint8))
     counted = np.zeros(1 << 16, np.uint32)
     good = words.kind == WordKind.GOOD
     counted[words.kind == WordKind.BIT_ERROR] = 1 + _FINGER_KEYS.index("parity_errors")
@@ -166,7 +166,7 @@ def payload_rows(payloads: Sequence[bytes]) -> tuple[Bytes, Ints]:
 
 
 class CanSlotDecoder(SlotDecoder):
-    """Slots out of the data frames of a bus; error and remote frames are not for it.
+    """Slots out of the data frames of a CAN bus; takes no error and no remote frames.
 
     Args:
         fingers: Words that each frame must have at least, 1..3.
@@ -182,7 +182,7 @@ class CanSlotDecoder(SlotDecoder):
         self.counters["other_ids"] = 0
 
     def ours(self, can_id: Ints) -> npt.NDArray[np.bool_] | None:
-        """Which data frames are for us by their identifiers; None = all. Counts the others."""
+        """Which data frames have our identifier; None = all. Counts the others."""
         if self._can_id is None:
             return None
         ours: npt.NDArray[np.bool_] = can_id == self._can_id

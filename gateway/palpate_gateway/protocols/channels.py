@@ -30,10 +30,7 @@ SLOTS_PER_FRAME = BIOTAC_LAYOUT.slots
 SLOT_RATE_HZ = 4400.0
 """The maker's default slot rate (hardware reference 1.7)."""
 
-# Places of the original BioTac's channels in ElectrodeFrame.validity.
-PDC_BIT = BIOTAC_LAYOUT.pdc_bit
-TAC_BIT = BIOTAC_LAYOUT.tac_bit
-TDC_BIT = BIOTAC_LAYOUT.tdc_bit
+# Bits of the original BioTac's channels in ElectrodeFrame.validity.
 FIRST_PAC_BIT = BIOTAC_LAYOUT.first_pac_bit
 ALL_VALID = BIOTAC_LAYOUT.all_valid
 

@@ -1,16 +1,12 @@
-"""Lines of the Weiss KMS 40's text protocol (hardware reference 3.1).
+"""The text protocol of the Weiss KMS 40 (hardware reference 3.1): its lines, and commands to it.
 
 The device answers over TCP (or RS-232, same text) in ASCII lines that end with LF: data
 ``F={fx,fy,fz,mx,my,mz},timestamp``, replies ``NAME=value``, echoes ``L1`` and ``L0``, refusals
 ``ERROR(code)``. Replies and data lines may come in any order, also between ``L0()`` and its echo.
-There is no checksum: a line is taken only if all of it has one of these shapes. What is sent to the
-device is in ``kms40_requests``.
+There is no checksum: a line is accepted only if all of it has one of these shapes.
 
-
-Commands to the Weiss KMS 40 (hardware reference 3.1).
-
-The order seen in the field: mask, filter, divider, ``VL(0)``, start. Stop the stream before a tare,
-and read on until the echo ``L0``: samples may still come before it.
+The order of commands seen in the field: mask, filter, divider, ``VL(0)``, start. Stop the stream
+before a tare, and read on until the echo ``L0``: samples may still come before it.
 """
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 
 LINE_MAX = 4096
-"""A line longer than this is no line of this protocol [bytes, without LF]."""
+"""Longest line of this protocol [bytes, without LF]."""
 
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
@@ -45,7 +41,7 @@ _TICKS = re.compile(r"\d{1,20}")
 _SAMPLE = re.compile(
     r"F=\{" + ",".join([rf" *({_NUMBER.pattern}) *"] * 6) + rf"\}}(?:, *({_TICKS.pattern}) *)?"
 )
-"""A sample as it should be, in one match: 500 come in a second."""
+"""A well-formed sample, read by one match: 500 come each second."""
 _FLAGS = re.compile(r"\d{1,10}|0[xX][0-9a-fA-F]{1,8}")
 
 
@@ -74,7 +70,7 @@ class KmsFlags(IntFlag):
 
 
 FAULTS = KmsFlags.CALIBRATION_FAULT | KmsFlags.TEMPERATURE_FAULT | KmsFlags.POWER_FAULT
-"""Flags that say the forces cannot be trusted."""
+"""Flags that make the forces invalid."""
 
 
 class KmsLineFault(StrEnum):
@@ -120,7 +116,7 @@ class KmsReply:
 
 @dataclass(frozen=True, slots=True)
 class KmsRefusal:
-    """The device refuses a command; it does not say which.
+    """The device refuses a command; its line does not name the command.
 
     Attributes:
         code: The device's number.
@@ -139,7 +135,7 @@ _COUNTER_OF = {KmsForceLine: "data_lines", KmsReply: "replies", KmsRefusal: "ref
 class KmsDecoder:
     """Cuts the stream of bytes into lines and reads them; see ``parse_line``.
 
-    ``untimed_lines`` counts samples without a usable time stamp, which are delivered all the same.
+    ``untimed_lines`` counts samples without a usable time stamp; they are delivered.
     """
 
     def __init__(self) -> None:
@@ -167,7 +163,7 @@ class KmsDecoder:
         return records
 
     def reset(self) -> None:
-        """Begin anew on a new connection: the line that has begun becomes junk."""
+        """A new connection: the line that has begun becomes junk."""
         self.counters["junk_bytes"] += len(self._line)
         self._line.clear()
         self._skipping = False
@@ -239,7 +235,7 @@ def _parse_data(text: str) -> KmsForceLine | KmsLineFault:
     if sample is not None:
         fx, fy, fz, mx, my, mz = map(float, sample.groups()[:6])
         ticks = sample[7]
-        # Each of them is finite if their sum is; if not, see below.
+        # A finite sum means that each value is finite; the other case is examined below.
         if math.isfinite(fx + fy + fz + mx + my + mz):
             return KmsForceLine((fx, fy, fz), (mx, my, mz), None if ticks is None else int(ticks))
     data = _DATA.fullmatch(text)
@@ -295,14 +291,14 @@ BASE_RATE_HZ = 500.0
 """Rate at divider 1: one sample each 2 ms [Hz]."""
 
 DIVIDER_MAX = 500
-"""Largest divider we ask for, one line a second; the device's own limit is not public."""
+"""Largest divider that we set, one line a second; the device's own limit is not public."""
 
 FILTER_MAX = 255
-"""Largest filter number we ask for; the device's table of filters is not public."""
+"""Largest filter number that we set; the device's table of filters is not public."""
 
 
 class KmsQuery(StrEnum):
-    """Commands without arguments that only ask; the value is also the name of the reply."""
+    """Questions to the device; the value is also the name of the reply."""
 
     IDENTITY = "ID"
     SERIAL_NUMBER = "SN"
@@ -315,7 +311,7 @@ class KmsQuery(StrEnum):
 
 
 def query_request(query: KmsQuery) -> bytes:
-    """Ask for one fact."""
+    """Ask one question."""
     return f"{query}()\n".encode("ascii")
 
 
@@ -345,7 +341,7 @@ def clear_tare_request() -> bytes:
 
 
 def quiet_request() -> bytes:
-    """Ask for the shortest replies."""
+    """Choose the shortest replies."""
     return b"VL(0)\n"
 
 

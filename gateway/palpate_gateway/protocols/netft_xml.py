@@ -1,7 +1,7 @@
 """Settings that an ATI or Schunk device serves as ``netftapi2.xml`` (hardware reference 3.2).
 
-They say what a count is worth, in the unit that the owner of the device chose. Often it is a
-millionth of 1 N and 1 N m, but that is not guaranteed: nothing is assumed where a tag is missing.
+They give the counts per unit, in the unit that is set on the device. Often a count is a millionth
+of 1 N and 1 N m, but not always: where a tag is missing nothing is assumed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _FOOT_M = 0.3048
 FORCE_UNITS_N: dict[str, float] = {
     "n": 1.0, "kn": 1000.0, "lbf": _LBF_N, "klbf": 1000 * _LBF_N, "kgf": _KGF_N,
     "gf": _KGF_N / 1000,
-    # The mass for the force, as calibration sheets write it.
+    # Mass units that stand for a force on calibration sheets.
     "lb": _LBF_N, "klb": 1000 * _LBF_N, "kg": _KGF_N, "g": _KGF_N / 1000,
 }  # fmt: skip
 """Units of force [N], small letters."""
@@ -35,7 +35,7 @@ TORQUE_UNITS_N_M: dict[str, float] = {
     "kgfcm": _KGF_N * 0.01,
     "lbin": _LBF_N * _INCH_M, "lbft": _LBF_N * _FOOT_M, "kgcm": _KGF_N * 0.01,
 }  # fmt: skip
-"""Units of torque [N m], small letters without what joins force and length."""
+"""Units of torque [N m], lower case, without the sign between force and length."""
 
 _JOINTS = re.compile(r"[\s\-.*·_]+")
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
@@ -53,7 +53,7 @@ class NetftSettings:
     """What palpate needs of the device's settings.
 
     Attributes:
-        product: Name of the product; empty where the device gives none.
+        product: Name of the product; empty if the device gives none.
         serial: Serial number of the calibration in use; empty where the device gives none.
         force_unit: Unit of force as the device writes it.
         torque_unit: Unit of torque as the device writes it.
@@ -78,7 +78,7 @@ def parse_netft_xml(document: bytes) -> NetftSettings:
         document: The document as the device's web server sends it.
 
     Raises:
-        DeviceError: It is no such document, or it does not say what a count is worth.
+        DeviceError: It is no such document, or it lacks the counts per unit.
     """
     tags = _tags(document)
     missing = [name for name in _NEEDED if not tags.get(name)]

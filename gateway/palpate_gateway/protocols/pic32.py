@@ -1,7 +1,7 @@
 """The PIC32 bridge's serial records (format B, hardware reference 2.2).
 
 Its stream has neither sync bytes nor a checksum, and its firmware strips the parity of the words.
-A lost byte shows only by values that no 12-bit word has; then the stream is good for nothing until
+A lost byte shows only by values that no 12-bit word has; then the stream is useless until
 it is stopped, drained and started again.
 """
 
@@ -23,7 +23,7 @@ TICK_S = 25e-9
 RATE_HZ = 100.0
 
 LARGEST_LOAD_G = 1_000_000
-"""A load cell that says more is a misaligned stream: no such cell carries a tonne [g]."""
+"""A larger load means a misaligned stream: no such cell carries a tonne [g]."""
 
 _NEWTON_PER_GRAM = 9.80665e-3
 _COUNTS = struct.Struct(f"<{ELECTRODES + 4}H")
@@ -139,7 +139,7 @@ class Pic32Decoder:
     are all bytes fed.
 
     Args:
-        layout: Order of the values; the firmware's, which nothing in the stream tells.
+        layout: Order of the values in this firmware; the stream itself does not show it.
     """
 
     def __init__(self, layout: Pic32Layout = Pic32Layout.PAC_FIRST) -> None:

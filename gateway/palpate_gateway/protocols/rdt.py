@@ -1,14 +1,12 @@
 """RDT datagrams: one format of ATI, Schunk and OnRobot (hardware reference 3.2, 3.3).
 
 A request is 8 bytes, a record 36, all big-endian, over UDP port 49152. A datagram holds one record,
-or several if the device buffers. What products do differently is in ``rdt_profiles``. There is no
-checksum beyond UDP's and no signature: take datagrams only from the device's own address.
+or several if the device buffers. There is no checksum beyond
+UDP's and no signature: take datagrams only from the device's own address.
 
-
-What each product makes of RDT (hardware reference 3.2, 3.3).
-
-All of them start with command 2: command 1 is undefined on the Net F/T (hardware reference 6).
-Status words are judged with caution: a bit that is not known to be harmless makes the data invalid.
+A profile holds what a product does differently. All of them start with command 2: command 1 is
+undefined on the Net F/T (hardware reference 6). A status bit that is not known to be harmless makes
+the data invalid.
 """
 
 from __future__ import annotations
@@ -28,13 +26,13 @@ RECORD_BYTES = 36
 U32 = 1 << 32
 
 LATE_WINDOW = 128
-"""A record that is further behind than this is not late: the device has restarted [records]."""
+"""A record further behind than this is not late: the device has restarted [records]."""
 
 LATE_COUNTS = 8000
-"""Nor is one that was sampled earlier than by this: a second of the fastest counter [counts]."""
+"""The same for the time of sampling: a second of the fastest counter [counts]."""
 
 BELIEVABLE_LOSS = 1_000_000
-"""More is not taken for a loss where a restart is possible too [records]."""
+"""A larger gap is taken for a restart where both are possible [records]."""
 
 _REQUEST = struct.Struct(">HHI")
 _REQUEST_HEADER = 0x1234
@@ -43,7 +41,7 @@ _RECORD = struct.Struct(">3I6i")
 RECORD_TYPE = np.dtype(
     [("rdt_sequence", ">u4"), ("ft_sequence", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)]
 )
-"""A record as NumPy sees it in a datagram."""
+"""A record in a datagram, for NumPy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +63,7 @@ class RdtRecord:
 
 @dataclass(frozen=True, slots=True)
 class RdtScale:
-    """What a count is worth.
+    """Counts per unit of force and torque.
 
     Attributes:
         counts_per_n: Counts of 1 N.
@@ -95,7 +93,7 @@ class RdtScale:
 
 
 class RdtDecoder:
-    """Reads datagrams; each is whole or nothing, so no bytes are ever kept."""
+    """Reads datagrams; each holds whole records, so no bytes are kept from one to the next."""
 
     pending = 0
 
@@ -128,12 +126,12 @@ class RdtDecoder:
 
 @dataclass(frozen=True, slots=True)
 class RdtStep:
-    """What a record's numbers say about its place in the stream.
+    """Place of a record in the stream, from its numbers.
 
     Attributes:
         keep: Whether the record is new; a repeated or late one is to be dropped.
         new_epoch: The device counts from 1 again, after a start request or a loss of power: its
-            clock and its bias may be others than before. True for the first record too.
+            clock and its bias may have changed. True for the first record too.
         lost: Records that did not arrive directly before this one.
         tick: Number of the record over all epochs, from 0, lost ones included.
     """
@@ -186,7 +184,7 @@ class RdtSequence:
         return self._accept(rdt_sequence, ft_sequence, lost=lost, new_epoch=True)
 
     def reset(self) -> None:
-        """Begin anew on a new connection; ticks run on, counters are kept."""
+        """A new connection: ticks run on, counters are kept."""
         self._last = None
 
     def _accept(
@@ -207,7 +205,7 @@ def unwrap(raw: int, previous: int) -> int:
 
     Args:
         raw: The counter as sent.
-        previous: The value before, unwrapped; any first value will do.
+        previous: The value before, unwrapped; any value for the first.
     """
     return previous + (raw - previous + U32 // 2) % U32 - U32 // 2
 
@@ -241,7 +239,7 @@ def encode_request(command: int, count: int = 0) -> bytes:
 
 
 class RdtCommand(IntEnum):
-    """Commands that palpate sends; those from 0x81 only OnRobot's converter knows."""
+    """Commands that palpate sends; those from 0x81 exist on OnRobot's converter only."""
 
     STOP = 0x0000
     START_REALTIME = 0x0002
@@ -276,9 +274,9 @@ class RdtProfile:
         ft_rate_hz: Rate of ``ft_sequence`` [Hz]; None = unknown, to be read or measured.
         scale: What a count is worth; None = must be read from the device.
         status_mask: Bits of the status word that are conditions of the device.
-        bit_names: Name of each known bit.
+        bit_names: Name of each bit with a known meaning.
         harmless: Bits that leave the data good.
-        overload: Bits that say a range is exceeded: to be published with that flag.
+        overload: Bits that report an exceeded range.
         latch_sets_summary: A latched threshold sets the summary bit as an error does.
         bias_count: Count field of the request that takes the present load as zero.
         clear_bias_count: The same for undoing it; None = the product cannot.
@@ -343,14 +341,14 @@ class RdtProfile:
         return tuple(dict.fromkeys(self.bit_names.get(bit, f"bit {bit}") for bit in bits))
 
     def valid(self, status: int) -> bool:
-        """Whether a record with this status word holds data that can be trusted."""
+        """Whether the data of a record with this status word is valid."""
         word = status & self.status_mask
         if self.latch_sets_summary and word & _LATCHED:
             word &= ~_SUMMARY
         return not word & ~self.harmless
 
     def overloaded(self, status: int) -> bool:
-        """Whether the device says that the range of some axis is exceeded."""
+        """Whether the device reports that the range of some axis is exceeded."""
         return bool(status & self.overload)
 
 
@@ -408,7 +406,7 @@ AXIA = RdtProfile(
 """ATI Ethernet Axia."""
 
 SCHUNK_FTN = replace(AXIA, name="schunk_ftn")
-"""Schunk FTN-AXIA: an Axia by another name."""
+"""Schunk FTN-AXIA: the same device as an Axia."""
 
 HEX = RdtProfile(
     name="onrobot_hex",
@@ -441,7 +439,7 @@ PROFILES: dict[str, RdtProfile] = {
 
 
 def hex_sensor_number(status: int) -> int:
-    """Which sensor at the converter a HEX record is from, 0..7."""
+    """Number of the sensor at the converter that a HEX record is from, 0..7."""
     return status & 0b111
 
 

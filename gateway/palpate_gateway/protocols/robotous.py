@@ -1,15 +1,10 @@
-"""Robotous RFT force/torque sensors: the data bytes, whatever line carries them.
+"""Robotous RFT force/torque sensors: data bytes, and the frames that carry them.
 
-A request has 8 data bytes, an answer 16 (D1..D16, D1 names the command); ``robotous_framing`` takes
-them off the serial line and the CAN bus. The sensor sends neither a counter nor a time (hardware
-reference 3.5). Where the page leaves the place of a setting inside a reply open, it is that of the
-maker's own packet class ``RFT_IF_PACKET`` (one source).
-
-
-Lines that carry the data bytes of Robotous RFT sensors (hardware reference 3.5).
-
-Serial: ``55``, data, sum of the data mod 256, ``AA``. CAN: an answer comes in two messages, the
-halves of D1..D16, with an id each; a request is one message.
+A request has 8 data bytes, an answer 16 (D1..D16, D1 names the command). On a serial line they are
+framed as ``55``, data, sum of the data mod 256, ``AA``. On CAN an answer comes in two messages, the
+halves of D1..D16, with an id each; a request is one message. The sensor sends neither a counter nor
+a time (hardware reference 3.5). Where the reference leaves the place of a setting inside a reply
+open, it is that of the maker's own packet class ``RFT_IF_PACKET`` (one source).
 """
 
 from __future__ import annotations
@@ -51,7 +46,7 @@ class RobotousCommand(IntEnum):
 
 
 class RobotousFilterOrder(Enum):
-    """How cutoffs are numbered; the sources conflict (hardware reference 6).
+    """How filter cutoffs are numbered; the sources conflict (hardware reference 6).
 
     Both manuals count down from 500 Hz, the maker's sample header up from 1 Hz.
     """
@@ -146,7 +141,7 @@ class RobotousValues:
 
 @dataclass(frozen=True, slots=True)
 class RobotousUnknown:
-    """An answer that is none of the above, kept as it came."""
+    """An answer of another kind, as it came."""
 
     payload: bytes
 
@@ -214,9 +209,9 @@ def scale_of(model: str, *, torque_divisor: float | None = None) -> RobotousScal
     """Scale of a model.
 
     Args:
-        model: Name as the sensor tells it, e.g. ``"RFT40-SA01-C"``: a suffix does not matter.
-        torque_divisor: Counts per newton metre where the table is not to be followed (the maker's
-            ROS 2 driver ships 1000 for all).
+        model: Name as the sensor sends it, e.g. ``"RFT40-SA01-C"``; a suffix is ignored.
+        torque_divisor: Counts per newton metre in place of the table's (the maker's ROS 2 driver
+            uses 1000 for all models).
 
     Raises:
         ValueError: The model is not in the table and no divisor is given, or it is not positive.
@@ -240,7 +235,7 @@ def cutoff_hz_of(code: int, order: RobotousFilterOrder = RobotousFilterOrder.MAN
 
 
 def start_request() -> bytes:
-    """Stream data; while it streams, the sensor takes only stop and bias."""
+    """Start the stream; while it runs, the sensor accepts only stop and bias."""
     return _request(RobotousCommand.START)
 
 
@@ -255,7 +250,7 @@ def sample_request() -> bytes:
 
 
 def bias_request(on: bool = True) -> bytes:
-    """Take the present load as zero, or forget that zero; there is no answer."""
+    """Take the present load as zero, or drop that zero; there is no answer."""
     return _request(RobotousCommand.BIAS, int(on))
 
 
@@ -366,8 +361,8 @@ class RobotousCanDecoder:
     A half whose other half did not follow is dropped: ``lonely_first``, ``lonely_second``.
     ``swapped_pairs`` counts those among them that came as a pair in the wrong order. The sensor
     numbers nothing: where a second half and the next first half are lost together, the halves of
-    two samples make one answer. Only the times of the messages show that; the caller who sees
-    such a gap calls ``reset()`` before it feeds on.
+    two samples would make one answer. Only the times of the messages show that: call ``reset()``
+    when there is such a gap between them.
 
     Args:
         first_id: CAN id of D1..D8.
@@ -395,7 +390,7 @@ class RobotousCanDecoder:
         return int(self._first is not None)
 
     def reset(self) -> None:
-        """A new connection: a half that waits is counted as lonely, counters are kept."""
+        """A new connection: a half that waits is counted as lonely; counters are kept."""
         self._drop_first()
         self._after_lonely_second = False
 

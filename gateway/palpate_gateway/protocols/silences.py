@@ -1,8 +1,9 @@
 """Stalls of the host and losses of frames, told apart by the stamps of a steady stream.
 
-Delay only ever adds (hardware reference 5.2): what comes late and is then made up for was held up;
-a silence that is not made up for is a loss. A sender or host that is starved falls behind and makes
-up in turns for a while, so a loss shows only where delays are as steady as they were before it.
+Delays are never negative (hardware reference 5.2). After a stall of the host the late slots come in
+a burst, and the delay returns to its usual value; after a loss it stays larger. A busy sender or
+host falls behind and catches up in turns for a while, so a loss can be told only while the delays
+are as steady as they were before it.
 """
 
 from __future__ import annotations
@@ -18,34 +19,34 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 
 _GAP_S = 5e-3
-"""Silence that is worth a thought; stamps of a bus scatter by 1 ms (hardware reference 5.1) [s]."""
+"""Shorter silences are no loss; stamps of a bus scatter by 1 ms (hardware reference 5.1) [s]."""
 
 _SCATTER_S = 1.5e-3
-"""Delays that differ by so much more than they used to are not steady [s]."""
+"""Delays whose spread exceeds the usual one by more than this are not steady [s]."""
 
 _ENVELOPE_S = 0.1
 """How long the least delay is remembered [s]."""
 
 _SPREADS = 30
-"""The steadiest of so many of these times is what is usual."""
+"""The smallest spread in so many of these times is the usual one."""
 
 _SETTLE_S = 20e-3
-"""Behind a loss delays are steady for as long [s],"""
+"""After a loss, delays must be steady for at least this time [s],"""
 
 _LONGER = 10.0
-"""and for so many times what they differ by at their steadiest: unsteady ones are so by chance."""
+"""and for this many times their usual spread: unsteady delays may be steady by chance."""
 
 _PATIENCE_S = 2.0
-"""Nobody falls behind and makes up in turns for longer [s]."""
+"""No sender or host falls behind and catches up in turns for longer than this [s]."""
 
 
 class FrameLoss(NamedTuple):
-    """What a slot shows to be gone before it.
+    """Loss directly before a slot.
 
     Attributes:
         frames: Whole frames.
-        shift_s: How much later than on the old grid the slots come now [s], by up to half a frame:
-            a sender that paused need not have kept its pace.
+        shift_s: How much later than on the old grid the slots come now [s], up to half a frame: a
+            sender that paused need not stay on its grid.
     """
 
     frames: int
@@ -61,11 +62,11 @@ class _Gap:
 
     Attributes:
         until_s: When to judge it, if delays are steady until then [s].
-        stall_s: Delay beyond the usual at its end [s].
-        low_s: Least delay of those that are looked at until then [s].
+        stall_s: Delay beyond the usual one at its end [s].
+        low_s: Smallest delay since the delays became steady [s].
         high_s: The largest [s].
-        give_up_s: When to judge it however delays are [s].
-        least_s: Least delay in the last half of this time [s].
+        give_up_s: When to judge it even if delays are not steady [s].
+        least_s: Smallest delay in the last half of the time until then [s].
     """
 
     until_s: float
@@ -87,8 +88,9 @@ class Silences:
     """Judges the silences of one run.
 
     A silence is judged at once where the order of the slots is broken too and the host has not
-    stalled alike before; else at the edge of a frame, when slots have come steadily for two frames
-    (at least 20 ms) and more where they usually scatter, or two seconds later if they never do.
+    stalled for as long before. Otherwise it is judged at the beginning of a frame, when slots have
+    come steadily for two frames (at least 20 ms, longer where they usually scatter), or after two
+    seconds if they never do.
 
     Args:
         frame_s: Duration of a frame [s].
@@ -97,23 +99,23 @@ class Silences:
 
     def __init__(self, frame_s: float, stamp_s: float) -> None:
         self._frame_s = frame_s
-        self._worth_s = max(frame_s, _GAP_S)
+        self._gap_s = max(frame_s, _GAP_S)
         self._settle_s = max(2 * frame_s, _SETTLE_S)
         self._last_s = stamp_s
-        self._lows = [0.0, 0.0]  # least delays, now and before
+        self._lows = [0.0, 0.0]  # smallest delays, of this time and of the one before
         self._high_s = 0.0  # largest delay now
         self._spreads_s: deque[float] = deque(maxlen=_SPREADS)
         self._lows_until_s = stamp_s + _ENVELOPE_S
         self._gap: _Gap | None = None
-        self._stall_s = 0.0  # longest silence that was made up for
+        self._stall_s = 0.0  # longest stall whose slots all came
 
     @property
     def usual_s(self) -> float:
-        """Least delay of late [s]."""
+        """Smallest delay in the last tenths of a second [s]."""
         return min(self._lows)
 
     def judge(self, stamp_s: float, delay_s: float, *, broken: bool, edge: bool) -> FrameLoss:
-        """Take a slot; return what is now known to be gone before it.
+        """Take a slot; return the loss before it, as soon as that is known.
 
         Args:
             stamp_s: Its stamp [s].
@@ -124,7 +126,7 @@ class Silences:
         silence_s = stamp_s - self._last_s
         self._last_s = stamp_s
         usual_s = self.usual_s
-        if self._gap is None and silence_s < self._worth_s:
+        if self._gap is None and silence_s < self._gap_s:
             self._remember(stamp_s, delay_s)
             return NO_LOSS
         spread_s = min(self._spreads_s, default=0.0)
@@ -134,15 +136,15 @@ class Silences:
             self._gap = _Gap(until_s, delay_s - usual_s, delay_s, delay_s, give_up_s)
         gap = self._gap
         gap.take(stamp_s, delay_s)
-        if delay_s - usual_s < self._worth_s / 2:
+        if delay_s - usual_s < self._gap_s / 2:
             self._stall_s = max(self._stall_s, gap.stall_s)
             self._begin(stamp_s, delay_s)
             return NO_LOSS
-        if silence_s >= self._worth_s or gap.high_s - gap.low_s > spread_s + _SCATTER_S:
-            # It is being made up for; or who makes up for it was held up again.
+        if silence_s >= self._gap_s or gap.high_s - gap.low_s > spread_s + _SCATTER_S:
+            # The sender or host is catching up, or was held up again while it did.
             gap.low_s = gap.high_s = delay_s
             gap.until_s = stamp_s + settle_s
-        at_once = broken and delay_s - usual_s >= max(0.75 * self._worth_s, 2 * self._stall_s)
+        at_once = broken and delay_s - usual_s >= max(0.75 * self._gap_s, 2 * self._stall_s)
         if not at_once and (stamp_s < min(gap.until_s, gap.give_up_s) or not edge):
             return NO_LOSS
         late_s = delay_s if at_once else gap.low_s if stamp_s >= gap.until_s else gap.least_s
@@ -151,7 +153,7 @@ class Silences:
         return FrameLoss(frames, late_s - usual_s - frames * self._frame_s)
 
     def pass_over(self, stamps_s: Floats, delays_s: Floats) -> bool:
-        """Take slots of an unbroken order at once, if none of them is worth a thought.
+        """Take slots of an unbroken order at once, if there is no silence among them.
 
         Args:
             stamps_s: Their stamps [s], one at least.
@@ -160,9 +162,9 @@ class Silences:
         Returns:
             False if they must be judged one by one; then none was taken.
         """
-        if self._gap is not None or stamps_s[0] - self._last_s >= self._worth_s:
+        if self._gap is not None or stamps_s[0] - self._last_s >= self._gap_s:
             return False
-        if len(stamps_s) > 1 and (stamps_s[1:] - stamps_s[:-1]).max() >= self._worth_s:
+        if len(stamps_s) > 1 and (stamps_s[1:] - stamps_s[:-1]).max() >= self._gap_s:
             return False
         self._last_s = float(stamps_s[-1])
         late = stamps_s >= self._lows_until_s

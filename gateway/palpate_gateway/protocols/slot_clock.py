@@ -1,9 +1,8 @@
-"""The place of a slot in its stream, of one and of many.
+"""Frame, position and time of slots that carry no number.
 
-The place of slots that carry no number, from the order of their channels and their stamps.
-
-A slot is known by its channel, PAC by standing between the others. A frame ends where the cycle of
-channels begins again (hardware reference 2.1).
+They follow from the order of the channels and from the stamps: each channel but PAC occurs once in
+a frame, and a PAC sample is identified by its neighbours. A frame ends where the cycle of channels
+begins again (hardware reference 2.1).
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class SlotPlace:
-    """Where a slot belongs.
+    """Place of one slot in its stream.
 
     Attributes:
-        run: Counts connections and changes of the sequence, from 0.
-        frame: Frame number from 0, with those that were lost.
+        run: Number of the connection, or of the change of the sequence, from 0.
+        frame: Frame number from 0, lost frames counted.
         position: Place in the sequence.
         time_s: When it was sampled [s], by the clock of the stamps: on the grid of slots, which
-            begins anew where frames were lost; the stamp itself if stamps are exact.
+            starts again where frames were lost; the stamp itself if stamps are exact.
     """
 
     run: int
@@ -42,7 +41,7 @@ class SlotPlace:
 
 @dataclass(frozen=True, slots=True)
 class SlotPlaces:
-    """Where slots belong; see ``SlotPlace``.
+    """Places of many slots; see ``SlotPlace``.
 
     Attributes:
         kept: Which of the slots have a place, int64, shape ``(N,)``.
@@ -70,10 +69,10 @@ _SCATTER_S = 2e-3
 
 
 class SlotOrder:
-    """A cycle of channels, and the way from slot to slot in it.
+    """A cycle of channels, and the number of steps from slot to slot in it.
 
     Args:
-        channels: Channel indices in order of sampling; one at least occurs just once.
+        channels: Channel indices in order of sampling; at least one occurs exactly once.
     """
 
     def __init__(self, channels: Sequence[int]) -> None:
@@ -81,13 +80,13 @@ class SlotOrder:
         self.size = size = len(self.channels)
         """Slots of a cycle."""
         self.anchors = {c: p for p, c in enumerate(channels) if self.channels.count(c) == 1}
-        """Positions of the channels that tell theirs."""
+        """Position of each channel that occurs once, so that it identifies its position."""
         if not self.anchors:
             raise ValueError("no channel of the sequence occurs exactly once")
         self.cycle = np.array(self.channels, np.int64)
         """The channels as an array."""
         self.is_anchor = np.array([c in self.anchors for c in self.channels])
-        """Of each position, whether its channel tells it, bool."""
+        """Whether the channel of each position identifies it, bool."""
         # From the last position back, so that the nearest place of a channel stays.
         self._steps = [
             {self.channels[(p + steps) % size]: steps for steps in range(size, 0, -1)}
@@ -99,7 +98,7 @@ class SlotOrder:
         return self._steps[position][channel]
 
     def steps_near(self, position: int, channel: int, expected: float) -> int:
-        """Slots forward to that place of a channel of the sequence which is nearest to a number."""
+        """Slots forward to a channel of the sequence, as near as possible to an expected number."""
         least, size = self.steps(position, channel), self.size
         if abs(least - expected) < 1:
             return least
@@ -110,7 +109,7 @@ class SlotOrder:
 
 
 def learn_order(seen: Sequence[int]) -> SlotOrder | None:
-    """The shortest cycle that all these channels repeat, from E1 on; None if they do not.
+    """The shortest cycle that these channels repeat, started at E1; None if they repeat none.
 
     Args:
         seen: Channel indices of consecutive slots; cycles up to half as long are found.
@@ -129,19 +128,19 @@ def learn_order(seen: Sequence[int]) -> SlotOrder | None:
 class SlotClock:
     """Gives slots without numbers their frame, position and time.
 
-    The position follows from the order of the channels; PAC is taken for the next one until a
-    channel with one place says better. How many whole frames are gone follows from the stamps, see
-    ``Silences``; where that has to be waited for, the times of four frames are early.
+    The position follows from the order of the channels; PAC is taken for the next PAC slot until a
+    channel that occurs once corrects that. How many whole frames were lost follows from the stamps,
+    see ``Silences``; that can take four frames to decide, whose times are then too early.
 
-    Slots before the first whole frame, and before the sequence is known, are not placed.
-    ``counters["lost_frames"]`` counts whole cycles, ``counters["lost_slots"]`` the slots beside.
+    Slots before the first whole frame, and before the sequence is known, get no place.
+    ``counters["lost_frames"]`` counts whole cycles, ``counters["lost_slots"]`` single slots.
 
     Args:
         slot_rate_hz: Slots per second of the sender's clock; if it is wrong by many percent, a
             silence is misjudged: compare ``measured_rate_hz``.
         sequence: Channels of a frame in order; None learns them from the stream, E1 first.
-        exact: The stamps are the sender's own times of sampling, so that they tell every loss at
-            once; ``reset`` when its clock begins anew.
+        exact: The stamps are the sender's own times of sampling, so that each loss shows at once;
+            call ``reset`` when that clock starts again.
     """
 
     def __init__(
@@ -161,13 +160,13 @@ class SlotClock:
         self._doubt = self._learns
         self._run = -1
         self._base = 0  # number of the first frame of this run
-        self._resume_s: float | None = None  # end of the last frame of the run before
-        self._silences: Silences | None = None  # none between two runs
+        self._resume_s: float | None = None  # end of the last frame of the previous run
+        self._silences: Silences | None = None  # None between two runs
         self._origin_s = 0.0  # time of index 0, the first slot of the first frame
         self._begun = (0, 0.0)  # index and stamp
-        self._index = 0  # of the last slot, with lost ones
+        self._index = 0  # of the last slot, lost slots counted
         self._last_s = 0.0
-        self._sure = (0, 0.0)  # index and stamp of the last slot whose channel has one place
+        self._sure = (0, 0.0)  # index and stamp of the last slot whose channel occurs once
         self._since = 0  # slots after it
         self._frame = 0  # of the last slot that was placed, in this run
         self.counters: dict[str, int] = dict.fromkeys(
@@ -188,7 +187,7 @@ class SlotClock:
         return (self._index - index) / (self._last_s - stamp_s)
 
     def place(self, channel: int, stamp_s: float) -> SlotPlace | None:
-        """Place the next slot; None if it has no place.
+        """Place the next slot; None if it gets no place.
 
         Args:
             channel: Its channel index.
@@ -213,7 +212,7 @@ class SlotClock:
             self.counters["unplaced"] += 1
             return None
         frame, position = divmod(self._index, order.size)
-        if frame < self._frame:  # PAC had run ahead over the edge
+        if frame < self._frame:  # PAC had run ahead into the next frame
             self.counters["late"] += 1
             return None
         self._frame = frame
@@ -222,7 +221,7 @@ class SlotClock:
         return SlotPlace(self._run, self._base + frame, position, time_s)
 
     def place_all(self, channels: Ints, stamps_s: Floats) -> SlotPlaces:
-        """Place slots, leaving out what has no place: the same as one by one, and faster.
+        """Place many slots, without those that get no place; the same result as ``place``, faster.
 
         Args:
             channels: Their channel indices, int64, shape ``(N,)``.
@@ -299,7 +298,7 @@ class SlotClock:
             return
         order = learn_order(tuple(self._seen))
         if order is None:
-            # To compare again with each further slot would take more time than there is.
+            # Comparing again at each further slot would cost too much time.
             for _ in range(_LEARNT_FROM // 2):
                 self._seen.popleft()
             return
@@ -309,14 +308,14 @@ class SlotClock:
             self._order = order
 
     def _begin_doubt(self) -> None:
-        """The order may have changed: 128 slots from here on say whether it has."""
+        """The order may have changed: the next 128 slots decide."""
         if self._learns and not self._doubt:
             self._doubt = True
             self._seen.clear()
 
     def _begin(self, order: SlotOrder, position: int, stamp_s: float) -> None:
         frame_s = order.size * self._period_s
-        # What is left of the frame that has begun stands before index 0 and is not placed.
+        # The rest of the frame that has begun lies before index 0 and gets no place.
         self._index = position - order.size if position else 0
         self._origin_s = stamp_s - self._index * self._period_s
         self._begun = self._sure = (self._index, stamp_s)
@@ -332,7 +331,7 @@ class SlotClock:
 
     def _end_run(self) -> None:
         if self._order is not None and self._silences is not None and self._index >= 0:
-            # PAC may have run ahead over the edge, and what came then is placed.
+            # PAC may have run ahead into the next frame, whose slots are placed then.
             frames = max(self._index // self._order.size, self._frame) + 1
             self._base += frames
             rest = frames * self._order.size - self._index
@@ -341,7 +340,7 @@ class SlotClock:
         self._silences = None
 
     def _advance(self, order: SlotOrder, silences: Silences, channel: int, stamp_s: float) -> bool:
-        """Go on to the next slot; False if it is a past one."""
+        """Advance to the next slot; False if it belongs to the past."""
         anchored = channel in order.anchors
         target = self._target(order, channel, stamp_s)
         if not self._exact and self._is_early(order, silences, target, stamp_s):
@@ -386,7 +385,7 @@ class SlotClock:
         return target + (ahead + size // 2) // size * size if ahead >= 0 else target
 
     def _is_early(self, order: SlotOrder, silences: Silences, target: int, stamp_s: float) -> bool:
-        """Whether a slot comes too early for its place far ahead, so that it is a past one."""
+        """Whether a slot comes too early for a place far ahead, so that it belongs to the past."""
         if 2 * (target - self._index) <= max(order.size, 2):
             return False
         leeway_s = max(order.size * self._period_s / 2, _SCATTER_S)

@@ -40,7 +40,7 @@ ERROR_WORDS: dict[int, str] = {
 
 
 class WordKind(IntEnum):
-    """What a word read from a finger is."""
+    """Kinds of words that a finger may answer with."""
 
     GOOD = 0
     ABSENT = 1
@@ -66,8 +66,8 @@ class SpiWord:
     Attributes:
         kind: Good, absent, device error or bit error.
         value: Raw counts 0..4095; 0 unless the word is good.
-        suspicious: Bits 2,1 of byte 1 are set: to be counted, not fatal.
-        error: The device's complaint for ``DEVICE_ERROR``, else empty.
+        suspicious: Bits 2,1 of byte 1 are set: counted, but the value is used.
+        error: Meaning of a ``DEVICE_ERROR``, else empty.
     """
 
     kind: WordKind
@@ -146,7 +146,7 @@ def decode_word(word: bytes) -> SpiWord:
 
 
 def decode_words(words: npt.NDArray[np.uint8]) -> SpiWords:
-    """Decode many words at once; the same answers as ``decode_word``.
+    """Decode many words at once, with the same result as ``decode_word``.
 
     Args:
         words: Bytes as read, uint8, shape ``(N, 2)``.

@@ -1,4 +1,4 @@
-"""The gateway's process: every sensor in its own thread, one status, one presence."""
+"""The gateway's process: a thread for each sensor, one status, one presence."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ SERVICE = "gateway"
 
 _POLL_S = 0.05
 _SETTLE_S = 0.3
-"""Between a consumer's presence and the first frame of a lossless replay [s]: presence and
-subscriptions travel apart, and a frame that overtakes the subscription would be lost."""
+"""Wait between a consumer's presence and the first frame of a lossless replay [s]: its subscription
+may arrive after its presence, and a frame before the subscription would be lost."""
 
 
 def run(
@@ -87,9 +87,9 @@ def run(
             workers.append(worker)
             if isinstance(device, WrenchDevice):
                 session.queryable(endpoints.ZERO, worker.answer_zero, sensor=sensor.name)
-                continue  # what has no electrodes has no baseline
+                continue  # without electrodes there is no baseline
             if sensor.of is not None:
-                continue  # its finger answers
+                continue  # its finger answers such requests
             session.queryable(
                 endpoints.TARE,
                 worker.answer_tare,
@@ -134,7 +134,7 @@ def _pipeline(config: GatewayConfig, device: Device) -> Pipeline:
 
 
 def _claim(sources: dict[tuple[str, str], str], sensor: SensorConfig, stream: str) -> None:
-    """One stream has one source, the finger's own first: two would mix their sequences."""
+    """Each stream has one source, the finger itself first: two would mix their sequences."""
     source = sources.get((sensor.key_name, stream))
     if source == sensor.name:
         return
@@ -166,7 +166,7 @@ def _serve(
         for worker in workers:
             if worker.crash is not None:
                 raise worker.crash
-        _tell(health, workers, presence)
+        _update(health, workers, presence)
         if not finished and all(worker.ended.is_set() for worker in workers):
             finished = True
             refresh()
@@ -180,8 +180,8 @@ def _serve(
         stop.wait(_POLL_S)
 
 
-def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> None:
-    """Ready while every sensor delivers or has ended well."""
+def _update(health: Health, workers: list[SensorWorker], presence: Presence) -> None:
+    """Ready while every sensor delivers or has ended."""
     if all(worker.ended.is_set() for worker in workers):
         return
     if all(worker.serving or worker.ended.is_set() for worker in workers):
@@ -194,7 +194,7 @@ def _tell(health: Health, workers: list[SensorWorker], presence: Presence) -> No
 
 
 def _finish(health: Health, workers: list[SensorWorker]) -> None:
-    """Every source has ended: account for it in the status."""
+    """Every source has ended: report the result in the status."""
     frames = sum(worker.pipeline.counters["frames_published"] for worker in workers)
     failed = [worker for worker in workers if worker.error is not None]
     if failed:
@@ -207,7 +207,7 @@ def _finish(health: Health, workers: list[SensorWorker]) -> None:
 
 
 def _refresh(health: Health, workers: list[SensorWorker], wall: WallClock) -> None:
-    """Take over what sensors count and measure; several are told apart by a prefix."""
+    """Copy counters and gauges of the sensors to the status; of several, with a prefix."""
     for worker in workers:
         prefix = f"{worker.name}." if len(workers) > 1 else ""
         health.set_counts({prefix + name: value for name, value in worker.counters().items()})

@@ -1,4 +1,4 @@
-"""What a sensor's thread tells of it: its state, its faults, refused tares; each once."""
+"""Reports of one sensor to the status and the log: its state, its faults, refused tares."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from palpate_gateway.condition.condition import Condition
 _log = logging.getLogger(__name__)
 
 _LOOK_S = 0.2
-"""The condition is judged anew as often [s]."""
+"""Shortest time between two updates of a sensor that delivers [s]."""
 
 _LOG_AGAIN_S = 60.0
-"""A sensor that stays away is logged again after this time [s]: attempts follow closely."""
+"""A sensor that stays away is logged again after this time only [s]: attempts follow closely."""
 
-_FORCES_OFF = "when nothing touches the BioTac, take its zero again: palpate tare {name}"
+_ZERO_REMEDY = "when nothing touches the BioTac, take its zero again: palpate tare {name}"
 
 
 class SensorReport:
-    """Tells ``Health`` how a sensor does; belongs to one thread.
+    """Reports the state of a sensor to ``Health``, each event once; belongs to one thread.
 
     Args:
         name: The sensor's name.
-        health: Told.
+        health: Receives the reports.
     """
 
     def __init__(self, name: str, health: Health) -> None:
         self._name, self._health = name, health
         self._state = SensorState.UNKNOWN
         self._looked_s = 0.0
-        self._told_faults: frozenset[tuple[FaultKind, str]] = frozenset()
+        self._faults: frozenset[tuple[FaultKind, str]] = frozenset()
         self._zero_lost = False
         self._refused = False
         self._lost_by, self._log_again_s = "", 0.0
-        self.untrue = False
-        """Whether it delivers what is not so: dead or stuck channels, forces without their zero."""
+        self.is_wrong = False
+        """Whether it delivers wrong values: dead or stuck channels, forces without their zero."""
 
     def starts(self) -> None:
         """It is about to be opened."""
-        self._tell(SensorState.STARTING)
+        self._set_state(SensorState.STARTING)
 
     def delivers(self, condition: Condition | None, *, zero_lost: bool) -> None:
         """Readings were published."""
@@ -55,7 +55,7 @@ class SensorReport:
         self._lost_by = ""
         faults = () if condition is None else condition.faults
         message = "" if condition is None else condition.message
-        self.untrue = zero_lost or (condition is not None and condition.untrue)
+        self.is_wrong = zero_lost or (condition is not None and condition.has_wrong_channel)
         if zero_lost:
             state = SensorState.ZERO_LOST
             message = "it was opened again: the zero that it had may be gone"
@@ -63,22 +63,22 @@ class SensorReport:
             state = SensorState.WARMING
         else:
             state = SensorState.LIVE
-        self._tell(state, faults, message)
-        self._tell_faults(faults)
-        self._tell_zero(zero_lost=zero_lost)
+        self._set_state(state, faults, message)
+        self._report_faults(faults)
+        self._report_zero(zero_lost=zero_lost)
 
     def is_silent(self, silent_s: float) -> None:
-        """Nothing comes."""
+        """Nothing has come for a while."""
         error = DeviceTimeout(
             f"sensor {self._name!r} is lost: silent for {1e3 * silent_s:.0f} ms",
-            remedy="check its power and cable; it is read on by itself",
+            remedy="check its power and cable; reading goes on by itself",
         )
-        self._tell(SensorState.LOST, message=f"silent for {1e3 * silent_s:.0f} ms")
+        self._set_state(SensorState.LOST, message=f"silent for {1e3 * silent_s:.0f} ms")
         self._health.fail(error)
 
     def is_lost(self, error: DeviceError, backoff_s: float) -> None:
         """It is gone, or cannot be opened."""
-        self._tell(SensorState.LOST, message=error.problem)
+        self._set_state(SensorState.LOST, message=error.problem)
         self._health.fail(error)
         now_s = time.monotonic()
         if error.problem != self._lost_by or now_s >= self._log_again_s:
@@ -87,7 +87,7 @@ class SensorReport:
 
     def ended(self, error: PalpateError | None) -> None:
         """It will deliver no more."""
-        self._tell(SensorState.ENDED, message="" if error is None else error.problem)
+        self._set_state(SensorState.ENDED, message="" if error is None else error.problem)
         if error is not None:
             self._health.fail(error)
             _log.error("sensor %s: %s", self._name, error)
@@ -101,17 +101,17 @@ class SensorReport:
             self._health.fail(error, degraded=False)
             _log.warning("sensor %s: %s", self._name, error)
 
-    def _tell(
+    def _set_state(
         self, state: SensorState, faults: tuple[ChannelFault, ...] = (), message: str = ""
     ) -> None:
         self._state = state
         self._health.set_sensor_state(self._name, state, faults=faults, message=message)
 
-    def _tell_faults(self, faults: tuple[ChannelFault, ...]) -> None:
-        """Saturation comes and goes with the load: its counter and the state tell enough."""
+    def _report_faults(self, faults: tuple[ChannelFault, ...]) -> None:
+        """Report new faults, but no saturation: it comes with the load, and has a counter."""
         present = frozenset((fault.kind, name) for fault in faults for name in fault.channels)
-        new = {kind for kind, _ in present - self._told_faults} - {FaultKind.SATURATED}
-        self._told_faults = present
+        new = {kind for kind, _ in present - self._faults} - {FaultKind.SATURATED}
+        self._faults = present
         for fault in faults:
             if fault.kind in new:
                 error = DeviceError(
@@ -120,11 +120,11 @@ class SensorReport:
                 self._health.fail(error, degraded=fault.kind is not FaultKind.ODD)
                 _log.warning("%s", error)
 
-    def _tell_zero(self, *, zero_lost: bool) -> None:
+    def _report_zero(self, *, zero_lost: bool) -> None:
         if zero_lost and not self._zero_lost:
             error = DeviceError(
                 f"sensor {self._name!r} was opened again: the zero that it had may be gone",
-                remedy=_FORCES_OFF.format(name=self._name),
+                remedy=_ZERO_REMEDY.format(name=self._name),
             )
             self._health.fail(error)
             _log.warning("%s", error)

@@ -188,7 +188,7 @@ class SensorWorker:
     def sound(self) -> bool:
         """Whether it delivers, and nothing that it delivers is known to be wrong."""
         return not (
-            self.error or self.silent or self._publisher.has_rejected or self._report.untrue
+            self.error or self.silent or self._publisher.has_rejected or self._report.is_wrong
         )
 
     def _run(self) -> None:
@@ -239,7 +239,7 @@ class SensorWorker:
     def _clock(self) -> ClockMap:
         identity = self.device.identity
         if self.device.info.live:
-            return (LiveClock if identity.tells_time else ArrivalClock)(self._wall)
+            return (LiveClock if identity.has_clock else ArrivalClock)(self._wall)
         if self._pace == "recorded":
             return PacedClock()
         return FileClock(identity.serial, identity.start_wall_ns)

@@ -259,14 +259,14 @@ class WrenchBota(WrenchDevice):
                 after = wait.feed(self._port.read(left_s))
                 if after is not None:
                     return after
-                ack = ask.find_ack(wait.heard)
+                ack = ask.find_ack(wait.before)
                 if ack is not None and ack.command == chr(request[0]) and ack.code:
                     raise DeviceError(
                         f"{what} was refused (code {ack.code})",
                         remedy="choose another rate or filter that this model has",
                     )
         raise DeviceTimeout(
-            f"{what} was not answered; it sent: {wait.heard[-40:]!r}",
+            f"{what} was not answered; it sent: {wait.before[-40:]!r}",
             remedy="check cable and baud",
         )
 

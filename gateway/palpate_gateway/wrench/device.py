@@ -206,7 +206,7 @@ class WrenchDevice(Device):
         return DeviceIdentity(
             self._serial or serial,
             slot_period_s=1.0 / self.info.rate_hz,
-            tells_time=self._tells_time,
+            has_clock=self._tells_time,
         )
 
     def _read(self, timeout_s: float) -> list[Reading]:

@@ -78,9 +78,9 @@ def _check_texts(stream: bytes, how: int) -> None:
     assert b"".join(one or b"" for one in heard) == (rest if found else b"")
     assert any(one is not None for one in heard) == bool(found)
     for wait in (whole, cut):
-        assert before.endswith(wait.heard)
+        assert before.endswith(wait.before)
         # Of what was remembered, the beginning of the text has to be taken off again.
-        assert min(len(before), 256 - len(text)) <= len(wait.heard) <= 256
+        assert min(len(before), 256 - len(text)) <= len(wait.before) <= 256
     ack = find_ack(stream)
     if ack is not None:
         assert len(ack.command) == 1

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.gateway.single_slots import Slot, slot_block
 
 from palpate.messages import BIOTAC_LAYOUT
 from palpate_gateway.biotac.frames import FrameAssembler
-from palpate_gateway.biotac.slots import Slot, slot_block
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading
 

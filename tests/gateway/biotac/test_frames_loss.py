@@ -9,10 +9,11 @@ import numpy.typing as npt
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.gateway.single_slots import Slot, slot_block
 
 from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
 from palpate_gateway.biotac.frames import FrameAssembler
-from palpate_gateway.biotac.slots import UNKNOWN, Slot, SlotBlock, slot_block
+from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading
 

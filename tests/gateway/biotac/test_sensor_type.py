@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.gateway.reading_devices import read_frames
+from tests.gateway.single_slots import Slot, slot_block
 
 from palpate.errors import ConfigError, DeviceError
 from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout, SensorType
 from palpate_gateway.biotac.finger import LEARNT_FROM, agreed_type, answering_type
-from palpate_gateway.biotac.slots import Slot, SlotBlock, slot_block
+from palpate_gateway.biotac.slots import SlotBlock
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import make_device
 from palpate_gateway.protocols import channels as ch

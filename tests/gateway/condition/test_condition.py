@@ -111,11 +111,11 @@ def test_a_dead_electrode_is_dead_only_where_nothing_presses() -> None:
     finger.fixed = {6: 0}
     feed(made, finger.frames(3.0))
     assert {fault.kind for fault in made.faults} == {FaultKind.SATURATED}
-    assert not made.untrue
+    assert not made.has_wrong_channel
     finger.press(0.0)
     feed(made, finger.frames(3.0))
     assert {fault.kind for fault in made.faults} == {FaultKind.DEAD}
-    assert made.untrue
+    assert made.has_wrong_channel
     assert made.message == "E7 dead"
 
 

@@ -206,7 +206,7 @@ def test_wait_hands_on_what_follows(size: int) -> None:
         frames += decoder.feed(rest or b"")
     assert len(frames) == 2
     assert decoder.counters["junk_bytes"] == 0
-    assert wait.heard == b"noise r,0,R"
+    assert wait.before == b"noise r,0,R"
 
 
 def test_boot_text() -> None:
@@ -221,7 +221,7 @@ def test_wait_is_bounded(chunks: list[bytes]) -> None:
     wait = bota.BotaTextWait(b"App Init")
     for chunk in chunks:
         wait.feed(chunk)
-        assert len(wait.heard) <= 256
+        assert len(wait.before) <= 256
     bota.find_ack(b"".join(chunks))
 
 

@@ -36,7 +36,7 @@ def test_a_kms_40_tells_no_time() -> None:
     with Kms40Emulator() as kms:
         host, _, port = kms.address.rpartition(":")
         with WrenchKms40(Kms40Options(host=host, port=int(port))) as device:
-            assert not device.identity.tells_time
+            assert not device.identity.has_clock
 
 
 @pytest.mark.parametrize(("counter_hz", "tells"), [(None, True), (0.0, False)])
@@ -54,7 +54,7 @@ def test_an_rdt_sensor_tells_time_if_the_rate_of_its_counter_is_known(
             counter_hz=counter_hz,
         )
         with WrenchRdt(options) as device:
-            assert device.identity.tells_time is tells
+            assert device.identity.has_clock is tells
             reading = device.read(5.0)[0]
     assert isinstance(reading, WrenchReading)
     assert reading.observed is not None
