@@ -19,8 +19,8 @@ from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.population.answers import Population
-from palpate_fem.population.member import read_population
+from palpate_fem.population.members import read_population
+from palpate_fem.population.responses import Population
 from palpate_fem.service.biotac import BiotacTip
 from palpate_gateway.biotac.conversions import BIOTAC
 from palpate_training.experiment.generate.simulator import ExperimentSpec
@@ -102,14 +102,14 @@ def main(folder: Path) -> None:
     spec = ExperimentSpec()
     geometry = biotac(edge_m=spec.edge_m, layers=2)
     tip = Fingertip.pressurised(geometry, parameters_of(spec), SolverSettings())
-    members = [member for member in read_population() if member.wanted.pressed_with("cube")]
-    population = Population(BiotacTip(tip).describe(), [member.unit for member in members])
-    found: dict[str, list[Floats]] = {member.unit.name: [] for member in members}
+    members = [member for member in read_population() if member.published.pressed_with("cube")]
+    population = Population(BiotacTip(tip).describe(), [member.specimen for member in members])
+    found: dict[str, list[Floats]] = {member.specimen.name: [] for member in members}
     for lean in leans:
         steps = tip.indent(PLATE, path_at(tip.nodes, lean, side)).steps
         rise = np.array([step.fluid_pressure_pa for step in steps]) - tip.fluid_pressure_pa
         chosen = [step for step, p in zip(steps, rise, strict=True) if rises[0] <= p <= rises[1]]
-        for name, counts in population.answer(chosen).items():
+        for name, counts in population.counts(chosen).items():
             found[name].append((counts - population.rest_counts[name]).mean(axis=0) / 4095)
     twin = {name: np.mean(values, axis=0) for name, values in found.items()}
     low, middle, high = np.degrees(leans)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
@@ -18,25 +18,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fem.config import FingertipParameters
-from palpate_fem.electrodes.signals import (
+from palpate_fem.electrodes.electronics import (
     ElectrodeSignals,
     core_temperature_c,
     log_sigma,
     skewed,
 )
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.outline import outline_of
-from palpate_fem.population.answers import Population
-from palpate_fem.population.member import Member, read_population
-from palpate_fem.population.mount import clear_steps
+from palpate_fem.population.members import Member, read_population
+from palpate_fem.population.responses import Population, clear_steps
 from palpate_fem.result import IndentationResult, IndentationStep
-from palpate_fem.service.batch import Batch, BatchReport
+from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.service.config import DEFAULT_FACTORY
-from palpate_fem.service.jobs import Setup
-from palpate_fem.service.start import skin_of
-from palpate_fem.service.sweep import sweep_into_store
+from palpate_fem.service.fingertips import skin_of
+from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.read import SimulationStore
@@ -85,7 +83,7 @@ class FemSpecimen:
     @property
     def name(self) -> str:
         """E.g. ``biotac-1``."""
-        return self.member.unit.name
+        return self.member.specimen.name
 
     @property
     def overtravel_m(self) -> float:
@@ -95,27 +93,27 @@ class FemSpecimen:
     @property
     def temperature_coefficient(self) -> float:
         """Change of ln conductivity with temperature [1/K]."""
-        return self.member.unit.temperature_coefficient
+        return self.member.specimen.temperature_coefficient
 
     def pressed_with(self, indenter: str) -> bool:
         """Whether it meets an indenter."""
-        return self.member.wanted.pressed_with(indenter)
+        return self.member.published.pressed_with(indenter)
 
     def content(self) -> dict[str, Any]:
         """All that decides its rows, as plain values."""
-        return asdict(self.member)
+        return self.member.to_dict()
 
     def to_json(self) -> str:
         """Its electrical parameters."""
-        return self.member.unit.to_json()
+        return self.member.specimen.to_json()
 
     def stream(self, rest: Floats, seed: int) -> FemElectrodeStream:
         """Its electrodes over time, from the untouched state."""
-        return FemElectrodeStream(ElectrodeSignals(self.member.unit, rest, seed))
+        return FemElectrodeStream(ElectrodeSignals(self.member.specimen, rest, seed))
 
     def warming(self, age_s: Floats) -> Floats:
         """Return ln of the conductivity at ages since power-on [s], shape (T,)."""
-        unit = self.member.unit
+        unit = self.member.specimen
         core = [core_temperature_c(float(age), AMBIENT_C, unit) for age in age_s]
         return np.array([log_sigma(temperature_c, unit) for temperature_c in core])
 
@@ -150,7 +148,7 @@ class FemElectrodeStream:
 class FemSpecimens:
     """Electrodes of specimens on one fingertip."""
 
-    def __init__(self, fingertip: StoredFingertip, units: Sequence[UnitParameters]) -> None:
+    def __init__(self, fingertip: StoredFingertip, units: Sequence[SpecimenParameters]) -> None:
         self._population = Population(fingertip, units)
         self._held = fingertip.mesh.fixed
 
@@ -165,13 +163,13 @@ class FemSpecimens:
 
     def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
         """Ideal counts of each specimen at each step."""
-        return self._population.answer(cast("Sequence[IndentationStep]", steps))
+        return self._population.counts(cast("Sequence[IndentationStep]", steps))
 
 
 class FemSpecimensOf:
     """Makes `FemSpecimens` in a worker, which keeps them: equal factories make equal ones."""
 
-    def __init__(self, fingertip: StoredFingertip, units: tuple[UnitParameters, ...]) -> None:
+    def __init__(self, fingertip: StoredFingertip, units: tuple[SpecimenParameters, ...]) -> None:
         self._fingertip, self._units = fingertip, units
         self._key = (fingertip.key, units)
 
@@ -276,8 +274,8 @@ class FemSimulator:
             DatasetError: The store is another fingertip's or damaged, or the disk refuses.
             RemoteError: The solver does not start.
         """
-        setup = Setup(DEFAULT_FACTORY, _mesh_options(spec), parameters_of(spec), 1)
-        batch = Batch(setup, workers=workers, threads=threads, limit_s=LIMIT_S)
+        setup = WorkerSetup(DEFAULT_FACTORY, _mesh_options(spec), parameters_of(spec), 1)
+        batch = SimulationBatch(setup, workers=workers, threads=threads, limit_s=LIMIT_S)
         try:
             fingertip = batch.fingertip(stop)
             if fingertip is None:
@@ -341,7 +339,7 @@ class FemSimulator:
         self, fingertip: SimulatedFingertip, specimens: Iterable[Specimen]
     ) -> FemSpecimensOf:
         """What makes the specimens' electrodes in a worker process."""
-        units = tuple(cast("FemSpecimen", specimen).member.unit for specimen in specimens)
+        units = tuple(cast("FemSpecimen", specimen).member.specimen for specimen in specimens)
         return FemSpecimensOf(cast("StoredFingertip", fingertip), units)
 
     def clear_steps(self, indentation: SimulatedIndentation, fingertip: SimulatedFingertip) -> int:

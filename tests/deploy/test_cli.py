@@ -31,7 +31,7 @@ from palpate_deploy.cli.app import app
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station.host import check_free, free_endpoint
 from palpate_deploy.station.logs import exit_code
-from palpate_fem.cli.group import EXTRA_MODULES
+from palpate_fem.cli.app import EXTRA_MODULES
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from palpate_deploy.cli.app import app
 from palpate_fem.indenter.approach import first_contact
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.service.start import skin_of
+from palpate_fem.service.fingertips import skin_of
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter

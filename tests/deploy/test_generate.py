@@ -18,8 +18,8 @@ import pytest
 from palpate.errors import ConfigError, DatasetError, LinkError
 from palpate.files.tape import read_tape
 from palpate_deploy.experiment import FemSimulator, FemSpecimen, specimens_of
-from palpate_fem.electrodes.unit import UnitParameters
-from palpate_fem.population.member import PAPER, Member
+from palpate_fem.electrodes.specimen import SpecimenParameters
+from palpate_fem.population.members import PAPER, Member
 from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.experiment import read_experiment, read_mixed
 from palpate_training.experiment.generate.pipeline import (
@@ -47,7 +47,7 @@ SPEC = ExperimentSpec(
 
 def specimens() -> tuple[FemSpecimen, ...]:
     """Two units, one of which was pressed deeper than planned."""
-    unit = replace(UnitParameters(), noise_counts=1.0)
+    unit = replace(SpecimenParameters(), noise_counts=1.0)
     return specimens_of(
         (
             Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),

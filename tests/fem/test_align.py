@@ -7,26 +7,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_fem.calibration.align import (
+from palpate_fem.calibration.alignment import (
     INCREMENTS,
-    Curve,
+    AlignmentError,
+    AlignmentProblem,
+    CostWeights,
     Floats,
-    Reason,
-    Unalignable,
+    ForceCurve,
     align,
+    axis_rms_n,
+    cost,
     curve,
     from_contact,
+    peak_n,
+    relative_rms,
+    rms_n,
 )
-from palpate_fem.calibration.cost import Weights, axis_rms_n, cost, peak_n, relative_rms, rms_n
 
 EXACT = 1e-12
 """Piecewise linear curves are interpolated exactly, up to rounding."""
 
 
-def line(stiffness: tuple[float, float, float], touch_m: float, end_m: float = 6e-3) -> Curve:
+def line(stiffness: tuple[float, float, float], touch_m: float, end_m: float = 6e-3) -> ForceCurve:
     """Force that rises linearly from a point of touch on [N/m], sampled every 0.1 mm."""
     travel = np.arange(0.0, end_m + 1e-9, 1e-4)
-    return Curve(travel, np.maximum(travel - touch_m, 0.0)[:, None] * np.array(stiffness))
+    return ForceCurve(travel, np.maximum(travel - touch_m, 0.0)[:, None] * np.array(stiffness))
 
 
 def upwards(force: list[float]) -> Floats:
@@ -34,11 +39,11 @@ def upwards(force: list[float]) -> Floats:
     return np.array([[0.0, 0.0, value] for value in force], np.float64).reshape(-1, 3)
 
 
-def hertz(scale: float, touch_m: float, end_m: float = 6e-3, step_m: float = 1e-4) -> Curve:
+def hertz(scale: float, touch_m: float, end_m: float = 6e-3, step_m: float = 1e-4) -> ForceCurve:
     """A curve that bends [N], as a press does."""
     travel = np.arange(0.0, end_m + 1e-9, step_m)
     normal = scale * np.maximum((travel - touch_m) * 1e3, 0.0) ** 1.5
-    return Curve(travel, normal[:, None] * np.array([0.1, 0.05, 1.0]))
+    return ForceCurve(travel, normal[:, None] * np.array([0.1, 0.05, 1.0]))
 
 
 def test_curve_begins_at_exactly_the_threshold() -> None:
@@ -50,7 +55,9 @@ def test_curve_begins_at_exactly_the_threshold() -> None:
 
 def test_threshold_is_exact_where_the_direction_turns() -> None:
     """Interpolating the magnitude would give another point."""
-    turning = Curve(np.array([0.0, 1e-4, 2e-4]), np.array([[0.4, 0, 0], [0, 0, 0.9], [0, 0, 2.0]]))
+    turning = ForceCurve(
+        np.array([0.0, 1e-4, 2e-4]), np.array([[0.4, 0, 0], [0, 0, 0.9], [0, 0, 2.0]])
+    )
     part = from_contact(turning, side="simulation")
     assert np.linalg.norm(part.force_n[0]) == pytest.approx(0.5, abs=EXACT)
     share = part.travel_m[0] / 1e-4
@@ -59,37 +66,37 @@ def test_threshold_is_exact_where_the_direction_turns() -> None:
 
 def test_a_sample_at_the_threshold_is_the_start_and_not_a_second_one() -> None:
     travel: Floats = np.arange(4.0) * 1e-4
-    part = from_contact(Curve(travel, upwards([0.0, 0.5, 0.8, 1.2])), side="simulation")
+    part = from_contact(ForceCurve(travel, upwards([0.0, 0.5, 0.8, 1.2])), side="simulation")
     np.testing.assert_allclose(part.travel_m, travel[1:], atol=EXACT)
 
 
 def test_noise_before_contact_is_no_contact_and_later_samples_below_are_left_out() -> None:
     force = upwards([0.0, 0.6, 0.1, 0.3, 0.7, 1.5, 2.0, 0.4, 0.9])
-    part = from_contact(Curve(np.linspace(0.0, 8e-4, 9), force), side="measurement")
+    part = from_contact(ForceCurve(np.linspace(0.0, 8e-4, 9), force), side="measurement")
     np.testing.assert_allclose(part.force_n[:, 2], [0.5, 0.7, 1.5, 2.0, 0.9], atol=EXACT)
 
 
 @pytest.mark.parametrize(
     ("force", "reason"),
     [
-        ([0.0, 0.1, 0.2], Reason.NEVER_REACHES),
-        ([0.8, 1.1, 2.0], Reason.STARTS_ABOVE),
-        ([0.1], Reason.TOO_SHORT),
-        ([], Reason.TOO_SHORT),
+        ([0.0, 0.1, 0.2], AlignmentProblem.NEVER_REACHES),
+        ([0.8, 1.1, 2.0], AlignmentProblem.STARTS_ABOVE),
+        ([0.1], AlignmentProblem.TOO_SHORT),
+        ([], AlignmentProblem.TOO_SHORT),
     ],
 )
-def test_what_cannot_be_aligned_says_why(force: list[float], reason: Reason) -> None:
-    bad = Curve(np.linspace(0.0, 3e-4, len(force)), upwards(force))
+def test_what_cannot_be_aligned_says_why(force: list[float], reason: AlignmentProblem) -> None:
+    bad = ForceCurve(np.linspace(0.0, 3e-4, len(force)), upwards(force))
     good = line((0.0, 0.0, 1000.0), 3e-3)
     for side, pair in (("simulation", (bad, good)), ("measurement", (good, bad))):
-        with pytest.raises(Unalignable, match=str(reason)) as caught:
+        with pytest.raises(AlignmentError, match=str(reason)) as caught:
             align(*pair)
         assert (caught.value.side, caught.value.reason) == (side, reason)
 
 
 def test_a_curve_that_ends_at_the_threshold_has_nothing_to_compare() -> None:
-    ends = Curve(np.array([0.0, 1e-4]), np.array([[0, 0, 0.2], [0, 0, 0.5]]))
-    with pytest.raises(Unalignable, match="ends where it reaches"):
+    ends = ForceCurve(np.array([0.0, 1e-4]), np.array([[0, 0, 0.2], [0, 0, 0.5]]))
+    with pytest.raises(AlignmentError, match="ends where it reaches"):
         align(ends, line((0.0, 0.0, 1000.0), 3e-3))
 
 
@@ -146,7 +153,9 @@ def test_fitted_offset_takes_back_what_noise_does_to_the_crossing() -> None:
     random = np.random.default_rng(3)
     truth, errors = hertz(1.0, 3e-3), []
     for _ in range(20):
-        noisy = Curve(truth.travel_m, truth.force_n + random.normal(0, 0.05, truth.force_n.shape))
+        noisy = ForceCurve(
+            truth.travel_m, truth.force_n + random.normal(0, 0.05, truth.force_n.shape)
+        )
         errors.append([rms_n(align(truth, noisy)), rms_n(align(truth, noisy, fit_offset=True))])
     crossing, fitted = np.mean(errors, axis=0)
     assert fitted < 3 * 0.05 < crossing
@@ -162,7 +171,7 @@ def test_cost_is_the_papers() -> None:
         for offset in measured
     ]
     np.testing.assert_allclose(axis_rms_n(pairs), [1e-3, 0.0, np.sqrt(12.5) * 1e-3], rtol=1e-12)
-    weights = Weights(force=2.0, thickness=1e4)
+    weights = CostWeights(force=2.0, thickness=1e4)
     expected = 2.0 * (1 + np.sqrt(12.5)) * 1e-3
     assert cost(pairs, 0.0151, weights=weights) == pytest.approx(expected)
     for thickness in (0.0150, 0.0152):  # the paper's sign would pay for one of them

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError, SimulationError
-from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.calibrate import calibrate
-from palpate_fem.calibration.measured import Indentation
+from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.calibration.recover import Planned, recover
 from palpate_fem.calibration.result import Evaluation, read_parameters, write_calibration
-from palpate_fem.calibration.runs import Simulated
+from palpate_fem.calibration.runs import SimulatedIndentation
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -59,7 +59,9 @@ class Formula:
     limit_n: float = 32.0
     thicknesses_m: tuple[float, float] = (0.0, 1.0)
 
-    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+    def simulate(
+        self, parameters: FingertipParameters, indenter: str, path: Floats
+    ) -> SimulatedIndentation:
         if indenter == self.refuses:
             raise SimulationError("the mesh is folded", remedy="none")
         if not self.thicknesses_m[0] < parameters.skin_thickness_m < self.thicknesses_m[1]:
@@ -91,7 +93,7 @@ class Formula:
                 outcome, count = end, int(at.argmax())
         volume = 366e-9 + 474e-9 * bulge / 1.46e-3
         reason = "" if outcome is IndentationOutcome.COMPLETE else "by design"
-        return Simulated(force[:count], way[:count], total, volume, outcome, reason)
+        return SimulatedIndentation(force[:count], way[:count], total, volume, outcome, reason)
 
 
 def press(
@@ -123,10 +125,10 @@ TRUTH = FingertipParameters(
 
 def measure(
     plans: Sequence[Planned] = PLANS, truth: FingertipParameters = TRUTH
-) -> list[Indentation]:
+) -> list[MeasuredIndentation]:
     """Perfect records of the formula."""
     return [
-        Indentation(
+        MeasuredIndentation(
             plan.name,
             plan.indenter,
             "biotac1",

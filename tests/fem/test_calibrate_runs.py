@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.calibration.align import Floats
-from palpate_fem.calibration.measured import Indentation
-from palpate_fem.calibration.runs import Runs, Simulated
+from palpate_fem.calibration.alignment import Floats
+from palpate_fem.calibration.measured import MeasuredIndentation
+from palpate_fem.calibration.runs import SimulatedIndentation, SimulationRuns
 from palpate_fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
@@ -24,24 +24,26 @@ TRUTH = FingertipParameters()
 class Spring:
     """Force = depth times modulus."""
 
-    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+    def simulate(
+        self, parameters: FingertipParameters, indenter: str, path: Floats
+    ) -> SimulatedIndentation:
         if indenter == "unknown":
             raise ConfigError("no such indenter", remedy="none")
         way = path_lengths(path)
         force = np.outer(way * parameters.shear_modulus_pa, np.array([0.0, 0.0, 1.0]))
-        return Simulated(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
+        return SimulatedIndentation(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
 
 
 def press(
     name: str = "cube/00/normal", sensor: str = "biotac1", depth_m: float = 1e-3
-) -> Indentation:
+) -> MeasuredIndentation:
     pose = np.zeros((5, 7))
     pose[:, 2], pose[:, 3] = np.linspace(0.0, depth_m, 5), 1.0
-    return Indentation(f"{name}/{sensor}", "cube", sensor, pose, np.ones((5, 3)))
+    return MeasuredIndentation(f"{name}/{sensor}", "cube", sensor, pose, np.ones((5, 3)))
 
 
 def test_each_run_is_made_once_whatever_the_sensor() -> None:
-    runs = Runs(Spring())
+    runs = SimulationRuns(Spring())
     twin = replace(press(sensor="biotac2"), force=np.zeros((5, 3)))
     first, second = runs.run([(TRUTH, press()), (TRUTH, twin)])
     assert first is second
@@ -53,7 +55,7 @@ def test_each_run_is_made_once_whatever_the_sensor() -> None:
 
 
 def test_a_refused_run_is_that_runs_trouble_only() -> None:
-    bad, good = Runs(Spring()).run(
+    bad, good = SimulationRuns(Spring()).run(
         [(TRUTH, replace(press(), indenter="unknown")), (TRUTH, press())]
     )
     assert (len(bad.forces), bad.outcome) == (0, IndentationOutcome.DIVERGED)
@@ -64,7 +66,7 @@ def test_a_refused_run_is_that_runs_trouble_only() -> None:
 def test_a_solvers_steps_begin_at_the_second_pose() -> None:
     path = press().pose
     stopped = IndentationResult("cube", path, (), IndentationOutcome.DIVERGED, "at once")
-    run = Simulated.of(stopped, thickness_m=0.0151, fluid_volume_m3=8e-7)
+    run = SimulatedIndentation.of(stopped, thickness_m=0.0151, fluid_volume_m3=8e-7)
     np.testing.assert_array_equal(run.forces, np.zeros((1, 3)))
     np.testing.assert_array_equal(run.travel, [0.0])
     assert run.reason == "at once"
@@ -74,8 +76,8 @@ def test_an_executor_changes_nothing_but_the_order_of_reports() -> None:
     jobs = [(TRUTH, press(depth_m=depth)) for depth in (1e-3, 2e-3, 3e-3)]
     told: list[tuple[int, int]] = []
     with ThreadPoolExecutor(2) as executor:
-        parallel = Runs(Spring(), executor, lambda *now: told.append(now)).run(jobs)
-    for one, other in zip(parallel, Runs(Spring()).run(jobs), strict=True):
+        parallel = SimulationRuns(Spring(), executor, lambda *now: told.append(now)).run(jobs)
+    for one, other in zip(parallel, SimulationRuns(Spring()).run(jobs), strict=True):
         np.testing.assert_array_equal(one.forces, other.forces)
     assert told == [(1, 3), (2, 3), (3, 3)]
 
@@ -83,15 +85,15 @@ def test_an_executor_changes_nothing_but_the_order_of_reports() -> None:
 class Dying(Executor):
     """An executor whose process dies."""
 
-    def submit(self, *_: object, **__: object) -> Future[Simulated]:  # type: ignore[override]
-        future: Future[Simulated] = Future()
+    def submit(self, *_: object, **__: object) -> Future[SimulatedIndentation]:  # type: ignore[override]
+        future: Future[SimulatedIndentation] = Future()
         future.set_exception(BrokenProcessPool("killed"))
         return future
 
 
 def test_a_dying_process_is_named() -> None:
     with pytest.raises(SimulationError, match="ended by itself: killed"):
-        Runs(Spring(), Dying()).run([(TRUTH, press())])
+        SimulationRuns(Spring(), Dying()).run([(TRUTH, press())])
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, LinkError, MissingExtraError, PalpateError
 from palpate.messages import SimulationOutcome, SimulationParameters, SimulationRequest
-from palpate_fem.calibration.measured import SIMULATED, Indentation, write_indentations
+from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
 from palpate_fem.calibration.result import read_parameters
 from palpate_fem.cli import model as cli_model
 from palpate_fem.cli.app import fem_app
@@ -167,7 +167,9 @@ def measured(tmp_path: Path) -> Path:
         path[:, :3] = start + np.linspace(0.0, 5e-3 + 2e-3 * k, 22)[:, None] * inward
         tip = fakes.RoundTip(TRUTH)
         force = np.array([tip.force(pose, TRUTH.friction_coefficient) for pose in path])
-        items.append(Indentation(f"cube/{k:02}/press", "cube", "virtual", path, force, SIMULATED))
+        items.append(
+            MeasuredIndentation(f"cube/{k:02}/press", "cube", "virtual", path, force, SIMULATED)
+        )
     write_indentations(tmp_path / "measured.h5", items, source="a formula")
     return tmp_path / "measured.h5"
 
@@ -192,7 +194,7 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
 
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "palpate_fem.cli.run", None)
-    monkeypatch.setattr("palpate_fem.cli.group.EXTRA_MODULES", ("palpate_fem",))
+    monkeypatch.setattr("palpate_fem.cli.app.EXTRA_MODULES", ("palpate_fem",))
     with pytest.raises(MissingExtraError, match=r'pip install "palpate\[fem\]"'):
         fem("run")
 
@@ -279,6 +281,6 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
 
 
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate_fem.cli.serve._ROUTER_WAIT_S", 0.2)
+    monkeypatch.setattr("palpate_fem.cli.run._ROUTER_WAIT_S", 0.2)
     with pytest.raises(LinkError, match="no router"):
         fem("serve", "--connect", f"tcp/127.0.0.1:{free_port}")

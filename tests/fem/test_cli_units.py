@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.cli.app import fem_app
-from palpate_fem.population.member import PAPER
+from palpate_fem.population.members import PAPER
 
 
 def test_show_names_each_unit_with_what_it_was_fitted_to() -> None:

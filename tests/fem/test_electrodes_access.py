@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 from scipy.special import ive
 
-from palpate_fem.electrodes.access import access_length
+from palpate_fem.electrodes.conduction import access_length
 
 Floats = NDArray[np.float64]
 

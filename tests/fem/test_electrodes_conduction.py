@@ -9,10 +9,9 @@ from scipy import special
 from scipy.spatial import Delaunay
 
 from palpate.errors import SimulationError
-from palpate_fem.electrodes.access import access_length
-from palpate_fem.electrodes.conduction import FilmConduction
+from palpate_fem.electrodes.conduction import FilmConduction, access_length
 from palpate_fem.electrodes.film import FilmMesh
-from palpate_fem.electrodes.table import DISC_DIAMETER_M
+from palpate_fem.electrodes.specimen import DISC_DIAMETER_M
 
 Floats = NDArray[np.float64]
 

@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.errors import ConfigError, SimulationError
 from palpate_fem.electrodes.film import FilmMesh, film_mesh, onto
-from palpate_fem.electrodes.gap import GapFinder
-from palpate_fem.electrodes.residual import CLAMP_X_M, fit_of, thickness
-from palpate_fem.electrodes.table import DISC_DIAMETER_M, DISC_TERMINAL, TERMINALS
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.gap import CLAMP_X_M, GapFinder, gap_adjustment, thickness
+from palpate_fem.electrodes.specimen import (
+    DISC_DIAMETER_M,
+    DISC_TERMINAL,
+    TERMINALS,
+    SpecimenParameters,
+)
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
@@ -188,33 +191,35 @@ def test_a_skin_that_is_not_there_is_refused(shell: Shell) -> None:
     exponent=st.floats(0.3, 2.0),
 )
 def test_residual_film_falls_to_its_floor(gap: float, pressure: float, exponent: float) -> None:
-    unit = UnitParameters(squeeze_exponent=exponent)
-    h, by_gap, by_pressure = thickness(np.array(gap), np.array(pressure), unit)
-    assert unit.floor_m < h <= max(gap, 0) + unit.asperity_m + 1e-6
+    specimen = SpecimenParameters(squeeze_exponent=exponent)
+    h, by_gap, by_pressure = thickness(np.array(gap), np.array(pressure), specimen)
+    assert specimen.floor_m < h <= max(gap, 0) + specimen.asperity_m + 1e-6
     assert 0 <= by_gap <= 1
     assert by_pressure <= 0
     step = 1e-4 * (1e3 + pressure)
-    harder = thickness(np.array(gap), np.array(pressure + step), unit)[0]
-    slope = (harder - thickness(np.array(gap), np.array(max(pressure - step, 0)), unit)[0]) / (
+    harder = thickness(np.array(gap), np.array(pressure + step), specimen)[0]
+    slope = (harder - thickness(np.array(gap), np.array(max(pressure - step, 0)), specimen)[0]) / (
         step + min(step, pressure)
     )
     assert slope == pytest.approx(float(by_pressure), rel=2e-3, abs=1e-16)
 
 
 def test_clamp_closes_the_film_behind_its_edge() -> None:
-    unit = UnitParameters(clamp_closing=0.8)
+    specimen = SpecimenParameters(clamp_closing=0.8)
     points = np.array([[CLAMP_X_M + dx, 0.0, 0.0] for dx in (-4e-3, 0.0, 4e-3)])
-    np.testing.assert_allclose(fit_of(points, unit).share, [0.2, 0.6, 1.0], atol=3e-3)
-    np.testing.assert_array_equal(fit_of(points, replace(unit, clamp_closing=0.0)).share, 1.0)
+    np.testing.assert_allclose(gap_adjustment(points, specimen).share, [0.2, 0.6, 1.0], atol=3e-3)
+    np.testing.assert_array_equal(
+        gap_adjustment(points, replace(specimen, clamp_closing=0.0)).share, 1.0
+    )
 
 
 def test_sides_stand_nearer_and_the_pad_does_not() -> None:
-    unit = UnitParameters(side_closing_m=0.4e-3)
+    specimen = SpecimenParameters(side_closing_m=0.4e-3)
     angle = np.radians([0.0, 44.0, 60.0, 77.0, 95.0])
     points = 5e-3 * np.stack([np.full(5, -1.0), np.sin(angle), -np.cos(angle)], axis=1)
-    nearer = fit_of(points, unit).nearer_m
+    nearer = gap_adjustment(points, specimen).nearer_m
     np.testing.assert_allclose(nearer[[0, 1, 3, 4]], [0.0, 0.0, 0.4e-3, 0.4e-3], atol=1e-9)
     assert 0.05e-3 < nearer[2] < 0.35e-3
-    np.testing.assert_array_equal(nearer, fit_of(points * [1, -1, 1], unit).nearer_m)
-    gap = fit_of(points, unit).gap(np.full(5, 1e-3))
+    np.testing.assert_array_equal(nearer, gap_adjustment(points * [1, -1, 1], specimen).nearer_m)
+    gap = gap_adjustment(points, specimen).gap(np.full(5, 1e-3))
     np.testing.assert_allclose(gap, 1e-3 - nearer, rtol=1e-4)  # the clamp is not quite gone

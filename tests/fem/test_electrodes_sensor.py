@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
-from palpate_fem.electrodes.circuit import FULL_SCALE
+from palpate_fem.electrodes.electronics import FULL_SCALE
 from palpate_fem.electrodes.gap import Gap
-from palpate_fem.electrodes.sensor import Electrodes, Response
-from palpate_fem.electrodes.table import SENSING
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.model import ElectrodeModel, ElectrodeResponse
+from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 from palpate_fem.mesh.nvlabs import read_nvlabs
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.surface import node_areas
@@ -28,16 +27,16 @@ Floats = NDArray[np.float64]
 
 E18 = 17
 LATERAL = [0, 3, 5, 10, 13, 15]  # E1 E4 E6 and E11 E14 E16
-BARE = UnitParameters(asperity_m=1e-6, floor_m=1e-6)  # the film is the gap, as in section 4.4
+BARE = SpecimenParameters(asperity_m=1e-6, floor_m=1e-6)  # the film is the gap, as in section 4.4
 
 
 @pytest.fixture(scope="module")
-def sensor() -> Electrodes:
-    return Electrodes(biotac(edge_m=0.6e-3, layers=1))
+def sensor() -> ElectrodeModel:
+    return ElectrodeModel(biotac(edge_m=0.6e-3, layers=1))
 
 
 @pytest.fixture(scope="module")
-def dented(sensor: Electrodes) -> Callable[[float, float], Floats]:
+def dented(sensor: ElectrodeModel) -> Callable[[float, float], Floats]:
     """Skin pushed in smoothly below E18, by some depth, somewhat to one side."""
     nodes = sensor.geometry.mesh.nodes
 
@@ -50,7 +49,7 @@ def dented(sensor: Electrodes) -> Callable[[float, float], Floats]:
 
 
 def test_skin_nearer_to_an_electrode_lowers_its_counts(
-    sensor: Electrodes, dented: Callable[[float, float], Floats]
+    sensor: ElectrodeModel, dented: Callable[[float, float], Floats]
 ) -> None:
     """Beyond 1.2 mm of film it hardly does: the way across the film counts too (section 4.4)."""
     counts = sensor.counts([dented(d, 0.0) for d in (0.0, 0.8e-3, 1.0e-3, 1.2e-3)])
@@ -60,7 +59,7 @@ def test_skin_nearer_to_an_electrode_lowers_its_counts(
 
 
 def test_a_batch_is_the_same_as_one_by_one(
-    sensor: Electrodes, dented: Callable[[float, float], Floats]
+    sensor: ElectrodeModel, dented: Callable[[float, float], Floats]
 ) -> None:
     states = [dented(depth, 0.0) for depth in (0.9e-3, 0.0, 0.5e-3)]
     batch = sensor.counts(np.array(states))
@@ -71,7 +70,7 @@ def test_a_batch_is_the_same_as_one_by_one(
 
 
 def test_mirrored_states_give_permuted_counts(
-    sensor: Electrodes, dented: Callable[[float, float], Floats]
+    sensor: ElectrodeModel, dented: Callable[[float, float], Floats]
 ) -> None:
     left, right = (sensor.respond(dented(1e-3, y)).counts for y in (1.5e-3, -1.5e-3))
     # Triangles of the film and the split of the skin's quads are not mirrored.
@@ -80,7 +79,7 @@ def test_mirrored_states_give_permuted_counts(
 
 
 def test_gradients_are_those_of_differences(
-    sensor: Electrodes, dented: Callable[[float, float], Floats]
+    sensor: ElectrodeModel, dented: Callable[[float, float], Floats]
 ) -> None:
     rng = np.random.default_rng(2)
     # A general state: at an edge of the skin's facets the gap has a kink.
@@ -104,7 +103,7 @@ def test_gradients_are_those_of_differences(
     assert (gradient * motion).sum() == pytest.approx((one - other) / 2e-8, rel=1e-4)
 
 
-def test_of_step_adds_rest_and_displacement(sensor: Electrodes) -> None:
+def test_of_step_adds_rest_and_displacement(sensor: ElectrodeModel) -> None:
     rest = sensor.geometry.mesh.nodes
     rng = np.random.default_rng(4)
     displacement = 1e-5 * rng.normal(size=rest.shape)
@@ -115,14 +114,16 @@ def test_of_step_adds_rest_and_displacement(sensor: Electrodes) -> None:
     assert direct.gap.pressure.max() > 0
 
 
-def test_finer_films_say_the_same(sensor: Electrodes) -> None:
+def test_finer_films_say_the_same(sensor: ElectrodeModel) -> None:
     nodes = sensor.geometry.mesh.nodes
     rest = sensor.respond(nodes).counts
-    fine = Electrodes(sensor.geometry, edge_m=0.35e-3).respond(nodes).counts
+    fine = ElectrodeModel(sensor.geometry, edge_m=0.35e-3).respond(nodes).counts
     np.testing.assert_allclose(rest, fine, atol=4.0)  # counts; noise is 0.5, misfits are 70
 
 
-def closed(sensor: Electrodes, film_m: float, pressure_pa: float = 0.0) -> tuple[Floats, Floats]:
+def closed(
+    sensor: ElectrodeModel, film_m: float, pressure_pa: float = 0.0
+) -> tuple[Floats, Floats]:
     """Tared counts over full scale where a 4 mm disc about E18 is closed, fluid spread out."""
     film = sensor.film
     rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
@@ -134,7 +135,7 @@ def closed(sensor: Electrodes, film_m: float, pressure_pa: float = 0.0) -> tuple
     lost = ((rest.gap - gap) * area).sum()
     gap = gap + lost * (1 - inside) / (area * (1 - inside)).sum()
     pressed: Gap = replace(rest, gap=gap, pressure=pressure_pa * inside)
-    response: Response = sensor.of_gap(pressed)
+    response: ElectrodeResponse = sensor.of_gap(pressed)
     return (response.counts - sensor.of_gap(rest).counts) / FULL_SCALE, response.counts
 
 
@@ -145,22 +146,22 @@ def closed(sensor: Electrodes, film_m: float, pressure_pa: float = 0.0) -> tuple
     [(0.3e-3, 0.07), (0.1e-3, 0.22), (0.03e-3, 0.47), (0.01e-3, 0.66), (0.005e-3, 0.74)],
 )
 def test_responses_have_the_size_of_the_notes(
-    sensor: Electrodes, film_m: float, fall: float
+    sensor: ElectrodeModel, film_m: float, fall: float
 ) -> None:
-    tared, _ = closed(sensor.with_unit(BARE), film_m - 1e-6)
+    tared, _ = closed(sensor.with_specimen(BARE), film_m - 1e-6)
     assert tared[E18] == pytest.approx(-fall, abs=0.05)
     assert (tared[LATERAL] > 0.01).all()  # where the fluid goes
     assert tared[LATERAL].max() < 0.06
 
 
-def test_pressure_on_the_core_squeezes_the_residual_film(sensor: Electrodes) -> None:
+def test_pressure_on_the_core_squeezes_the_residual_film(sensor: ElectrodeModel) -> None:
     falls = [closed(sensor, 0.0, p)[0][E18] for p in (0.0, 1e4, 1e5, 1e6)]
     assert (np.diff(falls) < 0).all()
     assert falls[0] > -0.35  # a light touch
     assert falls[-1] < -0.65  # the range of real sensors (section 0.7)
 
 
-def test_temperature_moves_all_counts(sensor: Electrodes) -> None:
+def test_temperature_moves_all_counts(sensor: ElectrodeModel) -> None:
     nodes = sensor.geometry.mesh.nodes
     cold, rest, warm = (sensor.respond(nodes, log_sigma=s) for s in (-0.125, 0.0, 0.125))
     # Section 4.4: 5 K at 2.5 %/K are -96 and +78 counts.
@@ -169,13 +170,13 @@ def test_temperature_moves_all_counts(sensor: Electrodes) -> None:
     np.testing.assert_allclose(warm.impedance, np.exp(-0.25) * cold.impedance, rtol=1e-9)
 
 
-def test_another_unit_shares_the_mesh_where_it_may(sensor: Electrodes) -> None:
+def test_another_unit_shares_the_mesh_where_it_may(sensor: ElectrodeModel) -> None:
     nodes = sensor.geometry.mesh.nodes
-    fast = sensor.with_unit(UnitParameters(sigma_s_m=0.3, clamp_closing=0.5))
+    fast = sensor.with_specimen(SpecimenParameters(sigma_s_m=0.3, clamp_closing=0.5))
     assert fast.conduction is sensor.conduction
-    whole = Electrodes(sensor.geometry, fast.unit)
+    whole = ElectrodeModel(sensor.geometry, fast.specimen)
     np.testing.assert_array_equal(fast.respond(nodes).counts, whole.respond(nodes).counts)
-    small = sensor.with_unit(UnitParameters(disc_diameter_m=2.3e-3))
+    small = sensor.with_specimen(SpecimenParameters(disc_diameter_m=2.3e-3))
     assert small.film.areas[small.film.terminal >= 0].sum() < 0.9 * (
         sensor.film.areas[sensor.film.terminal >= 0].sum()
     )
@@ -190,7 +191,7 @@ def misfit(shared_data: Path) -> Callable[..., Floats]:
     with np.load(shared_data / "lasa_contact_normal" / "contact_normal_logs.npz") as logs:
         rest = logs["log15330_electrodes_raw"][:50].mean(axis=0)
     geometry = read_nvlabs(shared_data / "nvlabs_biotac_mesh", layers=1)
-    sensor = Electrodes(geometry)
+    sensor = ElectrodeModel(geometry)
     gap = sensor.finder.measure(geometry.mesh.nodes)
 
     def fit(used: NDArray[np.bool_], **bounds: tuple[float, float]) -> Floats:
@@ -198,8 +199,8 @@ def misfit(shared_data: Path) -> Callable[..., Floats]:
 
         def error(share: Floats) -> Floats:
             values = dict(zip(bounds, low + share * (high - low), strict=True))
-            unit = replace(UnitParameters(), **values)
-            return np.asarray(sensor.with_unit(unit).of_gap(gap).counts - rest)
+            specimen = replace(SpecimenParameters(), **values)
+            return np.asarray(sensor.with_specimen(specimen).of_gap(gap).counts - rest)
 
         start = np.full(len(low), 0.3)
         best = least_squares(

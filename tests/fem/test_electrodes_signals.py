@@ -1,4 +1,4 @@
-"""Divider and converter, parameters of a unit, and what time does to the signals."""
+"""Divider and converter, parameters of a specimen, and what time does to the signals."""
 
 from __future__ import annotations
 
@@ -13,31 +13,29 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
-from palpate_fem.electrodes import channels
-from palpate_fem.electrodes.circuit import (
+from palpate_fem.electrodes import electronics as channels
+from palpate_fem.electrodes.electronics import (
+    ElectrodeSignals,
     convert,
+    core_temperature_c,
     counts_slope,
     ideal_counts,
     impedance_of,
     log_response,
-)
-from palpate_fem.electrodes.signals import (
-    ElectrodeSignals,
-    core_temperature_c,
     log_sigma,
     skewed,
     slot_offsets_s,
     spatial_modes,
 )
-from palpate_fem.electrodes.unit import LIMITS, UnitParameters
+from palpate_fem.electrodes.specimen import LIMITS, SpecimenParameters
 
 Floats = NDArray[np.float64]
-UNIT = UnitParameters()
+UNIT = SpecimenParameters()
 # Section 4.3: a real sensor at rest, counts and the impedances that follow from 10 kOhm.
 REST = {"E1": (2987, 3.71e3), "E2": (3449, 1.87e3), "E17": (3403, 2.03e3), "E19": (3108, 3.18e3)}
 
 
-def drawn(seed: int) -> UnitParameters:
+def drawn(seed: int) -> SpecimenParameters:
     return UNIT.drawn(np.random.default_rng(seed))
 
 
@@ -50,14 +48,16 @@ def test_divider_is_that_of_the_notes(electrode: str) -> None:
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10**6), size=st.floats(1e2, 1e6))
 def test_counts_and_impedances_are_inverse(seed: int, size: float) -> None:
-    unit = drawn(seed)
+    specimen = drawn(seed)
     impedance = size * np.linspace(0.5, 2, 19)
-    ideal = ideal_counts(impedance, unit)
+    ideal = ideal_counts(impedance, specimen)
     good = (ideal > 1) & (ideal < 4090)
-    np.testing.assert_allclose(impedance_of(ideal, unit)[good], impedance[good], rtol=1e-9)
+    np.testing.assert_allclose(impedance_of(ideal, specimen)[good], impedance[good], rtol=1e-9)
     step = 1e-5 * impedance
-    difference = ideal_counts(impedance + step, unit) - ideal_counts(impedance - step, unit)
-    np.testing.assert_allclose(difference / (2 * step), counts_slope(impedance, unit), rtol=1e-5)
+    difference = ideal_counts(impedance + step, specimen) - ideal_counts(impedance - step, specimen)
+    np.testing.assert_allclose(
+        difference / (2 * step), counts_slope(impedance, specimen), rtol=1e-5
+    )
 
 
 def test_converter_rounds_and_ends() -> None:
@@ -83,8 +83,8 @@ def test_log_response_does_not_see_the_conductivity() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_unit_survives_json(seed: int) -> None:
-    unit = replace(drawn(seed), name="finger")
-    assert UnitParameters.from_json(unit.to_json()) == unit
+    specimen = replace(drawn(seed), name="finger")
+    assert SpecimenParameters.from_json(specimen.to_json()) == specimen
 
 
 @pytest.mark.parametrize("key", LIMITS)
@@ -93,14 +93,14 @@ def test_unit_refuses_what_is_out_of_range(key: str, bad: object) -> None:
     values = json.loads(UNIT.to_json())
     values[key] = [bad] * 19 if isinstance(values[key], list) else bad
     with pytest.raises(ConfigError, match=key):
-        UnitParameters.from_json(json.dumps(values))
+        SpecimenParameters.from_json(json.dumps(values))
 
 
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("{", "no JSON"),
-        ("[]", "no JSON object"),
+        ("{", "not JSON"),
+        ("[]", "not a JSON object"),
         ('{"sigma": 0.2}', "sigma"),
         ('{"gain": [0.0]}', "gain"),
         ('{"gain": 0.0}', "gain"),
@@ -108,17 +108,19 @@ def test_unit_refuses_what_is_out_of_range(key: str, bad: object) -> None:
         ('{"name": 3}', "name"),
     ],
 )
-def test_unit_refuses_what_is_no_unit(text: str, word: str) -> None:
+def test_parameters_out_of_range_are_refused(text: str, word: str) -> None:
     with pytest.raises(ConfigError, match=word):
-        UnitParameters.from_json(text)
+        SpecimenParameters.from_json(text)
 
 
 def test_priors_have_the_sheets_spread() -> None:
-    units = [drawn(seed) for seed in range(400)]
-    logs = np.log([unit.sigma_s_m for unit in units])
+    specimens = [drawn(seed) for seed in range(400)]
+    logs = np.log([specimen.sigma_s_m for specimen in specimens])
     assert logs.std() == pytest.approx(0.25, rel=0.1)
-    assert np.log([unit.asymmetry for unit in units]).std() == pytest.approx(0.03, rel=0.05)
-    assert max(unit.series_ohm for unit in units) <= 300
+    assert np.log([specimen.asymmetry for specimen in specimens]).std() == pytest.approx(
+        0.03, rel=0.05
+    )
+    assert max(specimen.series_ohm for specimen in specimens) <= 300
     assert drawn(7) == drawn(7)
 
 
@@ -145,30 +147,30 @@ def test_signals_of_a_seed_repeat_and_have_the_units_noise() -> None:
 def test_spatial_modes_drift_by_their_share() -> None:
     modes = spatial_modes()
     np.testing.assert_allclose(modes.mean(axis=1), 0, atol=1e-12)
-    unit = replace(UNIT, noise_counts=0.0, gradient_sd=0.05)
+    specimen = replace(UNIT, noise_counts=0.0, gradient_sd=0.05)
     rest = np.full(19, 3200.0)
-    impedance = impedance_of(rest, unit)
+    impedance = impedance_of(rest, specimen)
     drifts = []
     for seed in range(200):
-        warm = ElectrodeSignals(unit, rest, seed=seed).read(rest, 0.01, warmth=1.0)
-        drifts.append(np.log(impedance / impedance_of(warm, unit)))
+        warm = ElectrodeSignals(specimen, rest, seed=seed).read(rest, 0.01, warmth=1.0)
+        drifts.append(np.log(impedance / impedance_of(warm, specimen)))
     # Two independent modes of unit mean square share the variance over the electrodes.
     assert np.sqrt(np.mean(np.square(drifts))) == pytest.approx(0.05, rel=0.15)
-    cold = ElectrodeSignals(unit, rest, seed=1).read(rest, 0.01, warmth=0.0)
+    cold = ElectrodeSignals(specimen, rest, seed=1).read(rest, 0.01, warmth=0.0)
     assert (cold == 3200).all()
 
 
 def test_creep_comes_late_and_goes_late() -> None:
-    unit = replace(UNIT, noise_counts=0.0, gradient_sd=0.0, creep_share=0.02, creep_tau_s=15.0)
+    specimen = replace(UNIT, noise_counts=0.0, gradient_sd=0.0, creep_share=0.02, creep_tau_s=15.0)
     rest, pressed = np.full(19, 3200.0), np.full(19, 1700.0)
-    finger = ElectrodeSignals(unit, rest)
+    finger = ElectrodeSignals(specimen, rest)
     assert (finger.read(rest, 1.0) == 3200).all()
     assert (finger.read(pressed, 1e-6) == 1730).all()
     assert (finger.read(pressed, 500.0) == 1700).all()
     assert (finger.read(rest, 1e-6) == 3170).all()  # section 4.5: -30..+10 counts
     assert finger.read(rest, 15.0)[0] == round(3200 - 30 / math.e)
     # The same time in many steps.
-    coarse, fine = ElectrodeSignals(unit, rest), ElectrodeSignals(unit, rest)
+    coarse, fine = ElectrodeSignals(specimen, rest), ElectrodeSignals(specimen, rest)
     for _ in range(100):
         last = fine.read(pressed, 0.1)
     np.testing.assert_array_equal(coarse.read(pressed, 10.0), last)

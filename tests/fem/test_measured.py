@@ -15,7 +15,7 @@ from palpate.errors import DatasetError
 from palpate_fem.calibration.measured import (
     MEASURED,
     SIMULATED,
-    Indentation,
+    MeasuredIndentation,
     read_indentations,
     write_indentations,
 )
@@ -23,12 +23,12 @@ from palpate_fem.calibration.measured import (
 NAME = "sphere_medium/03/normal/biotac1"
 
 
-def press(name: str = NAME, samples: int = 5, origin: str = MEASURED) -> Indentation:
+def press(name: str = NAME, samples: int = 5, origin: str = MEASURED) -> MeasuredIndentation:
     random = np.random.default_rng(len(name))
     pose = np.zeros((samples, 7))
     pose[:, 2], pose[:, 3] = np.arange(samples) * 1e-4, 1.0
     force = random.normal(size=(samples, 3)) / 3.0
-    return Indentation(name, "sphere_medium", "biotac1", pose, force, origin)
+    return MeasuredIndentation(name, "sphere_medium", "biotac1", pose, force, origin)
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def test_missing_truncated_and_foreign_files_are_named(path: Path, tmp_path: Pat
     ],
 )
 def test_nothing_is_written_that_could_not_be_read(
-    tmp_path: Path, items: list[Indentation], says: str
+    tmp_path: Path, items: list[MeasuredIndentation], says: str
 ) -> None:
     path = tmp_path / "measured.h5"
     with pytest.raises(DatasetError, match=says):

@@ -31,8 +31,7 @@ from palpate.v1 import simulation_pb2
 from palpate_fem.config import FingertipParameters
 from palpate_fem.service import node
 from palpate_fem.service.config import FemConfig
-from palpate_fem.service.reply import as_reply
-from palpate_fem.service.request import path_of
+from palpate_fem.service.requests import as_reply, path_of
 
 fakes: Any = importlib.import_module("fem_fakes")
 

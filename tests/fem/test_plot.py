@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_fem.plot.curves import travel_m
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.step import plot_curves, plot_overview, plot_step, von_mises
+from palpate_fem.plot.trajectories import travel_m
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.files import StoreDiskError

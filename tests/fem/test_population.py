@@ -1,4 +1,4 @@
-"""Units on one finger: answers, and a fit that finds the range of a planted unit."""
+"""Specimens on one finger: answers, and a fit that finds the range of a planted unit."""
 
 from __future__ import annotations
 
@@ -16,32 +16,30 @@ from numpy.typing import NDArray
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.electrodes.gap import Gap
-from palpate_fem.electrodes.sensor import Electrodes
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.model import ElectrodeModel
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.population.answers import Extremes
-from palpate_fem.population.fit import fit_unit
-from palpate_fem.population.fitting import OVERTRAVELS_M, Deep, overtravel_for
-from palpate_fem.population.member import (
+from palpate_fem.population.fitting import OVERTRAVELS_M, DeepStates, fit_specimen, overtravel_for
+from palpate_fem.population.members import (
     PAPER,
     Member,
-    Wanted,
+    PublishedRange,
     read_population,
     write_population,
 )
-from palpate_fem.population.mount import clear_steps
+from palpate_fem.population.responses import TaredRange, clear_steps
 from palpate_fem.result import IndentationResult, IndentationStep
 
 Floats = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
-def sensor() -> Electrodes:
-    return Electrodes(biotac(edge_m=0.8e-3), edge_m=0.9e-3)
+def sensor() -> ElectrodeModel:
+    return ElectrodeModel(biotac(edge_m=0.8e-3), edge_m=0.9e-3)
 
 
 @pytest.fixture(scope="module")
-def states(sensor: Electrodes) -> tuple[list[Gap], Gap]:
+def states(sensor: ElectrodeModel) -> tuple[list[Gap], Gap]:
     """Presses over single electrodes: closed there, open elsewhere; and the untouched finger."""
     rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
     pressed = []
@@ -53,36 +51,37 @@ def states(sensor: Electrodes) -> tuple[list[Gap], Gap]:
     return pressed, rest
 
 
-def tared(sensor: Electrodes, states: list[Gap], rest: Gap) -> Floats:
+def tared(sensor: ElectrodeModel, states: list[Gap], rest: Gap) -> Floats:
     base = sensor.of_gap(rest).counts
     return np.array([sensor.of_gap(gap).counts - base for gap in states]) / 4095
 
 
-def test_fit_finds_the_range_of_a_planted_unit(
-    sensor: Electrodes, states: tuple[list[Gap], Gap]
+def test_fit_finds_the_range_of_a_planted_specimen(
+    sensor: ElectrodeModel, states: tuple[list[Gap], Gap]
 ) -> None:
     pressed, rest = states
     planted = replace(
-        UnitParameters(), sigma_s_m=0.30, squeeze_pa=1.2e4, floor_m=3e-6, side_closing_m=0.15e-3
+        SpecimenParameters(), sigma_s_m=0.30, squeeze_pa=1.2e4, floor_m=3e-6, side_closing_m=0.15e-3
     )
-    ends = Extremes.of(tared(sensor.with_unit(planted), pressed, rest))
-    start = replace(UnitParameters(), name="unit")
-    before = Extremes.of(tared(sensor.with_unit(start), pressed, rest))
+    ends = TaredRange.of(tared(sensor.with_specimen(planted), pressed, rest))
+    start = replace(SpecimenParameters(), name="one")
+    before = TaredRange.of(tared(sensor.with_specimen(start), pressed, rest))
     assert max(abs(before.low - ends.low), abs(before.high - ends.high)) > 0.01
-    fitted = fit_unit(sensor.with_unit(start), pressed, rest, (ends.low, ends.high))
+    fitted = fit_specimen(sensor.with_specimen(start), pressed, rest, (ends.low, ends.high))
     assert fitted.found.low == pytest.approx(ends.low, abs=4e-3)
     assert fitted.found.high == pytest.approx(ends.high, abs=4e-3)
-    again = Extremes.of(tared(sensor.with_unit(fitted.unit), pressed, rest))
+    again = TaredRange.of(tared(sensor.with_specimen(fitted.specimen), pressed, rest))
     assert (again.low, again.high) == pytest.approx((fitted.found.low, fitted.found.high))
-    assert fitted.unit.name == "unit"
+    assert fitted.specimen.name == "one"
 
 
 def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
-    sensor: Electrodes, states: tuple[list[Gap], Gap]
+    sensor: ElectrodeModel, states: tuple[list[Gap], Gap]
 ) -> None:
     pressed, rest = states
     wide, narrow = (
-        sensor.with_unit(replace(UnitParameters(), side_closing_m=m)) for m in (0.0, 0.35e-3)
+        sensor.with_specimen(replace(SpecimenParameters(), side_closing_m=m))
+        for m in (0.0, 0.35e-3)
     )
     lateral = [0, 3, 5, 10, 13, 15]
     assert (narrow.of_gap(rest).counts < wide.of_gap(rest).counts)[lateral].all()
@@ -90,31 +89,31 @@ def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
     assert highest[1] > 1.3 * highest[0]
 
 
-def deep(indenter: str, forces: list[float]) -> Deep:
+def deep(indenter: str, forces: list[float]) -> DeepStates:
     """A trajectory planned to end at its third step, 0.1 mm a step."""
     left: Floats = np.array([1e-4 * (2 - k) for k in range(len(forces))])
-    return Deep(f"{indenter}/00/normal", indenter, left, np.array(forces), (None,) * 7)
+    return DeepStates(f"{indenter}/00/normal", indenter, left, np.array(forces), (None,) * 7)
 
 
 def test_overtravel_is_what_the_largest_force_asks_for() -> None:
-    wanted = Wanted("one", -0.5, 0.1, 10.0, ("sphere_",))
+    published = PublishedRange("one", -0.5, 0.1, 10.0, ("sphere_",))
     states = [
         deep("sphere_small", [1.0, 2.0, 4.0, 7.0, 9.5, 14.0]),
-        deep("cube", [5.0, 10.0, 20.0, 30.0, 31.0, 32.0]),  # another unit's
+        deep("cube", [5.0, 10.0, 20.0, 30.0, 31.0, 32.0]),  # another specimen's
     ]
     # 9.5 N is near enough; 14 N is not.
-    assert overtravel_for(states, wanted, most_m=6e-4) == (2, 9.5)
-    assert overtravel_for(states, wanted, most_m=1e-4) == (1, 7.0)  # the nearest there is
+    assert overtravel_for(states, published, most_m=6e-4) == (2, 9.5)
+    assert overtravel_for(states, published, most_m=1e-4) == (1, 7.0)  # the nearest there is
     gentle = [deep("sphere_small", [1.0, 2.0, 8.5, 8.6, 8.7, 8.8])]
-    assert overtravel_for(gentle, wanted, most_m=6e-4) == (6, 8.8)  # any would do: the deepest
+    assert overtravel_for(gentle, published, most_m=6e-4) == (6, 8.8)  # any would do: the deepest
     assert states[0].deepest(float(OVERTRAVELS_M[0])) == 2
     with pytest.raises(DatasetError, match="one"):
-        overtravel_for(states[1:], wanted, most_m=6e-4)
+        overtravel_for(states[1:], published, most_m=6e-4)
 
 
 def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
     members = [
-        Member(replace(UnitParameters(), name=wanted.name), wanted, 1e-4 * i, {"low": -0.5})
+        Member(replace(SpecimenParameters(), name=wanted.name), wanted, 1e-4 * i, {"low": -0.5})
         for i, wanted in enumerate(PAPER)
     ]
     path = tmp_path / "three.json"
@@ -138,15 +137,15 @@ def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
         read_population(tmp_path / "nowhere.json")
 
 
-def test_shipped_units_have_the_published_ranges() -> None:
+def test_shipped_specimens_have_the_published_ranges() -> None:
     """What was found when they were fitted, on all simulations.
 
-    Of the third unit's largest force 20.2 % too much is simulated and 19.5 % too much in its rows.
+    The third specimen's largest force is 20.2 % too large in simulations, 19.5 % in its rows.
     """
     members = read_population()
-    assert [member.unit.name for member in members] == [wanted.name for wanted in PAPER]
+    assert [member.specimen.name for member in members] == [wanted.name for wanted in PAPER]
     for member, wanted in zip(members, PAPER, strict=True):
-        assert member.wanted == wanted
+        assert member.published == wanted
         assert member.found["low"] == pytest.approx(wanted.low, abs=0.03)
         assert member.found["high"] == pytest.approx(wanted.high, abs=0.03)
         assert member.found["max_force_n"] == pytest.approx(wanted.max_force_n, rel=0.21)

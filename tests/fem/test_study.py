@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate_fem import study
-from palpate_fem.plot.study import plot_study
+from palpate_fem.plot.validation import plot_study
 from palpate_fem.result import IndentationOutcome
 
 

@@ -20,9 +20,8 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.shape import signed_distance
 from palpate_fem.result import IndentationOutcome, IndentationResult
-from palpate_fem.service.batch import Batch, BatchReport, Press
-from palpate_fem.service.jobs import Setup
-from palpate_fem.service.sweep import sweep_into_store
+from palpate_fem.service.batch import BatchReport, PlannedPath, SimulationBatch, sweep_into_store
+from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.read import SimulationStore
 
 fakes: Any = importlib.import_module("fem_fakes")
@@ -32,17 +31,17 @@ KEPT_M = 2e-9
 """Outlines are kept as float32, which rounds 18 mm to 1 nm."""
 
 
-def plans(count: int, name: str = "sphere_medium") -> list[Press]:
+def plans(count: int, name: str = "sphere_medium") -> list[PlannedPath]:
     path = np.zeros((STEPS + 1, 7))
     path[:, 3] = 1.0
     path[:, 2] = np.linspace(-0.009, -0.005, STEPS + 1)
-    return [Press(f"{name}/{k:02}/normal", name, path) for k in range(count)]
+    return [PlannedPath(f"{name}/{k:02}/normal", name, path) for k in range(count)]
 
 
-def batch_of(kind: float, **more: Any) -> Batch:
+def batch_of(kind: float, **more: Any) -> SimulationBatch:
     parameters = FingertipParameters(friction_coefficient=kind)
-    setup = Setup("fem_fakes:make", more.pop("options", {}), parameters, 1)
-    return Batch(setup, **{"workers": 1, "threads": 1, "grace_s": 0.3, **more})
+    setup = WorkerSetup("fem_fakes:make", more.pop("options", {}), parameters, 1)
+    return SimulationBatch(setup, **{"workers": 1, "threads": 1, "grace_s": 0.3, **more})
 
 
 pytestmark = pytest.mark.usefixtures("workers_find_fakes")

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_fem.calibration.align import Floats
-from palpate_fem.calibration.measured import SIMULATED, Indentation, write_indentations
-from palpate_fem.calibration.runs import Simulated, simulate_all
+from palpate_fem.calibration.alignment import Floats
+from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
+from palpate_fem.calibration.runs import SimulatedIndentation, simulate_all
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
@@ -22,16 +22,17 @@ from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
-from palpate_fem.validation.report import (
+from palpate_fem.validation.sources import measured_from, simulated_from
+from palpate_fem.validation.validate import (
     INDENTER_HEADINGS,
     TRAJECTORY_HEADINGS,
+    Validation,
     indenter_rows,
     summary_lines,
     trajectory_rows,
+    validate,
     write_report,
 )
-from palpate_fem.validation.simulated import measured_from, simulated_from
-from palpate_fem.validation.validate import Validation, validate
 
 TOUCH_M = 1e-3
 STIFFNESS = np.array([200.0, 0.0, 1000.0])
@@ -47,14 +48,16 @@ def ramp(stiffness: Floats = STIFFNESS, touch_m: float = TOUCH_M) -> Floats:
     return np.maximum(path_lengths(way()) - touch_m, 0.0)[:, None] * stiffness
 
 
-def measured(name: str, indenter: str, sensor: str = "biotac1") -> Indentation:
-    return Indentation(f"{name}/{sensor}", indenter, sensor, way(), ramp())
+def measured(name: str, indenter: str, sensor: str = "biotac1") -> MeasuredIndentation:
+    return MeasuredIndentation(f"{name}/{sensor}", indenter, sensor, way(), ramp())
 
 
 def run(
     force: Floats, outcome: IndentationOutcome = IndentationOutcome.COMPLETE, reason: str = ""
-) -> Simulated:
-    return Simulated(force, path_lengths(way())[: len(force)], 0.0151, 8e-7, outcome, reason)
+) -> SimulatedIndentation:
+    return SimulatedIndentation(
+        force, path_lengths(way())[: len(force)], 0.0151, 8e-7, outcome, reason
+    )
 
 
 @pytest.fixture
@@ -181,7 +184,9 @@ class Counting:
     def __init__(self) -> None:
         self.runs = 0
 
-    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+    def simulate(
+        self, parameters: FingertipParameters, indenter: str, path: Floats
+    ) -> SimulatedIndentation:
         self.runs += 1
         return run(ramp() * parameters.shear_modulus_pa / 2.8e5)
 
@@ -248,7 +253,7 @@ def test_a_stored_simulation_serves_each_sensor_from_its_own_start(store: Simula
     pose = np.concatenate([before, item.pose])
     force = np.concatenate([np.zeros((1, 3)), item.force])
     sensors = [
-        Indentation(f"{item.name}/{sensor}", item.indenter, sensor, pose, force)
+        MeasuredIndentation(f"{item.name}/{sensor}", item.indenter, sensor, pose, force)
         for sensor in ("biotac1", "biotac2")
     ]
     runs, _ = simulated_from(store, sensors)

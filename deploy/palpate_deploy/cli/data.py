@@ -128,8 +128,7 @@ def data_generate(
     """Press nine indenters on three simulated BioTacs; write both of the paper's data sets."""
     from palpate_deploy.experiment import FemSimulator, read_specimens
     from palpate_fem.cli.model import workers_for
-    from palpate_fem.cli.show import progress_bar
-    from palpate_fem.cli.stopping import stop_on_signal
+    from palpate_fem.cli.terminal import progress_bar, stop_on_signal
     from palpate_fem.config import LIMITS
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_training.experiment.generate.pipeline import generate as run
@@ -275,7 +274,7 @@ def data_plan(
 ) -> None:
     """Plan nine indenters x ten points x (one normal, four angled presses) for one or two arms."""
     from palpate_deploy.experiment import FemSimulator
-    from palpate_fem.cli.show import console, progress_bar
+    from palpate_fem.cli.terminal import console, progress_bar
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_training.cli.experiment import arms_of, by_arm
     from palpate_training.experiment.generate.planning import plan_experiment, stations_of
@@ -370,7 +369,7 @@ def data_process(
 ) -> None:
     """Process raw trials as the paper does: experimental data set, and mixed with a simulation."""
     from palpate_deploy.experiment import FemSimulator
-    from palpate_fem.cli.show import progress_bar
+    from palpate_fem.cli.terminal import progress_bar
     from palpate_training.experiment.generate.measured import process_files
 
     with progress_bar() as bar:

@@ -18,20 +18,19 @@ from dataclasses import replace
 import numpy as np
 
 from palpate.errors import DatasetError, SimulationError
-from palpate_fem.calibration.align import Floats, Unalignable
-from palpate_fem.calibration.errors import estimates
-from palpate_fem.calibration.local import LocalModel
-from palpate_fem.calibration.measured import SIMULATED, Indentation
-from palpate_fem.calibration.model import (
-    Case,
-    Fit,
-    State,
+from palpate_fem.calibration.alignment import AlignmentError, Floats
+from palpate_fem.calibration.local import LocalModel, estimates, minimise
+from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
+from palpate_fem.calibration.point import (
+    CalibrationCase,
+    ModulusFit,
+    SimulatedPoint,
     compare,
     failures_at,
     fit_modulus,
 )
 from palpate_fem.calibration.result import Calibration, Evaluation, axis_rms, trajectory_fits
-from palpate_fem.calibration.runs import Runs, Simulated, Simulator
+from palpate_fem.calibration.runs import SimulatedIndentation, SimulationRuns, Simulator
 from palpate_fem.calibration.settings import (
     FRICTION,
     STEPS,
@@ -39,7 +38,6 @@ from palpate_fem.calibration.settings import (
     VOLUME,
     CalibrationSettings,
 )
-from palpate_fem.calibration.slsqp import minimise
 from palpate_fem.result import IndentationOutcome
 
 _REACH = {THICKNESS: 0.15, FRICTION: 0.6, VOLUME: 0.15}
@@ -53,7 +51,7 @@ by one standard deviation changes the cost of N samples by about 1 / 2N of it.""
 
 def calibrate(
     simulator: Simulator,
-    measured: Sequence[Indentation],
+    measured: Sequence[MeasuredIndentation],
     settings: CalibrationSettings | None = None,
     *,
     executor: Executor | None = None,
@@ -63,13 +61,14 @@ def calibrate(
     """Find the parameters that bring simulated forces closest to measured ones.
 
     Args:
-        simulator: Runs indentations; the sensor is not part of a run.
+        simulator: SimulationRuns indentations; the sensor is not part of a run.
         measured: Trajectories, of one or several sensors. Friction shows only where the indenter
             slips, so angled ones belong to them. Thickness and modulus replace one another until
             the skin is pinched on the core: one press of the long cylinder with noise of 0.02 N
             gives the thickness within 2.2 % up to 6 N, and within 0.13 % up to 12 N.
         settings: Bounds, weights, search; None = the paper's.
-        executor: Runs simulations in parallel, e.g. a process pool; None = one after the other.
+        executor: SimulationRuns simulations in parallel, e.g. a process pool; None = one after the
+            other.
         on_evaluation: Told of every evaluation of the cost that took runs.
         on_run: Told after each run how many of the present batch are done, and how many it has.
 
@@ -86,27 +85,27 @@ def calibrate(
 
 
 class _Search:
-    """State of one calibration."""
+    """SimulatedPoint of one calibration."""
 
     def __init__(
         self,
         simulator: Simulator,
-        measured: Sequence[Indentation],
+        measured: Sequence[MeasuredIndentation],
         settings: CalibrationSettings,
         executor: Executor | None,
         on_run: Callable[[int, int], None] | None,
     ) -> None:
         self.settings = settings
-        self.runs = Runs(simulator, executor, on_run)
+        self.runs = SimulationRuns(simulator, executor, on_run)
         self.on_evaluation: Callable[[Evaluation], None] | None = None
         self.history: list[Evaluation] = []
         self.excluded: dict[str, str] = {}
         self.notes: list[str] = []
-        self.cases: list[Case] = []
+        self.cases: list[CalibrationCase] = []
         for item in measured:
             try:
-                self.cases.append(Case.of(item, settings))
-            except Unalignable as error:
+                self.cases.append(CalibrationCase.of(item, settings))
+            except AlignmentError as error:
                 self.excluded[item.name] = error.problem
         if not self.cases:
             reasons = "; ".join(f"{name}: {why}" for name, why in self.excluded.items())
@@ -126,7 +125,7 @@ class _Search:
                 raise _hopeless(self.cases, fit)
         return self.refine(state, fit)
 
-    def simulate(self, points: Sequence[Floats]) -> list[State]:
+    def simulate(self, points: Sequence[Floats]) -> list[SimulatedPoint]:
         """Run all cases at all points, in one batch."""
         jobs = [
             (self.settings.parameters(point), case.item) for point in points for case in self.cases
@@ -136,9 +135,9 @@ class _Search:
         batches = [results[i * count : (i + 1) * count] for i in range(len(points))]
         for batch in batches:
             self._note_early_ends(batch)
-        return [State.of(p, batch) for p, batch in zip(points, batches, strict=True)]
+        return [SimulatedPoint.of(p, batch) for p, batch in zip(points, batches, strict=True)]
 
-    def _note_early_ends(self, batch: Sequence[Simulated]) -> None:
+    def _note_early_ends(self, batch: Sequence[SimulatedIndentation]) -> None:
         for case, result in zip(self.cases, batch, strict=True):
             if result.outcome is not IndentationOutcome.COMPLETE:
                 why = f" ({result.reason})" if result.reason else ""
@@ -146,8 +145,8 @@ class _Search:
                 if note not in self.notes:
                     self.notes.append(note)
 
-    def evaluate(self, state: State, stage: str) -> Fit:
-        """Fit the modulus and report."""
+    def evaluate(self, state: SimulatedPoint, stage: str) -> ModulusFit:
+        """ModulusFit the modulus and report."""
         fit = fit_modulus(state, self.cases, self.settings)
         names = [case.item.name for case in self.cases]
         entry = Evaluation(
@@ -167,14 +166,14 @@ class _Search:
             self.on_evaluation(entry)
         return fit
 
-    def drop(self, which: int, why: str, states: Sequence[State]) -> list[State]:
+    def drop(self, which: int, why: str, states: Sequence[SimulatedPoint]) -> list[SimulatedPoint]:
         """Leave a case out from now on, in the open."""
         self.excluded[self.cases[which].item.name] = why
         kept = [i for i in range(len(self.cases)) if i != which]
         self.cases = [self.cases[i] for i in kept]
         return [state.only(kept) for state in states]
 
-    def scan(self) -> tuple[State, Fit]:
+    def scan(self) -> tuple[SimulatedPoint, ModulusFit]:
         """Best point of the coarse scan; a case that fails at most points is left out.
 
         Where most cases fail it is the point's fault, e.g. as paths begin inside a thick skin.
@@ -194,7 +193,7 @@ class _Search:
                 raise _hopeless(self.cases, fit)
             states = self.drop(worst, f"simulation: {fit.failures[worst]}", states)
 
-    def refine(self, state: State, fit: Fit) -> Calibration:
+    def refine(self, state: SimulatedPoint, fit: ModulusFit) -> Calibration:
         """Step to the optimum, each step confirmed by runs."""
         names = self.settings.simulated
         largest = np.array([_REACH[name] for name in names])
@@ -223,8 +222,10 @@ class _Search:
             state, fit, model = self.local_model(state, fit)
         return self._result(model, fit, converged)
 
-    def local_model(self, state: State, fit: Fit) -> tuple[State, Fit, LocalModel]:
-        """Runs beside a point, one parameter moved each; cases that fail both ways are left out."""
+    def local_model(
+        self, state: SimulatedPoint, fit: ModulusFit
+    ) -> tuple[SimulatedPoint, ModulusFit, LocalModel]:
+        """Model from runs near a point, with one parameter moved each; drops cases that fail."""
         while True:
             moved, failures = self._moved(state, fit.modulus_pa)
             if not failures:
@@ -238,7 +239,9 @@ class _Search:
             (state,) = self.drop(which, f"simulation beside the optimum: {why}", [state])
             fit = fit_modulus(state, self.cases, self.settings)
 
-    def _moved(self, state: State, modulus_pa: float) -> tuple[list[State], dict[int, str]]:
+    def _moved(
+        self, state: SimulatedPoint, modulus_pa: float
+    ) -> tuple[list[SimulatedPoint], dict[int, str]]:
         points = []
         for i, name in enumerate(self.settings.simulated):
             ahead = state.point.copy()
@@ -258,7 +261,7 @@ class _Search:
                 return moved, failures
         return moved, {}
 
-    def _result(self, model: LocalModel, fit: Fit, converged: bool) -> Calibration:
+    def _result(self, model: LocalModel, fit: ModulusFit, converged: bool) -> Calibration:
         state, settings = model.base, self.settings
         still = np.zeros(len(state.point))
         paper = replace(settings, fit_offsets=False)
@@ -293,7 +296,7 @@ class _Search:
         )
 
 
-def _hopeless(cases: Sequence[Case], fit: Fit) -> SimulationError:
+def _hopeless(cases: Sequence[CalibrationCase], fit: ModulusFit) -> SimulationError:
     reasons = "; ".join(f"{cases[i].item.name}: {why}" for i, why in fit.failures.items())
     return SimulationError(
         f"no simulation can be compared with its measurement ({reasons})",

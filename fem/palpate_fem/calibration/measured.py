@@ -51,7 +51,7 @@ do not."""
 
 
 @dataclass(frozen=True, slots=True)
-class Indentation:
+class MeasuredIndentation:
     """One indentation: the way of the indenter and the force that answered.
 
     Attributes:
@@ -61,7 +61,7 @@ class Indentation:
         pose: Indenter in the sensor frame, position [m] and quaternion w x y z, shape (K, 7).
         force: Net force on the BioTac [N], sensor frame, shape (K, 3).
         origin: ``measured`` or ``simulated``.
-        outcome: How it ended, if simulated (the words of ``result.Outcome``).
+        outcome: How it ended, if simulated (the words of ``result.IndentationOutcome``).
 
     Raises:
         DatasetError: Shapes, NaN, no unit quaternion, no movement; names the trajectory.
@@ -111,7 +111,9 @@ class Indentation:
         return ""
 
 
-def write_indentations(path: Path, indentations: Sequence[Indentation], *, source: str) -> None:
+def write_indentations(
+    path: Path, indentations: Sequence[MeasuredIndentation], *, source: str
+) -> None:
     """Write indentations; the file appears complete or not at all.
 
     Args:
@@ -146,7 +148,7 @@ def write_indentations(path: Path, indentations: Sequence[Indentation], *, sourc
                 group.create_dataset(name, data=getattr(item, name)).attrs["unit"] = unit
 
 
-def read_indentations(path: Path) -> tuple[Indentation, ...]:
+def read_indentations(path: Path) -> tuple[MeasuredIndentation, ...]:
     """Read indentations and check everything about them but the names of the indenters.
 
     Args:
@@ -202,14 +204,14 @@ def _trajectories(group: Any, kind: type, above: str = "") -> dict[str, Any]:
     return found
 
 
-def _read(path: Path, name: str, group: Any, origin: str) -> Indentation:
+def _read(path: Path, name: str, group: Any, origin: str) -> MeasuredIndentation:
     for attribute in ("indenter", "sensor"):
         if attribute not in group.attrs:
             raise DatasetError(
                 f"{path}: trajectory {name!r} has no attribute {attribute}", remedy="set it"
             )
     try:
-        return Indentation(
+        return MeasuredIndentation(
             name,
             text(group.attrs["indenter"]),
             text(group.attrs["sensor"]),

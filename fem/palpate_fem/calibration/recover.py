@@ -1,11 +1,12 @@
-"""Does calibration find what was planted? Simulate, add noise, calibrate, compare.
+"""Does calibration find known parameters? Simulate with them, add noise, calibrate, compare.
 
-A self-test: the simulator explains its own forces, so it says how far noise, alignment and search
-reach, and nothing about the model.
+A self-test: the simulator explains its own forces. So it says how far noise, alignment and search
+reach, and nothing about whether the model is right.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -14,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate.errors import SimulationError
-from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.calibrate import calibrate
-from palpate_fem.calibration.measured import SIMULATED, Indentation
+from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.result import Calibration, Evaluation
-from palpate_fem.calibration.runs import Runs, Simulated, Simulator
+from palpate_fem.calibration.runs import SimulatedIndentation, SimulationRuns, Simulator
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -27,7 +28,11 @@ from palpate_fem.calibration.settings import (
     CalibrationSettings,
 )
 from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.approach import OuterSurface
+from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.trajectory import angled_direction, pad_point, press_path
 
 TOLERANCES = {THICKNESS: 0.02, MODULUS: 0.02, FRICTION: 0.05, VOLUME: 0.01}
 """Relative errors that the calibration must stay below."""
@@ -42,7 +47,7 @@ class Planned(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Recovery:
+class ParameterRecovery:
     """Planted and found parameters.
 
     Attributes:
@@ -57,7 +62,7 @@ class Recovery:
     found: dict[str, float]
     sd: dict[str, float]
     calibration: Calibration
-    measured: tuple[Indentation, ...]
+    measured: tuple[MeasuredIndentation, ...]
 
     @property
     def errors(self) -> dict[str, float]:
@@ -86,8 +91,12 @@ class Recovery:
 
 
 def noisy(
-    planned: Planned, run: Simulated, sensor: str, noise_n: float, random: np.random.Generator
-) -> Indentation:
+    planned: Planned,
+    run: SimulatedIndentation,
+    sensor: str,
+    noise_n: float,
+    random: np.random.Generator,
+) -> MeasuredIndentation:
     """A simulated trajectory as an instrument would record it, up to where it ended.
 
     Args:
@@ -106,7 +115,7 @@ def noisy(
             f"{planned.name} cannot be simulated: {run.outcome} {run.reason}".strip(),
             remedy="plan another trajectory",
         )
-    return Indentation(
+    return MeasuredIndentation(
         f"{planned.name}/{sensor}",
         planned.indenter,
         sensor,
@@ -129,13 +138,13 @@ def recover(
     executor: Executor | None = None,
     on_evaluation: Callable[[Evaluation], None] | None = None,
     on_run: Callable[[int, int], None] | None = None,
-) -> Recovery:
+) -> ParameterRecovery:
     """Calibrate on simulated, noisy trajectories of known parameters.
 
     The calibration gets forces and poses only, and begins with its scan.
 
     Args:
-        simulator: Runs both.
+        simulator: SimulationRuns both.
         truth: Planted parameters.
         trajectories: What to simulate; angled ones among them, for friction.
         noise_n: Standard deviation of the noise of each axis [N].
@@ -150,9 +159,9 @@ def recover(
         SimulationError: The planted trajectories cannot be simulated or compared.
     """
     random = np.random.default_rng(seed)
-    plans = [Indentation(p.name, p.indenter, "-", p.path, np.zeros((len(p.path), 3)))
+    plans = [MeasuredIndentation(p.name, p.indenter, "-", p.path, np.zeros((len(p.path), 3)))
              for p in trajectories]  # fmt: skip
-    runs = Runs(simulator, executor, on_run).run((truth, plan) for plan in plans)
+    runs = SimulationRuns(simulator, executor, on_run).run((truth, plan) for plan in plans)
     measured = tuple(
         noisy(planned, run, f"virtual{number + 1}", noise_n, random)
         for planned, run in zip(trajectories, runs, strict=True)
@@ -173,10 +182,55 @@ def recover(
         VOLUME: runs[0].fluid_volume_m3,
     }
     sd = {estimate.name: estimate.sd for estimate in result.estimates}
-    return Recovery(
+    return ParameterRecovery(
         planted,
         {name: result.value(name) for name in planted},
         {VOLUME: result.fluid_volume_sd_m3} | sd,
         result,
         measured,
     )
+
+
+class _Press(NamedTuple):
+    indenter: str
+    x_m: float
+    depth_m: float
+    angle_deg: float
+    azimuth_deg: float
+
+
+# Below some 6 N thickness and modulus act alike; a pinch on the core to 10 N and more tells them
+# apart. Friction shows where an indenter moves sideways.
+PRESSES = {
+    "pinch": _Press("cylinder_long", -4e-3, 4.2e-3, 0.0, 0.0),
+    "normal": _Press("sphere_medium", -4e-3, 3.0e-3, 0.0, 0.0),
+    "distal": _Press("sphere_medium", -4e-3, 2.5e-3, 30.0, 0.0),
+    "lateral": _Press("sphere_large", -6e-3, 2.5e-3, 30.0, 90.0),
+    "proximal": _Press("cube", -4e-3, 2.0e-3, 30.0, 180.0),
+}
+
+CLEARANCE_M = 1e-3
+"""Paths begin so far from the skin [m]: the calibration tries thicker ones, too."""
+
+
+def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
+    """Poses for the presses, from first contact with this finger's pad on."""
+    surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
+    planned = []
+    for name, press in PRESSES.items():
+        target, normal = pad_point(surface, press.x_m, 0.0)
+        direction = angled_direction(
+            normal, math.radians(press.angle_deg), math.radians(press.azimuth_deg)
+        )
+        indenter = make_indenter(press.indenter)
+        path = press_path(
+            indenter,
+            target,
+            direction,
+            surface,
+            depth_m=press.depth_m,
+            steps=steps,
+            clearance_m=CLEARANCE_M,
+        )
+        planned.append(Planned(name, press.indenter, path))
+    return planned

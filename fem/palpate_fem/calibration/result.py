@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import ConfigError, DatasetError
-from palpate_fem.calibration.align import Aligned
-from palpate_fem.calibration.cost import axis_rms_n, rms_n
-from palpate_fem.calibration.errors import Estimate
-from palpate_fem.calibration.measured import Indentation
+from palpate_fem.calibration.alignment import AlignedCurves, axis_rms_n, rms_n
+from palpate_fem.calibration.local import ParameterEstimate
+from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.config import FingertipParameters
 
 SCHEMA = "palpate.calibration"
@@ -34,7 +33,7 @@ class Evaluation:
         axis_rms_n: RMS force error of each axis [N].
         thickness_m: Total thickness [m].
         fluid_volume_m3: Fluid [m^3].
-        simulations: Runs made until now.
+        simulations: SimulationRuns made until now.
         failures: Trajectory and reason, of those that could not be compared.
     """
 
@@ -62,7 +61,7 @@ class TrajectoryFit:
     paper_rms_n: float
     depth_offset_m: float
     coverage: float
-    pair: Aligned
+    pair: AlignedCurves
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ class Calibration:
         paper_axis_rms_n: The same with the paper's alignment at 0.5 N.
         trajectories: Each compared trajectory.
         history: Every evaluation that took runs, in order.
-        simulations: Runs made.
+        simulations: SimulationRuns made.
         converged: Whether the last step was below what matters.
         excluded: Trajectories that were not compared, with the reason.
         notes: What else the reader must know, such as runs that ended early.
@@ -88,7 +87,7 @@ class Calibration:
     """
 
     parameters: FingertipParameters
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[ParameterEstimate, ...]
     fluid_volume_m3: float
     fluid_volume_sd_m3: float
     thickness_m: float
@@ -135,13 +134,15 @@ class Calibration:
         return rows
 
 
-def axis_rms(pairs: Sequence[Aligned]) -> tuple[float, ...]:
+def axis_rms(pairs: Sequence[AlignedCurves]) -> tuple[float, ...]:
     """RMS force error of each axis [N]; NaN if nothing was compared."""
     return tuple(axis_rms_n(pairs).tolist()) if pairs else (math.nan,) * 3
 
 
 def trajectory_fits(
-    items: Sequence[Indentation], pairs: Sequence[Aligned], paper_pairs: Sequence[Aligned]
+    items: Sequence[MeasuredIndentation],
+    pairs: Sequence[AlignedCurves],
+    paper_pairs: Sequence[AlignedCurves],
 ) -> tuple[TrajectoryFit, ...]:
     """Pair each compared trajectory with its curves."""
     return tuple(

@@ -1,4 +1,4 @@
-"""Runs of the simulator for comparison with measurements: each once, several at a time."""
+"""Runs of the simulator for comparison with measurements: each only once, several at a time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from palpate.errors import ConfigError, SimulationError
-from palpate_fem.calibration.align import Curve, Floats, along
-from palpate_fem.calibration.measured import Indentation
+from palpate_fem.calibration.alignment import Floats, ForceCurve, along
+from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.result import IndentationOutcome, IndentationResult
@@ -25,7 +25,7 @@ _PLACES = 9
 
 
 @dataclass(frozen=True, slots=True)
-class Simulated:
+class SimulatedIndentation:
     """What a comparison needs of one simulated indentation.
 
     Attributes:
@@ -48,7 +48,7 @@ class Simulated:
     @classmethod
     def of(
         cls, trajectory: IndentationResult, *, thickness_m: float, fluid_volume_m3: float
-    ) -> Simulated:
+    ) -> SimulatedIndentation:
         """From a solver's trajectory, whose steps begin at the second pose, and its finger."""
         forces = from_rest(trajectory.forces)
         return cls(
@@ -61,7 +61,7 @@ class Simulated:
         )
 
     @property
-    def curve(self) -> Curve:
+    def curve(self) -> ForceCurve:
         """Force against travel."""
         return along(self.travel, self.forces)
 
@@ -72,18 +72,20 @@ def from_rest(force_n: Floats) -> Floats:
 
 
 class Simulator(Protocol):
-    """Runs one indentation; it must be picklable for a process pool.
+    """SimulationRuns one indentation; it must be picklable for a process pool.
 
     Successive calls of a process mostly share their parameters: an implementation should keep the
     last pressurised finger. A run that ends early is an answer, not an error.
     """
 
-    def simulate(self, parameters: FingertipParameters, indenter: str, path: Floats) -> Simulated:
+    def simulate(
+        self, parameters: FingertipParameters, indenter: str, path: Floats
+    ) -> SimulatedIndentation:
         """Indent a finger of these parameters along a path, shape (K, 7)."""
         ...
 
 
-class Runs:
+class SimulationRuns:
     """Memo of runs, filled through an executor.
 
     Args:
@@ -92,7 +94,7 @@ class Runs:
         on_run: Told after each run how many of those now asked for are done, and how many they are.
 
     Attributes:
-        count: Runs made so far.
+        count: SimulationRuns made so far.
     """
 
     def __init__(
@@ -104,10 +106,12 @@ class Runs:
         self._simulator = simulator
         self._executor = executor
         self._on_run = on_run
-        self._memo: dict[Key, Simulated] = {}
+        self._memo: dict[Key, SimulatedIndentation] = {}
         self.count = 0
 
-    def run(self, jobs: Iterable[tuple[FingertipParameters, Indentation]]) -> list[Simulated]:
+    def run(
+        self, jobs: Iterable[tuple[FingertipParameters, MeasuredIndentation]]
+    ) -> list[SimulatedIndentation]:
         """Results in the order of the jobs; what ran before is not run again.
 
         A run that the simulator refuses comes back without steps, with the reason.
@@ -125,13 +129,13 @@ class Runs:
         return [self._memo[key] for key, _, _ in wanted]
 
     def _results(
-        self, new: dict[Key, tuple[FingertipParameters, Indentation]]
-    ) -> Iterable[tuple[Key, Simulated]]:
+        self, new: dict[Key, tuple[FingertipParameters, MeasuredIndentation]]
+    ) -> Iterable[tuple[Key, SimulatedIndentation]]:
         if self._executor is None:
             for key, (parameters, item) in new.items():
                 yield key, _simulate(self._simulator, parameters, item.indenter, item.pose)
             return
-        futures: dict[Future[Simulated], Key] = {}
+        futures: dict[Future[SimulatedIndentation], Key] = {}
         try:
             for key, (parameters, item) in new.items():
                 future = self._executor.submit(
@@ -152,13 +156,13 @@ class Runs:
 
 def _simulate(
     simulator: Simulator, parameters: FingertipParameters, indenter: str, path: Floats
-) -> Simulated:
+) -> SimulatedIndentation:
     """One run; a refused one is one trajectory's trouble, not that of all."""
     try:
         return simulator.simulate(parameters, indenter, path)
     except (SimulationError, ConfigError) as error:
         nothing = np.empty(0)
-        return Simulated(
+        return SimulatedIndentation(
             np.empty((0, 3)),
             nothing,
             math.nan,
@@ -168,7 +172,7 @@ def _simulate(
         )
 
 
-def _key(parameters: FingertipParameters, item: Indentation) -> Key:
+def _key(parameters: FingertipParameters, item: MeasuredIndentation) -> Key:
     """One key for what gives one answer: the sensor and the measured force do not matter."""
     path = np.round(item.pose, _PLACES) + 0.0  # -0.0 and 0.0 are one place
     return (parameters, item.indenter, path.tobytes())
@@ -177,11 +181,11 @@ def _key(parameters: FingertipParameters, item: Indentation) -> Key:
 def simulate_all(
     simulator: Simulator,
     parameters: FingertipParameters,
-    measured: Sequence[Indentation],
+    measured: Sequence[MeasuredIndentation],
     *,
     executor: Executor | None = None,
     on_run: Callable[[int, int], None] | None = None,
-) -> dict[str, Simulated]:
+) -> dict[str, SimulatedIndentation]:
     """Run every measured trajectory in simulation; sensors that share a path share its run.
 
     Returns:
@@ -190,5 +194,7 @@ def simulate_all(
     Raises:
         SimulationError: A process of the simulation died.
     """
-    results = Runs(simulator, executor, on_run).run((parameters, item) for item in measured)
+    results = SimulationRuns(simulator, executor, on_run).run(
+        (parameters, item) for item in measured
+    )
     return {item.name: result for item, result in zip(measured, results, strict=True)}

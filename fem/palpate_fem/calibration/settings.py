@@ -8,8 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from palpate.errors import ConfigError
-from palpate_fem.calibration.align import INCREMENTS, THRESHOLD_N, Floats
-from palpate_fem.calibration.cost import TARGET_THICKNESS_M, Weights
+from palpate_fem.calibration.alignment import (
+    INCREMENTS,
+    TARGET_THICKNESS_M,
+    THRESHOLD_N,
+    CostWeights,
+    Floats,
+)
 from palpate_fem.config import LIMITS, FingertipParameters
 
 THICKNESS, MODULUS, FRICTION, VOLUME = (
@@ -51,7 +56,7 @@ class CalibrationSettings:
     """
 
     bounds: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(PAPER_BOUNDS))
-    weights: Weights = field(default_factory=Weights)
+    weights: CostWeights = field(default_factory=CostWeights)
     target_thickness_m: float = TARGET_THICKNESS_M
     threshold_n: float = THRESHOLD_N
     increments: int = INCREMENTS

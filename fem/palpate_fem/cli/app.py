@@ -1,36 +1,85 @@
-"""``palpate fem``: signatures and help only; each command's work is in its own module.
+"""``palpate fem``: signatures and help only; each command's work is in another module.
 
 Nothing heavy is imported before a command runs: ``palpate --help`` must not wait for NumPy.
 """
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from palpate_fem.cli.group import FemGroup
-from palpate_fem.cli.options import (
-    EdgeOption,
-    FrictionOption,
-    JsonOption,
-    LayersOption,
-    MeasuredArgument,
-    MeshOption,
-    ModulusOption,
-    ParametersOption,
-    Study,
-    ThicknessOption,
-    WorkersOption,
-)
-from palpate_fem.cli.units_app import units_app
+from palpate.errors import MissingExtraError
+
+EXTRA_MODULES = ("scipy", "warp", "pymetis", "threadpoolctl", "h5py", "matplotlib")
+"""Packages that ``palpate[fem]`` installs and a bare palpate does not."""
+
+
+class FemGroup(typer.core.TyperGroup):
+    """A group of commands that name the missing extra when a package is not installed."""
+
+    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
+        """Run the command of the command line."""
+        try:
+            return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing in EXTRA_MODULES:
+                raise MissingExtraError(missing, extra="fem") from error
+            raise
+
+
+MeshOption = Annotated[
+    str, typer.Option("--mesh", metavar="biotac|FOLDER", help="Mesh, or folder of the public mesh.")
+]
+EdgeOption = Annotated[
+    float | None, typer.Option("--edge-mm", help="Edge of the mesh's elements on the pad [mm].")
+]
+LayersOption = Annotated[int, typer.Option("--layers", min=1, help="Elements through the skin.")]
+ParametersOption = Annotated[
+    Path | None,
+    typer.Option("--parameters", metavar="FIT.json", help="Parameters that `calibrate` found."),
+]
+ThicknessOption = Annotated[
+    float | None, typer.Option("--skin-thickness-mm", help="Skin thickness [mm].")
+]
+ModulusOption = Annotated[
+    float | None, typer.Option("--shear-modulus-kpa", help="Shear modulus of the skin [kPa].")
+]
+FrictionOption = Annotated[
+    float | None, typer.Option("--friction", help="Friction coefficient of indenter and skin.")
+]
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=0, help="Solver processes; 0 = one for each core.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+MeasuredArgument = Annotated[
+    Path, typer.Argument(metavar="MEASURED.h5", help="Measured indentations.")
+]
+
+
+class StudyKind(StrEnum):
+    """What a refinement study refines."""
+
+    MESH = "mesh"
+    STEPS = "steps"
+
 
 fem_app = typer.Typer(
     cls=FemGroup,
     help="The fingertip in finite elements: simulate, verify, calibrate, serve (palpate[fem]).",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+units_app = typer.Typer(
+    cls=FemGroup,
+    help="Specimens (individual BioTacs) on the simulated finger: fit them, show them.",
+    no_args_is_help=True,
     rich_markup_mode=None,
 )
 fem_app.add_typer(units_app, name="units")
@@ -48,35 +97,37 @@ def _example(*lines: str) -> str:
 )
 def run(
     indenter: Annotated[
-        list[str] | None, typer.Option("--indenter", help="Indenter; --sweep: may be repeated.")
+        list[str] | None, typer.Option("--indenter", help="Indenter; with --sweep repeatable.")
     ] = None,
     depth_mm: Annotated[float, typer.Option(help="Travel from first contact on [mm].")] = 3.0,
     at_mm: Annotated[
-        tuple[float, float], typer.Option(metavar="X Y", help="Point of the pad it aims at [mm].")
+        tuple[float, float], typer.Option(metavar="X Y", help="Target on the pad [mm].")
     ] = (-4.0, 0.0),
     angle_deg: Annotated[float, typer.Option(help="Angle to the inward normal [degrees].")] = 0.0,
     azimuth_deg: Annotated[
-        float, typer.Option(help="Where an angled one goes: 0 distal, 90 +y [degrees].")
+        float, typer.Option(help="Direction of an angled path: 0 distal, 90 +y [degrees].")
     ] = 0.0,
     steps: Annotated[int, typer.Option(min=1, help="Steps of a path.")] = 20,
     path: Annotated[
         Path | None,
-        typer.Option(metavar="POSES.csv", help="Poses x_m,y_m,z_m,qw,qx,qy,qz instead of a press."),
+        typer.Option(metavar="POSES.csv", help="Path of poses x_m,y_m,z_m,qw,qx,qy,qz."),
     ] = None,
     sweep: Annotated[
         bool, typer.Option("--sweep", help="The paper's set of indentations.")
     ] = False,
     points: Annotated[int, typer.Option(min=1, help="--sweep: points for each indenter.")] = 10,
-    angled: Annotated[int, typer.Option(min=0, max=4, help="--sweep: angled ones a point.")] = 4,
+    angled: Annotated[
+        int, typer.Option(min=0, max=4, help="--sweep: angled paths for each point.")
+    ] = 4,
     seed: Annotated[int, typer.Option(min=0, help="--sweep: seed of the points.")] = 0,
     store: Annotated[
         Path | None,
-        typer.Option(metavar="NAME.sim", help="Store; what it holds already is not run again."),
+        typer.Option(metavar="NAME.sim", help="Store to write or continue."),
     ] = None,
     stress: Annotated[bool, typer.Option("--stress", help="Keep stress in the store.")] = False,
     png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the result.")] = None,
     limit_s: Annotated[
-        float, typer.Option(min=1, help="Longest time for one trajectory [s].")
+        float, typer.Option(min=1, help="Time limit for one trajectory [s].")
     ] = 600.0,
     workers: WorkersOption = 0,
     mesh: MeshOption = "biotac",
@@ -88,13 +139,13 @@ def run(
     friction: FrictionOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Simulate one indentation, or the paper's set of them; Ctrl-C keeps what has ended."""
+    """Simulate one indentation, or the paper's set; Ctrl-C keeps completed trajectories."""
     from palpate_fem.cli.model import model_of
-    from palpate_fem.cli.run import Wanted, run_command
+    from palpate_fem.cli.run import RunOptions, run_command
 
     raise typer.Exit(
         run_command(
-            Wanted(
+            RunOptions(
                 indenters=tuple(indenter or ()),
                 depth_m=depth_mm * 1e-3,
                 at_m=(at_mm[0] * 1e-3, at_mm[1] * 1e-3),
@@ -106,6 +157,11 @@ def run(
                 points=points,
                 angled=angled,
                 seed=seed,
+                store=store,
+                stress=stress,
+                png=png,
+                limit_s=limit_s,
+                as_json=json_,
             ),
             model_of(
                 mesh=mesh,
@@ -117,11 +173,6 @@ def run(
                 friction=friction,
             ),
             workers=workers,
-            limit_s=limit_s,
-            store=store,
-            stress=stress,
-            png=png,
-            as_json=json_,
         )
     )
 
@@ -131,8 +182,8 @@ def export(
     store: Annotated[Path, typer.Argument(metavar="NAME.sim", help="A store of simulations.")],
     out: Annotated[Path, typer.Argument(metavar="OUT.h5", help="The file; never replaced.")],
 ) -> None:
-    """Copy a store into one HDF5 file, to hand on; every reader takes it like the store."""
-    from palpate_fem.cli.export import export_command
+    """Copy a store into one HDF5 file to pass on; all commands read it like the store."""
+    from palpate_fem.cli.run import export_command
 
     raise typer.Exit(export_command(store, out))
 
@@ -140,9 +191,10 @@ def export(
 @fem_app.command(epilog=_example("palpate fem verify", "palpate fem verify --only hertz --json"))
 def verify(
     only: Annotated[
-        str | None, typer.Option("--only", metavar="WORD", help="Tests whose name has this word.")
+        str | None,
+        typer.Option("--only", metavar="WORD", help="Only checks with this word in the name."),
     ] = None,
-    slow: Annotated[bool, typer.Option("--slow", help="Also tests that take minutes.")] = False,
+    slow: Annotated[bool, typer.Option("--slow", help="Also checks that take minutes.")] = False,
     shared_data: Annotated[
         Path | None,
         typer.Option(
@@ -151,7 +203,7 @@ def verify(
     ] = None,
     json_: JsonOption = False,
 ) -> None:
-    """Check the solver against closed forms and itself; a line each with value and tolerance."""
+    """Check the solver against closed forms and itself; one line for each check."""
     from palpate_fem.cli.check import verify_command
 
     raise typer.Exit(verify_command(only=only, slow=slow, shared_data=shared_data, as_json=json_))
@@ -163,7 +215,7 @@ def bench(
     layers: LayersOption = 2,
     json_: JsonOption = False,
 ) -> None:
-    """Seconds for a trajectory of 20 steps, with GFlop/s beside the machine's peak."""
+    """Time a trajectory of 20 steps; compare its GFlop/s with the peak of the machine."""
     from palpate_fem.cli.check import bench_command
 
     raise typer.Exit(bench_command(edge_mm=edge_mm, layers=layers, as_json=json_))
@@ -171,12 +223,12 @@ def bench(
 
 @fem_app.command(epilog=_example("palpate fem study mesh --png mesh.png"))
 def study(
-    what: Annotated[Study, typer.Argument(metavar="mesh|steps", help="What is refined.")],
+    what: Annotated[StudyKind, typer.Argument(metavar="mesh|steps", help="What to refine.")],
     png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw it.")] = None,
     json_: JsonOption = False,
 ) -> None:
-    """What finer meshes or smaller steps change: sphere, cube on its edge and ring, 3 mm deep."""
-    from palpate_fem.cli.study import study_command
+    """Refine mesh or steps for sphere, cube on its edge and ring, 3 mm deep, and compare."""
+    from palpate_fem.cli.check import study_command
 
     raise typer.Exit(study_command(what.value, png=png, as_json=json_))
 
@@ -185,10 +237,10 @@ def study(
 def calibrate(
     measured: MeasuredArgument,
     out: Annotated[
-        Path, typer.Option(metavar="FIT.json", help="Result; `run --parameters` takes it.")
+        Path, typer.Option(metavar="FIT.json", help="Result, for `run --parameters`.")
     ] = Path("fit.json"),
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="Use trajectories that begin so; repeatable.")
+        list[str] | None, typer.Option("--only", help="Only names with this prefix; repeatable.")
     ] = None,
     png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the fit.")] = None,
     workers: WorkersOption = 0,
@@ -197,7 +249,7 @@ def calibrate(
     layers: LayersOption = 2,
 ) -> None:
     """Find skin thickness, modulus, friction and fluid volume from measured forces."""
-    from palpate_fem.cli.calibrate import calibrate_command
+    from palpate_fem.cli.identify import calibrate_command
     from palpate_fem.cli.model import model_of
 
     model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers)
@@ -214,9 +266,9 @@ def recover(
     edge_mm: EdgeOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Plant parameters, simulate noisy forces with them, and see whether calibration finds them."""
+    """Simulate noisy forces with known parameters, and check that calibration finds them."""
+    from palpate_fem.cli.identify import recover_command
     from palpate_fem.cli.model import model_of
-    from palpate_fem.cli.recover import recover_command
 
     model = model_of(mesh="biotac", edge_mm=edge_mm, layers=2)
     raise typer.Exit(
@@ -231,15 +283,15 @@ def recover(
 )
 def validate(
     measured: MeasuredArgument,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of table and plots.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for table and plots.")] = Path(
         "runs/validation"
     ),
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="Use trajectories that begin so; repeatable.")
+        list[str] | None, typer.Option("--only", help="Only names with this prefix; repeatable.")
     ] = None,
     store: Annotated[
         Path | None,
-        typer.Option(metavar="NAME.sim", help="Take simulations from this store; run none."),
+        typer.Option(metavar="NAME.sim", help="Use simulations of this store; run none."),
     ] = None,
     workers: WorkersOption = 0,
     mesh: MeshOption = "biotac",
@@ -247,8 +299,8 @@ def validate(
     layers: LayersOption = 2,
     parameters: ParametersOption = None,
 ) -> None:
-    """Compare simulated with measured forces: the paper's table by indenter, and its plots."""
-    from palpate_fem.cli.calibrate import validate_command
+    """Compare simulated with measured forces: the paper's table by indenter and its plots."""
+    from palpate_fem.cli.identify import validate_command
     from palpate_fem.cli.model import model_of
 
     model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers, fit=parameters)
@@ -263,11 +315,11 @@ def serve(
         str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
     ] = "tcp/127.0.0.1:7447",
     station: Annotated[str, typer.Option("--station", help="Name of the station.")] = "lab",
-    sensor: Annotated[str, typer.Option("--sensor", help="Name to answer under.")] = "twin",
+    sensor: Annotated[str, typer.Option("--sensor", help="Sensor name of the service.")] = "twin",
     workers: WorkersOption = 0,
-    waiting: Annotated[int, typer.Option(min=0, help="Requests that may wait.")] = 8,
+    waiting: Annotated[int, typer.Option(min=0, help="Most requests that wait.")] = 8,
     max_deadline_s: Annotated[
-        float, typer.Option(min=1, help="Longest time for a request [s].")
+        float, typer.Option(min=1, help="Time limit for a request [s].")
     ] = 600.0,
     mesh: MeshOption = "biotac",
     edge_mm: EdgeOption = None,
@@ -279,7 +331,7 @@ def serve(
 ) -> None:
     """Answer simulation requests of a running station until Ctrl-C."""
     from palpate_fem.cli.model import model_of
-    from palpate_fem.cli.serve import serve_command
+    from palpate_fem.cli.run import serve_command
 
     model = model_of(
         mesh=mesh,
@@ -299,3 +351,31 @@ def serve(
         waiting=waiting,
         max_deadline_s=max_deadline_s,
     )
+
+
+@units_app.command(epilog="Example: palpate fem units fit runs/twin/mechanics.sim --out three.json")
+def fit(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="Simulated trajectories.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.json", help="Where to write.")],
+    overtravel_mm: Annotated[
+        float, typer.Option(help="Depth of the paths beyond the paper's [mm].")
+    ] = 0.6,
+) -> None:
+    """Fit three specimens to the ranges and forces that the paper publishes."""
+    from palpate_fem.cli.identify import fit_units_command
+
+    raise typer.Exit(fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3))
+
+
+@units_app.command(epilog="Example: palpate fem units show")
+def show(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE.json]", help="Population; default: the one of palpate."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the parameters of the specimens, and what they were fitted to."""
+    from palpate_fem.cli.identify import show_units_command
+
+    raise typer.Exit(show_units_command(file, as_json=as_json))

@@ -1,4 +1,4 @@
-"""``palpate fem verify`` and ``palpate fem bench``: what the solver's own checks say, as tables."""
+"""``palpate fem verify``, ``bench`` and ``study``: is the solver right, fast, and fine enough?"""
 
 from __future__ import annotations
 
@@ -17,30 +17,31 @@ from rich.markup import escape
 from rich.table import Table
 
 from palpate.errors import ConfigError
-from palpate_fem.cli.show import progress_bar
+from palpate_fem.cli.terminal import print_table, progress_bar
 
 if TYPE_CHECKING:
+    from palpate_fem.study import StudyRow
     from palpate_fem.verify import VerificationCheck
 
 
 def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as_json: bool) -> int:
-    """Run the verification suite; a line for each check as it ends.
+    """Run the verification suite, and print one line for each check.
 
     Args:
         only: Word in the names of the checks that are run; None = all.
         slow: Also those that take minutes.
-        shared_data: Folder that holds the public BioTac's folder; None = beside the project.
+        shared_data: Folder that holds the public BioTac's folder; None = next to the project.
         as_json: Print JSON instead of a table.
 
     Returns:
-        0, or 1 if a check failed; one that was skipped has not.
+        0, or 1 if a check failed; a skipped check has not failed.
 
     Raises:
         ConfigError: No check has such a name, or the public BioTac is not in ``shared_data``.
     """
     from palpate_fem.verify import PUBLIC_SKIN, run
 
-    # Where it is asked for by name, a check that is skipped for its lack would be an answer missed.
+    # Whoever names the folder wants the check that needs it, so it must not be skipped silently.
     if shared_data is not None and not (shared_data / PUBLIC_SKIN).is_dir():
         raise ConfigError(
             f"--public-data {shared_data}: there is no {PUBLIC_SKIN} in it",
@@ -65,7 +66,7 @@ def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as
 
 
 def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
-    """Measure and show, metric by metric.
+    """Measure, and print each metric.
 
     Returns:
         0.
@@ -81,12 +82,15 @@ def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
     if as_json:
         typer.echo(json.dumps(dict(metrics), indent=1))
         return 0
-    table = Table(title="one trajectory")
-    table.add_column("metric")
-    table.add_column("value", justify="right")
-    for name, value in metrics.items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(table)
+    print_table(
+        ("metric", "value"),
+        [
+            (name, f"{value:.4g}" if isinstance(value, float) else str(value))
+            for name, value in metrics.items()
+        ],
+        title="one trajectory",
+        numbers_from=1,
+    )
     return 0
 
 
@@ -95,7 +99,7 @@ def _show_checks(checks: list[VerificationCheck]) -> None:
     passed = sum(check.passed and not check.skipped for check in checks)
     table = Table(
         title="verification",
-        box=SIMPLE_HEAD,  # without lines between its columns a note is not cut off at 80 characters
+        box=SIMPLE_HEAD,  # lines between columns would cost the width that notes need
         padding=(0, 1, 0, 0),
         caption=f"{passed} of {len(checks)} passed"
         + (f", {skipped} skipped" if skipped else "")
@@ -124,8 +128,65 @@ def _verdict(check: VerificationCheck) -> str:
 
 
 def _plain(check: VerificationCheck) -> dict[str, object]:
-    """For JSON, which has no NaN and no infinity."""
+    """For JSON, which has neither NaN nor infinity."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in asdict(check).items()
     }
+
+
+def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
+    """Run a study.
+
+    Args:
+        what: ``mesh`` or ``steps``.
+        png: Picture to draw.
+        as_json: Print JSON instead of a table.
+
+    Returns:
+        0, or 1 if the last refinement changed more than is accepted, or an indentation did not
+        complete.
+    """
+    from palpate_fem.study import EDGES_M, PRESSES, STEPS, mesh_study, step_study
+
+    total = len(PRESSES) * (len(EDGES_M) if what == "mesh" else len(STEPS))
+    with progress_bar() as bar:
+        task = bar.add_task(f"{what} study", total=total)
+
+        def on_row(row: StudyRow) -> None:
+            bar.update(task, advance=1, info=f"{row.indenter}, {row.seconds:.0f} s")
+
+        rows = (mesh_study if what == "mesh" else step_study)(on_row=on_row)
+    if png is not None:
+        from palpate_fem.plot.validation import plot_study
+
+        plot_study(rows, png)
+    if as_json:
+        typer.echo(json.dumps([row.plain() for row in rows], indent=1))
+    else:
+        _show_study(rows)
+    return 0 if all(row.accepted for row in rows[-len(PRESSES) :]) else 1
+
+
+def _show_study(rows: list[StudyRow]) -> None:
+    headings = (
+        "indenter", "edge [mm]", "unknowns", "steps", "force [N]", "change [%]", "moved [um]",
+        "at most [um]", "iterations", "seconds", "outcome",
+    )  # fmt: skip
+    cells = [
+        (
+            row.indenter,
+            f"{row.edge_m * 1e3:g}",
+            f"{row.unknowns:,}",
+            str(row.steps),
+            f"{row.force_n:.4f}",
+            f"{100 * row.force_change:.2f}",
+            f"{1e6 * row.displacement_change_m:.1f}",
+            f"{1e6 * row.largest_change_m:.1f}",
+            str(row.iterations),
+            f"{row.seconds:.1f}",
+            row.outcome,
+        )
+        for row in rows
+    ]
+    print_table(headings, cells, title="what refinement changes", numbers_from=1)

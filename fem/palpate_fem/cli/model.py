@@ -10,13 +10,13 @@ from pathlib import Path
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.service.config import DEFAULT_FACTORY
-from palpate_fem.service.jobs import Setup
+from palpate_fem.service.jobs import WorkerSetup
 
 PARAMETRIC = "biotac"
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class FingertipModel:
     """What the options of a command say.
 
     Attributes:
@@ -29,9 +29,9 @@ class Model:
     options: Mapping[str, object]
     parameters: FingertipParameters
 
-    def setup(self, *, keep: int = 1) -> Setup:
+    def setup(self, *, keep: int = 1) -> WorkerSetup:
         """For workers."""
-        return Setup(self.factory, self.options, self.parameters, keep)
+        return WorkerSetup(self.factory, self.options, self.parameters, keep)
 
 
 def model_of(
@@ -43,7 +43,7 @@ def model_of(
     skin_thickness_mm: float | None = None,
     shear_modulus_kpa: float | None = None,
     friction: float | None = None,
-) -> Model:
+) -> FingertipModel:
     """Check the options and convert their units.
 
     Raises:
@@ -74,7 +74,7 @@ def model_of(
         "friction_coefficient": friction,
     }
     wanted = {name: value for name, value in given.items() if value is not None}
-    return Model(DEFAULT_FACTORY, options, replace(base, **wanted))
+    return FingertipModel(DEFAULT_FACTORY, options, replace(base, **wanted))
 
 
 def workers_for(wanted: int, jobs: int | None = None) -> tuple[int, int]:

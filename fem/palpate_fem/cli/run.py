@@ -1,42 +1,65 @@
-"""``palpate fem run``: one indentation or the paper's set of them, into a picture or a store."""
+"""``palpate fem run``, ``export`` and ``serve``: simulate one indentation, a set, or on request."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+import signal
+import statistics
+import threading
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import typer
 
 from palpate.command import typed_command
+from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
-from palpate_fem.cli.model import Model, workers_for
-from palpate_fem.cli.show import (
+from palpate.files.simulation_store import SUFFIX
+from palpate_fem.cli.model import FingertipModel, workers_for
+from palpate_fem.cli.terminal import (
     console,
+    print_lines,
+    print_table,
     progress_bar,
-    show_report,
-    show_summaries,
-    show_trajectory,
-    write_json,
+    stop_on_signal,
 )
-from palpate_fem.cli.stopping import stop_on_signal
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import read_path
-from palpate_fem.result import IndentationResult
-from palpate_fem.service.batch import Batch, BatchReport, Plan, Press
-from palpate_fem.service.start import check_start, skin_of
-from palpate_fem.store.content import StoredFingertip
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
+from palpate_fem.service.batch import (
+    FAILED,
+    BatchReport,
+    PlannedPath,
+    SimulationBatch,
+    TrajectoryPlan,
+    sweep_into_store,
+)
+from palpate_fem.service.fingertips import check_start, skin_of
+from palpate_fem.store.content import StoredFingertip, TrajectorySummary
+from palpate_fem.store.export import export
+from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import Campaign, angled_direction, pad_point, press_path
 
 DEFAULT_INDENTER = "sphere_medium"
 GOOD = ("complete", "force limit")
 """Outcomes that answer the question: to the end, or to where the skin is pinched on the core."""
 
+EXPORT_SUFFIX = ".h5"
+_ROUTER_WAIT_S = 5.0
+_COLUMNS = ("pose", "force", "torque", "centre_of_pressure")
+_SHOWN_EARLY = 40
+
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is to be run, in SI; the words are those of the command's options."""
+class RunOptions:
+    """Options of ``palpate fem run``, in SI, with the names that they have there."""
 
     indenters: tuple[str, ...]
     depth_m: float
@@ -49,19 +72,68 @@ class Wanted:
     points: int
     angled: int
     seed: int
+    store: Path | None
+    stress: bool
+    png: Path | None
+    limit_s: float
+    as_json: bool
+
+    def check(self) -> None:
+        """Refuse what can be refused before a fingertip is built.
+
+        Raises:
+            ConfigError: An option makes no sense.
+        """
+        for name in self.indenters:
+            make_indenter(name)
+        if self.sweep and self.path is not None:
+            raise ConfigError("--sweep and --path exclude each other", remedy="leave one out")
+        if self.sweep and self.store is None:
+            raise ConfigError(
+                "a sweep takes long and its results must be stored", remedy="give --store NAME.sim"
+            )
+        if self.store is not None and self.store.suffix != SUFFIX:
+            raise ConfigError(
+                f"--store {self.store} does not end in {SUFFIX}",
+                remedy=f"call it {self.store.stem}{SUFFIX}",
+            )
+        if not self.sweep and len(self.indenters) > 1:
+            raise ConfigError(
+                "several indenters without --sweep", remedy="add --sweep, or name one"
+            )
+        if not 0.0 <= self.angle_deg < 90.0:
+            raise ConfigError(
+                f"--angle-deg {self.angle_deg:g} does not lead into the skin",
+                remedy="give 0 to 89 degrees to the inward normal",
+            )
+        if self.path is not None:
+            read_path(self.path)
+
+    def plans(self, fingertip: StoredFingertip) -> Sequence[TrajectoryPlan]:
+        """The trajectories to run on a fingertip."""
+        skin = skin_of(fingertip)
+        if self.sweep:
+            names = tuple(make_indenter(name).name for name in self.indenters) or indenter_names()
+            return list(
+                Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
+            )
+        indenter = make_indenter((self.indenters or (DEFAULT_INDENTER,))[0])
+        if self.path is not None:
+            path = read_path(self.path)
+            check_start(fingertip, indenter.name, path[0])
+        else:
+            target, normal = pad_point(skin, *self.at_m)
+            direction = angled_direction(
+                normal, math.radians(self.angle_deg), math.radians(self.azimuth_deg)
+            )
+            path = press_path(
+                indenter, target, direction, skin, depth_m=self.depth_m, steps=self.steps
+            )
+        digest = hashlib.sha256(path.tobytes()).hexdigest()[:10]
+        return [PlannedPath(f"{indenter.name}/press-{digest}", indenter.name, path)]
 
 
-def run_command(
-    wanted: Wanted,
-    model: Model,
-    *,
-    workers: int,
-    limit_s: float,
-    store: Path | None,
-    stress: bool,
-    png: Path | None,
-    as_json: bool,
-) -> int:
+def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> int:
     """Run, show, draw.
 
     Returns:
@@ -71,161 +143,310 @@ def run_command(
         ConfigError: An option makes no sense.
         PalpateError: The solver does not start, or the store cannot be written.
     """
-    _check(wanted, store)
-    jobs = None if wanted.sweep else 1
-    count, threads = workers_for(workers, jobs)
+    options.check()
+    sweep, store = options.sweep, options.store
+    count, threads = workers_for(workers, None if sweep else 1)
     done: list[IndentationResult] = []
-    with stop_on_signal() as stop, _batch(model, count, threads, limit_s) as batch:
-        with progress_bar() as bar:
-            task = bar.add_task("pressurise", total=None)
-            fingertip = batch.fingertip(stop)
-            if fingertip is None:
-                return 1
-            bar.update(task, description="plan")
-            plans = _plans(wanted, fingertip)
-            total = len(plans) if wanted.sweep else len(plans[0].path) - 1
-            bar.update(task, description="simulate", total=total, completed=0)
+    present = 0
+    with (
+        stop_on_signal() as stop,
+        SimulationBatch(
+            model.setup(), workers=count, threads=threads, limit_s=options.limit_s
+        ) as batch,
+        progress_bar() as bar,
+    ):
+        task = bar.add_task("pressurise", total=None)
+        fingertip = batch.fingertip(stop)
+        if fingertip is None:
+            return 1
+        bar.update(task, description="plan")
+        plans = options.plans(fingertip)
+        total = len(plans) if sweep else len(plans[0].path) - 1
+        bar.update(task, description="simulate", total=total, completed=0)
 
-            def on_report(report: BatchReport) -> None:
-                steps = report.done if wanted.sweep else sum(report.running.values())
-                bar.update(task, completed=steps + present, info=_info(report))
+        def on_report(report: BatchReport) -> None:
+            steps = report.done if sweep else sum(report.running.values())
+            bar.update(task, completed=steps + present, info=_outcomes(report))
 
-            present = 0
-            if store is None:
-                report = batch.run(
-                    plans,
-                    len(plans),
-                    stop=stop,
-                    on_trajectory=lambda _, trajectory: done.append(trajectory),
-                    on_report=on_report,
-                )
-            else:
-                from palpate_fem.service.sweep import sweep_into_store
-
-                report, present = sweep_into_store(
-                    batch,
-                    plans,
-                    store,
-                    stop=stop,
-                    on_report=on_report,
-                    stress=stress,
-                    command=typed_command(),
-                )
-    if store is not None and not wanted.sweep:
-        done = _from_store(store, plans)
-    _show(wanted, fingertip, done, report, plans, store, png=png, as_json=as_json, present=present)
+        if store is None:
+            report = batch.run(
+                plans,
+                len(plans),
+                stop=stop,
+                on_trajectory=lambda _, trajectory: done.append(trajectory),
+                on_report=on_report,
+            )
+        else:
+            report, present = sweep_into_store(
+                batch,
+                plans,
+                store,
+                stop=stop,
+                on_report=on_report,
+                stress=options.stress,
+                command=typed_command(),
+            )
+    if store is not None and not sweep:
+        opened = SimulationStore.open(store)
+        there = set(opened.ids())
+        done = [opened.trajectory(plan.name) for plan in plans if plan.name in there]
+    if options.as_json:
+        write_json(fingertip, done, report, present)
+    else:
+        if sweep:
+            assert store is not None
+            show_summaries(store, [plan.name for plan in plans])
+        for trajectory in done:
+            show_trajectory(fingertip, trajectory)
+        show_report(report, present, store)
+    if options.png is not None:
+        _draw(options.png, fingertip, done, store if sweep else None)
     return 0 if not report.stopped and all(early.how in GOOD for early in report.early) else 1
 
 
-def _check(wanted: Wanted, store: Path | None) -> None:
-    for name in wanted.indenters:
-        make_indenter(name)
-    if wanted.sweep and wanted.path is not None:
-        raise ConfigError("--sweep and --path exclude each other", remedy="leave one out")
-    if wanted.sweep and store is None:
+def export_command(store: Path, out: Path) -> int:
+    """Check a store against its checksums, copy it into one file and print what is in it.
+
+    Returns:
+        0.
+
+    Raises:
+        ConfigError: ``out`` exists, or does not end in ``.h5``.
+        DatasetError: ``store`` is not a store, is one file already, or is damaged.
+        StoreDiskError: The disk is full or refuses.
+    """
+    if out.suffix != EXPORT_SUFFIX:
         raise ConfigError(
-            "a sweep takes long and its results need a place", remedy="give --store NAME.sim"
+            f"{out} does not end in {EXPORT_SUFFIX}", remedy=f"call it {out.stem}{EXPORT_SUFFIX}"
         )
-    if store is not None:
-        from palpate.files.simulation_store import SUFFIX
-
-        if store.suffix != SUFFIX:
-            raise ConfigError(
-                f"--store {store} does not end in {SUFFIX}", remedy=f"call it {store.stem}{SUFFIX}"
-            )
-    if not wanted.sweep and len(wanted.indenters) > 1:
-        raise ConfigError("several indenters without --sweep", remedy="add --sweep, or name one")
-    if not 0.0 <= wanted.angle_deg < 90.0:
-        raise ConfigError(
-            f"--angle-deg {wanted.angle_deg:g} does not lead into the skin",
-            remedy="give 0 to 89 degrees to the inward normal",
+    if out.exists():
+        raise ConfigError(f"{out} is there already", remedy="name another file, or remove it")
+    opened = SimulationStore.open(store)
+    with progress_bar() as bar:
+        task = bar.add_task("check", total=None)
+        # Copying would take damaged bytes over unnoticed, and the receiver could not repair them.
+        opened.fingertip()
+        opened.check()
+        bar.update(task, description="copy")
+        count = export(
+            opened,
+            out,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            command=typed_command(),
         )
-    if wanted.path is not None:
-        read_path(wanted.path)
-
-
-def _plans(wanted: Wanted, fingertip: StoredFingertip) -> Sequence[Plan]:
-    skin = skin_of(fingertip)
-    if wanted.sweep:
-        names = tuple(make_indenter(name).name for name in wanted.indenters) or indenter_names()
-        return list(
-            Campaign(skin, names, wanted.points, wanted.seed, wanted.steps, angled=wanted.angled)
-        )
-    indenter = make_indenter((wanted.indenters or (DEFAULT_INDENTER,))[0])
-    if wanted.path is not None:
-        path = read_path(wanted.path)
-        check_start(fingertip, indenter.name, path[0])
-    else:
-        target, normal = pad_point(skin, *wanted.at_m)
-        direction = angled_direction(
-            normal, math.radians(wanted.angle_deg), math.radians(wanted.azimuth_deg)
-        )
-        path = press_path(
-            indenter, target, direction, skin, depth_m=wanted.depth_m, steps=wanted.steps
-        )
-    digest = hashlib.sha256(path.tobytes()).hexdigest()[:10]
-    return [Press(f"{indenter.name}/press-{digest}", indenter.name, path)]
+    print_lines(f"{out}: {count} trajectories, {out.stat().st_size / 1e6:.1f} MB")
+    return 0
 
 
-def _show(
-    wanted: Wanted,
-    fingertip: StoredFingertip,
-    done: Sequence[IndentationResult],
-    report: BatchReport,
-    plans: Sequence[Plan],
-    store: Path | None,
+def serve_command(
+    model: FingertipModel,
     *,
-    png: Path | None,
-    as_json: bool,
+    connect: str,
+    station: str,
+    sensor: str,
+    workers: int,
+    waiting: int,
+    max_deadline_s: float,
+) -> None:
+    """Serve until ``SIGINT`` or ``SIGTERM``.
+
+    Raises:
+        ConfigError: An option is out of range.
+        LinkError: There is no router.
+        RemoteError: The solver does not start.
+    """
+    # Only this command needs the bus.
+    from palpate_fem.service import node
+    from palpate_fem.service.config import FemConfig
+
+    count, threads = workers_for(workers)
+    config = parse_config(
+        FemConfig,
+        {
+            "sensor": sensor,
+            "workers": count,
+            "threads": threads,
+            "waiting": waiting,
+            "max_deadline_s": max_deadline_s,
+            "factory": model.factory,
+            "options": dict(model.options),
+            "fingertip": asdict(model.parameters),
+        },
+        where="command line",
+    )
+    link = parse_config(
+        LinkConfig,
+        {"connect": (connect,), "wait_for_router_s": _ROUTER_WAIT_S},
+        where="--connect",
+    )
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    print_lines(
+        f"fem serves {sensor!r} at station {station!r} through {connect}: {count} workers, "
+        f"{waiting} may wait",
+        "`palpate status` shows when it is ready; Ctrl-C stops it",
+        to=console,
+    )
+    node.run(config, link, station, stop)
+
+
+def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -> None:
+    """Print the steps of a trajectory, one in a row."""
+    ending = trajectory.outcome.value + (f": {trajectory.reason}" if trajectory.reason else "")
+    places = np.array([trajectory.path[0], *(step.pose for step in trajectory.steps)])[:, :3]
+    travel = np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)) * 1e3
+    print_table(
+        ("step", "travel mm", "|F| N", "Fx", "Fy", "Fz", "p kPa", "area mm²", "Newton"),
+        [
+            (
+                str(number + 1),
+                f"{travel[number]:.3f}",
+                f"{np.linalg.norm(step.force):.3f}",
+                *(f"{component:.3f}" for component in step.force),
+                f"{step.fluid_pressure_pa / 1e3:.2f}",
+                f"{step.contact_area_m2 * 1e6:.2f}",
+                str(step.convergence.iterations),
+            )
+            for number, step in enumerate(trajectory.steps)
+        ],
+        title=f"{trajectory.indenter}: {ending}",
+        caption=f"{len(fingertip.mesh.nodes):,} nodes, "
+        f"fluid {fingertip.fluid_pressure_pa / 1e3:.1f} kPa, "
+        f"{fingertip.total_thickness_m * 1e3:.2f} mm; {trajectory.seconds:.1f} s",
+        numbers_from=0,
+    )
+
+
+def show_summaries(store: Path, names: Sequence[str]) -> None:
+    """Print what a store holds of these trajectories, one row for each indenter."""
+    opened = SimulationStore.open(store)
+    there = set(opened.ids())
+    groups: dict[str, list[TrajectorySummary]] = defaultdict(list)
+    for name in names:
+        if name in there:
+            summary = opened.summary(name)
+            groups[summary.indenter].append(summary)
+    rows = []
+    for indenter, found in groups.items():
+        complete, limit = (
+            sum(summary.outcome is how for summary in found)
+            for how in (IndentationOutcome.COMPLETE, IndentationOutcome.FORCE_LIMIT)
+        )
+        peaks = [np.linalg.norm(s.force, axis=1).max() for s in found if len(s.force)]
+        rows.append(
+            (
+                indenter,
+                str(len(found)),
+                str(complete),
+                str(limit),
+                str(len(found) - complete - limit),
+                f"{min(peaks):.2f} - {max(peaks):.2f}" if peaks else "",
+                f"{statistics.median(summary.seconds for summary in found):.1f}",
+            )
+        )
+    headings = ("indenter", "run", "complete", "force limit", "other", "peak |F| N", "s each")
+    print_table(headings, rows, title=str(store), numbers_from=1)
+
+
+def show_report(report: BatchReport, present: int, store: Path | None) -> None:
+    """Print every early end, and a summary."""
+    if report.early:
+        more = len(report.early) - _SHOWN_EARLY
+        print_table(
+            ("trajectory", "how", "steps", "why"),
+            [
+                (early.name, early.how, f"{early.steps} of {early.steps_total}", early.reason)
+                for early in report.early[:_SHOWN_EARLY]
+            ],
+            title="did not complete",
+            caption=f"and {more} more" if more > 0 else "",
+        )
+    outcomes = ", ".join(f"{count} {how}" for how, count in sorted(report.outcomes.items()))
+    parts = [f"{report.done} of {report.total} run" + (f": {outcomes}" if outcomes else "")]
+    if present:
+        parts.append(f"{present} were there already")
+    if report.stopped:
+        parts.append("stopped early; the same command goes on" if store else "stopped early")
+    if report.failed and store:
+        parts.append(f"{report.failed} {FAILED}: the same command tries them again")
+    print_lines("; ".join(parts))
+
+
+def write_json(
+    fingertip: StoredFingertip,
+    trajectories: Sequence[IndentationResult],
+    report: BatchReport,
     present: int,
 ) -> None:
-    if as_json:
-        write_json(fingertip, done, report, present)
-    elif wanted.sweep:
-        assert store is not None
-        show_summaries(store, [plan.name for plan in plans])
-    else:
-        for trajectory in done:
-            show_trajectory(fingertip, trajectory)
-    if not as_json:
-        show_report(report, present, store)
-    if png is None:
-        return
-    if wanted.sweep:
-        from palpate_fem.plot.step import plot_overview
-        from palpate_fem.store.read import SimulationStore
+    """Print everything except nodal fields as JSON on stdout."""
+    content = {
+        "fingertip": {
+            "mesh": fingertip.mesh.name,
+            "mesh_sha256": fingertip.mesh.sha256.hex(),
+            "nodes": len(fingertip.mesh.nodes),
+            "parameters": asdict(fingertip.parameters),
+            "fluid_pressure_pa": fingertip.fluid_pressure_pa,
+            "fluid_volume_m3": fingertip.fluid_volume_m3,
+            "total_thickness_m": fingertip.total_thickness_m,
+        },
+        "outcomes": dict(report.outcomes),
+        "present": present,
+        "stopped": report.stopped,
+        "early": [asdict(early) for early in report.early],
+        "trajectories": [
+            {
+                "indenter": trajectory.indenter,
+                "outcome": trajectory.outcome.value,
+                "reason": trajectory.reason,
+                "travel_m": trajectory.travel_m,
+                "seconds": trajectory.seconds,
+                "steps": [_step_json(step) for step in trajectory.steps],
+            }
+            for trajectory in trajectories
+        ],
+    }
+    typer.echo(json.dumps(content, indent=1, allow_nan=False))
 
-        assert store is not None
+
+def _step_json(step: IndentationStep) -> dict[str, object]:
+    """A step without its fields; None for NaN, which JSON does not have."""
+    return {
+        **{
+            name: [
+                value if math.isfinite(value) else None for value in getattr(step, name).tolist()
+            ]
+            for name in _COLUMNS
+        },
+        "fluid_pressure_pa": step.fluid_pressure_pa,
+        "contact_area_m2": step.contact_area_m2,
+        "convergence": asdict(step.convergence),
+    }
+
+
+def _draw(
+    png: Path, fingertip: StoredFingertip, done: Sequence[IndentationResult], store: Path | None
+) -> None:
+    """Draw a whole store, or the last step of one trajectory."""
+    if store is not None:
+        from palpate_fem.plot.trajectories import plot_overview
+
         opened = SimulationStore.open(store)
         plot_overview([opened.summary(name) for name in opened.ids()], png, title=store.name)
     elif done and done[0].steps:
-        from palpate_fem.indenter.outline import outline_of
         from palpate_fem.plot.step import plot_step
 
         plot_step(fingertip, done[0], png, indenter=outline_of(done[0].indenter))
     else:
-        console.print(f"{png} is not drawn: no step converged")
+        print_lines(f"{png} is not drawn: no step converged", to=console)
         return
-    console.print(f"drew {png}", soft_wrap=True, markup=False, highlight=False)
+    print_lines(f"drew {png}", to=console)
 
 
-def _from_store(store: Path, plans: Sequence[Plan]) -> list[IndentationResult]:
-    from palpate_fem.store.read import SimulationStore
-
-    opened = SimulationStore.open(store)
-    there = set(opened.ids())
-    return [opened.trajectory(plan.name) for plan in plans if plan.name in there]
-
-
-def _info(report: BatchReport) -> str:
-    """What ended how, for the line of the progress bar."""
+def _outcomes(report: BatchReport) -> str:
+    """Number of trajectories by outcome, for the progress bar."""
     return "  ".join(f"{how} {count}" for how, count in sorted(report.outcomes.items()))
-
-
-@contextmanager
-def _batch(model: Model, workers: int, threads: int, limit_s: float) -> Iterator[Batch]:
-    batch = Batch(model.setup(), workers=workers, threads=threads, limit_s=limit_s)
-    try:
-        yield batch
-    finally:
-        batch.close()

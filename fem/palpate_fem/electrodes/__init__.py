@@ -1,1 +1,1 @@
-"""Electrode physics: from the film between skin and core to the sensor's counts."""
+"""Electrode physics: from the skin's position, through the fluid film, to the sensor's counts."""

@@ -4,9 +4,18 @@ The film is thin, so its potential lives on the core's surface (learning notes, 
 
     div(sigma h grad phi) = sum_k chi_k (phi - V_k) / (z_c + zeta(h) / sigma),   insulated border,
 
-with the access length zeta of a disc (`access_length`; the notes have h / 2) and linear triangles.
-The potentials of the film are eliminated (Kron reduction), which leaves the conductance matrix of
-the 20 terminals.
+with linear triangles. The potentials of the film are eliminated (Kron reduction), which leaves the
+conductance matrix of the 20 terminals.
+
+The access length zeta stands for the resistance that a disc's current meets on its way into the
+full height of the film. The learning notes take zeta = h / 2. That is too much for thin films, and
+it grows without limit: *less* fluid over an electrode would lower its impedance, so counts would
+rise under a fingertip pressed from 2 mm of fluid to 1 mm. Removing a conductor cannot do that
+(Rayleigh's monotonicity), and no real sensor does it. Here zeta makes the film model of one disc
+(radius a, insulated ground and roof) give exactly the resistance of the three-dimensional
+conductor, which was solved by finite volumes for 0.05 a < h < 3 a. For thinner films, the edge
+current of a half plane gives (2 ln 2 / pi)^2 h = 0.195 h. The formula follows those values within 3
+% (docs/adr/0016).
 """
 
 from __future__ import annotations
@@ -22,25 +31,45 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from palpate.errors import SimulationError
-from palpate_fem.electrodes.access import access_length
 from palpate_fem.electrodes.film import FilmMesh
-from palpate_fem.electrodes.table import DISC_DIAMETER_M, TERMINALS
+from palpate_fem.electrodes.specimen import DISC_DIAMETER_M, TERMINALS
 
 Floats = NDArray[np.float64]
+
+SHARE, TURN, EXPONENT = 0.2035, 4.56, 2.113
+"""zeta / a = SHARE eta / (1 + (eta / TURN)^EXPONENT), eta = h / a; fitted for 0.05 < eta < 3."""
+
+
+def access_length(film: Floats, radius_m: float) -> tuple[Floats, Floats]:
+    """Access resistance of a disc times conductivity and area, and its derivative.
+
+    Args:
+        film: Thickness h over the disc [m], shape (...), positive.
+        radius_m: Radius of the disc [m].
+
+    Returns:
+        zeta [m] and d zeta / d h, both of the film's shape.
+    """
+    eta = film / radius_m
+    bend = (eta / TURN) ** EXPONENT
+    zeta = SHARE * film / (1 + bend)
+    slope = SHARE * (1 + (1 - EXPONENT) * bend) / (1 + bend) ** 2
+    return np.asarray(zeta), np.asarray(slope)
+
+
 Indices = NDArray[np.int64]
 
-PARTS = ("the film falls into parts", "check the film's mesh, and that its thickness has a floor")
-SINGULAR = 1e11  # impedance times conductance; 5 um beside 2 mm make 1e4
+SINGULAR = 1e11  # limit of impedance times conductance; a film of 5 um beside 2 mm gives 1e4
 
 
 @dataclass(frozen=True)
-class Conduction:
-    """The film's answer to one thickness.
+class FilmSolution:
+    """The solved film for one distribution of thickness.
 
     Attributes:
-        conductance: Between the terminals, all of the film eliminated [S], shape (20, 20):
+        conductance: Between the terminals, after elimination of the film [S], shape (20, 20);
             symmetric, rows sum to zero. Terminal 0 is the excitation.
-        impedance: Z_i between the excitation and E_i, all others floating [Ohm], shape (19,).
+        impedance: Z_i between the excitation and E_i, with all others floating [Ohm], shape (19,).
         film: The thickness [m], shape (N,).
         sigma_s_m: Conductivity of the fluid [S/m].
         contact_ohm_m2: Impedance of the interface [Ohm m^2].
@@ -56,7 +85,7 @@ class Conduction:
 
     @cached_property
     def _potentials(self) -> tuple[Floats, Floats]:
-        """For a unit current from E_i to the excitation, which is at zero [V / A].
+        """Potentials for a unit current from E_i to the excitation, which is at zero [V / A].
 
         Of the film, shape (N, 19), and of the terminals, shape (20, 19).
         """
@@ -69,7 +98,7 @@ class Conduction:
 
     @property
     def potential(self) -> Floats:
-        """Of the film for a unit current from E_i to the excitation [V / A], shape (N, 19)."""
+        """Potential of the film for a unit current from E_i to the excitation [V / A], (N, 19)."""
         return self._potentials[0]
 
     @cached_property
@@ -82,7 +111,7 @@ class Conduction:
         return np.einsum("fin,fin->fn", slope, slope), jump**2
 
     def gradient_film(self) -> Floats:
-        """dZ_i / dh_j [Ohm / m], shape (19, N): the adjoint, which is the solution itself."""
+        """dZ_i / dh_j [Ohm / m], shape (19, N). The problem is self-adjoint: no further solve."""
         mesh, (steep, jump) = self.solver, self._field
         per_face = -self.sigma_s_m / 3 * mesh.areas[:, None] * steep
         share = mesh.share_area[:, None] * jump
@@ -91,7 +120,7 @@ class Conduction:
         return np.asarray(mesh.to_nodes @ per_face + mesh.share_to_nodes @ vertical).T
 
     def gradient_log_sigma(self) -> Floats:
-        """dZ_i / d ln sigma [Ohm], shape (19,); -Z_i where there is no contact impedance."""
+        """dZ_i / d ln sigma [Ohm], shape (19,); equals -Z_i without contact impedance."""
         mesh, (steep, jump) = self.solver, self._field
         thick = self.film[mesh.mesh.faces].mean(axis=1)
         bulk = self.sigma_s_m * (mesh.areas * thick) @ steep
@@ -112,7 +141,7 @@ class Conduction:
 
 
 class FilmConduction:
-    """A film mesh made ready: pattern, order of elimination, what is linear in the thickness."""
+    """A film mesh prepared for many solves: sparsity, order of elimination, linear operators."""
 
     def __init__(
         self,
@@ -125,8 +154,8 @@ class FilmConduction:
 
         Args:
             mesh: The film.
-            terminals: How many there are; each must have a triangle.
-            disc_radius_m: Of the electrodes [m].
+            terminals: Number of terminals; each must have a triangle.
+            disc_radius_m: Radius of the electrodes [m].
         """
         self.mesh, self.terminals, self.disc_radius_m = mesh, terminals, disc_radius_m
         count = len(mesh.nodes)
@@ -158,8 +187,8 @@ class FilmConduction:
             adj_starts=graph.indptr.tolist(), adjacent=graph.indices.tolist()
         )
         self.position = np.asarray(pymetis.nested_dissection(adjacency)[1], np.int64)
-        # Terminals come last (without the excitation, which is ground): what the elimination of
-        # the film leaves of them is the conductance matrix, without any solution.
+        # Terminals come last (without the excitation, which is ground): eliminating the film then
+        # leaves the conductance matrix of the terminals, and no right-hand side is solved.
         size = count + self.terminals - 1
         node, terminal = self.position[self.share_node], count + self.share_terminal - 1
         live = terminal >= count
@@ -178,14 +207,14 @@ class FilmConduction:
             np.repeat(np.arange(len(faces)), 9),
             *(len(faces) + i for i in (shares, shares[live], shares[live], shares[live])),
         ]
-        # The diagonal of a terminal gathers all its links.
+        # The diagonal entry of a terminal sums all its links.
         place = np.concatenate([place[: -len(own)], place[-len(own) :][terminal[live] - count]])
         self._entries = sp.csr_matrix(
             (np.concatenate(weights), (place, np.concatenate(owner))),
             shape=(len(entries), len(faces) + len(node)),
         )
 
-    def solve(self, film: Floats, *, sigma_s_m: float, contact_ohm_m2: float = 0.0) -> Conduction:
+    def solve(self, film: Floats, *, sigma_s_m: float, contact_ohm_m2: float = 0.0) -> FilmSolution:
         """Conductances and impedances of one film.
 
         Args:
@@ -202,7 +231,7 @@ class FilmConduction:
         if not (np.isfinite(film).all() and film.min() > 0 and 0 < sigma_s_m < np.inf):
             raise SimulationError(
                 f"the film is {film.min():g} m at its thinnest, sigma {sigma_s_m:g} S/m",
-                remedy="both must be positive; a residual film has a floor",
+                remedy="give positive, finite values; a residual film has a floor",
             )
         access, _ = access_length(film[self.share_node], self.disc_radius_m)
         transfer = 1 / (contact_ohm_m2 + access / sigma_s_m)
@@ -210,13 +239,13 @@ class FilmConduction:
         values = self._entries @ np.concatenate([sheet, transfer * self.share_area])
         size = len(self._starts) - 1
         matrix = sp.csc_matrix((values, self._rows, self._starts), shape=(size, size))
-        # Symmetric and positive definite: the order of elimination may stay as planned.
+        # Symmetric and positive definite, so the planned order of elimination is stable.
         inner, resistance, factor = _reduce(matrix, self.terminals - 1)
         whole = np.zeros((self.terminals, self.terminals))
         whole[1:, 1:] = inner
         whole[0, 1:] = whole[1:, 0] = -inner.sum(axis=0)
         whole[0, 0] = inner.sum()
-        return Conduction(
+        return FilmSolution(
             conductance=whole,
             impedance=np.diag(resistance).copy(),
             film=film,
@@ -227,7 +256,7 @@ class FilmConduction:
         )
 
     def impedances(self, films: Floats, *, sigma_s_m: float, contact_ohm_m2: float = 0.0) -> Floats:
-        """Z of many films (B, N) [m], shape (B, 19) [Ohm]; the same numbers as one by one."""
+        """Z of many films (B, N) [m], shape (B, 19) [Ohm]; the same as `solve` one by one."""
         return np.stack(
             [
                 self.solve(film, sigma_s_m=sigma_s_m, contact_ohm_m2=contact_ohm_m2).impedance
@@ -237,7 +266,7 @@ class FilmConduction:
 
 
 def _reduce(matrix: sp.csc_matrix, count: int) -> tuple[Floats, Floats, Any]:
-    """What elimination leaves of the last unknowns (Schur complement), its inverse, the factor."""
+    """Schur complement of the last `count` unknowns, its inverse, and the factorisation."""
     try:
         factor: Any = splu(
             matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
@@ -248,15 +277,22 @@ def _reduce(matrix: sp.csc_matrix, count: int) -> tuple[Floats, Floats, Any]:
         left = (left + left.T) / 2
         resistance = np.linalg.inv(left)
     except (RuntimeError, np.linalg.LinAlgError) as error:
-        raise SimulationError(PARTS[0], remedy=PARTS[1]) from error
+        raise _disconnected() from error
     diagonal = np.diag(resistance)
     if not kept or not (0 < diagonal.min() and diagonal.max() * left.max() < SINGULAR):
-        raise SimulationError(PARTS[0], remedy=PARTS[1])
+        raise _disconnected()
     return left, resistance, factor
 
 
+def _disconnected() -> SimulationError:
+    return SimulationError(
+        "the film falls into parts that are not connected",
+        remedy="check the film's mesh, and that its thickness has a floor",
+    )
+
+
 def _shape_gradients(mesh: FilmMesh) -> tuple[Floats, Floats]:
-    """Surface gradients of the three linear functions [1/m], (F, 3, 3), and areas [m^2], (F,)."""
+    """Surface gradients of the linear shape functions [1/m], (F, 3, 3), and areas [m^2], (F,)."""
     corner = mesh.nodes[mesh.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     double = np.linalg.norm(normal, axis=1)

@@ -1,4 +1,4 @@
-"""The film's mesh: triangles on the core where fluid wets it, with the electrodes' rims in it."""
+"""Mesh of the fluid film: triangles on the wetted core, with nodes on the rims of electrodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 from palpate.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.errors import ConfigError
-from palpate_fem.electrodes.table import DISC_DIAMETER_M, DISC_TERMINAL
+from palpate_fem.electrodes.specimen import DISC_DIAMETER_M, DISC_TERMINAL
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.surface import face_vectors, open_edges
 
@@ -18,15 +18,17 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 EDGE_M = 0.55e-3
-"""Of the triangles between the discs [m]: 3,000 nodes on the BioTac."""
+"""Edge of the triangles between the discs [m]; gives 3,000 nodes on the BioTac."""
 
 TOP_Z_M = 1.2e-3  # above, the core turns into the dorsal flat under the nail (mesh.shape: 1.91 mm)
 BACK_X_M = -17.9e-3  # behind, the rounded proximal edge and the clamp (mesh.shape: -18.54 mm)
-RADIUS_M = 5.1e-3  # of the capsule that the points are laid on before they go onto the core
+RADIUS_M = (
+    5.1e-3  # of the capsule on which points are placed before they are projected onto the core
+)
 
-# Rings of nodes about a disc: radius over the disc's, how many, angle of the first in steps. The
-# current leaves at the rim, so rings are dense there; those next to it have its angles, or Delaunay
-# would flip its edges.
+# Rings of nodes around a disc: radius over the disc's radius, number of nodes, angle of the first
+# one in steps. Most current leaves at the rim, so rings are dense there. Those next to the rim use
+# its angles, or Delaunay would flip its edges.
 RINGS = (
     (0.4, 8, 0.0),
     (0.7, 14, 0.5),
@@ -36,9 +38,11 @@ RINGS = (
     (1.35, 20, 0.5),
 )
 RIM = 3
-LONGEST_M = 1.8e-3  # edge of a triangle at a disc, however short the others are
-CLEAR = 1.52  # no other nodes within so many radii of a *nominal* disc: topology is kept
-# Larger discs, or a smaller core, would let E7..E10 touch.
+LONGEST_M = 1.8e-3  # longest edge of a triangle at a disc, however short the others are
+# No other nodes within this many radii of a *nominal* disc, so that a small change of the diameter
+# does not change the topology.
+CLEAR = 1.52
+# With larger discs, or a smaller core, E7..E10 would touch.
 LIMITS = {
     "edge_m": (0.25e-3, 1.0e-3),
     "disc_diameter_m": (2.0e-3, 2.6e-3),
@@ -64,11 +68,11 @@ class FilmMesh:
 
     @property
     def areas(self) -> Floats:
-        """Of the triangles [m^2], shape (F,)."""
+        """Areas of the triangles [m^2], shape (F,)."""
         return np.asarray(np.linalg.norm(face_vectors(self.nodes, self.faces), axis=1))
 
     def volume(self, film: Floats) -> float:
-        """Fluid under a film of thickness (N,) [m^3], the core's curvature left out."""
+        """Volume of a film of thickness (N,) [m^3]; ignores the core's curvature."""
         return float((self.areas * film[self.faces].mean(axis=1)).sum())
 
 
@@ -81,15 +85,15 @@ def film_mesh(
 ) -> FilmMesh:
     """Mesh the wetted surface of a core, from the clamp over the pad to the nail's rim.
 
-    Nodes lie on the rims of the discs, so a disc is a union of triangles of exactly its area, and
-    no result jumps where a disc's diameter changes a little.
+    Nodes lie on the rims of the discs, so a disc is a union of triangles with exactly its area, and
+    results change smoothly with a disc's diameter.
 
     Args:
         core: The core, in the sensor frame.
         edge_m: Edge of the triangles between the discs [m].
         disc_diameter_m: Of the electrodes [m].
-        recess_m: How far the film's floor lies below the core's surface [m]: 0.25 mm makes the
-            radius of the electrode table (5.08 mm) of that of the public part (5.33 mm).
+        recess_m: Depth of the film's floor below the core's surface [m]. With 0.25 mm, the radius
+            of the public part (5.33 mm) becomes that of the electrode table (5.08 mm).
 
     Raises:
         ConfigError: An argument is out of range, or the electrodes do not fit onto the core.
@@ -98,11 +102,13 @@ def film_mesh(
     for name, value in given.items():
         low, high = LIMITS[name]
         if not low <= value <= high:
-            raise ConfigError(f"{name} = {value} is not within [{low:g}, {high:g}]", remedy="in m")
+            raise ConfigError(
+                f"{name} = {value} is not within [{low:g}, {high:g}]", remedy="give it in m"
+            )
     centres = onto(core, np.concatenate([ELECTRODE_POSITIONS, EXCITATION_POSITIONS]), -recess_m)[0]
     radius = disc_diameter_m / 2
     points, disc, about = _disc_points(core, centres, radius, recess_m)
-    # Where discs stand close, a ring's node that comes near to another disc is left out.
+    # Where discs are close together, ring nodes near another disc are left out.
     away = np.linalg.norm(points[:, None] - centres, axis=2)
     away[np.arange(len(points)), about] = np.inf
     keep = (disc >= 0) | (away.min(axis=1) > 1.15 * radius)
@@ -122,7 +128,7 @@ def film_mesh(
     mesh = FilmMesh(points, onto(core, points, -recess_m)[1], faces, terminal)
     for i in range(len(centres)):
         area = mesh.areas[inside & (at[:, 0] == i)].sum() / (np.pi * radius**2)
-        if not 0.97 < area < 1.04:  # curvature makes it up to 2 % larger
+        if not 0.97 < area < 1.04:  # curvature makes the area up to 2 % larger
             raise ConfigError(
                 f"electrode disc {i} covers {area:.2f} of its area on the core",
                 remedy="check that the core is in the sensor frame",
@@ -131,7 +137,7 @@ def film_mesh(
 
 
 def onto(core: RigidCore, points: Floats, level_m: float = 0.0) -> tuple[Floats, Floats]:
-    """Nearest points of a level of the core's distance, and the unit normals there.
+    """Nearest points on a level set of the core's distance field, and the unit normals there.
 
     Args:
         core: The core.
@@ -150,9 +156,9 @@ def onto(core: RigidCore, points: Floats, level_m: float = 0.0) -> tuple[Floats,
 def _disc_points(
     core: RigidCore, centres: Floats, radius: float, recess: float
 ) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
-    """Rings about the discs, in which disc each point lies (-1 in none), about which it was laid.
+    """Points of the rings; the disc that each lies in (-1 = none); the disc it was placed around.
 
-    Points stand in order of rings, then discs.
+    Points are ordered by ring, then by disc.
     """
     _, normal = onto(core, centres, -recess)
     across = np.cross(normal, [1.0, 0.0, 0.0])
@@ -162,7 +168,7 @@ def _disc_points(
     about = np.concatenate([everyone, *(np.repeat(everyone, ring[1]) for ring in RINGS)])
     within = len(centres) * (1 + sum(ring[1] for ring in RINGS[: RIM + 1]))
     disc = np.where(np.arange(len(about)) < within, about, -1)
-    # On a curved core a disc laid on shrinks by some per cent; it gets its area back.
+    # Projection onto the curved core shrinks a disc by some per cent; stretching restores its area.
     stretch = np.ones(len(centres))
     for trial in range(3):
         points = [centres]
@@ -180,7 +186,7 @@ def _disc_points(
 
 
 def _rim_areas(laid: Floats, count: int) -> Floats:
-    """Area within the rim of each disc, by triangles from its centre [m^2]."""
+    """Area within the rim of each disc, from triangles around its centre [m^2]."""
     start = count * (1 + sum(ring[1] for ring in RINGS[:RIM]))
     rim = laid[start : start + count * RINGS[RIM][1]].reshape(count, -1, 3)
     middle = laid[:count, None]
@@ -189,7 +195,7 @@ def _rim_areas(laid: Floats, count: int) -> Floats:
 
 
 def _lattice(edge: float) -> Floats:
-    """Points about `edge` apart on the ventral part of a capsule; rows are mirror-symmetric."""
+    """Points on the ventral part of a capsule, about `edge` apart; rows are mirror-symmetric."""
     row = edge * np.sqrt(3) / 2
     rows = np.ceil(-BACK_X_M / row)
     barrel = np.linspace(BACK_X_M, 0.0, int(rows) + 1)
@@ -205,7 +211,7 @@ def _lattice(edge: float) -> Floats:
             widest = np.arccos(-TOP_Z_M / r)
             count = round(2 * widest * r / edge)
             angle = np.linspace(-widest, widest, count + 1)
-            if number % 2:  # staggered, its ends on the border all the same
+            if number % 2:  # staggered, but its ends stay on the border
                 middle = (angle[1:] + angle[:-1]) / 2
                 angle = np.concatenate([angle[:1], middle, angle[-1:]])
         points.append(
@@ -215,7 +221,7 @@ def _lattice(edge: float) -> Floats:
 
 
 def _triangles(points: Floats, edge: float) -> Ints:
-    """Delaunay triangles in a conformal picture of the capsule, which keeps their shapes."""
+    """Delaunay triangles in a conformal map of the capsule, which preserves their shapes."""
     x, y, z = points.T
     angle = np.arctan2(y, -z)
     polar = np.arctan2(np.hypot(y, z), np.maximum(x, 0.0))
@@ -234,7 +240,7 @@ def _triangles(points: Floats, edge: float) -> Ints:
 
 
 def _trimmed(points: Floats, faces: Ints) -> Ints:
-    """Without the flat triangles that Delaunay leaves along a border."""
+    """The faces without the flat triangles that Delaunay leaves along a border."""
     while True:
         corner = points[faces]
         longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
@@ -250,9 +256,9 @@ def _trimmed(points: Floats, faces: Ints) -> Ints:
 
 
 def _flipped(points: Floats, faces: Ints) -> Ints:
-    """Flip edges until opposite angles add up to less than pi in space, not in the picture.
+    """Flip edges until opposite angles add up to less than pi in space, not only in the map.
 
-    (Lawson 1977.) The picture is not conformal on the tip's facet.
+    Lawson (1977). Needed because the map is not conformal on the tip's facet.
     """
     faces = faces.copy()
     for _ in range(30):
@@ -271,7 +277,7 @@ def _flipped(points: Floats, faces: Ints) -> Ints:
         if not len(worst):
             break
         taken = np.zeros(len(faces), bool)
-        for i in worst:  # each triangle once a round
+        for i in worst:  # each triangle at most once in a round
             (f, a), (g, b) = divmod(int(one[i]), 3), divmod(int(other[i]), 3)
             if taken[f] or taken[g]:
                 continue

@@ -1,7 +1,7 @@
-"""How far the skin stands off the core at each node of the film, with gradients.
+"""From a state of the skin to the thickness of the fluid film on the core, with gradients.
 
-Along the core's normal from a node of the film to the skin's inner surface; which triangle is met,
-and where, is found anew for every state, starting from the unpressurised one.
+First the gap: along the core's normal, from each node of the film to the skin's inner surface. Then
+the film in that gap: where skin and core touch, asperities of the skin hold a residual film open.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from palpate.errors import SimulationError
 from palpate_fem.electrodes.film import FilmMesh
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.mesh.surface import face_vectors
 from palpate_fem.result import IndentationStep
@@ -21,10 +22,11 @@ from palpate_fem.result import IndentationStep
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-OUTSIDE = -1e-9  # a barycentric coordinate below is outside
-MOST_STEPS = 60  # from triangle to triangle; an indentation of 3 mm needs fewer than 20
-TRIED = 256  # nearest triangles that are tried where that does not end
-# Where the core is cut back below the skin's own edge a line may meet the surface far away.
+OUTSIDE = -1e-9  # a barycentric coordinate below this is outside of its triangle
+MOST_STEPS = 60  # of the walk from triangle to triangle; 3 mm of indentation need fewer than 20
+TRIED = 256  # nearest triangles that are tried where the walk does not end
+# Where the core is cut back below the skin's own edge, a normal may meet the surface far away; such
+# a hit is not a film.
 REACH_M = 4.0e-3
 
 
@@ -70,7 +72,12 @@ class Gap:
 
 
 class GapFinder:
-    """From states of a skin to gaps at the nodes of a film."""
+    """Measures gaps of a skin at the nodes of a film.
+
+    A film node keeps its normal, but the skin slides along it: which triangle the normal meets is
+    found anew for every state, by a walk over neighbours from the triangle of the unpressurised
+    skin.
+    """
 
     def __init__(self, film: FilmMesh, skin: SolidMesh) -> None:
         """Find where the core's normals meet the unpressurised skin.
@@ -80,7 +87,7 @@ class GapFinder:
             skin: The skin, in the same frame.
 
         Raises:
-            SimulationError: They do not belong together: a normal misses the skin.
+            SimulationError: A normal misses the skin: film and skin do not belong together.
         """
         faces = skin.inner_faces
         if faces.shape[1] == 4:
@@ -97,7 +104,7 @@ class GapFinder:
             core_force: Nodal forces of the core on the skin [N], shape (V, 3); None = no contact.
 
         Raises:
-            SimulationError: A normal of the core misses the skin: it is folded or torn.
+            SimulationError: A normal of the core misses the skin: the skin is folded or torn.
         """
         position = np.asarray(position, np.float64)
         face = self._start.copy()
@@ -153,7 +160,7 @@ class GapFinder:
         return share / safe[:, None], np.cross(b - a, c - a)
 
     def _search(self, position: Floats, rays: NDArray[np.int64]) -> Ints:
-        """Nearest triangle that each of some normals meets from inside, by trying many."""
+        """The nearest triangle that each of these normals meets from inside, by trying many."""
         tree = cKDTree(position[self.faces].mean(axis=1))
         tried = min(TRIED, len(self.faces))
         _, near = tree.query(self.film.nodes[rays], k=tried)
@@ -181,7 +188,84 @@ def _neighbours(faces: Ints) -> Ints:
     key = (pairs.min(axis=2).astype(np.int64) * count + pairs.max(axis=2)).ravel()
     order = np.argsort(key, kind="stable")
     twice = np.flatnonzero(np.diff(key[order]) == 0)
-    beside = np.repeat(np.arange(len(faces), dtype=np.int32), 3)  # at an open edge: stay
+    beside = np.repeat(np.arange(len(faces), dtype=np.int32), 3)  # at an open edge the walk stays
     one, other = order[twice], order[twice + 1]
     beside[one], beside[other] = other // 3, one // 3
     return beside.reshape(-1, 3)
+
+
+# Width over which max(gap, 0) is rounded: contacts of the mechanics penetrate by 0.5e-6 m, so a
+# sharp bend would make counts jump there.
+ROUNDING_M = 1e-6
+
+# The public clamp begins here (mesh.parametric: NAIL_X_M); E19's disc ends 0.9 mm behind it.
+CLAMP_X_M, CLAMP_BLEND_M = -13.96e-3, 0.7e-3
+# Angle about the core's axis from the ventral midline between which the sides begin: E2..E5 lie at
+# 44 degrees, E1, E4, E6 at 77.
+SIDES_RAD = (0.85, 1.25)
+
+
+@dataclass(frozen=True)
+class GapAdjustment:
+    """How the gap of one specimen differs from that of the mechanics, at each node of the film.
+
+    Attributes:
+        share: Share of the gap that stays open [1], shape (N,): below 1 behind the clamp's edge.
+        nearer_m: How much closer to the core the specimen's skin is [m], shape (N,).
+    """
+
+    share: Floats
+    nearer_m: Floats
+
+    def gap(self, gap: Floats) -> Floats:
+        """The specimen's gap [m] from that of the mechanics, same shape."""
+        return np.asarray(self.share * gap - self.nearer_m)
+
+
+def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> GapAdjustment:
+    """How a specimen's gap differs from that of the mechanics, which all specimens share.
+
+    Behind the clamp's edge skin and core are anchored together, as in the paper's model ("Finite
+    element model configuration", boundary condition 1), which closes the film there. At the sides
+    specimens differ: real ones rise by up to 0.17 of full scale where the skin bulges, which needs
+    films of 0.05-0.2 mm at rest (learning notes, section 4.4). Under the pad the fill decides.
+
+    Args:
+        points: Nodes of the film [m], shape (N, 3), sensor frame.
+        specimen: Its `clamp_closing` and `side_closing_m` are used.
+    """
+    x, y, z = points.T
+    behind = 0.5 * (1 + np.tanh((CLAMP_X_M - x) / (2 * CLAMP_BLEND_M)))
+    angle = np.arctan2(np.abs(y), -z)
+    low, high = SIDES_RAD
+    t = np.clip((angle - low) / (high - low), 0.0, 1.0)
+    return GapAdjustment(
+        1 - specimen.clamp_closing * behind, specimen.side_closing_m * t * t * (3 - 2 * t)
+    )
+
+
+def thickness(
+    gap: Floats, pressure: Floats, specimen: SpecimenParameters
+) -> tuple[Floats, Floats, Floats]:
+    """Thickness of the film in a gap.
+
+    The skin of the mechanics is the plane through the tips of the inner surface's asperities.
+    Between them fluid stays, and the less the harder they are pressed (learning notes, section
+    4.4)::
+
+        h = max(gap, 0) + floor + (asperity - floor) / (1 + p / p0)^m
+
+    Args:
+        gap: Between core and skin [m], shape (...); negative where they are in contact.
+        pressure: Of the core on the skin [Pa], same shape, not negative.
+        specimen: Its asperity, floor and squeeze parameters are used.
+
+    Returns:
+        Thickness h [m], dh/d gap and dh/d pressure [m/Pa], each of the same shape.
+    """
+    t = gap / ROUNDING_M
+    above, slope = ROUNDING_M * np.logaddexp(0.0, t), 0.5 * (1 + np.tanh(t / 2))
+    squeezed = 1 + pressure / specimen.squeeze_pa
+    left = (specimen.asperity_m - specimen.floor_m) * squeezed**-specimen.squeeze_exponent
+    by_pressure = -specimen.squeeze_exponent * left / (squeezed * specimen.squeeze_pa)
+    return above + specimen.floor_m + left, slope, by_pressure

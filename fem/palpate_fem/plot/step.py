@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
 from palpate.extras import require
-from palpate_fem.plot.curves import draw_force, plot_curves, travel_mm
-from palpate_fem.plot.overview import plot_overview
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.style import (
     CORE,
@@ -28,6 +26,7 @@ from palpate_fem.plot.style import (
     new_figure,
     save,
 )
+from palpate_fem.plot.trajectories import draw_force, plot_curves, plot_overview, travel_mm
 from palpate_fem.result import IndentationResult, IndentationStep
 from palpate_fem.store.content import Outline, StoredFingertip
 

@@ -1,1 +1,1 @@
-"""Several BioTacs on one simulated finger: answers of their electrodes, fitted to ranges."""
+"""Several specimens on one simulated finger: their electrodes, fitted to published ranges."""

@@ -1,4 +1,12 @@
-"""A population from a store of trajectories: how deep each unit is pressed, then fitted."""
+"""Fit specimens to what is published of real ones.
+
+Published is little: the smallest and the largest tared value over a whole data set, and the largest
+force (paper, "Experimental data processing"). Force and depth decide how deep a specimen was
+pressed. Four electrical parameters then produce the range: the conductivity and the thickness of
+the film at the sides set where electrodes rest and how far they rise, the residual film under
+pressure sets how far they fall. The priors of section 4.5 decide between the combinations that
+remain.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +15,125 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from palpate.errors import DatasetError
+from palpate_fem.electrodes.electronics import FULL_SCALE
 from palpate_fem.electrodes.gap import Gap
-from palpate_fem.electrodes.sensor import Electrodes
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.model import ElectrodeModel
+from palpate_fem.electrodes.specimen import LIMITS, LOG_SD, SpecimenParameters
 from palpate_fem.mesh.solid import FingertipGeometry
-from palpate_fem.population.fit import fit_unit
-from palpate_fem.population.member import Member, Wanted
-from palpate_fem.population.mount import clear_steps
+from palpate_fem.population.members import Member, PublishedRange
+from palpate_fem.population.responses import TaredRange, clear_steps
 from palpate_fem.store.read import SimulationStore
 
 Floats = NDArray[np.float64]
+
+TOLERANCE = 0.004
+"""Misfit of the range that costs as much as a parameter one standard deviation off."""
+
+SIDE_SD_M = 0.4e-3  # of the prior on side_closing_m: half its uniform range
+FITTED = ("sigma_s_m", "squeeze_pa", "floor_m")  # by their logarithms; and side_closing_m itself
+KEPT = 3
+"""Number of states that are kept for each electrode and each end of the range while fitting."""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedSpecimen:
+    """A specimen and what it was fitted to.
+
+    Attributes:
+        specimen: Its parameters.
+        found: Its range over all states.
+        wanted: Smallest and largest tared value that it should have.
+        rounds: How often the extreme states were selected again.
+    """
+
+    specimen: SpecimenParameters
+    found: TaredRange
+    wanted: tuple[float, float]
+    rounds: int
+
+
+def fit_specimen(
+    sensor: ElectrodeModel,
+    states: Sequence[Gap],
+    rest: Gap,
+    wanted: tuple[float, float],
+    *,
+    rounds: int = 4,
+) -> FittedSpecimen:
+    """Fit a specimen, starting from its present parameters.
+
+    A range is set by a few extreme states, so only those are evaluated while fitting; they are
+    selected again until the selection no longer grows.
+
+    Args:
+        sensor: Model of the specimen to start from; its parameters are the centre of the priors.
+        states: Gaps at the deep states of many trajectories.
+        rest: Gap of the untouched finger.
+        wanted: Smallest and largest tared value over full scale.
+        rounds: How often the extreme states are selected again, at most.
+
+    Returns:
+        The specimen, with its range over all the given states.
+    """
+    start = sensor.specimen
+    centre = np.array([*(np.log(getattr(start, key)) for key in FITTED), start.side_closing_m])
+    spread = np.array([*(LOG_SD[key] for key in FITTED), SIDE_SD_M])
+    low, high = _bounds(start)
+
+    def specimen_at(scaled: Floats) -> SpecimenParameters:
+        at = np.clip(centre + scaled * spread, low, high)
+        values = dict(zip(FITTED, np.exp(at[:-1]).tolist(), strict=True))
+        return replace(start, **values, side_closing_m=float(at[-1]))
+
+    scaled = np.zeros(len(centre))
+    chosen: set[int] = set()
+    done = 0
+    while done < rounds:
+        done += 1
+        tared = _tared(sensor.with_specimen(specimen_at(scaled)), states, rest)
+        picked = _extreme(tared)
+        if picked <= chosen:
+            break
+        chosen |= picked
+        some = [states[i] for i in sorted(chosen)]
+
+        def misfit(scaled: Floats, some: list[Gap] = some) -> Floats:
+            ends = TaredRange.of(_tared(sensor.with_specimen(specimen_at(scaled)), some, rest))
+            missed = np.array([ends.low - wanted[0], ends.high - wanted[1]]) / TOLERANCE
+            return np.concatenate([missed, scaled])
+
+        found = least_squares(misfit, scaled, diff_step=1e-2, x_scale=1.0, max_nfev=25)
+        scaled = found.x
+    specimen = specimen_at(scaled)
+    return FittedSpecimen(
+        specimen, TaredRange.of(_tared(sensor.with_specimen(specimen), states, rest)), wanted, done
+    )
+
+
+def _tared(sensor: ElectrodeModel, states: Sequence[Gap], rest: Gap) -> Floats:
+    """Tared values over full scale, shape (S, 19)."""
+    untouched = sensor.of_gap(rest).counts
+    counts = np.array([sensor.of_gap(gap).counts for gap in states])
+    # An ideal count may lie outside of what the converter can output.
+    return np.asarray((np.clip(counts, 0, FULL_SCALE) - untouched) / FULL_SCALE)
+
+
+def _extreme(tared: Floats) -> set[int]:
+    """States at which some electrode is lowest or highest."""
+    order = np.argsort(tared, axis=0)
+    return {int(i) for i in np.concatenate([order[:KEPT], order[-KEPT:]]).ravel()}
+
+
+def _bounds(specimen: SpecimenParameters) -> tuple[Floats, Floats]:
+    ends = [np.log(LIMITS[key]) for key in FITTED] + [np.array(LIMITS["side_closing_m"])]
+    low, high = np.array(ends).T
+    high[FITTED.index("floor_m")] = np.log(specimen.asperity_m)
+    return low, high
+
+
 OnTrajectory = Callable[[], None]
 
 SEED = 2026
@@ -27,16 +142,15 @@ OVERTRAVELS_M = 1e-4 * np.arange(7)
 
 
 @dataclass(frozen=True, slots=True)
-class Deep:
+class DeepStates:
     """A stored trajectory's force by depth, and the film at some depths.
 
     Attributes:
         name: Of the trajectory.
-        indenter: Of it.
-        left_m: Planned travel that is still missing at each step [m], shape (S,); negative =
-            beyond the plan.
-        force_n: Size of the net force [N], shape (S,).
-        gaps: Film at the deepest step for each of ``OVERTRAVELS_M``; None without a step.
+        indenter: Its indenter.
+        left_m: Planned travel that remains at each step [m], shape (S,); negative beyond the plan.
+        force_n: Magnitude of the net force [N], shape (S,).
+        gaps: Film at the deepest step for each of ``OVERTRAVELS_M``; None where there is no step.
     """
 
     name: str
@@ -52,16 +166,16 @@ class Deep:
 
 def deep_states(
     store: SimulationStore,
-    sensor: Electrodes,
+    sensor: ElectrodeModel,
     planned: Callable[[str], float],
     *,
     on_trajectory: OnTrajectory | None = None,
-) -> list[Deep]:
-    """Go through a store once.
+) -> list[DeepStates]:
+    """Collect the deep states of all trajectories of a store, in one pass.
 
     Args:
         store: Trajectories whose paths begin just clear of the skin.
-        sensor: Whose film it is.
+        sensor: Model with the film.
         planned: Planned travel of a trajectory from its first pose on [m], by its name.
         on_trajectory: Called after each one.
 
@@ -76,7 +190,7 @@ def deep_states(
         steps = trajectory.steps[: clear_steps(trajectory, fingertip.mesh.fixed)]
         poses = np.array([step.pose[:3] for step in steps]).reshape(-1, 3)
         travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1)
-        deep = Deep(
+        deep = DeepStates(
             name,
             trajectory.indenter,
             planned(name) - travel,
@@ -93,33 +207,35 @@ def deep_states(
     return found
 
 
-def overtravel_for(states: Sequence[Deep], wanted: Wanted, most_m: float) -> tuple[int, float]:
-    """Which of ``OVERTRAVELS_M`` a unit was pressed with, and its largest force then [N].
+def overtravel_for(
+    states: Sequence[DeepStates], published: PublishedRange, most_m: float
+) -> tuple[int, float]:
+    """Index of the overtravel that a specimen was pressed with, and its largest force there [N].
 
-    The deepest whose largest force is within ``FORCE_SHARE`` of the published one, or else the one
-    that comes nearest: where forces do not decide, depth does, as the paper's trials have more rows
-    above 0.5 N than its planned depths would give.
+    The deepest of ``OVERTRAVELS_M`` whose largest force is within ``FORCE_SHARE`` of the published
+    one, or else the one that comes nearest. If forces allow several, the deepest is taken, because
+    the paper's trials have more rows above 0.5 N than its planned depths would give.
 
     Args:
         states: Of all trajectories.
-        wanted: The published unit.
-        most_m: The store's paths end here [m].
+        published: The published specimen.
+        most_m: Overtravel of the store's paths [m].
 
     Raises:
-        DatasetError: No trajectory of the unit's indenters has a step.
+        DatasetError: No trajectory of the specimen's indenters has a step.
     """
     found: list[tuple[float, int, float]] = []
     for i, extra in enumerate(OVERTRAVELS_M):
         forces = [
             float(deep.force_n[: deep.deepest(extra) + 1].max())
             for deep in states
-            if wanted.pressed_with(deep.indenter) and deep.deepest(extra) >= 0
+            if published.pressed_with(deep.indenter) and deep.deepest(extra) >= 0
         ]
         if forces and extra <= most_m + 1e-9:
-            found.append((abs(max(forces) / wanted.max_force_n - 1), i, max(forces)))
+            found.append((abs(max(forces) / published.max_force_n - 1), i, max(forces)))
     if not found:
         raise DatasetError(
-            f"no trajectory of {wanted.name}'s indenters has converged", remedy="simulate some"
+            f"no trajectory of {published.name}'s indenters has converged", remedy="simulate some"
         )
     near = [one for one in found if one[0] <= FORCE_SHARE]
     nearest = min(miss for miss, _, _ in found)
@@ -128,28 +244,28 @@ def overtravel_for(states: Sequence[Deep], wanted: Wanted, most_m: float) -> tup
 
 
 FORCE_SHARE = 0.2
-"""How far the largest force may be from the published one, of it."""
+"""Largest relative difference of the largest force from the published one."""
 
 
 def fit_member(
     geometry: FingertipGeometry,
     rest: Gap,
-    states: Sequence[Deep],
-    wanted: Wanted,
+    states: Sequence[DeepStates],
+    published: PublishedRange,
     number: int,
     *,
     most_m: float,
 ) -> Member:
-    """Fit one unit: drawn from the priors by its number, then moved to the published range.
+    """Fit one specimen: drawn from the priors with its number as seed, then fitted to its range.
 
-    The core and its discs are nominal, so that all units share one film mesh and one gap.
+    The core and its discs are nominal, so that all specimens share one film mesh and one gap.
     """
-    extra, force = overtravel_for(states, wanted, most_m)
+    extra, force = overtravel_for(states, published, most_m)
     rng = np.random.default_rng([SEED, number])
-    nominal = UnitParameters()
+    nominal = SpecimenParameters()
     start = replace(
         nominal.drawn(rng),
-        name=wanted.name,
+        name=published.name,
         disc_diameter_m=nominal.disc_diameter_m,
         side_closing_m=0.4e-3,
         contact_ohm_m2=0.0,
@@ -157,13 +273,15 @@ def fit_member(
     gaps = [
         gap
         for deep in states
-        if wanted.pressed_with(deep.indenter) and (gap := deep.gaps[extra]) is not None
+        if published.pressed_with(deep.indenter) and (gap := deep.gaps[extra]) is not None
     ]
-    fitted = fit_unit(Electrodes(geometry, start), gaps, rest, (wanted.low, wanted.high))
+    fitted = fit_specimen(
+        ElectrodeModel(geometry, start), gaps, rest, (published.low, published.high)
+    )
     found = {
         "low": fitted.found.low,
         "high": fitted.found.high,
         "max_force_n": force,
         "states": float(len(gaps)),
     }
-    return Member(fitted.unit, wanted, float(OVERTRAVELS_M[extra]), found)
+    return Member(fitted.specimen, published, float(OVERTRAVELS_M[extra]), found)

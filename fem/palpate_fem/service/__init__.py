@@ -1,1 +1,1 @@
-"""Workers that solve, and the service that asks them."""
+"""Simulations on request: the service on the bus, its worker processes, and batches over them."""

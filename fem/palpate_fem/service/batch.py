@@ -1,34 +1,53 @@
-"""Many trajectories over worker processes; what has converged is kept, every early end is told."""
+"""Many trajectories over worker processes: into a store, or as the simulator of a calibration.
+
+What has converged is kept, and every early end is reported.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import queue
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
-from palpate.errors import RemoteError
+from palpate.closing import Closing
+from palpate.errors import RemoteError, SimulationError
+from palpate_fem.calibration.runs import SimulatedIndentation
 from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.outline import outline_of
+from palpate_fem.indenter.path import check_path
 from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
-from palpate_fem.service.jobs import Ended, Event, Failed, Job, Setup, Stepped
-from palpate_fem.service.pool import Pool
+from palpate_fem.service.jobs import (
+    JobEnded,
+    JobEvent,
+    JobFailed,
+    JobStarted,
+    SimulationJob,
+    StepConverged,
+    WorkerSetup,
+)
+from palpate_fem.service.pool import WorkerPool
 from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.files import StoreTakenError
+from palpate_fem.store.writer import Place, StoreWriter
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 FAILED = "failed"
-"""What a report calls a trajectory that could not be run, or whose worker died."""
+"""IndentationOutcome, in a report, of a trajectory that could not be run or whose worker died."""
 
 
-class Plan(Protocol):
-    """One trajectory to run, e.g. ``palpate_fem.trajectory.Indentation``."""
+class TrajectoryPlan(Protocol):
+    """One trajectory to run, e.g. of ``palpate_fem.trajectory.Campaign``."""
 
     @property
     def name(self) -> str:
-        """Its id in a store, unique."""
+        """Its id in a store; unique."""
         ...
 
     @property
@@ -43,8 +62,8 @@ class Plan(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Press:
-    """A plan of one's own."""
+class PlannedPath:
+    """A trajectory to run along any path."""
 
     name: str
     indenter: str
@@ -52,15 +71,15 @@ class Press:
 
 
 @dataclass(frozen=True, slots=True)
-class Early:
+class EarlyEnd:
     """A trajectory that did not complete.
 
     Attributes:
-        name: Which.
+        name: Its id.
         how: Its outcome, or ``failed``.
-        reason: Why.
-        steps: Steps that converged.
-        steps_total: Steps of its path.
+        reason: Why it ended.
+        steps: Number of steps that converged.
+        steps_total: Number of steps of its path.
     """
 
     name: str
@@ -72,53 +91,53 @@ class Early:
 
 @dataclass(slots=True)
 class BatchReport:
-    """How a batch went; also how it goes, while it does.
+    """How a batch went, or how it is going.
 
     Attributes:
         total: Trajectories to run.
-        outcomes: How many ended how; ``failed`` among them.
+        outcomes: Number of trajectories by outcome, ``failed`` included.
         early: Every trajectory that did not complete.
-        running: Steps done by the trajectories that run now.
-        seconds: Time that each one took that ended [s].
+        running: Converged steps of the trajectories that run now.
+        seconds: Computing time of each trajectory that ended [s].
         stopped: Whether it was stopped before all were run.
     """
 
     total: int
     outcomes: Counter[str] = field(default_factory=Counter)
-    early: list[Early] = field(default_factory=list)
+    early: list[EarlyEnd] = field(default_factory=list)
     running: dict[str, int] = field(default_factory=dict)
     seconds: list[float] = field(default_factory=list)
     stopped: bool = False
 
     @property
     def done(self) -> int:
-        """Trajectories that ended, whatever the outcome."""
+        """Trajectories that ended, with any outcome."""
         return self.outcomes.total()
 
     @property
     def failed(self) -> int:
-        """Trajectories of which nothing is known."""
+        """Trajectories without a result."""
         return self.outcomes[FAILED]
 
 
-OnTrajectory = Callable[[Plan, IndentationResult], None]
+OnTrajectory = Callable[[TrajectoryPlan, IndentationResult], None]
 OnReport = Callable[[BatchReport], None]
 
 
-class Batch:
-    """Runs trajectories on fingertips of one set of parameters.
+class SimulationBatch(Closing):
+    """Runs trajectories on fingertips with one set of parameters, in worker processes.
 
     Args:
-        setup: How workers make fingertips; all trajectories run with its ``warm`` parameters.
-        workers: Worker processes.
+        setup: How workers make fingertips; all trajectories use its ``warm`` parameters.
+        workers: Number of worker processes.
         threads: Threads that each may use.
-        limit_s: Longest time that one trajectory may take [s].
-        grace_s: How long a solver may go on after that before it is killed [s].
+        limit_s: Longest time for one trajectory [s].
+        grace_s: Time after that at which a solver that still runs is killed [s].
     """
 
     def __init__(
         self,
-        setup: Setup,
+        setup: WorkerSetup,
         *,
         workers: int,
         threads: int,
@@ -129,8 +148,8 @@ class Batch:
         self._limit_s = limit_s
         self._fingertip: queue.SimpleQueue[StoredFingertip] = queue.SimpleQueue()
         self._first: StoredFingertip | None = None
-        self._events: queue.SimpleQueue[tuple[Plan, Event]] = queue.SimpleQueue()
-        self._pool = Pool(
+        self._events: queue.SimpleQueue[tuple[TrajectoryPlan, JobEvent]] = queue.SimpleQueue()
+        self._pool = WorkerPool(
             setup,
             workers=workers,
             threads=threads,
@@ -140,41 +159,41 @@ class Batch:
         )
 
     def fingertip(self, stop: threading.Event) -> StoredFingertip | None:
-        """Wait for the first pressurised fingertip; None = told to stop.
+        """Wait for the first pressurised fingertip; None if ``stop`` is set before.
 
         Raises:
-            RemoteError: None will ever come; says why.
+            RemoteError: No worker starts; says why.
         """
         while self._first is None and not stop.is_set():
             if self._pool.broken is not None:
                 raise self._pool.broken
             with contextlib.suppress(queue.Empty):
-                self._first = self._fingertip.get(timeout=_LOOK_S)
+                self._first = self._fingertip.get(timeout=_POLL_S)
         return self._first
 
     def run(
         self,
-        plans: Iterable[Plan],
+        plans: Iterable[TrajectoryPlan],
         total: int,
         *,
         stop: threading.Event,
         on_trajectory: OnTrajectory,
         on_report: OnReport | None = None,
     ) -> BatchReport:
-        """Run them all, as many at once as there are workers.
+        """Run trajectories, as many at once as there are workers.
 
         Args:
-            plans: What to run; names unique. The next one is taken when a worker is free.
-            total: How many they are, for the report.
-            stop: Set it to end early: what runs is cancelled and not kept.
-            on_trajectory: Called in this thread with everything that ended by itself, complete or
-                not. What it raises ends the batch.
-            on_report: Called in this thread whenever something has happened.
+            plans: What to run, with unique names. The next one is taken when a worker is free.
+            total: Number of plans, for the report.
+            stop: Set it to end early: what runs then is cancelled and dropped.
+            on_trajectory: Called in this thread with every trajectory that was not cancelled,
+                complete or not. An exception from it ends the batch.
+            on_report: Called in this thread after every event.
 
         Raises:
             RemoteError: The workers cannot run any more; says why.
         """
-        pending: Iterator[Plan] = iter(plans)
+        pending: Iterator[TrajectoryPlan] = iter(plans)
         ahead = next(pending, None)
         report = BatchReport(total)
         steps: dict[str, list[IndentationStep]] = {}
@@ -184,7 +203,7 @@ class Batch:
                 ahead = None
                 for name in steps:
                     self._pool.cancel(name)
-            # Not before a worker can take it: its time runs from here.
+            # A trajectory's time runs from its submission, so it must not wait in the queue.
             while ahead is not None and len(steps) < self._pool.ready:
                 self._submit(ahead, steps)
                 ahead = next(pending, None)
@@ -193,13 +212,13 @@ class Batch:
             if self._pool.broken is not None:
                 raise self._pool.broken
             try:
-                plan, event = self._events.get(timeout=_LOOK_S)
+                plan, event = self._events.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
-            if isinstance(event, Stepped):
+            if isinstance(event, StepConverged):
                 steps[plan.name].append(event.step)
                 report.running[plan.name] = len(steps[plan.name])
-            elif isinstance(event, Ended | Failed):
+            elif isinstance(event, JobEnded | JobFailed):
                 report.running.pop(plan.name, None)
                 _account(report, plan, event, steps.pop(plan.name), on_trajectory)
             if on_report is not None:
@@ -209,47 +228,153 @@ class Batch:
         """End the workers."""
         self._pool.close()
 
-    def _submit(self, plan: Plan, steps: dict[str, list[IndentationStep]]) -> None:
-        job = Job(plan.name, self._parameters, plan.indenter, plan.path, self._limit_s)
+    def _submit(self, plan: TrajectoryPlan, steps: dict[str, list[IndentationStep]]) -> None:
+        job = SimulationJob(plan.name, self._setup.warm, plan.indenter, plan.path, self._limit_s)
         steps[plan.name] = []
         try:
             self._pool.submit(job, lambda event: self._events.put((plan, event)))
         except RemoteError as error:
-            self._events.put((plan, Failed.of(error)))
-
-    @property
-    def _parameters(self) -> FingertipParameters:
-        return self._setup.warm
+            self._events.put((plan, JobFailed.of(error)))
 
 
 def _account(
     report: BatchReport,
-    plan: Plan,
-    event: Ended | Failed,
+    plan: TrajectoryPlan,
+    event: JobEnded | JobFailed,
     steps: Sequence[IndentationStep],
     on_trajectory: OnTrajectory,
 ) -> None:
-    """Count how one ended, and hand it on unless it was stopped by whoever stops the batch."""
+    """Count the end of a trajectory, and pass it on unless the batch was stopped."""
     total = len(plan.path) - 1
-    if isinstance(event, Failed):
+    if isinstance(event, JobFailed):
         report.outcomes[FAILED] += 1
-        report.early.append(Early(plan.name, FAILED, event.problem, len(steps), total))
+        report.early.append(EarlyEnd(plan.name, FAILED, event.problem, len(steps), total))
         return
     if event.outcome is IndentationOutcome.CANCELLED:
         return
     report.outcomes[event.outcome.value] += 1
     report.seconds.append(event.seconds)
     if event.outcome is not IndentationOutcome.COMPLETE:
-        report.early.append(Early(plan.name, event.outcome.value, event.reason, len(steps), total))
+        report.early.append(
+            EarlyEnd(plan.name, event.outcome.value, event.reason, len(steps), total)
+        )
     on_trajectory(
         plan,
-        IndentationResult(
-            plan.indenter,
-            plan.path,
-            tuple(steps),
-            event.outcome,
-            event.reason,
-            event.travel_m,
-            event.seconds,
-        ),
+        event.trajectory(plan.indenter, plan.path, steps),
     )
+
+
+def sweep_into_store(
+    batch: SimulationBatch,
+    plans: Sequence[TrajectoryPlan],
+    path: Path,
+    *,
+    stop: threading.Event,
+    on_report: OnReport | None = None,
+    stress: bool = False,
+    command: str = "",
+) -> tuple[BatchReport, int]:
+    """Run the trajectories that a store does not hold yet; each is on the disk when it has ended.
+
+    Several processes may fill one store at the same time. Each trajectory is stored with the
+    outline of its indenter, for pictures.
+
+    Args:
+        batch: Runs them; the caller closes it.
+        plans: All trajectories that the store shall hold.
+        path: The store, ``NAME.sim``; created if it does not exist.
+        stop: Set it to end early; what runs then is dropped.
+        on_report: Called after every event.
+        stress: Whether to keep stress.
+        command: Command line that runs it, for provenance.
+
+    Returns:
+        The report, and the number of trajectories that the store held before.
+
+    Raises:
+        DatasetError: The store belongs to another fingertip, is damaged or in use, or the disk
+            refuses.
+        RemoteError: The solver does not start.
+    """
+    fingertip = batch.fingertip(stop)
+    if fingertip is None:
+        return BatchReport(len(plans), stopped=True), 0
+    with StoreWriter(
+        path, fingertip, shared=True, outline=outline_of, stress=stress, command=command
+    ) as store:
+        done = store.done()
+        left = [plan for plan in plans if plan.name not in done]
+        places: dict[str, Place] = {}
+
+        def claimed() -> Iterator[TrajectoryPlan]:
+            for plan in left:
+                with contextlib.suppress(StoreTakenError):  # another process runs it, or has run it
+                    places[plan.name] = store.claim(plan.name)
+                    yield plan
+
+        def keep(plan: TrajectoryPlan, trajectory: IndentationResult) -> None:
+            with places.pop(plan.name) as place:
+                place.write(trajectory)
+
+        try:
+            report = batch.run(
+                claimed(), len(left), stop=stop, on_trajectory=keep, on_report=on_report
+            )
+        finally:
+            for place in places.values():
+                place.close()  # releases what was not written
+    return report, len(plans) - len(left)
+
+
+class PoolSimulator(Closing):
+    """Runs indentations in worker processes, as a ``Simulator`` that many threads may call.
+
+    Each call waits for its own result, so it takes as many threads as there are workers: run it in
+    a ``ThreadPoolExecutor``. If a worker dies, only its own run fails.
+
+    Args:
+        setup: How workers make fingertips.
+        workers: Number of worker processes.
+        threads: Threads that each may use.
+        limit_s: Longest time for one run [s].
+    """
+
+    def __init__(
+        self, setup: WorkerSetup, *, workers: int, threads: int, limit_s: float = math.inf
+    ) -> None:
+        self._limit_s = limit_s
+        self._numbers = itertools.count()
+        self._pool = WorkerPool(setup, workers=workers, threads=threads, waiting=10_000)
+
+    def simulate(
+        self, parameters: FingertipParameters, indenter: str, path: Floats
+    ) -> SimulatedIndentation:
+        """Indent a finger of these parameters along a path, shape (K, 7).
+
+        Raises:
+            SimulationError: It cannot be run; says why.
+        """
+        events: queue.SimpleQueue[JobEvent] = queue.SimpleQueue()
+        poses = check_path(path)
+        job = SimulationJob(str(next(self._numbers)), parameters, indenter, poses, self._limit_s)
+        self._pool.submit(job, events.put)
+        steps: list[IndentationStep] = []
+        thickness_m = fluid_m3 = math.nan
+        while True:
+            event = events.get()
+            if isinstance(event, JobStarted):
+                thickness_m = event.fingertip.total_thickness_m
+                fluid_m3 = event.fingertip.fluid_volume_m3
+            elif isinstance(event, StepConverged):
+                steps.append(event.step)
+            elif isinstance(event, JobFailed):
+                raise SimulationError(event.problem, remedy=event.remedy)
+            elif isinstance(event, JobEnded):
+                done = event.trajectory(indenter, poses, steps)
+                return SimulatedIndentation.of(
+                    done, thickness_m=thickness_m, fluid_volume_m3=fluid_m3
+                )
+
+    def close(self) -> None:
+        """End the workers."""
+        self._pool.close()

@@ -1,4 +1,4 @@
-"""The BioTac for worker processes: its geometry by name, and the solver behind ``Tip``."""
+"""The BioTac for worker processes: its geometry by name, and the solver as ``PressurisedTip``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
-from palpate_fem.service.fingertips import Build, OnFraction
+from palpate_fem.service.fingertips import BuildTip, OnFraction
 from palpate_fem.store.content import Setting, StoredFingertip
 
 PARAMETRIC = "biotac"
@@ -21,13 +21,13 @@ PARAMETRIC = "biotac"
 
 
 class BiotacTip:
-    """A pressurised fingertip of the solver."""
+    """A pressurised fingertip of the finite-element solver."""
 
     def __init__(self, solved: Fingertip) -> None:
         self._solved = solved
 
     def describe(self) -> StoredFingertip:
-        """See ``Tip.describe``."""
+        """See ``PressurisedTip.describe``."""
         tip = self._solved
         return StoredFingertip(
             mesh=tip.geometry.mesh,
@@ -50,9 +50,9 @@ class BiotacTip:
         on_step: Callable[[IndentationStep], None] | None = None,
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
     ) -> IndentationResult:
-        """See ``Tip.indent``."""
+        """See ``PressurisedTip.indent``."""
         tip = self._solved
-        # Friction has no part in the pressurised state, so one state serves all coefficients.
+        # Friction has no effect on the pressurised state, so one state serves all coefficients.
         tip.parameters = replace(tip.parameters, friction_coefficient=friction_coefficient)
         return tip.indent(make_indenter(indenter), path, on_step=on_step, should_stop=should_stop)
 
@@ -63,17 +63,17 @@ def biotac(
     edge_m: float | None = None,
     layers: int = 2,
     solver: Mapping[str, Setting] | None = None,
-) -> Build:
-    """Fingertips of one geometry.
+) -> BuildTip:
+    """Factory of fingertips with one geometry.
 
     Args:
         mesh: ``biotac`` for the open parametric mesh, else the folder of the public meshes.
         edge_m: Edge of the parametric mesh's elements on the pad [m]; None = ``EDGE_M``.
         layers: Elements through the skin.
-        solver: Settings of the solver by name, e.g. ``{"force_limit_n": 32.0}``.
+        solver: SolverSettings of the solver by name, e.g. ``{"force_limit_n": 32.0}``.
 
     Raises:
-        ConfigError: An option that makes no mesh, or a setting that does not exist.
+        ConfigError: An option makes no mesh, or a setting does not exist.
     """
     geometry_of = _geometry(mesh, edge_m, layers)
     settings = _settings(solver or {})
@@ -86,7 +86,7 @@ def biotac(
 
 
 def _geometry(mesh: str, edge_m: float | None, layers: int) -> Callable[[float], FingertipGeometry]:
-    """Makes the geometry for a skin thickness [m]."""
+    """A function from skin thickness [m] to geometry."""
     if mesh == PARAMETRIC:
         from palpate_fem.mesh.parametric import biotac as parametric
 
@@ -109,7 +109,7 @@ def _settings(given: Mapping[str, Setting]) -> SolverSettings:
 
 
 def _named(settings: object, above: str = "") -> list[tuple[str, Setting]]:
-    """Every number and word of nested settings by its dotted name."""
+    """Every number, flag and word of nested settings, by dotted name."""
     found: list[tuple[str, Setting]] = []
     assert is_dataclass(settings)
     for field in fields(settings):

@@ -15,7 +15,7 @@ DEFAULT_FACTORY = "palpate_fem.service.biotac:biotac"
 
 
 class FingertipTable(StrictConfig):
-    """Parameters where a request names none; None = the paper's, see ``FingertipParameters``."""
+    """Default parameters of requests; None = the paper's, see ``FingertipParameters``."""
 
     skin_thickness_m: float | None = None
     shear_modulus_pa: float | None = None
@@ -25,7 +25,7 @@ class FingertipTable(StrictConfig):
     bulk_ratio: float | None = None
 
     def parameters(self) -> FingertipParameters:
-        """As the solver takes them.
+        """As parameters of the solver.
 
         Raises:
             ConfigError: One is out of range.
@@ -37,15 +37,15 @@ class FemConfig(StrictConfig):
     """How simulations are served.
 
     Attributes:
-        sensor: Name under which the service answers, in the place of a sensor's.
-        workers: Processes that solve, one trajectory each at a time.
-        threads: Threads that each of them may use; 0 = share the cores of this host.
-        waiting: Requests that may wait for a worker; more are refused.
-        max_steps: Steps that a request may have.
-        max_deadline_s: Longest time that a request may take, waiting included [s].
-        grace_s: A solver that goes on for this long after its deadline is killed [s].
-        keep: Pressurised fingertips that each worker keeps.
-        fingertip: Parameters where a request names none.
+        sensor: Name under which the service answers, where others have the name of a sensor.
+        workers: Solver processes; each solves one trajectory at a time.
+        threads: Threads of each process; 0 = share the cores of this host evenly.
+        waiting: Most requests that wait for a worker; further ones are refused.
+        max_steps: Most steps of a request.
+        max_deadline_s: Longest time for a request, waiting included [s].
+        grace_s: Time after its deadline at which a solver that still runs is killed [s].
+        keep: Number of pressurised fingertips that each worker keeps.
+        fingertip: Default parameters of requests.
         factory: ``module:function`` that makes fingertips.
         options: Its keyword arguments.
     """

@@ -1,4 +1,8 @@
-"""Pressurised fingertips for those who run many trajectories: built once, kept, and indented."""
+"""Pressurised fingertips for many trajectories: built once, kept, and indented.
+
+The solver behind them is a protocol, so that the service and its tests do not depend on it;
+``service.biotac`` implements it.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +12,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol, cast
 
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, SimulationError
 from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.approach import OuterSurface, check_clear
+from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 OnFraction = Callable[[float], None]
-"""Called with the fraction of the pressurisation that is done; what it raises ends it."""
+"""Called with the completed fraction of the pressurisation; an exception from it ends that."""
 
 
-class Tip(Protocol):
-    """A pressurised fingertip."""
+class PressurisedTip(Protocol):
+    """A pressurised fingertip that can be indented."""
 
     def describe(self) -> StoredFingertip:
         """Mesh, pressurised state and settings."""
@@ -37,31 +43,31 @@ class Tip(Protocol):
         ...
 
 
-class Build(Protocol):
+class BuildTip(Protocol):
     """Builds a pressurised fingertip."""
 
-    def __call__(self, parameters: FingertipParameters, on_fraction: OnFraction) -> Tip:
+    def __call__(self, parameters: FingertipParameters, on_fraction: OnFraction) -> PressurisedTip:
         """Build and pressurise."""
         ...
 
 
-class Fingertips:
-    """The last few pressurised fingertips.
+class FingertipCache:
+    """The most recently used pressurised fingertips.
 
-    Friction plays no part before contact, so fingertips that differ in it only are one.
+    Friction has no effect before contact, so fingertips that differ only in it share one entry.
 
     Args:
         build: Builds one.
-        keep: How many are kept.
+        keep: Number of fingertips that are kept.
     """
 
-    def __init__(self, build: Build, keep: int) -> None:
+    def __init__(self, build: BuildTip, keep: int) -> None:
         self._build = build
         self._keep = keep
-        self._tips: OrderedDict[FingertipParameters, Tip] = OrderedDict()
+        self._tips: OrderedDict[FingertipParameters, PressurisedTip] = OrderedDict()
 
-    def get(self, parameters: FingertipParameters, on_fraction: OnFraction) -> Tip:
-        """A fingertip with these parameters, built if it is not there.
+    def get(self, parameters: FingertipParameters, on_fraction: OnFraction) -> PressurisedTip:
+        """The fingertip with these parameters, which is built if it is not kept.
 
         Raises:
             PalpateError: It cannot be built.
@@ -69,14 +75,15 @@ class Fingertips:
         key = without_friction(parameters)
         tip = self._tips.pop(key, None)
         if tip is None:
-            while len(self._tips) >= self._keep:  # before building: memory is what is short
+            # Dropped before building: two fingertips at once may not fit into memory.
+            while len(self._tips) >= self._keep:
                 self._tips.popitem(last=False)
             tip = self._build(key, on_fraction)
         self._tips[key] = tip
         return tip
 
     def describe(self, parameters: FingertipParameters) -> StoredFingertip:
-        """What a store keeps of a fingertip that is there, with this friction."""
+        """Description of a kept fingertip for a store, with this friction."""
         tip = self._tips[without_friction(parameters)]
         return replace(tip.describe(), parameters=parameters)
 
@@ -86,21 +93,43 @@ def without_friction(parameters: FingertipParameters) -> FingertipParameters:
     return replace(parameters, friction_coefficient=0.0)
 
 
-def load_factory(name: str) -> Callable[..., Build]:
-    """The function that a dotted name stands for.
+def load_factory(name: str) -> Callable[..., BuildTip]:
+    """Import the factory of fingertips with a dotted name.
 
     Args:
-        name: ``module:function``; the function takes options and returns a ``Build``.
+        name: ``module:function``; the function takes options and returns a ``BuildTip``.
 
     Raises:
         ConfigError: There is no such function.
     """
     module, _, function = name.partition(":")
     try:
-        return cast("Callable[..., Build]", getattr(importlib.import_module(module), function))
+        return cast("Callable[..., BuildTip]", getattr(importlib.import_module(module), function))
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
             f"fingertip factory {name!r} cannot be loaded: {error}",
             remedy="give module:function, e.g. palpate_fem.service.biotac:biotac, and install "
             '"palpate[fem]"',
         ) from error
+
+
+def skin_of(fingertip: StoredFingertip) -> OuterSurface:
+    """The outer surface of the pressurised, untouched skin."""
+    return OuterSurface(fingertip.pressurised_nodes, fingertip.mesh.outer_faces)
+
+
+def check_start(fingertip: StoredFingertip, indenter: str, pose: Floats) -> None:
+    """Check that an indentation starts outside of the finger, clear of the skin.
+
+    Args:
+        fingertip: The skin.
+        indenter: Name of the indenter.
+        pose: Its first pose, shape (7,), sensor frame.
+
+    Raises:
+        ConfigError: It starts in the skin or in the finger; says how far.
+    """
+    try:
+        check_clear(make_indenter(indenter), pose, skin_of(fingertip))
+    except SimulationError as error:  # here it is the request that is wrong, not the solver
+        raise ConfigError(error.problem, remedy=error.remedy) from error

@@ -1,25 +1,25 @@
-"""What goes to a worker process and what comes back; plain values, pickled on a private socket."""
+"""Messages between a pool and its worker processes: plain values, pickled on a private socket."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from palpate.errors import ErrorCode, PalpateError, RemoteError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import Floats, IndentationOutcome, IndentationStep
+from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
-    """First to a worker: how it makes fingertips.
+class WorkerSetup:
+    """First message to a worker: how it makes fingertips.
 
     Attributes:
-        factory: ``module:function`` that builds one, see ``palpate_fem.service.fingertips``.
-        options: Its keyword arguments.
+        factory: ``module:function`` that returns a ``BuildTip``, see ``service.fingertips``.
+        options: Keyword arguments of that function.
         warm: Parameters of the fingertip to build before the first job.
-        keep: Pressurised fingertips to keep.
+        keep: Number of pressurised fingertips to keep.
     """
 
     factory: str
@@ -29,15 +29,15 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One trajectory.
+class SimulationJob:
+    """One trajectory to simulate.
 
     Attributes:
-        id: Names it among those that run at once.
+        id: Unique among the jobs that wait or run.
         parameters: Of the fingertip.
         indenter: Name of the indenter.
         path: Poses, shape (K, 7); the first does not touch the skin.
-        deadline_s: Time it may take from now on [s]; inf = as long as it takes.
+        deadline_s: Time that it may take from now on [s]; inf = no limit.
     """
 
     id: str
@@ -48,53 +48,61 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Cancel:
+class CancelJob:
     """To a worker: stop this job."""
 
     id: str
 
 
 @dataclass(frozen=True, slots=True)
-class Waiting:
-    """All workers are busy, and this many jobs are served before."""
+class JobWaiting:
+    """All workers are busy; this many jobs are before it in the queue."""
 
     before: int
 
 
 @dataclass(frozen=True, slots=True)
 class Pressurising:
-    """The fluid is being filled in."""
+    """The fluid is being filled in; ``fraction`` of it is there."""
 
     fraction: float
 
 
 @dataclass(frozen=True, slots=True)
-class Began:
-    """The fingertip is ready, the indenter starts. Also what an idle worker says first."""
+class JobStarted:
+    """The fingertip is ready and the indenter starts. Also the first message of an idle worker."""
 
     fingertip: StoredFingertip
 
 
 @dataclass(frozen=True, slots=True)
-class Stepped:
+class StepConverged:
     """A step has converged."""
 
     step: IndentationStep
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
-    """The last of a job that ran: how it ended, as in ``Trajectory``."""
+class JobEnded:
+    """Last event of a job that ran: how it ended, as in ``IndentationResult``."""
 
     outcome: IndentationOutcome
     reason: str = ""
     travel_m: float = 0.0
     seconds: float = 0.0
 
+    def trajectory(
+        self, indenter: str, path: Floats, steps: Sequence[IndentationStep]
+    ) -> IndentationResult:
+        """The whole result, from the steps that were reported before."""
+        return IndentationResult(
+            indenter, path, tuple(steps), self.outcome, self.reason, self.travel_m, self.seconds
+        )
+
 
 @dataclass(frozen=True, slots=True)
-class Failed:
-    """The last of a job that could not run, or whose worker died. An exception as plain values."""
+class JobFailed:
+    """Last event of a job that could not run, or whose worker died: an error as plain values."""
 
     code: ErrorCode
     problem: str
@@ -102,14 +110,15 @@ class Failed:
     retry_after_s: float = 0.0
 
     @classmethod
-    def of(cls, error: BaseException) -> Failed:
-        """What an exception means to the one who asked."""
+    def of(cls, error: BaseException) -> JobFailed:
+        """From an exception; one that is not ours is reported as a defect."""
         if isinstance(error, PalpateError):
-            return cls(error.code, error.problem, error.remedy)
+            retry_after_s = error.retry_after_s if isinstance(error, RemoteError) else 0.0
+            return cls(error.code, error.problem, error.remedy, retry_after_s)
         return cls(
             ErrorCode.INTERNAL,
             f"{type(error).__name__}: {error}",
-            "this is a defect of the finite-element room: look at its log",
+            "this is a defect of the finite-element solver: look at its log",
         )
 
     def error(self) -> RemoteError:
@@ -119,5 +128,5 @@ class Failed:
         )
 
 
-Event = Waiting | Pressurising | Began | Stepped | Ended | Failed
-"""What a job's owner hears; ``Ended`` or ``Failed`` is the last, and comes exactly once."""
+JobEvent = JobWaiting | Pressurising | JobStarted | StepConverged | JobEnded | JobFailed
+"""Event of a job; ``JobEnded`` or ``JobFailed`` is the last one and comes exactly once."""

@@ -1,34 +1,54 @@
 """The finite-element service: requests in, converged steps out as they come.
 
-A request is checked, then waits for one of a few worker processes. Whatever happens it is answered:
-with its steps and how it ended, or with a typed error.
+A request is checked, then waits for one of a few worker processes. It always gets an answer: its
+steps and how it ended, or a typed error.
 """
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
 
-from palpate.bus import Presence, QueryAnswer, Session, endpoints
+from palpate.bus import Presence, Publisher, QueryAnswer, Session, endpoints
 from palpate.bus.topics import SIMULATION_PROGRESS, caller_key
 from palpate.closing import Closing
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, ErrorCode, PalpateError, SimulationError, WireError
+from palpate.errors import (
+    ConfigError,
+    ErrorCode,
+    LinkError,
+    PalpateError,
+    RemoteError,
+    SimulationError,
+    WireError,
+)
 from palpate.health import Health, HealthReporter
 from palpate.messages import (
     ServiceState,
     SimulationCancelReply,
     SimulationCancelRequest,
+    SimulationPhase,
+    SimulationProgress,
     SimulationReply,
     SimulationRequest,
 )
 from palpate_fem.config import FingertipParameters
-from palpate_fem.service.answering import Asked
+from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.config import FemConfig
 from palpate_fem.service.fingertips import without_friction
-from palpate_fem.service.jobs import Ended, Event, Failed, Setup
-from palpate_fem.service.pool import Pool
-from palpate_fem.service.request import job_of
+from palpate_fem.service.jobs import (
+    JobEnded,
+    JobEvent,
+    JobFailed,
+    JobStarted,
+    JobWaiting,
+    Pressurising,
+    StepConverged,
+    WorkerSetup,
+)
+from palpate_fem.service.pool import WorkerPool
+from palpate_fem.service.requests import OUTCOMES, as_step, job_of
 from palpate_fem.store.content import StoredFingertip
 
 SERVICE = "fem"
@@ -38,14 +58,125 @@ _FINGERTIPS_KNOWN = 16
 _REFUSED = (ErrorCode.INVALID_REQUEST, ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
 
 
-class Simulations(Closing):
-    """Answers requests with the help of a pool.
+class ActiveSimulation:
+    """An accepted request: turns the events of its job into replies and progress.
+
+    Args:
+        request: As received.
+        answer: Sends the replies to the caller.
+        progress: Publishes progress for everybody else.
+
+    Attributes:
+        steps_done: Steps that were sent.
+    """
+
+    def __init__(
+        self,
+        request: SimulationRequest,
+        answer: QueryAnswer[SimulationReply],
+        progress: Publisher[SimulationProgress],
+    ) -> None:
+        self.request = request
+        self.answer = answer
+        self.steps_done = 0
+        self._progress = progress
+        self._since = time.monotonic()
+        self._mesh = b""
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since it was accepted [s]."""
+        return time.monotonic() - self._since
+
+    def on_event(self, event: JobEvent) -> None:
+        """Send what an event means to the caller.
+
+        Raises:
+            WireError: A result that the contract does not allow.
+        """
+        match event:
+            case JobWaiting(before):
+                self._send(SimulationPhase.WAITING, waiting_before=before)
+            case Pressurising():
+                self._send(SimulationPhase.PRESSURISING)
+            case JobStarted(fingertip):
+                self._mesh = fingertip.mesh.sha256
+                self._send(SimulationPhase.INDENTING)
+            case StepConverged(step):
+                self._send(SimulationPhase.INDENTING, step)
+            case JobEnded():
+                self._end(event)
+            case JobFailed():
+                self.answer.fail(event.error())
+
+    def _send(
+        self,
+        phase: SimulationPhase,
+        step: IndentationStep | None = None,
+        *,
+        waiting_before: int = 0,
+    ) -> None:
+        """Send progress, with a step if one has converged."""
+        first = self.steps_done
+        self.steps_done += step is not None
+        progress = SimulationProgress(
+            self.request.request_id,
+            self.steps_done,
+            len(self.request.path) - 1,
+            self.elapsed_s,
+            phase,
+            waiting_before,
+        )
+        self.answer.send(
+            SimulationReply(
+                self.request.request_id,
+                self._mesh,
+                () if step is None else (as_step(step, self.request),),
+                elapsed_s=progress.elapsed_s,
+                more=True,
+                first_step=first,
+                progress=progress,
+            )
+        )
+        try:
+            self._progress.put(progress)
+        except LinkError:  # for onlookers only; the answer does not depend on it
+            return
+
+    def _end(self, event: JobEnded) -> None:
+        if event.outcome is IndentationOutcome.DEADLINE and not self.steps_done:
+            self.answer.fail(
+                RemoteError(
+                    f"no step converged within {self.elapsed_s:.1f} s: {event.reason}",
+                    remedy="allow more time (deadline_s); palpate status shows how many wait",
+                    code=ErrorCode.DEADLINE_EXCEEDED,
+                )
+            )
+            return
+        no_reason = "" if event.outcome is IndentationOutcome.COMPLETE else event.outcome.value
+        self.answer.send(
+            SimulationReply(
+                self.request.request_id,
+                self._mesh,
+                (),
+                event.reason or no_reason,
+                self.elapsed_s,
+                first_step=self.steps_done,
+                outcome=OUTCOMES[event.outcome],
+                travel_m=event.travel_m,
+            )
+        )
+        self.answer.end()
+
+
+class SimulationService(Closing):
+    """Answers simulation requests with a pool of workers.
 
     Args:
         session: The bus.
         config: What is served.
-        default: Parameters where a request names none.
-        health: Hears of every event.
+        default: Parameters where a request gives none.
+        health: Counts requests and results.
     """
 
     def __init__(
@@ -56,43 +187,43 @@ class Simulations(Closing):
         self._default = default
         self._health = health
         self._lock = threading.Lock()
-        self._asked: dict[str, Asked] = {}
+        self._active: dict[str, ActiveSimulation] = {}
         self._fingertips: OrderedDict[FingertipParameters, StoredFingertip] = OrderedDict()
         self._progress = session.publisher(SIMULATION_PROGRESS, sensor=config.sensor)
-        self.pool = Pool(
-            Setup(config.factory, config.options, default, config.keep),
+        self.pool = WorkerPool(
+            WorkerSetup(config.factory, config.options, default, config.keep),
             workers=config.workers,
             threads=config.threads_each(),
             waiting=config.waiting,
             grace_s=config.grace_s,
-            on_fingertip=self._know,
+            on_fingertip=self._remember,
         )
 
-    def ask(self, request: SimulationRequest, answer: QueryAnswer[SimulationReply]) -> None:
-        """Take a request; it is answered from the pool's threads.
+    def simulate(self, request: SimulationRequest, answer: QueryAnswer[SimulationReply]) -> None:
+        """Accept a request; the pool's threads send the answer.
 
         Raises:
-            ConfigError: It is refused; says why.
-            RemoteError: There is no place for it.
+            ConfigError: The request is refused; says why.
+            RemoteError: No place is free.
         """
         self._health.count("requests_received")
         try:
             with self._lock:
                 known = dict(self._fingertips)
             job = job_of(request, self._config, self._default, known)
-            asked = Asked(request, answer, self._progress)
+            active = ActiveSimulation(request, answer, self._progress)
             with self._lock:
-                if request.request_id in self._asked:
+                if request.request_id in self._active:
                     raise ConfigError(
                         f"request_id {request.request_id!r} is in use by a simulation that waits "
                         "or runs",
                         remedy="choose another, e.g. uuid.uuid4().hex",
                     )
-                self._asked[request.request_id] = asked
+                self._active[request.request_id] = active
             try:
-                self.pool.submit(job, lambda event: self._on_event(asked, event))
+                self.pool.submit(job, lambda event: self._on_event(active, event))
             except PalpateError:
-                self._forget(asked)
+                self._forget(active)
                 raise
         except PalpateError as error:
             if error.code in _REFUSED:
@@ -100,63 +231,60 @@ class Simulations(Closing):
             raise
 
     def cancel(self, request: SimulationCancelRequest) -> SimulationCancelReply:
-        """Stop a simulation, whoever asked for it."""
+        """Stop a simulation, no matter who requested it."""
         return SimulationCancelReply(self.pool.cancel(request.request_id))
 
     def caller_gone(self, key: str) -> None:
-        """Stop the simulation that nobody waits for any more.
+        """Stop the simulations of a caller that has left.
 
         Args:
             key: The ``caller_key`` that vanished.
         """
         with self._lock:
-            ids = [name for name in self._asked if caller_key(self._station, name) == key]
+            ids = [name for name in self._active if caller_key(self._station, name) == key]
         for name in ids:
             if self.pool.cancel(name):
                 self._health.count("callers_gone")
 
-    def take_over(self) -> None:
-        """Hand the pool's numbers to health."""
+    def refresh_health(self) -> None:
+        """Copy the pool's numbers into the health report."""
         self._health.gauge("busy_workers", self.pool.busy)
         self._health.gauge("ready_workers", self.pool.ready)
         self._health.gauge("waiting_requests", self.pool.waiting)
         self._health.set_counts({"worker_restarts": self.pool.restarts})
 
     def close(self) -> None:
-        """Answer whatever waits or runs with UNAVAILABLE, and end the workers."""
+        """QueryAnswer whatever waits or runs with UNAVAILABLE, and end the workers."""
         self.pool.close()
 
-    def _on_event(self, asked: Asked, event: Event) -> None:
-        over = isinstance(event, Ended | Failed)
+    def _on_event(self, active: ActiveSimulation, event: JobEvent) -> None:
+        over = isinstance(event, JobEnded | JobFailed)
         if over:
-            self._forget(asked)
+            self._forget(active)
         try:
-            asked.hear(event)
+            active.on_event(event)
         except WireError as error:  # a result that the contract does not allow
             ours = SimulationError(
                 f"the result cannot be sent: {error.problem}",
                 remedy="the solver went wrong: report it with this request",
             )
-            asked.answer.fail(ours)
-            self.pool.cancel(asked.request.request_id)
+            active.answer.fail(ours)
+            self.pool.cancel(active.request.request_id)
             self._health.fail(ours, degraded=False)
-        if over:
-            self._account(event, asked)
-
-    def _account(self, event: Event, asked: Asked) -> None:
-        if isinstance(event, Ended):
+        if isinstance(event, JobEnded):
             self._health.count(f"simulations_{event.outcome.name.lower()}")
-            self._health.count("steps_sent", asked.steps_done)
-            self._health.gauge("last_simulation_s", asked.elapsed_s)
-        elif isinstance(event, Failed):
+            self._health.count("steps_sent", active.steps_done)
+            self._health.gauge("last_simulation_s", active.elapsed_s)
+        elif isinstance(event, JobFailed):
             self._health.count("simulations_failed")
             self._health.fail(event.error(), degraded=False)
 
-    def _forget(self, asked: Asked) -> None:
+    def _forget(self, active: ActiveSimulation) -> None:
         with self._lock:
-            self._asked.pop(asked.request.request_id, None)
+            self._active.pop(active.request.request_id, None)
 
-    def _know(self, fingertip: StoredFingertip) -> None:
+    def _remember(self, fingertip: StoredFingertip) -> None:
+        """Keep a fingertip, so that later requests can be checked against its skin at once."""
         key = without_friction(fingertip.parameters)
         with self._lock:
             self._fingertips.pop(key, None)
@@ -173,7 +301,7 @@ def run(
     *,
     instance: str = SERVICE,
 ) -> None:
-    """Serve until ``stop`` is set; then answer what is left with UNAVAILABLE, and leave.
+    """Serve until ``stop`` is set; then answer what is left with UNAVAILABLE, and end.
 
     Args:
         config: What is served, and by how many workers.
@@ -193,28 +321,28 @@ def run(
     with Session.open(link, station=station) as session:
         presence = session.presence(SERVICE, instance=instance)
         with (
-            Simulations(session, config, default, health) as simulations,
-            HealthReporter(session, health, refresh=simulations.take_over),
+            SimulationService(session, config, default, health) as service,
+            HealthReporter(session, health, refresh=service.refresh_health),
         ):
-            session.watch_callers(simulations.caller_gone)
-            session.queryable(endpoints.CANCEL_SIMULATION, simulations.cancel, sensor=config.sensor)
+            session.watch_callers(service.caller_gone)
+            session.queryable(endpoints.CANCEL_SIMULATION, service.cancel, sensor=config.sensor)
             served = session.stream_queryable(
-                endpoints.SIMULATE, simulations.ask, sensor=config.sensor
+                endpoints.SIMULATE, service.simulate, sensor=config.sensor
             )
             health.set_state(ServiceState.STARTING, "the first fingertip is being pressurised")
             try:
-                _serve(simulations.pool, health, presence, stop)
+                _serve(service.pool, health, presence, stop)
             finally:
                 presence.not_ready()
                 health.set_state(ServiceState.STOPPING)
                 served.close()
 
 
-def _serve(pool: Pool, health: Health, presence: Presence, stop: threading.Event) -> None:
-    """Ready while a worker is; what is asked before waits for one.
+def _serve(pool: WorkerPool, health: Health, presence: Presence, stop: threading.Event) -> None:
+    """Show as ready while a worker is; requests that come earlier wait for one.
 
     Raises:
-        RemoteError: There never will be one.
+        RemoteError: No worker will ever be ready.
     """
     while not stop.wait(_POLL_S):
         if pool.broken is not None:

@@ -1,28 +1,56 @@
-"""A bounded pool of worker processes with a bounded queue before it.
+"""A bounded pool of worker processes with a bounded queue in front of it.
 
-What a worker does wrong costs its own job: one that dies is replaced and its job's owner is told;
-one that does not stop at its deadline, or when it is cancelled, is killed.
+A fault of one worker costs only its own job. A worker that dies is replaced, and the owner of its
+job gets an error. A worker that does not stop at its deadline, or when its job is cancelled, is
+killed. Each job's owner gets exactly one last event, whatever happens.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import Enum
+from multiprocessing.connection import Connection
 
 from palpate.closing import Closing
-from palpate.errors import RemoteError
+from palpate.errors import ErrorCode, RemoteError
+from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome
 from palpate_fem.service.fingertips import without_friction
-from palpate_fem.service.jobs import Began, Ended, Event, Failed, Job, Setup, Waiting
-from palpate_fem.service.process import WorkerProcess, WorkerState
-from palpate_fem.service.tasks import OnEvent, Task, crashed, failed, full, not_starting, stopping
+from palpate_fem.service.jobs import (
+    CancelJob,
+    JobEnded,
+    JobEvent,
+    JobFailed,
+    JobStarted,
+    JobWaiting,
+    SimulationJob,
+    WorkerSetup,
+)
 from palpate_fem.store.content import StoredFingertip
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
+
+OnEvent = Callable[[JobEvent], None]
+
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+)
+_END_WAIT_S = 5.0
 _TICK_S = 0.05
 _STARTS_BEFORE_GIVING_UP = 3
 _PAUSE_S = 0.25  # after a worker that did not start; doubled each time
@@ -30,26 +58,151 @@ _LONGEST_PAUSE_S = 30.0
 _FIRST_GUESS_S = 5.0  # of a job's duration, before one has ended
 
 
-class Pool(Closing):
-    """Runs jobs in worker processes.
+class WorkerState(Enum):
+    """State of a worker process."""
+
+    STARTING = "starting"
+    IDLE = "idle"
+    BUSY = "busy"
+
+
+class WorkerProcess:
+    """One worker process, as its pool sees it.
+
+    Not ``multiprocessing.Process``: that imports the caller's main script again in the child, so
+    the script would have to be written for it (``if __name__ == "__main__"``).
 
     Args:
-        setup: How workers make fingertips.
-        workers: How many there are.
-        threads: Threads that each may use.
-        waiting: Jobs that may wait.
-        grace_s: How long a job may go on after its deadline, or after it was cancelled, before its
-            worker is killed [s].
-        on_fingertip: Called with every fingertip that a worker has at hand.
+        setup: How it makes fingertips.
+        threads: Threads that its libraries may use.
+        on_event: Called with each of its events, from a thread of its own.
+        on_gone: Called once, from that thread, when it has ended.
 
     Attributes:
-        broken: Why there are no workers, when they do not even start.
-        restarts: Workers that were started again.
+        state: Kept up to date by the pool.
     """
 
     def __init__(
         self,
-        setup: Setup,
+        setup: WorkerSetup,
+        threads: int,
+        on_event: Callable[[WorkerProcess, JobEvent], None],
+        on_gone: Callable[[WorkerProcess], None],
+    ) -> None:
+        self.state = WorkerState.STARTING
+        self._killed = False
+        self._on_event = on_event
+        self._on_gone = on_gone
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "palpate_fem.service.worker", str(theirs.fileno())],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(threads))},
+            )
+        self._connection = Connection(ours.detach())
+        self._sending = threading.Lock()
+        self._send(setup)
+        self._reader = threading.Thread(target=self._read, name=f"worker {self.pid}", daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def start(self, job: SimulationJob) -> None:
+        """Send it a job."""
+        self.state = WorkerState.BUSY
+        self._send(job)
+
+    def cancel(self, job_id: str) -> None:
+        """Ask it to stop a job."""
+        self._send(CancelJob(job_id))
+
+    def kill(self) -> None:
+        """End it now."""
+        self._killed = True
+        self._process.kill()
+
+    def join(self) -> None:
+        """Wait until it has ended."""
+        self._reader.join(_END_WAIT_S)
+
+    def how_it_ended(self) -> str:
+        """The end of an error message, e.g. ``ended with exit status 7``."""
+        status = self._process.poll()
+        if self._killed:
+            return "was ended because it did not stop by itself"
+        if status is None:
+            return "lost its connection"
+        if status >= 0:
+            return f"ended with exit status {status}"
+        name = signal.Signals(-status).name
+        hint = " (out of memory?)" if -status == signal.SIGKILL else ""
+        return f"was ended by {name}{hint}"
+
+    def _send(self, message: WorkerSetup | SimulationJob | CancelJob) -> None:
+        # The reader notices a process that is gone, and reports it to the pool.
+        with self._sending, contextlib.suppress(OSError):
+            self._connection.send(message)
+
+    def _read(self) -> None:
+        while True:
+            try:
+                event = self._connection.recv()
+            except (EOFError, OSError):
+                break
+            self._on_event(self, event)
+        self._process.kill()  # it may still run, but without a connection it is of no use
+        self._process.wait()
+        with self._sending:
+            self._connection.close()
+        self._on_gone(self)
+
+
+@dataclass(slots=True, eq=False)
+class PoolTask:
+    """A job on its way through the pool.
+
+    ``deadline`` and ``overdue`` are monotonic times [s]: when it must stop, and when its worker is
+    killed because it has not.
+    """
+
+    job: SimulationJob
+    on_event: OnEvent
+    deadline: float
+    overdue: float = math.inf
+    worker: WorkerProcess | None = None
+    cancelled: bool = False
+    over: bool = False
+
+
+class WorkerPool(Closing):
+    """Runs jobs in worker processes.
+
+    Three kinds of threads enter it: callers, one reader for each worker, and its own upkeep thread.
+    Shared state is changed under one lock; callbacks to owners run outside of it, so that an owner
+    may call the pool.
+
+    Args:
+        setup: How workers make fingertips.
+        workers: Number of workers.
+        threads: Threads that each may use.
+        waiting: Most jobs that wait.
+        grace_s: Time after its deadline, or after it was cancelled, at which the worker of a job
+            that still runs is killed [s].
+        on_fingertip: Called with every fingertip that a worker has built.
+
+    Attributes:
+        broken: Error that says why no worker starts; None while they do.
+        restarts: Number of workers that were started again.
+    """
+
+    def __init__(
+        self,
+        setup: WorkerSetup,
         *,
         workers: int,
         threads: int,
@@ -66,20 +219,21 @@ class Pool(Closing):
         self._on_fingertip = on_fingertip or (lambda _: None)
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._waiting: deque[Task] = deque()
-        self._running: dict[WorkerProcess, Task] = {}
-        self._held: dict[WorkerProcess, object] = {}
+        self._waiting: deque[PoolTask] = deque()
+        self._running: dict[WorkerProcess, PoolTask] = {}
+        # Fingertips that each worker keeps, the last used one at the end, as in `FingertipCache`.
+        self._kept: dict[WorkerProcess, list[FingertipParameters]] = {}
         self._starts_at = [0.0] * workers  # when each missing worker is due
         self._failed_starts = 0
         self._ever_ready = False
         self._typical_s = _FIRST_GUESS_S
         self._workers: list[WorkerProcess] = []
-        self._keeper = threading.Thread(target=self._keep, name="pool", daemon=True)
-        self._keeper.start()
+        self._upkeep = threading.Thread(target=self._keep_up, name="pool", daemon=True)
+        self._upkeep.start()
 
     @property
     def ready(self) -> int:
-        """Workers that could take a job, or are at one."""
+        """Workers that have started, idle or busy."""
         with self._lock:
             return sum(worker.state is not WorkerState.STARTING for worker in self._workers)
 
@@ -95,27 +249,27 @@ class Pool(Closing):
         with self._lock:
             return len(self._waiting)
 
-    def submit(self, job: Job, on_event: OnEvent) -> None:
+    def submit(self, job: SimulationJob, on_event: OnEvent) -> None:
         """Run a job as soon as a worker is free.
 
         Args:
             job: What to run.
-            on_event: Hears of it, from the pool's threads. ``Ended`` or ``Failed`` comes last,
-                exactly once.
+            on_event: Called with its events, from the pool's threads. ``JobEnded`` or ``JobFailed``
+                comes last, exactly once.
 
         Raises:
-            RemoteError: Too many wait (RESOURCE_EXHAUSTED, says when to ask again), or the pool is
+            RemoteError: Too many wait (RESOURCE_EXHAUSTED, with the time to wait), or the pool is
                 closing or broken (UNAVAILABLE).
         """
         now = time.monotonic()
         with self._lock:
             if self._closing.is_set() or self.broken is not None:
-                raise self.broken or stopping()
+                raise self.broken or _stopping()
             free = sum(worker.state is WorkerState.IDLE for worker in self._workers)
             if len(self._waiting) >= self._capacity + free:
                 wait_s = self._typical_s * (len(self._waiting) + 1) / max(1, len(self._workers))
-                raise full(len(self._running), len(self._waiting), wait_s)
-            self._waiting.append(Task(job, on_event, now + job.deadline_s))
+                raise _full(len(self._running), len(self._waiting), wait_s)
+            self._waiting.append(PoolTask(job, on_event, now + job.deadline_s))
         self._dispatch()
 
     def cancel(self, job_id: str) -> bool:
@@ -136,8 +290,8 @@ class Pool(Closing):
             else:
                 task.overdue = min(task.overdue, time.monotonic() + self._grace_s)
         if worker is None:
-            self._finish(task, Ended(IndentationOutcome.CANCELLED, "cancelled while it waited"))
-            self._tell_waiting()
+            self._finish(task, JobEnded(IndentationOutcome.CANCELLED, "cancelled while it waited"))
+            self._report_waiting()
         else:
             worker.cancel(job_id)
         return True
@@ -152,18 +306,23 @@ class Pool(Closing):
         for worker in workers:
             worker.kill()
         for task in tasks:
-            self._finish(task, failed(stopping()))
-        self._keeper.join(timeout=5)
+            self._finish(task, JobFailed.of(_stopping()))
+        self._upkeep.join(timeout=5)
         for worker in workers:
             worker.join()
 
-    def _idle(self, job: Job) -> WorkerProcess | None:
-        """A free worker, if possible one that has the job's fingertip at hand."""
-        free = [worker for worker in self._workers if worker.state is WorkerState.IDLE]
-        wanted = without_friction(job.parameters)
-        return next((w for w in free if self._held.get(w) == wanted), free[0] if free else None)
+    def _idle(self, job: SimulationJob) -> WorkerProcess | None:
+        """An idle worker, if possible one that keeps the job's fingertip; None if all are busy.
+
+        Pressurising a fingertip takes longer than many a job, so a warm worker is preferred.
+        """
+        idle = [worker for worker in self._workers if worker.state is WorkerState.IDLE]
+        needed = without_friction(job.parameters)
+        warm = [worker for worker in idle if needed in self._kept.get(worker, ())]
+        return next(iter(warm or idle), None)
 
     def _dispatch(self) -> None:
+        """Start waiting jobs in order, while there are idle workers."""
         moved = False
         while True:
             with self._lock:
@@ -180,46 +339,52 @@ class Pool(Closing):
                 worker.start(replace(task.job, deadline_s=left_s))
                 moved = True
         if moved or self.waiting:
-            self._tell_waiting()
+            self._report_waiting()
 
-    def _tell_waiting(self) -> None:
+    def _report_waiting(self) -> None:
+        """Tell each waiting job its place in the queue."""
         with self._lock:
             waiting = list(self._waiting)
         for before, task in enumerate(waiting):
-            if task.worker is None:  # else it has begun meanwhile
-                self._tell(task, Waiting(before))
+            if task.worker is None:  # else it has been started meanwhile
+                self._report(task, JobWaiting(before))
 
-    def _on_worker_event(self, worker: WorkerProcess, event: Event) -> None:
-        if isinstance(event, Began):  # first: who sees a worker ready can count on it
+    def _on_worker_event(self, worker: WorkerProcess, event: JobEvent) -> None:
+        # Before the worker counts as ready: whoever sees it ready relies on the fingertip.
+        if isinstance(event, JobStarted):
             self._on_fingertip(event.fingertip)
         with self._lock:
             task = self._running.get(worker)
             starting = worker.state is WorkerState.STARTING
-            if isinstance(event, Began):
-                self._held[worker] = without_friction(event.fingertip.parameters)
+            if isinstance(event, JobStarted):
+                self._note_fingertip(worker, without_friction(event.fingertip.parameters))
                 if starting:
                     worker.state = WorkerState.IDLE
                     self._ever_ready, self._failed_starts = True, 0
-            elif isinstance(event, Failed) and starting and not self._ever_ready:
+            elif isinstance(event, JobFailed) and starting and not self._ever_ready:
                 self.broken = event.error()
-            over = isinstance(event, Ended | Failed)
+            over = isinstance(event, JobEnded | JobFailed)
             if over and task is not None:
                 del self._running[worker]
                 worker.state = WorkerState.IDLE
-                if isinstance(event, Ended):
+                if isinstance(event, JobEnded):
                     self._typical_s += 0.3 * (event.seconds - self._typical_s)
-        if task is not None and isinstance(event, Ended | Failed):
+        if task is not None and isinstance(event, JobEnded | JobFailed):
             self._finish(task, event)
         elif task is not None:
-            self._tell(task, event)
+            self._report(task, event)
         if over or starting:
             self._dispatch()
 
+    def _note_fingertip(self, worker: WorkerProcess, used: FingertipParameters) -> None:
+        kept = [one for one in self._kept.get(worker, ()) if one != used]
+        self._kept[worker] = [*kept, used][-self._setup.keep :]
+
     def _on_worker_gone(self, worker: WorkerProcess) -> None:
-        epitaph = worker.epitaph()
+        how = worker.how_it_ended()
         with self._lock:
             task = self._running.pop(worker, None)
-            self._held.pop(worker, None)
+            self._kept.pop(worker, None)
             self._workers.remove(worker)
             closing = self._closing.is_set()
             pause_s = 0.0
@@ -227,31 +392,38 @@ class Pool(Closing):
                 self._failed_starts += 1
                 pause_s = min(_PAUSE_S * 2.0**self._failed_starts, _LONGEST_PAUSE_S)
                 if not self._ever_ready and self._failed_starts >= _STARTS_BEFORE_GIVING_UP:
-                    self.broken = self.broken or not_starting(epitaph)
+                    self.broken = self.broken or _not_starting(how)
             self._starts_at.append(time.monotonic() + pause_s)
             self.restarts += not closing
         if not closing:
-            log.warning("worker %d %s", worker.pid, epitaph)
+            _log.warning("worker %d %s", worker.pid, how)
         if task is not None:
-            self._finish(task, failed(stopping()) if closing else self._last_of(task, epitaph))
+            self._finish(
+                task, JobFailed.of(_stopping()) if closing else self._last_event(task, how)
+            )
 
-    def _last_of(self, task: Task, epitaph: str) -> Ended | Failed:
-        """What the owner of a job hears whose worker is gone."""
+    def _last_event(self, task: PoolTask, how: str) -> JobEnded | JobFailed:
+        """Last event of a job whose worker is gone."""
         overdue = time.monotonic() >= task.overdue
         if overdue and task.cancelled:
-            return Ended(
+            return JobEnded(
                 IndentationOutcome.CANCELLED, "cancelled; the solver was ended as it did not stop"
             )
         if overdue:
-            return Ended(
+            return JobEnded(
                 IndentationOutcome.DEADLINE,
                 f"the solver was ended as it did not stop within {self._grace_s:g} s after the "
                 "deadline",
             )
-        return crashed(epitaph)
+        return JobFailed(
+            ErrorCode.INTERNAL,
+            f"the process that ran the simulation {how}",
+            "ask again; if it happens again, look at the log of the fem service",
+            1.0,
+        )
 
-    def _keep(self) -> None:
-        """Start missing workers; end what is too late."""
+    def _keep_up(self) -> None:
+        """Start missing workers; end jobs that are too late, or that no worker will take."""
         while not self._closing.wait(_TICK_S):
             now = time.monotonic()
             with self._lock:
@@ -262,20 +434,21 @@ class Pool(Closing):
                 for task in late:
                     self._waiting.remove(task)
                 hung = [worker for worker, task in self._running.items() if task.overdue <= now]
-                broken = list(self._waiting) if self.broken else []
-                for task in broken:
+                hopeless = list(self._waiting) if self.broken else []
+                for task in hopeless:
                     self._waiting.remove(task)
             for task in late:
                 self._finish(
-                    task, Ended(IndentationOutcome.DEADLINE, "the deadline passed while it waited")
+                    task,
+                    JobEnded(IndentationOutcome.DEADLINE, "the deadline passed while it waited"),
                 )
             for worker in hung:
                 worker.kill()
-            for task in broken:
+            for task in hopeless:
                 assert self.broken is not None
-                self._finish(task, failed(self.broken))
+                self._finish(task, JobFailed.of(self.broken))
             if late:
-                self._tell_waiting()
+                self._report_waiting()
 
     def _start_due(self, now: float) -> None:
         for at in [at for at in self._starts_at if at <= now and self.broken is None]:
@@ -284,21 +457,47 @@ class Pool(Closing):
                 worker = WorkerProcess(
                     self._setup, self._threads, self._on_worker_event, self._on_worker_gone
                 )
-            except OSError as error:  # no memory, or no process more
-                log.warning("no worker can be started: %s", error)
+            except OSError as error:  # out of memory or of processes
+                _log.warning("no worker can be started: %s", error)
                 self._starts_at.append(now + _LONGEST_PAUSE_S)
             else:
                 self._workers.append(worker)
 
-    def _tell(self, task: Task, event: Event) -> None:
+    def _report(self, task: PoolTask, event: JobEvent) -> None:
         try:
             task.on_event(event)
-        except Exception:  # the owner's defect must not end this thread, which serves others too
-            log.exception("owner of job %s", task.job.id)
+        except Exception:  # a defect of one owner must not end this thread, which serves others too
+            _log.exception("owner of job %s", task.job.id)
 
-    def _finish(self, task: Task, event: Ended | Failed) -> None:
+    def _finish(self, task: PoolTask, event: JobEnded | JobFailed) -> None:
         with self._lock:
             if task.over:
                 return
             task.over = True
-        self._tell(task, event)
+        self._report(task, event)
+
+
+def _stopping() -> RemoteError:
+    return RemoteError(
+        "the finite-element service is stopping",
+        remedy="ask again when it is back: palpate status",
+        code=ErrorCode.UNAVAILABLE,
+        retry_after_s=2.0,
+    )
+
+
+def _not_starting(how: str) -> RemoteError:
+    return RemoteError(
+        f"the solver's process {how} before it was ready, again and again",
+        remedy="look at the log above; try it alone: palpate fem run",
+        code=ErrorCode.UNAVAILABLE,
+    )
+
+
+def _full(running: int, waiting: int, retry_after_s: float) -> RemoteError:
+    return RemoteError(
+        f"{running} simulations run and {waiting} wait",
+        remedy="ask again later, or start the service with more workers",
+        code=ErrorCode.RESOURCE_EXHAUSTED,
+        retry_after_s=round(min(max(retry_after_s, 0.5), 60.0), 1),
+    )

@@ -1,7 +1,8 @@
-"""The process that solves, started by ``WorkerProcess`` as a module with its socket.
+"""The solver's process: takes jobs from its pool, one at a time, and reports their events.
 
-Its own process, so that a crash, a leak or an endless loop of the solver costs one trajectory and
-not the service. It takes jobs from the socket with descriptor FD, one at a time, and ends with it.
+``WorkerProcess`` starts it with ``python -m`` and the descriptor of a socket; it ends when the
+socket closes. As a process of its own, a crash, a leak or an endless loop of the solver costs one
+trajectory and not the service.
 """
 
 from __future__ import annotations
@@ -18,63 +19,62 @@ from multiprocessing.connection import Connection
 
 from palpate.errors import PalpateError
 from palpate_fem.result import IndentationOutcome
-from palpate_fem.service.fingertips import Fingertips, load_factory
+from palpate_fem.service.fingertips import FingertipCache, check_start, load_factory
 from palpate_fem.service.jobs import (
-    Began,
-    Cancel,
-    Ended,
-    Event,
-    Failed,
-    Job,
+    CancelJob,
+    JobEnded,
+    JobEvent,
+    JobFailed,
+    JobStarted,
     Pressurising,
-    Setup,
-    Stepped,
+    SimulationJob,
+    StepConverged,
+    WorkerSetup,
 )
-from palpate_fem.service.start import check_start
 
-_TELL_EVERY_S = 0.2
+_REPORT_EVERY_S = 0.2
 
 
 class _Stopped(Exception):
-    """Ends a pressurisation that nobody waits for any more."""
+    """Ends the pressurisation of a job that was cancelled or is late."""
 
 
 class Worker:
-    """Solves jobs and tells the other end of the connection."""
+    """Solves jobs and reports to the other end of the connection."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[SimulationJob] = queue.SimpleQueue()
         self._cancelled: set[str] = set()
 
     def run(self) -> None:
         """Serve until the other end is closed."""
-        setup: Setup = self._connection.recv()
+        setup: WorkerSetup = self._connection.recv()
         threading.Thread(target=self._listen, daemon=True).start()
         try:
-            tips = Fingertips(load_factory(setup.factory)(**setup.options), setup.keep)
+            tips = FingertipCache(load_factory(setup.factory)(**setup.options), setup.keep)
             tips.get(setup.warm, lambda _: None)
         except Exception as error:
-            self._tell(Failed.of(error))
+            self._report(JobFailed.of(error))
             raise
-        self._tell(Began(tips.describe(setup.warm)))
+        self._report(JobStarted(tips.describe(setup.warm)))
         while True:
-            self._tell(self._answer(self._jobs.get(), tips))
+            self._report(self._solve(self._jobs.get(), tips))
 
     def _listen(self) -> None:
         while True:
             try:
                 message = self._connection.recv()
             except (EOFError, OSError):
-                os._exit(0)  # nobody is there to hear the rest of it
-            if isinstance(message, Job):
+                os._exit(0)  # the pool is gone, and the solver's thread has no other end
+            if isinstance(message, SimulationJob):
                 self._jobs.put(message)
-            elif isinstance(message, Cancel):
+            elif isinstance(message, CancelJob):
                 self._cancelled.add(message.id)
 
-    def _answer(self, job: Job, tips: Fingertips) -> Ended | Failed:
+    def _solve(self, job: SimulationJob, tips: FingertipCache) -> JobEnded | JobFailed:
         deadline = time.monotonic() + job.deadline_s
-        told = -math.inf
+        reported = -math.inf
 
         def should_stop() -> IndentationOutcome | None:
             if job.id in self._cancelled:
@@ -82,37 +82,37 @@ class Worker:
             return IndentationOutcome.DEADLINE if time.monotonic() > deadline else None
 
         def on_fraction(fraction: float) -> None:
-            nonlocal told
+            nonlocal reported
             if should_stop() is not None:
                 raise _Stopped
-            if time.monotonic() - told > _TELL_EVERY_S:
-                told = time.monotonic()
-                self._tell(Pressurising(fraction))
+            if time.monotonic() - reported > _REPORT_EVERY_S:
+                reported = time.monotonic()
+                self._report(Pressurising(fraction))
 
         try:
             tip = tips.get(job.parameters, on_fraction)
             fingertip = tips.describe(job.parameters)
             check_start(fingertip, job.indenter, job.path[0])
-            self._tell(Began(fingertip))
+            self._report(JobStarted(fingertip))
             done = tip.indent(
                 job.indenter,
                 job.path,
                 friction_coefficient=job.parameters.friction_coefficient,
-                on_step=lambda step: self._tell(Stepped(step)),
+                on_step=lambda step: self._report(StepConverged(step)),
                 should_stop=should_stop,
             )
         except _Stopped:
             outcome = should_stop() or IndentationOutcome.CANCELLED
-            return Ended(outcome, "stopped while the fluid was filled in")
-        except Exception as error:  # any trouble is this job's, and its owner is told
+            return JobEnded(outcome, "stopped while the fluid was filled in")
+        except Exception as error:  # whatever it is, it ends this job only
             if not isinstance(error, PalpateError):
                 sys.excepthook(type(error), error, error.__traceback__)
-            return Failed.of(error)
+            return JobFailed.of(error)
         finally:
             self._cancelled.discard(job.id)
-        return Ended(done.outcome, done.reason, done.travel_m, done.seconds)
+        return JobEnded(done.outcome, done.reason, done.travel_m, done.seconds)
 
-    def _tell(self, event: Event) -> None:
+    def _report(self, event: JobEvent) -> None:
         try:
             self._connection.send(event)
         except OSError:
@@ -120,11 +120,11 @@ class Worker:
 
 
 def main() -> None:
-    """Be a worker."""
-    # Libraries print to stdout what is for people; a command's stdout may be JSON for machines.
+    """Run as a worker until the socket closes."""
+    # Libraries print remarks to stdout, but a command's stdout may be JSON for machines.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     faulthandler.enable()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us handles Ctrl-C
     Worker(Connection(int(sys.argv[1]))).run()
 
 

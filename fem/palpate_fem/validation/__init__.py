@@ -1,1 +1,1 @@
-"""Simulated beside measured forces, as the paper compares them."""
+"""SimulatedIndentation beside measured forces, as the paper compares them."""

@@ -9,15 +9,15 @@ import numpy as np
 
 from palpate.errors import DatasetError
 from palpate.files.simulation_store import SIMULATIONS
-from palpate_fem.calibration.align import Floats
+from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.measured import (
     MEASURED,
     SIMULATED,
-    Indentation,
+    MeasuredIndentation,
     is_file_of,
     read_indentations,
 )
-from palpate_fem.calibration.runs import Simulated, from_rest
+from palpate_fem.calibration.runs import SimulatedIndentation, from_rest
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.store.content import TrajectorySummary
 from palpate_fem.store.read import SimulationStore
@@ -27,7 +27,7 @@ _SIDEWAYS_M = 20e-6
 _TURNED = np.cos(np.radians(1.0))
 
 
-def measured_from(path: Path) -> tuple[tuple[Indentation, ...], dict[str, str]]:
+def measured_from(path: Path) -> tuple[tuple[MeasuredIndentation, ...], dict[str, str]]:
     """Trajectories to compare with, from a file of indentations or from a store.
 
     Args:
@@ -51,7 +51,7 @@ def measured_from(path: Path) -> tuple[tuple[Indentation, ...], dict[str, str]]:
             pose, force = np.concatenate([item.path[:1], pose]), from_rest(force)
         try:
             found.append(
-                Indentation(
+                MeasuredIndentation(
                     name,
                     item.indenter,
                     item.sensor or "simulated",
@@ -67,8 +67,8 @@ def measured_from(path: Path) -> tuple[tuple[Indentation, ...], dict[str, str]]:
 
 
 def simulated_from(
-    store: SimulationStore, measured: Sequence[Indentation]
-) -> tuple[dict[str, Simulated], dict[str, str]]:
+    store: SimulationStore, measured: Sequence[MeasuredIndentation]
+) -> tuple[dict[str, SimulatedIndentation], dict[str, str]]:
     """The stored simulation of each measured trajectory.
 
     A simulation serves every sensor: ``sphere_medium/03/normal`` is that of
@@ -86,7 +86,7 @@ def simulated_from(
         DatasetError: The store is damaged.
     """
     tip, there = store.fingertip(), set(store.ids())
-    found: dict[str, Simulated] = {}
+    found: dict[str, SimulatedIndentation] = {}
     refused: dict[str, str] = {}
     for item in measured:
         names = (item.name, item.name.removesuffix(f"/{item.sensor}"))
@@ -100,7 +100,7 @@ def simulated_from(
             continue
         force = from_rest(summary.force)
         ahead = _direction(item.pose) @ (summary.path[0, :3] - item.pose[0, :3])
-        found[item.name] = Simulated(
+        found[item.name] = SimulatedIndentation(
             force,
             path_lengths(summary.path)[: len(force)] + ahead,
             tip.total_thickness_m,
@@ -111,7 +111,7 @@ def simulated_from(
     return found, refused
 
 
-def _mismatch(simulated: TrajectorySummary, item: Indentation) -> str:
+def _mismatch(simulated: TrajectorySummary, item: MeasuredIndentation) -> str:
     """Why a simulation is not of this trajectory; empty if it is."""
     if simulated.indenter != item.indenter:
         return f"simulated with {simulated.indenter}, measured with {item.indenter}"

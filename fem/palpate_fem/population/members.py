@@ -1,4 +1,8 @@
-"""The members of a population: three BioTacs as the paper's, fitted to what it tells of them."""
+"""Members of a population: three specimens like the paper's, fitted to what it publishes of them.
+
+The file (schema ``palpate.population/1``) calls a specimen ``unit`` and a published range
+``wanted``.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from typing import Any
 
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.specimen import SpecimenParameters
 
 SCHEMA = "palpate.population/1"
 SHIPPED = "three.json"
@@ -20,15 +24,15 @@ _REMEDY = "make it with: palpate fem units fit STORE --out FILE"
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What the paper tells of one of its BioTacs ("Experimental data processing", figures).
+class PublishedRange:
+    """What the paper publishes of one of its BioTacs ("Experimental data processing", figures).
 
     Attributes:
-        name: Of the unit.
+        name: Of the specimen.
         low: Smallest tared value over full scale.
         high: Largest.
         max_force_n: Largest net force [N].
-        indenters: Begin of the names of its indenters; empty = all.
+        indenters: Prefixes of the names of its indenters; empty = all.
     """
 
     name: str
@@ -38,14 +42,14 @@ class Wanted:
     indenters: tuple[str, ...] = ()
 
     def pressed_with(self, indenter: str) -> bool:
-        """Whether this unit met an indenter."""
+        """Whether this specimen was pressed with an indenter."""
         return not self.indenters or indenter.startswith(self.indenters)
 
 
 PAPER = (
-    Wanted("biotac-1", -0.65, 0.13, 23.4, ("sphere_",)),
-    Wanted("biotac-2", -0.78, 0.11, 32.1),
-    Wanted("biotac-3", -0.51, 0.17, 29.0),
+    PublishedRange("biotac-1", -0.65, 0.13, 23.4, ("sphere_",)),
+    PublishedRange("biotac-2", -0.78, 0.11, 32.1),
+    PublishedRange("biotac-3", -0.51, 0.17, 29.0),
 )
 
 
@@ -54,25 +58,34 @@ class Member:
     """One BioTac of the experiment.
 
     Attributes:
-        unit: Its electrics.
-        wanted: What it was fitted to.
+        specimen: Its electrical parameters.
+        published: What it was fitted to.
         overtravel_m: How much deeper it was pressed than planned [m]: the share of the robot's
             registration error that points into the skin.
-        found: What came out: ``low``, ``high``, ``max_force_n``.
+        found: Result of the fit: ``low``, ``high``, ``max_force_n``, ``states``.
     """
 
-    unit: UnitParameters
-    wanted: Wanted
+    specimen: SpecimenParameters
+    published: PublishedRange
     overtravel_m: float
     found: dict[str, float] = field(default_factory=dict)
 
+    def to_dict(self) -> dict[str, Any]:
+        """As stored, with the stored names."""
+        return {
+            "unit": asdict(self.specimen),
+            "wanted": asdict(self.published),
+            "overtravel_m": self.overtravel_m,
+            "found": dict(self.found),
+        }
+
 
 def write_population(path: Path, members: Sequence[Member], *, source: str) -> None:
-    """Write members as JSON; ``source`` says what they were fitted on."""
+    """Write members as JSON; ``source`` describes the data that they were fitted on."""
     content = {
         "schema": SCHEMA,
         "source": source,
-        "members": [asdict(member) for member in members],
+        "members": [member.to_dict() for member in members],
     }
     with written_whole(path) as partial:
         partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -85,7 +98,7 @@ def read_population(path: Path | None = None) -> tuple[Member, ...]:
         path: File of `write_population`; None = the three that come with palpate.
 
     Raises:
-        ConfigError: No such file, or its content is no population; names the file.
+        ConfigError: The file does not exist or is not a population; names the file.
     """
     where = "the shipped population" if path is None else str(path)
     try:
@@ -98,26 +111,28 @@ def read_population(path: Path | None = None) -> tuple[Member, ...]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{where} cannot be read: {error}", remedy=_REMEDY) from error
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise ConfigError(f"{where} is not of the schema {SCHEMA}", remedy=_REMEDY)
+        raise ConfigError(f"{where} does not have the schema {SCHEMA}", remedy=_REMEDY)
     try:
         members = tuple(_member(entry) for entry in content["members"])
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{where}: a member lacks or misplaces {error}", remedy=_REMEDY
         ) from error
-    names = [member.unit.name for member in members]
+    names = [member.specimen.name for member in members]
     if not names or len(set(names)) != len(names):
         raise ConfigError(
             f"{where}: members are called {', '.join(names) or 'nothing'}",
-            remedy="give at least one member, each with a name of its own",
+            remedy="give at least one member, and each a different name",
         )
     return members
 
 
 def _member(entry: dict[str, Any]) -> Member:
-    wanted = Wanted(**{**entry["wanted"], "indenters": tuple(entry["wanted"]["indenters"])})
+    published = PublishedRange(
+        **{**entry["wanted"], "indenters": tuple(entry["wanted"]["indenters"])}
+    )
     overtravel = float(entry["overtravel_m"])
     if not math.isfinite(overtravel):
         raise ValueError(f"overtravel_m = {overtravel}")
-    unit = UnitParameters.from_json(json.dumps(entry["unit"]))
-    return Member(unit, wanted, overtravel, dict(entry["found"]))
+    specimen = SpecimenParameters.from_json(json.dumps(entry["unit"]))
+    return Member(specimen, published, overtravel, dict(entry["found"]))

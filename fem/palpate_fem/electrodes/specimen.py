@@ -1,4 +1,8 @@
-"""One sensor's electrical parameters: nominal values, limits, and how units differ."""
+"""One specimen: how its electrodes are wired and what makes one BioTac differ from another.
+
+``palpate.anatomy`` says where the electrodes sit. The parameters here are nominal values, their
+limits, and how they vary across specimens (learning notes, section 4.5).
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
-from palpate_fem.electrodes.table import DISC_DIAMETER_M, SENSING
+
+SENSING = 19
+TERMINALS = 1 + SENSING
+"""Terminal 0 is the four excitation electrodes, terminal i is E_i."""
+
+DISC_DIAMETER_M = 2.5e-3
+"""Of every electrode [m]: from a photo and the electrode map (section 4.3); counts alone say little
+about it."""
+
+DISC_TERMINAL = np.array([*range(1, TERMINALS), 0, 0, 0, 0], np.int32)
+"""Terminal of each of the 23 discs: E1..E19, then X1..X4; shape (23,)."""
+
 
 Floats = NDArray[np.float64]
 
-# Range that the model is made for; outside, a number is a slip of units.
+# The range that the model is made for. A value outside is most likely in the wrong unit.
 LIMITS = {
     "sigma_s_m": (0.01, 10.0),
     "reference_c": (0.0, 60.0),
@@ -49,7 +64,7 @@ LIMITS = {
     "tac_offset": (0.0, 4095.0),
 }
 
-# Standard deviations across units (section 4.5): of the logarithm, or of the value itself.
+# Standard deviations across specimens (section 4.5): of the logarithm, or of the value itself.
 LOG_SD = {
     "sigma_s_m": 0.25,
     "asperity_m": 0.5,
@@ -59,14 +74,14 @@ LOG_SD = {
     "disc_diameter_m": 0.04,
     "asymmetry": 0.03,
 }
-SD = {"gain": 0.005 / 2, "offset": 5.0 / 2}  # the sheet gives ranges; they are two of these
+SD = {"gain": 0.005 / 2, "offset": 5.0 / 2}  # the data sheet gives ranges: two standard deviations
 UNIFORM = {
     "temperature_coefficient": (0.02, 0.03),
     "squeeze_exponent": (0.5, 1.0),
     "contact_ohm_m2": (0.0, 500e-6),
     "series_ohm": (0.0, 300.0),
-    # Settled, 100 Hz: 0.3-0.6 in the learning notes; 1.7-6.2 on the idle sensors of the force logs,
-    # which also warm up with 210-260 s.
+    # At 100 Hz after warm-up: 0.3-0.6 in the learning notes, but 1.7-6.2 on the idle sensors of the
+    # force logs, which also warm up with time constants of 210-260 s.
     "noise_counts": (0.3, 6.0),
     "heating_tau_s": (200.0, 1200.0),
     "side_closing_m": (0.0, 0.8e-3),
@@ -79,14 +94,14 @@ UNIFORM = {
 }
 PER_ELECTRODE = ("asymmetry", "gain", "offset")
 _REMEDY = "give it in SI units and within these limits"
-_FLAT = (0.0,) * SENSING
+_ZERO_EACH = (0.0,) * SENSING
 
 
 @dataclass(frozen=True, slots=True)
-class UnitParameters:
-    """Electrical parameters of one sensor; defaults are section 4.5's nominal ones.
+class SpecimenParameters:
+    """Electrical parameters of one specimen; the defaults are section 4.5's nominal ones.
 
-    What shapes the gap of all units alike (fill, skin) belongs to the mechanics and is not here.
+    What shapes the gap of all specimens alike (fill, skin) belongs to the mechanics, not here.
 
     Attributes:
         sigma_s_m: Conductivity of the fluid at the reference temperature [S/m].
@@ -94,9 +109,10 @@ class UnitParameters:
         temperature_coefficient: d ln sigma / d T [1/K].
         disc_diameter_m: Of the electrodes [m].
         recess_m: Depth of the film's floor under the core's surface [m]; see `film_mesh`.
-        clamp_closing: Share of the gap that the clamp closes behind its edge; see `fit_of`.
-        side_closing_m: How much nearer to the core the skin stands at the sides [m]; see `fit_of`.
-        asperity_m: Residual film of an unloaded contact: what stands between asperities [m].
+        clamp_closing: Share of the gap that the clamp closes behind its edge; see `gap_adjustment`.
+        side_closing_m: How much nearer to the core the skin stands at the sides [m]; see
+            `gap_adjustment`.
+        asperity_m: Residual film of an unloaded contact [m]: the fluid between the asperities.
         floor_m: Residual film at infinite pressure [m].
         squeeze_pa: Pressure scale of the residual film [Pa].
         squeeze_exponent: Its exponent.
@@ -105,22 +121,22 @@ class UnitParameters:
         load_ohm: Load R_L [Ohm].
         asymmetry: Factor on each film impedance (gap and area of one electrode), 19 values.
         gain: Relative error of the converter's gain, 19 values.
-        offset: Its offset [counts], 19 values.
+        offset: Offset of the converter [counts], 19 values.
         noise_counts: Standard deviation of an electrode's noise [counts].
-        heating_k: Rise of the core's temperature by its own electronics [K].
-        heating_tau_s: With this time constant [s].
+        heating_k: Final rise of the core's temperature by its own electronics [K].
+        heating_tau_s: Time constant of that rise [s].
         gradient_sd: Standard deviation of two smooth spatial modes of ln sigma.
-        creep_share: Share of an electrode's change that comes late and goes late.
-        creep_tau_s: With this time constant [s].
+        creep_share: Share of an electrode's change that follows slowly, when loaded and unloaded.
+        creep_tau_s: Time constant of that slow response [s].
         pdc_offset: Reading at ambient pressure [counts].
-        pdc_strain_pa_n: What PDC shows more for each newton, as the core bends [Pa/N].
-        pdc_warmth_pa_k: What it shows more for each kelvin above the reference [Pa/K].
-        cooling_share: How much an indenter cools the thermistor in the end, over the difference
-            of temperature and the share of the pad that it touches [1]; see `ContactCooling`.
-        cooling_tau_s: With this time constant [s].
+        pdc_strain_pa_n: Error of PDC for each newton, as the core bends [Pa/N].
+        pdc_warmth_pa_k: Error of PDC for each kelvin above the reference temperature [Pa/K].
+        cooling_share: Final cooling of the thermistor by an indenter, divided by the difference of
+            temperature and by the share of the pad that it touches [1]; see `ContactCooling`.
+        cooling_tau_s: Time constant of that cooling [s].
         pac_offset: Reading at constant pressure [counts].
         tac_offset: Reading at constant temperature [counts].
-        name: For people.
+        name: Label, e.g. ``biotac-1``.
 
     Raises:
         ConfigError: A value is not finite or out of range; names it and its limits.
@@ -141,8 +157,8 @@ class UnitParameters:
     series_ohm: float = 0.0
     load_ohm: float = 10e3
     asymmetry: tuple[float, ...] = (1.0,) * SENSING
-    gain: tuple[float, ...] = _FLAT
-    offset: tuple[float, ...] = _FLAT
+    gain: tuple[float, ...] = _ZERO_EACH
+    offset: tuple[float, ...] = _ZERO_EACH
     noise_counts: float = 0.45
     heating_k: float = 10.0
     heating_tau_s: float = 900.0
@@ -164,7 +180,8 @@ class UnitParameters:
             many = key in PER_ELECTRODE
             if many and not (isinstance(value, tuple) and len(value) == SENSING):
                 raise ConfigError(
-                    f"{key} is no tuple of {SENSING} values", remedy="give one per electrode"
+                    f"{key} is not a tuple of {SENSING} values",
+                    remedy="give one for each electrode",
                 )
             for one in value if many else (value,):
                 if (
@@ -176,11 +193,11 @@ class UnitParameters:
                         f"{key} = {one} is not within [{low:g}, {high:g}]", remedy=_REMEDY
                     )
         if not isinstance(self.name, str):
-            raise ConfigError(f"name = {self.name} is no text", remedy="give a text")
+            raise ConfigError(f"name = {self.name} is not a string", remedy="give a string")
         if self.floor_m > self.asperity_m:
             raise ConfigError(
                 f"floor_m = {self.floor_m} exceeds asperity_m = {self.asperity_m}",
-                remedy="the film of a pressed contact is the thinner one",
+                remedy="give a smaller floor_m: a pressed contact has the thinner film",
             )
 
     @property
@@ -199,34 +216,34 @@ class UnitParameters:
         return np.array(self.offset)
 
     def to_json(self) -> str:
-        """As text that `from_json` reads to the last bit."""
+        """JSON text; `from_json` restores every value to the last bit."""
         return json.dumps(asdict(self), indent=2)
 
     @classmethod
-    def from_json(cls, text: str) -> UnitParameters:
-        """Read `to_json`.
+    def from_json(cls, text: str) -> SpecimenParameters:
+        """Parameters from the text of `to_json`.
 
         Raises:
-            ConfigError: No JSON object, an unknown key, or a value out of range.
+            ConfigError: Not a JSON object, an unknown key, or a value out of range.
         """
         try:
             values: Any = json.loads(text)
         except json.JSONDecodeError as error:
-            raise ConfigError(f"the unit is no JSON: {error}", remedy="use to_json") from error
+            raise ConfigError(f"the specimen is not JSON: {error}", remedy="use to_json") from error
         if not isinstance(values, dict):
-            raise ConfigError("the unit is no JSON object", remedy="use to_json")
+            raise ConfigError("the specimen is not a JSON object", remedy="use to_json")
         known = {field.name for field in fields(cls)}
         if unknown := sorted(set(values) - known):
             raise ConfigError(
-                f"unknown key {unknown[0]!r} of a unit", remedy=f"known are {', '.join(known)}"
+                f"unknown key {unknown[0]!r} of a specimen", remedy=f"known are {', '.join(known)}"
             )
         typed: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
         }
         return cls(**typed)
 
-    def drawn(self, rng: np.random.Generator) -> UnitParameters:
-        """Another unit, drawn from the priors about this one; values end at their limits."""
+    def drawn(self, rng: np.random.Generator) -> SpecimenParameters:
+        """A specimen drawn from the priors around this one; values are clipped to `LIMITS`."""
         values: dict[str, Any] = {}
         for key, sd in (*LOG_SD.items(), *SD.items()):
             here = np.asarray(getattr(self, key))

@@ -1,16 +1,21 @@
-"""How two indentations are made comparable: the paper's data processing, as pure functions.
+"""How two indentations are compared: the paper's data processing and cost, as pure functions.
 
-Paper, "Experimental data processing" and "Experimental and simulation data processing": force
-below 0.5 N is noise and is left out; the point of exactly 0.5 N is interpolated and starts the
-curve; both curves end at the smaller final displacement, counted from there; both are
-interpolated at the ends of 20 even increments. The start itself is no sample: there both are 0.5 N
-by construction, so it would only flatter the error.
+Alignment (paper, "Experimental data processing" and "Experimental and simulation data processing"):
+force below 0.5 N is noise and is left out; the point of exactly 0.5 N is interpolated and starts
+the curve; both curves end at the smaller final displacement, counted from there; both are
+interpolated at the ends of 20 even increments. The start itself is no sample: both forces are 0.5 N
+there by construction, so it would only flatter the error. Aligning at 0.5 N hides by how much one
+of them touches earlier: ``AlignedCurves.depth_offset_m``.
 
-Aligning at 0.5 N hides by how much one of them touches earlier: ``Aligned.depth_offset_m``.
+Cost (paper, equation "cost_function"): J = w1 J_force + w2 J_thick. J_force is the sum over the
+axes of the RMS over all samples (sensors x steps), J_thick the thickness minus 15.1 mm. The paper
+writes that difference with its sign, which would reward a finger that is too thin; here it is the
+absolute value.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -35,7 +40,7 @@ _SAME_PLACE_M = 1e-9
 """Poses closer than this are one place: held, not moved; robots repeat to 2e-5 m."""
 
 
-class Reason(StrEnum):
+class AlignmentProblem(StrEnum):
     """Why two curves cannot be compared."""
 
     TOO_SHORT = "fewer than two samples"
@@ -44,7 +49,7 @@ class Reason(StrEnum):
     NOTHING_BEYOND = "ends where it reaches the threshold force"
 
 
-class Unalignable(DatasetError):
+class AlignmentError(DatasetError):
     """Two curves cannot be compared.
 
     Args:
@@ -53,7 +58,7 @@ class Unalignable(DatasetError):
         threshold_n: Force at which curves begin [N].
     """
 
-    def __init__(self, side: str, reason: Reason, threshold_n: float) -> None:
+    def __init__(self, side: str, reason: AlignmentProblem, threshold_n: float) -> None:
         super().__init__(
             f"the {side} {reason} ({threshold_n:g} N)",
             remedy="leave this trajectory out, or record it from above the skin and deeper",
@@ -63,7 +68,7 @@ class Unalignable(DatasetError):
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class ForceCurve:
     """Net force against the way of the indenter.
 
     Attributes:
@@ -78,18 +83,18 @@ class Curve:
         """Whether the first sample has this force: such a curve has been cut there."""
         return bool(abs(np.linalg.norm(self.force_n[0]) - threshold_n) < 1e-9 * threshold_n)
 
-    def scaled(self, factor: float) -> Curve:
+    def scaled(self, factor: float) -> ForceCurve:
         """The same curve with ``factor`` times the force."""
-        return Curve(self.travel_m, self.force_n * factor)
+        return ForceCurve(self.travel_m, self.force_n * factor)
 
 
 @dataclass(frozen=True, slots=True)
-class Aligned:
+class AlignedCurves:
     """Two curves, sampled alike; N = number of increments.
 
     Attributes:
         displacement_m: Since the threshold force, each its own [m], shape (N,).
-        simulated_n: Simulated force [N], shape (N, 3).
+        simulated_n: SimulatedIndentation force [N], shape (N, 3).
         measured_n: Measured force [N], shape (N, 3).
         depth_offset_m: Travel at the threshold, simulation minus measurement [m]: positive if the
             simulation touches later, that is deeper. The comparison of forces does not see it.
@@ -104,8 +109,8 @@ class Aligned:
     coverage: float
 
 
-def curve(path: Floats, force_n: Floats) -> Curve:
-    """Curve of a trajectory, shorter than its path if it stopped early.
+def curve(path: Floats, force_n: Floats) -> ForceCurve:
+    """ForceCurve of a trajectory, shorter than its path if it stopped early.
 
     Args:
         path: Poses of the indenter, shape (K, 7).
@@ -114,8 +119,8 @@ def curve(path: Floats, force_n: Floats) -> Curve:
     return along(path_lengths(path)[: len(force_n)], force_n)
 
 
-def along(travel_m: Floats, force_n: Floats) -> Curve:
-    """Curve of samples.
+def along(travel_m: Floats, force_n: Floats) -> ForceCurve:
+    """ForceCurve of samples.
 
     Of several at one place the last counts, as in the paper ("the final time step of each 0.1 mm
     displacement increment").
@@ -125,10 +130,10 @@ def along(travel_m: Floats, force_n: Floats) -> Curve:
         force_n: Net force there [N], shape (K, 3).
     """
     last = np.append(np.diff(travel_m) > _SAME_PLACE_M, True)[: len(travel_m)]
-    return Curve(travel_m[last], np.asarray(force_n, np.float64)[last])
+    return ForceCurve(travel_m[last], np.asarray(force_n, np.float64)[last])
 
 
-def from_contact(whole: Curve, *, side: str, threshold_n: float = THRESHOLD_N) -> Curve:
+def from_contact(whole: ForceCurve, *, side: str, threshold_n: float = THRESHOLD_N) -> ForceCurve:
     """The part of a curve from exactly the threshold force on.
 
     Single samples that noise lifts over the threshold before contact do not count as contact: the
@@ -141,19 +146,19 @@ def from_contact(whole: Curve, *, side: str, threshold_n: float = THRESHOLD_N) -
         threshold_n: Force at which it begins [N].
 
     Raises:
-        Unalignable: It never reaches the threshold, or begins above it.
+        AlignmentError: It never reaches the threshold, or begins above it.
     """
     magnitude = np.sqrt(np.einsum("ki,ki->k", whole.force_n, whole.force_n))
     if len(magnitude) < 2:
-        raise Unalignable(side, Reason.TOO_SHORT, threshold_n)
+        raise AlignmentError(side, AlignmentProblem.TOO_SHORT, threshold_n)
     peak = int(magnitude.argmax())
     if magnitude[peak] < threshold_n:
-        raise Unalignable(side, Reason.NEVER_REACHES, threshold_n)
+        raise AlignmentError(side, AlignmentProblem.NEVER_REACHES, threshold_n)
     below = np.flatnonzero(magnitude[:peak] < threshold_n)
     if whole.begins_at(threshold_n):
         return whole
     if not len(below):
-        raise Unalignable(side, Reason.STARTS_ABOVE, threshold_n)
+        raise AlignmentError(side, AlignmentProblem.STARTS_ABOVE, threshold_n)
     before = int(below[-1])
     share = _share_to(whole.force_n[before], whole.force_n[before + 1], threshold_n)
     keep = np.flatnonzero(magnitude[before + 1 :] >= threshold_n) + before + 1
@@ -161,20 +166,20 @@ def from_contact(whole: Curve, *, side: str, threshold_n: float = THRESHOLD_N) -
     start_n = whole.force_n[before] + share * np.diff(whole.force_n[before : before + 2], axis=0)[0]
     # the first sample may hold the threshold exactly: then it is the start, not a second one
     keep = keep[whole.travel_m[keep] > start_m + _SAME_PLACE_M]
-    return Curve(
+    return ForceCurve(
         np.concatenate([[start_m], whole.travel_m[keep]]),
         np.concatenate([start_n[None], whole.force_n[keep]]),
     )
 
 
 def align(
-    simulated: Curve,
-    measured: Curve,
+    simulated: ForceCurve,
+    measured: ForceCurve,
     *,
     threshold_n: float = THRESHOLD_N,
     increments: int = INCREMENTS,
     fit_offset: bool = False,
-) -> Aligned:
+) -> AlignedCurves:
     """Bring a simulated and a measured curve of the same path to the same samples.
 
     Args:
@@ -187,23 +192,25 @@ def align(
             that back. The paper does not do it.
 
     Raises:
-        Unalignable: One of them never reaches the threshold, begins above it, or ends there.
+        AlignmentError: One of them never reaches the threshold, begins above it, or ends there.
     """
     ours = from_contact(simulated, side="simulation", threshold_n=threshold_n)
     theirs = from_contact(measured, side="measurement", threshold_n=threshold_n)
     for side, part in (("simulation", ours), ("measurement", theirs)):
         if part.travel_m[-1] <= part.travel_m[0]:
-            raise Unalignable(side, Reason.NOTHING_BEYOND, threshold_n)
+            raise AlignmentError(side, AlignmentProblem.NOTHING_BEYOND, threshold_n)
     start_m = float(ours.travel_m[0])
     if fit_offset:
         start_m += _best_shift(simulated, start_m, theirs, increments)
     return _resampled(simulated, start_m, theirs, increments)
 
 
-def _resampled(simulated: Curve, start_m: float, measured: Curve, increments: int) -> Aligned:
+def _resampled(
+    simulated: ForceCurve, start_m: float, measured: ForceCurve, increments: int
+) -> AlignedCurves:
     """Sample a whole simulated curve from some travel on, and a measured one from its start."""
     displacement, coverage = _common(simulated, start_m, measured, increments)
-    return Aligned(
+    return AlignedCurves(
         displacement,
         _at(simulated, start_m + displacement)[0],
         _at(measured, measured.travel_m[0] + displacement)[0],
@@ -213,7 +220,7 @@ def _resampled(simulated: Curve, start_m: float, measured: Curve, increments: in
 
 
 def _common(
-    simulated: Curve, start_m: float, measured: Curve, increments: int
+    simulated: ForceCurve, start_m: float, measured: ForceCurve, increments: int
 ) -> tuple[Floats, float]:
     """Displacements that both have [m], shape (increments,), and their part of the measured one."""
     length = float(measured.travel_m[-1] - measured.travel_m[0])
@@ -221,7 +228,9 @@ def _common(
     return common * np.arange(1, increments + 1) / increments, common / length
 
 
-def _best_shift(simulated: Curve, start_m: float, measured: Curve, increments: int) -> float:
+def _best_shift(
+    simulated: ForceCurve, start_m: float, measured: ForceCurve, increments: int
+) -> float:
     """Shift of the simulation's start with the least squared difference of the forces [m].
 
     Gauss-Newton in one unknown; the curves are piecewise linear, so it may end up between two
@@ -240,7 +249,7 @@ def _best_shift(simulated: Curve, start_m: float, measured: Curve, increments: i
     return shift
 
 
-def _at(line: Curve, travel_m: Floats) -> tuple[Floats, Floats]:
+def _at(line: ForceCurve, travel_m: Floats) -> tuple[Floats, Floats]:
     """Force at some travels, linearly interpolated, and its slope [N/m], shapes (N, 3)."""
     way, force = line.travel_m, line.force_n
     before = np.minimum(np.maximum(way.searchsorted(travel_m) - 1, 0), len(way) - 2)
@@ -262,3 +271,65 @@ def _share_to(a: Floats, b: Floats, magnitude: float) -> float:
     root = np.sqrt(half * half - square * rest)
     share = -rest / (half + root) if half > 0 else (root - half) / square
     return min(float(share), 1.0)
+
+
+TARGET_THICKNESS_M = 15.1e-3
+"""Total thickness of the pressurised finger [m], the manufacturer's (paper, SynTouch manual)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CostWeights:
+    """CostWeights of the cost, hand-selected in the paper.
+
+    Attributes:
+        force: w1, of the force error in newton.
+        thickness: w2 [N/m], of the thickness error in metre.
+    """
+
+    force: float = 1.0
+    thickness: float = 1e4
+
+
+def axis_rms_n(pairs: Sequence[AlignedCurves]) -> Floats:
+    """RMS force error of each axis over all samples of all pairs [N], shape (3,)."""
+    squares = sum((((p.simulated_n - p.measured_n) ** 2).sum(axis=0) for p in pairs), np.zeros(3))
+    return np.asarray(np.sqrt(squares / sum(len(p.displacement_m) for p in pairs)))
+
+
+def rms_n(pair: AlignedCurves) -> float:
+    """RMS force error of one trajectory [N]: the sum of its axes', as in the cost."""
+    return float(axis_rms_n([pair]).sum())
+
+
+def peak_n(pair: AlignedCurves) -> float:
+    """Greatest measured force magnitude in the compared part of a trajectory [N]."""
+    return float(np.linalg.norm(pair.measured_n, axis=1).max())
+
+
+def relative_rms(pair: AlignedCurves) -> float:
+    """RMS force error of one trajectory over its greatest measured force."""
+    return rms_n(pair) / peak_n(pair)
+
+
+def thickness_error_m(thickness_m: float, target_m: float = TARGET_THICKNESS_M) -> float:
+    """Absolute error of the total thickness [m]."""
+    return abs(thickness_m - target_m)
+
+
+def cost(
+    pairs: Sequence[AlignedCurves],
+    thickness_m: float,
+    *,
+    weights: CostWeights,
+    target_m: float = TARGET_THICKNESS_M,
+) -> float:
+    """Total cost [N] of simulations against measurements.
+
+    Args:
+        pairs: Every compared trajectory.
+        thickness_m: SimulatedIndentation total thickness [m].
+        weights: Of force and thickness.
+        target_m: Thickness to reach [m].
+    """
+    force = float(axis_rms_n(pairs).sum())
+    return weights.force * force + weights.thickness * thickness_error_m(thickness_m, target_m)

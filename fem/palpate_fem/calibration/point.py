@@ -9,18 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from palpate_fem.calibration.align import (
-    Aligned,
-    Curve,
+from palpate_fem.calibration.alignment import (
+    AlignedCurves,
+    AlignmentError,
     Floats,
-    Unalignable,
+    ForceCurve,
     align,
+    axis_rms_n,
     curve,
     from_contact,
+    thickness_error_m,
 )
-from palpate_fem.calibration.cost import axis_rms_n, thickness_error_m
-from palpate_fem.calibration.measured import Indentation
-from palpate_fem.calibration.runs import Simulated
+from palpate_fem.calibration.measured import MeasuredIndentation
+from palpate_fem.calibration.runs import SimulatedIndentation
 from palpate_fem.calibration.settings import MODULUS, CalibrationSettings
 
 _GRID = 13
@@ -28,31 +29,33 @@ _GRID = 13
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class CalibrationCase:
     """A measured trajectory, its whole curve, and the part from the threshold force on."""
 
-    item: Indentation
-    whole: Curve
-    contact: Curve
+    item: MeasuredIndentation
+    whole: ForceCurve
+    contact: ForceCurve
 
     @classmethod
-    def of(cls, item: Indentation, settings: CalibrationSettings) -> Case:
+    def of(cls, item: MeasuredIndentation, settings: CalibrationSettings) -> CalibrationCase:
         """Prepare a trajectory.
 
         Raises:
-            Unalignable: It does not reach the threshold from below.
+            AlignmentError: It does not reach the threshold from below.
         """
         return cls.of_curve(item, curve(item.pose, item.force), settings)
 
     @classmethod
-    def of_curve(cls, item: Indentation, whole: Curve, settings: CalibrationSettings) -> Case:
+    def of_curve(
+        cls, item: MeasuredIndentation, whole: ForceCurve, settings: CalibrationSettings
+    ) -> CalibrationCase:
         """Prepare a trajectory with another curve than its own."""
         threshold = settings.threshold_n
         return cls(item, whole, from_contact(whole, side="measurement", threshold_n=threshold))
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class SimulatedPoint:
     """All runs at one point.
 
     Attributes:
@@ -63,12 +66,12 @@ class State:
     """
 
     point: Floats
-    curves: tuple[Curve, ...]
+    curves: tuple[ForceCurve, ...]
     thickness_m: float
     fluid_volume_m3: float
 
     @classmethod
-    def of(cls, point: Floats, runs: Sequence[Simulated]) -> State:
+    def of(cls, point: Floats, runs: Sequence[SimulatedIndentation]) -> SimulatedPoint:
         """From the runs of all cases; refused ones know no thickness."""
         known = [run for run in runs if math.isfinite(run.thickness_m)]
         first = known[0] if known else runs[0]
@@ -76,34 +79,36 @@ class State:
             point, tuple(run.curve for run in runs), first.thickness_m, first.fluid_volume_m3
         )
 
-    def only(self, kept: Sequence[int]) -> State:
+    def only(self, kept: Sequence[int]) -> SimulatedPoint:
         """The same without the cases that are not kept."""
         curves = tuple(self.curves[i] for i in kept)
-        return State(self.point, curves, self.thickness_m, self.fluid_volume_m3)
+        return SimulatedPoint(self.point, curves, self.thickness_m, self.fluid_volume_m3)
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class ModulusFit:
     """The best modulus at one point, and how well it fits.
 
     Attributes:
         cost: Total cost [N]; infinite if a case cannot be compared.
         modulus_pa: Best modulus [Pa].
-        pairs: Aligned curves, one for each case.
+        pairs: AlignedCurves curves, one for each case.
         failures: Index of each case that cannot be compared, and why.
     """
 
     cost: float
     modulus_pa: float
-    pairs: tuple[Aligned, ...]
+    pairs: tuple[AlignedCurves, ...]
     failures: dict[int, str]
 
 
-def compare(simulated: Curve, case: Case, factor: float, settings: CalibrationSettings) -> Aligned:
+def compare(
+    simulated: ForceCurve, case: CalibrationCase, factor: float, settings: CalibrationSettings
+) -> AlignedCurves:
     """A simulated curve, scaled by the modulus, against a measured one.
 
     Raises:
-        Unalignable: It does not reach the threshold.
+        AlignmentError: It does not reach the threshold.
     """
     return align(
         simulated.scaled(factor),
@@ -114,18 +119,20 @@ def compare(simulated: Curve, case: Case, factor: float, settings: CalibrationSe
     )
 
 
-def fit_modulus(state: State, cases: Sequence[Case], settings: CalibrationSettings) -> Fit:
+def fit_modulus(
+    state: SimulatedPoint, cases: Sequence[CalibrationCase], settings: CalibrationSettings
+) -> ModulusFit:
     """Find the modulus that fits the runs of one point best; needs no further run."""
     low, high = settings.log_bounds(MODULUS)
     grid = np.linspace(low, high, _GRID)
     costs = np.array([_cost_at(log, state, cases, settings) for log in grid])
     best = int(costs.argmin())
     if not math.isfinite(costs[best]):
-        return Fit(math.inf, math.nan, (), _failures(state, cases, settings, grid))
+        return ModulusFit(math.inf, math.nan, (), _failures(state, cases, settings, grid))
     if best > 0 and not math.isfinite(costs[best - 1]):
         # the best would be softer still, but a case that ends early holds it back
         softer = math.exp(grid[best - 1])
-        return Fit(math.inf, math.nan, (), failures_at(state, cases, softer, settings))
+        return ModulusFit(math.inf, math.nan, (), failures_at(state, cases, softer, settings))
     bracket = (grid[max(best - 1, 0)], grid[min(best + 1, _GRID - 1)])
     worst = 10.0 * float(costs[best]) + 1.0  # instead of infinity, which spoils a parabola
     found = minimize_scalar(
@@ -140,18 +147,21 @@ def fit_modulus(state: State, cases: Sequence[Case], settings: CalibrationSettin
         compare(line, case, factor, settings)
         for line, case in zip(state.curves, cases, strict=True)
     )
-    return Fit(float(cost), math.exp(log), pairs, {})
+    return ModulusFit(float(cost), math.exp(log), pairs, {})
 
 
 def failures_at(
-    state: State, cases: Sequence[Case], modulus_pa: float, settings: CalibrationSettings
+    state: SimulatedPoint,
+    cases: Sequence[CalibrationCase],
+    modulus_pa: float,
+    settings: CalibrationSettings,
 ) -> dict[int, str]:
     """Index of each case that cannot be compared at this modulus, and why."""
     failures = {}
     for i, (line, case) in enumerate(zip(state.curves, cases, strict=True)):
         try:
             pair = compare(line, case, modulus_pa / settings.reference_shear_modulus_pa, settings)
-        except Unalignable as error:
+        except AlignmentError as error:
             failures[i] = error.problem
         else:
             if pair.coverage < settings.least_coverage:
@@ -160,15 +170,18 @@ def failures_at(
 
 
 def _cost_at(
-    log_modulus: float, state: State, cases: Sequence[Case], settings: CalibrationSettings
+    log_modulus: float,
+    state: SimulatedPoint,
+    cases: Sequence[CalibrationCase],
+    settings: CalibrationSettings,
 ) -> float:
     factor = math.exp(log_modulus) / settings.reference_shear_modulus_pa
     return force_and_thickness_cost(state.curves, cases, factor, state.thickness_m, settings)
 
 
 def force_and_thickness_cost(
-    curves: Sequence[Curve],
-    cases: Sequence[Case],
+    curves: Sequence[ForceCurve],
+    cases: Sequence[CalibrationCase],
     factor: float,
     thickness_m: float,
     settings: CalibrationSettings,
@@ -178,7 +191,7 @@ def force_and_thickness_cost(
     for line, case in zip(curves, cases, strict=True):
         try:
             pairs.append(compare(line, case, factor, settings))
-        except Unalignable:
+        except AlignmentError:
             return math.inf
         if pairs[-1].coverage < settings.least_coverage:
             return math.inf
@@ -188,7 +201,10 @@ def force_and_thickness_cost(
 
 
 def _failures(
-    state: State, cases: Sequence[Case], settings: CalibrationSettings, grid: Floats
+    state: SimulatedPoint,
+    cases: Sequence[CalibrationCase],
+    settings: CalibrationSettings,
+    grid: Floats,
 ) -> dict[int, str]:
     """Cases that can be compared at no modulus, and why not at the stiffest, which reaches most."""
     at_each = [failures_at(state, cases, math.exp(log), settings) for log in grid]

@@ -1,4 +1,4 @@
-"""A state of the skin in, the counts of one sensor out, with gradients."""
+"""The whole electrode model: a state of the skin in, counts of one specimen and gradients out."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_fem.electrodes.circuit import counts_slope, ideal_counts
-from palpate_fem.electrodes.conduction import Conduction, FilmConduction
+from palpate_fem.electrodes.conduction import FilmConduction, FilmSolution
+from palpate_fem.electrodes.electronics import counts_slope, ideal_counts
 from palpate_fem.electrodes.film import EDGE_M, film_mesh
-from palpate_fem.electrodes.gap import Gap, GapFinder
-from palpate_fem.electrodes.residual import fit_of, thickness
-from palpate_fem.electrodes.unit import UnitParameters
+from palpate_fem.electrodes.gap import Gap, GapFinder, gap_adjustment, thickness
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.result import IndentationStep
 
@@ -22,13 +21,13 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Response:
-    """What the electrodes say to one state.
+class ElectrodeResponse:
+    """Response of the electrodes to one state of the skin.
 
     Attributes:
-        counts: Before noise, rounding and the converter's ends, shape (19,).
+        counts: Before noise, rounding and clipping by the converter, shape (19,).
         impedance: Of the film [Ohm], shape (19,).
-        gap: From core to skin.
+        gap: Gap from core to skin.
         film: Thickness of the fluid [m], shape (N,).
         conduction: The film's solution.
     """
@@ -37,7 +36,7 @@ class Response:
     impedance: Floats
     gap: Gap
     film: Floats
-    conduction: Conduction
+    conduction: FilmSolution
     _slope: Floats
     _by_gap: Floats
 
@@ -48,91 +47,93 @@ class Response:
         )
 
     def to_skin(self, gradient: Floats, count: int) -> Floats:
-        """Transpose of the derivative: of a scalar by counts (19,) to by positions, (V, 3) [1/m].
+        """Gradient of a scalar by skin positions, shape (V, 3) [1/m], from that by counts, (19,).
 
-        Contact pressures are held fixed.
+        The transpose of the derivative; contact pressures are held fixed.
         """
         return self.gap.to_skin(gradient @ self.gradient_gap(), count)
 
 
-class Electrodes:
-    """The electrodes of one geometry and one unit."""
+class ElectrodeModel:
+    """The electrodes of one geometry and one specimen."""
 
     def __init__(
         self,
         geometry: FingertipGeometry,
-        unit: UnitParameters | None = None,
+        specimen: SpecimenParameters | None = None,
         *,
         edge_m: float = EDGE_M,
     ) -> None:
-        """Mesh the film and make it ready; half a second.
+        """Mesh the film and factorise its pattern; takes half a second.
 
         Args:
             geometry: Skin and core.
-            unit: Electrical parameters; None = nominal.
+            specimen: Electrical parameters; None = nominal.
             edge_m: Edge of the film's triangles between the discs [m].
 
         Raises:
             ConfigError: The electrodes do not fit onto the core.
             SimulationError: Skin and core do not belong together.
         """
-        unit = unit or UnitParameters()
-        self.unit, self.geometry, self._edge_m = unit, geometry, edge_m
+        specimen = specimen or SpecimenParameters()
+        self.specimen, self.geometry, self._edge_m = specimen, geometry, edge_m
         self.film = film_mesh(
             geometry.core,
             edge_m=edge_m,
-            disc_diameter_m=unit.disc_diameter_m,
-            recess_m=unit.recess_m,
+            disc_diameter_m=specimen.disc_diameter_m,
+            recess_m=specimen.recess_m,
         )
         self.finder = GapFinder(self.film, geometry.mesh)
-        self.conduction = FilmConduction(self.film, disc_radius_m=unit.disc_diameter_m / 2)
-        self._fit = fit_of(self.film.nodes, unit)
+        self.conduction = FilmConduction(self.film, disc_radius_m=specimen.disc_diameter_m / 2)
+        self._adjustment = gap_adjustment(self.film.nodes, specimen)
 
-    def with_unit(self, unit: UnitParameters) -> Electrodes:
-        """The same geometry with another unit; at once where its discs and core are the same."""
-        old = self.unit
-        if (unit.disc_diameter_m, unit.recess_m) != (old.disc_diameter_m, old.recess_m):
-            return Electrodes(self.geometry, unit, edge_m=self._edge_m)
+    def with_specimen(self, specimen: SpecimenParameters) -> ElectrodeModel:
+        """The model of another specimen; shares the film mesh if discs and core are the same."""
+        old = self.specimen
+        if (specimen.disc_diameter_m, specimen.recess_m) != (old.disc_diameter_m, old.recess_m):
+            return ElectrodeModel(self.geometry, specimen, edge_m=self._edge_m)
         other = copy(self)
-        other.unit, other._fit = unit, fit_of(self.film.nodes, unit)
+        other.specimen, other._adjustment = specimen, gap_adjustment(self.film.nodes, specimen)
         return other
 
     def respond(
         self, position: Floats, core_force: Floats | None = None, *, log_sigma: float = 0.0
-    ) -> Response:
-        """Answer to a state.
+    ) -> ElectrodeResponse:
+        """Response to a state of the skin.
 
         Args:
             position: Nodal positions of the skin [m], shape (V, 3), sensor frame.
             core_force: Nodal forces of the core on the skin [N], shape (V, 3); None = no contact.
-            log_sigma: ln of the conductivity over the unit's nominal one: temperature.
+            log_sigma: ln of the conductivity over the specimen's nominal one, from temperature.
 
         Raises:
             SimulationError: The skin is folded or torn.
         """
         return self.of_gap(self.finder.measure(position, core_force), log_sigma=log_sigma)
 
-    def of_step(self, rest: Floats, step: IndentationStep, *, log_sigma: float = 0.0) -> Response:
-        """Answer to a simulated step of a finger whose untouched nodes are at `rest` (V, 3) [m]."""
+    def of_step(
+        self, rest: Floats, step: IndentationStep, *, log_sigma: float = 0.0
+    ) -> ElectrodeResponse:
+        """Response to a simulated step; `rest` are the untouched nodes [m], shape (V, 3)."""
         return self.respond(rest + step.displacement, step.core_force, log_sigma=log_sigma)
 
-    def of_gap(self, gap: Gap, *, log_sigma: float = 0.0) -> Response:
-        """Answer to known gaps."""
-        unit = self.unit
-        film, by_gap, _ = thickness(self._fit.gap(gap.gap), gap.pressure, unit)
+    def of_gap(self, gap: Gap, *, log_sigma: float = 0.0) -> ElectrodeResponse:
+        """Response to known gaps."""
+        specimen = self.specimen
+        film, by_gap, _ = thickness(self._adjustment.gap(gap.gap), gap.pressure, specimen)
         solved = self.conduction.solve(
             film,
-            sigma_s_m=unit.sigma_s_m * float(np.exp(log_sigma)),
-            contact_ohm_m2=unit.contact_ohm_m2,
+            sigma_s_m=specimen.sigma_s_m * float(np.exp(log_sigma)),
+            contact_ohm_m2=specimen.contact_ohm_m2,
         )
-        return Response(
-            counts=ideal_counts(solved.impedance, unit),
+        return ElectrodeResponse(
+            counts=ideal_counts(solved.impedance, specimen),
             impedance=solved.impedance,
             gap=gap,
             film=film,
             conduction=solved,
-            _slope=counts_slope(solved.impedance, unit),
-            _by_gap=by_gap * self._fit.share,
+            _slope=counts_slope(solved.impedance, specimen),
+            _by_gap=by_gap * self._adjustment.share,
         )
 
     def counts(
@@ -142,7 +143,7 @@ class Electrodes:
         *,
         log_sigma: float = 0.0,
     ) -> Floats:
-        """Ideal counts of many states, shape (B, 19): the same numbers as one by one.
+        """Ideal counts of many states, shape (B, 19); the same numbers as `respond` one by one.
 
         Args:
             positions: Nodal positions [m], shape (B, V, 3).

@@ -1,0 +1,362 @@
+"""``palpate fem calibrate``, ``validate``, ``recover``, ``units``: parameters from measurements.
+
+Calibration finds the fingertip's mechanical parameters from measured forces, ``recover`` checks
+that method on known parameters, ``validate`` compares simulated with measured forces, and
+``units`` fits the electrodes of specimens to published ranges.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress
+
+from palpate.errors import ConfigError
+from palpate_fem.calibration.calibrate import calibrate
+from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
+from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
+from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
+from palpate_fem.calibration.runs import SimulatedIndentation, simulate_all
+from palpate_fem.cli.model import FingertipModel, workers_for
+from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
+from palpate_fem.config import EDGE_M, FingertipParameters
+from palpate_fem.electrodes.model import ElectrodeModel
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.plot.validation import plot_calibration, plot_examples, plot_indenters
+from palpate_fem.population.fitting import deep_states, fit_member
+from palpate_fem.population.members import PAPER, Member, read_population, write_population
+from palpate_fem.population.responses import geometry_of
+from palpate_fem.service.batch import PoolSimulator
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.trajectory import ANGLED_DEPTH_M, CLEARANCE_M, NORMAL_DEPTH_M
+from palpate_fem.validation.sources import measured_from, simulated_from
+from palpate_fem.validation.validate import (
+    INDENTER_HEADINGS,
+    indenter_rows,
+    summary_lines,
+    validate,
+    write_report,
+)
+
+CALIBRATION_HEADINGS = ("parameter", "value", "deviation", "force per 1 %", "bounds", "remark")
+_LIMIT_S = 900.0  # of one run; the slowest trajectory takes a tenth of it
+
+
+def calibrate_command(
+    measured: Path,
+    out: Path,
+    only: Sequence[str],
+    model: FingertipModel,
+    *,
+    png: Path | None,
+    workers: int,
+) -> int:
+    """Calibrate and write the result.
+
+    Returns:
+        0, or 1 if the search did not converge.
+
+    Raises:
+        DatasetError: The file is damaged, or nothing in it can be compared.
+        SimulationError: No simulation can be compared with its measurement.
+        ConfigError: No trajectory is left.
+    """
+    chosen = _chosen(measured, only)
+    with simulator_for(model, workers, len(chosen)) as (simulator, executor), _search_bar() as bar:
+        result = calibrate(
+            simulator,
+            chosen,
+            executor=executor,
+            on_evaluation=bar.on_evaluation,
+            on_run=bar.on_run,
+        )
+    write_calibration(out, result)
+    _show_calibration(result, out)
+    if png is not None:
+        plot_calibration(result, png)
+    return 0 if result.converged else 1
+
+
+def validate_command(
+    measured: Path,
+    out: Path,
+    only: Sequence[str],
+    model: FingertipModel,
+    *,
+    store: Path | None,
+    workers: int,
+) -> int:
+    """Compare, and write table and plots.
+
+    Returns:
+        0, or 1 if nothing could be compared.
+
+    Raises:
+        DatasetError: A file is damaged.
+        ConfigError: No trajectory is left.
+    """
+    chosen = _chosen(measured, only)
+    refused: dict[str, str] = {}
+    if store is not None:
+        simulated, refused = simulated_from(SimulationStore.open(store), chosen)
+    else:
+        simulated = _simulated(chosen, model, workers)
+    result = validate(chosen, simulated)
+    print_lines(*(f"{name}: {why}" for name, why in refused.items()))
+    if result.compared:
+        print_table(INDENTER_HEADINGS, indenter_rows(result))
+    print_lines(*summary_lines(result))
+    if not result.compared:
+        return 1
+    files = [*write_report(out, result), out / "examples.png", out / "indenters.png"]
+    plot_examples(result, files[-2])
+    plot_indenters(result, files[-1])
+    print_lines(f"wrote {out}: {', '.join(file.name for file in files)}")
+    return 0
+
+
+def _simulated(
+    chosen: Sequence[MeasuredIndentation], model: FingertipModel, workers: int
+) -> dict[str, SimulatedIndentation]:
+    with simulator_for(model, workers, len(chosen)) as (simulator, executor), _search_bar() as bar:
+        return simulate_all(
+            simulator, model.parameters, chosen, executor=executor, on_run=bar.on_run
+        )
+
+
+def _chosen(measured: Path, only: Sequence[str]) -> list[MeasuredIndentation]:
+    """Trajectories of the file whose name begins with one of ``only``; without, all."""
+    found, left_out = measured_from(measured)
+    print_lines(*(f"left out: {name}: {why}" for name, why in left_out.items()), to=console)
+    chosen = [
+        item for item in found if not only or any(item.name.startswith(start) for start in only)
+    ]
+    if not chosen:
+        raise ConfigError(
+            f"no trajectory of {measured} begins with {' or '.join(only) or 'anything'}",
+            remedy=f"there are e.g. {', '.join(item.name for item in found[:3]) or 'none'}",
+        )
+    if any(item.origin == SIMULATED for item in chosen):
+        print_lines(
+            "these forces are simulated, not measured: this tests the method, not the model",
+            to=console,
+        )
+    return chosen
+
+
+@contextmanager
+def simulator_for(
+    model: FingertipModel, workers: int, jobs: int
+) -> Iterator[tuple[PoolSimulator, ThreadPoolExecutor]]:
+    """A simulator over worker processes, and an executor with a thread for each of them."""
+    count, threads = workers_for(workers, jobs)
+    with (
+        PoolSimulator(
+            model.setup(keep=2), workers=count, threads=threads, limit_s=_LIMIT_S
+        ) as simulator,
+        ThreadPoolExecutor(count) as executor,
+    ):
+        try:
+            yield simulator, executor
+        except BaseException:
+            simulator.close()  # before the executor, whose threads wait for the simulator
+            raise
+
+
+class _SearchBar:
+    """Progress of a calibration."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task = bar.add_task("simulate", total=None, info="")
+
+    def on_evaluation(self, evaluation: Evaluation) -> None:
+        self._bar.update(
+            self._task,
+            info=f"{evaluation.stage}: cost {evaluation.cost:.3f} N after "
+            f"{evaluation.simulations} runs",
+        )
+
+    def on_run(self, done: int, total: int) -> None:
+        self._bar.update(self._task, completed=done, total=total)
+
+
+@contextmanager
+def _search_bar() -> Iterator[_SearchBar]:
+    with progress_bar() as bar:
+        yield _SearchBar(bar)
+
+
+def _show_calibration(result: Calibration, out: Path) -> None:
+    title = "calibrated" if result.converged else "the search did not converge"
+    print_table(CALIBRATION_HEADINGS, result.rows(), title=title)
+    print_lines(
+        f"cost {result.cost:.4g} N, {result.thickness_m * 1e3:.2f} mm thick, "
+        f"{result.simulations} runs; wrote {out}",
+        *(f"left out: {name}: {why}" for name, why in result.excluded.items()),
+        *(f"note: {note}" for note in result.notes),
+    )
+
+
+# Away from the defaults, so that a search that does not move fails the test.
+PLANTED = FingertipParameters(
+    skin_thickness_m=1.45e-3, shear_modulus_pa=3.3e5, friction_coefficient=0.25
+)
+RECOVERY_HEADINGS = ("parameter", "planted", "found", "error", "deviation", "tolerance", "")
+
+
+def recover_command(
+    model: FingertipModel,
+    *,
+    edge_mm: float | None,
+    noise_n: float,
+    seed: int,
+    workers: int,
+    as_json: bool,
+) -> int:
+    """Simulate with known parameters, add noise, calibrate, compare.
+
+    Args:
+        model: Mesh of the calibration; its parameters are not used.
+        edge_mm: Edge of that mesh on the pad [mm]; None = the default mesh.
+        noise_n: Standard deviation of the noise of each axis [N].
+        seed: For the noise.
+        workers: Processes that solve.
+        as_json: Print JSON instead of a table.
+
+    Returns:
+        0, or 1 if the error of a parameter exceeds its tolerance.
+    """
+    geometry = biotac(
+        thickness_m=PLANTED.skin_thickness_m, edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3
+    )
+    planned = plan_recovery(Fingertip.pressurised(geometry, replace(PLANTED)))
+    with (
+        simulator_for(model, workers, len(planned)) as (simulator, executor),
+        _search_bar() as bar,
+    ):
+        recovery = recover(
+            simulator,
+            PLANTED,
+            planned,
+            noise_n,
+            seed,
+            executor=executor,
+            on_evaluation=bar.on_evaluation,
+            on_run=bar.on_run,
+        )
+    if as_json:
+        typer.echo(json.dumps(_recovery_json(recovery, noise_n, seed), indent=1))
+    else:
+        title = f"planted and found, noise {noise_n:g} N, seed {seed}"
+        print_table(RECOVERY_HEADINGS, recovery.rows(), title=title)
+        excluded = recovery.calibration.excluded
+        print_lines(*(f"left out: {name}: {why}" for name, why in excluded.items()))
+    return 0 if recovery.passed else 1
+
+
+def _recovery_json(recovery: ParameterRecovery, noise_n: float, seed: int) -> dict[str, object]:
+    return {
+        "noise_n": noise_n,
+        "seed": seed,
+        "passed": recovery.passed,
+        "simulations": recovery.calibration.simulations,
+        "converged": recovery.calibration.converged,
+        "cost_n": recovery.calibration.cost,
+        "left_out": recovery.calibration.excluded,
+        "notes": recovery.calibration.notes,
+        "deviation": {name: recovery.sd[name] / value for name, value in recovery.found.items()},
+        "planted": recovery.truth,
+        "found": recovery.found,
+        "error": recovery.errors,
+        "largest_force_n": {item.name: float(abs(item.force).max()) for item in recovery.measured},
+    }
+
+
+def planned_travel_m(name: str) -> float:
+    """Planned travel of a trajectory of the paper, from its first pose on [m], by its name."""
+    return CLEARANCE_M + (NORMAL_DEPTH_M if name.endswith("/normal") else ANGLED_DEPTH_M)
+
+
+def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> int:
+    """Fit the paper's three specimens on a store.
+
+    Args:
+        store: Trajectories of the whole set.
+        out: Population file to write.
+        overtravel_m: How much deeper than planned the store's paths go [m].
+
+    Raises:
+        ConfigError: The overtravel is negative.
+        DatasetError: The store is empty, damaged, or of another mesh.
+    """
+    if overtravel_m < 0:
+        raise ConfigError(f"overtravel of {overtravel_m} m", remedy="give 0 or more")
+    opened = SimulationStore.open(store)
+    fingertip = opened.fingertip()
+    geometry = geometry_of(fingertip)
+    sensor = ElectrodeModel(geometry)
+    rest = sensor.finder.measure(fingertip.pressurised_nodes)
+    ids = opened.ids()
+    with progress_bar() as bar:
+        task = bar.add_task("films", total=len(ids))
+        states = deep_states(
+            opened, sensor, planned_travel_m, on_trajectory=lambda: bar.advance(task)
+        )
+        bar.update(task, description="specimens", total=len(PAPER), completed=0)
+        members: list[Member] = []
+        for number, published in enumerate(PAPER, 1):
+            members.append(
+                fit_member(geometry, rest, states, published, number, most_m=overtravel_m)
+            )
+            bar.advance(task)
+    source = f"{len(ids)} trajectories of the fingertip {fingertip.key[:12]}"
+    write_population(out, members, source=source)
+    _show_members(members)
+    print_lines(f"wrote {out}")
+    return 0
+
+
+def show_units_command(file: Path | None, *, as_json: bool) -> int:
+    """Print a population.
+
+    Raises:
+        ConfigError: The file cannot be read, or is none.
+    """
+    members = read_population(file)
+    if as_json:
+        typer.echo(json.dumps([member.to_dict() for member in members], indent=2))
+    else:
+        _show_members(members)
+    return 0
+
+
+def _show_members(members: Sequence[Member]) -> None:
+    rows: list[tuple[str, Callable[[Member], str]]] = [
+        ("lowest tared value", lambda m: f"{m.found['low']:.3f} ({m.published.low})"),
+        ("highest tared value", lambda m: f"{m.found['high']:.3f} ({m.published.high})"),
+        (
+            "largest force [N]",
+            lambda m: f"{m.found['max_force_n']:.1f} ({m.published.max_force_n})",
+        ),
+        ("pressed deeper by [mm]", lambda m: f"{m.overtravel_m * 1e3:.1f}"),
+        ("conductivity [S/m]", lambda m: f"{m.specimen.sigma_s_m:.3f}"),
+        ("sides closer to the core by [mm]", lambda m: f"{m.specimen.side_closing_m * 1e3:.2f}"),
+        ("squeeze pressure [kPa]", lambda m: f"{m.specimen.squeeze_pa * 1e-3:.1f}"),
+        ("film at infinite pressure [um]", lambda m: f"{m.specimen.floor_m * 1e6:.1f}"),
+    ]
+    print_table(
+        ("", *(member.specimen.name for member in members)),
+        # Rich would take [N] for a style.
+        [(escape(label), *(value(member) for member in members)) for label, value in rows],
+        title="specimens: found (published)",
+        numbers_from=1,
+    )

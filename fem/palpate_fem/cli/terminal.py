@@ -1,0 +1,100 @@
+"""Terminal output and Ctrl-C of the finite-element commands.
+
+Results go to stdout; progress and remarks go to stderr.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+console = Console(stderr=True)
+"""For progress and remarks."""
+
+
+class _Info(ProgressColumn):
+    """The ``info`` of a task, if it has one."""
+
+    def render(self, task: Task) -> Text:
+        return Text(str(task.fields.get("info", "")))
+
+
+def progress_bar() -> Progress:
+    """A progress bar on stderr; tasks may carry ``info``, a text after the bar."""
+    return Progress(
+        TextColumn("{task.description:10}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        _Info(),
+        console=console,
+        transient=True,
+    )
+
+
+def print_lines(*lines: str, to: Console | None = None) -> None:
+    """Print lines unchanged (no markup, colours or wrapping); to stdout unless ``to`` is given."""
+    if lines:
+        (to or Console()).print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
+
+
+def print_table(
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    title: str = "",
+    caption: str = "",
+    numbers_from: int | None = None,
+) -> None:
+    """Print a table to stdout.
+
+    Args:
+        headings: Of the columns.
+        rows: Cells, as Rich markup.
+        title: Above it.
+        caption: Below it.
+        numbers_from: First of the columns that hold numbers, which are aligned right; None = none.
+    """
+    table = Table(title=title or None, caption=caption or None)
+    for at, heading in enumerate(headings):
+        right = numbers_from is not None and at >= numbers_from
+        table.add_column(heading, justify="right" if right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """An event that is set by the first Ctrl-C or ``SIGTERM``; a second Ctrl-C ends at once."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        console.print("stopping; what has ended is kept")
+        stop.set()
+
+    before = {
+        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
