@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from palpate.config import StrictConfig
-from palpate.names import Name
+from palpate.config import Name, StrictConfig
 from palpate_gateway.condition.condition import DRIFT_COUNTS
 from palpate_gateway.condition.stillness import MAX_PAC_SD_COUNTS, MAX_SD_COUNTS
 from palpate_gateway.one_core import CoreChoice

@@ -1,16 +1,50 @@
-"""Configuration shared by all rooms: strict models, and how a process joins the bus."""
+"""Configuration shared by all rooms: strict models, names in keys, links to the bus."""
 
 from __future__ import annotations
 
 import difflib
 import ipaddress
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from palpate.errors import ConfigError
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+
+
+def check_name(name: str, what: str = "name") -> str:
+    """Return ``name`` if it may stand in a key.
+
+    Args:
+        name: The name.
+        what: What it names, for the error.
+
+    Raises:
+        ConfigError: It may not; the error names it and the rule.
+    """
+    if not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"{what} {name!r} cannot stand in a Zenoh key",
+            remedy="use 1-63 of a-z, 0-9, '-', '_', starting with a letter or digit",
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(check_name)]
+"""A configuration value that is checked by :func:`check_name`."""
+
 
 C = TypeVar("C", bound=BaseModel)
 

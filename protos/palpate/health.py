@@ -16,7 +16,6 @@ from palpate import __version__, clock
 from palpate.bus import Session, endpoints
 from palpate.bus.query import error_reply
 from palpate.bus.topics import STATUS as STATUS_TOPIC
-from palpate.closing import Closing
 from palpate.errors import PalpateError
 from palpate.messages import (
     ChannelFault,
@@ -26,6 +25,7 @@ from palpate.messages import (
     ServiceState,
     Status,
 )
+from palpate.process import Closing
 
 _log = logging.getLogger(__name__)
 

@@ -7,8 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from palpate.config import StrictConfig
-from palpate.names import Name
+from palpate.config import Name, StrictConfig
 
 DEFAULT_BUNDLE = "features-virtual"
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from tests.fuzz.corpus import TARGETS, load_target
 
-from palpate.extras import require
+from palpate.process import require
 
 _WATCHED = ("palpate_gateway", "palpate.files.record", "mcap")
 """Packages whose branches count as coverage."""

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.files.tape import Tape, TapePress, TapeUnit, build_tape, tape_unit
+from palpate.files.tape import Tape, TapeUnit
+from palpate.files.tape_build import TapePress, build_tape, tape_unit
 
 STEPS = 6
 REST_PRESSURE_PA = 1750.0

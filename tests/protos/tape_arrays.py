@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.files.tape import TapePress, tape_unit
+from palpate.files.tape_build import TapePress, tape_unit
 
 ELECTRICS = {
     "noise_counts": 0.4,

@@ -14,8 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.errors import BundleError
-from palpate.files.bundle import Manifest, read_bundle, read_mesh, write_bundle
-from palpate.files.field_mesh import FieldMesh, mesh_from_bytes, mesh_to_bytes
+from palpate.files.bundle import (
+    FieldMesh,
+    Manifest,
+    mesh_from_bytes,
+    mesh_to_bytes,
+    read_bundle,
+    read_mesh,
+    write_bundle,
+)
 from palpate.files.tasks import TASKS, check_tensors, tensors_of
 from palpate.messages import TensorInfo
 

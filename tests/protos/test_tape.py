@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError
-from palpate.files.tape import Tape, build_tape, check_tape, read_tape, tape_unit, write_tape
+from palpate.files.tape import Tape, check_tape, read_tape, write_tape
+from palpate.files.tape_build import build_tape, tape_unit
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("tape_arrays")

@@ -17,8 +17,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from palpate.errors import DatasetError
-from palpate.files.tape import build_tape, read_tape, write_tape
-from palpate.files.tape import file as tape_file
+from palpate.files import tape as tape_file
+from palpate.files.tape import read_tape, write_tape
+from palpate.files.tape_build import build_tape
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("tape_arrays")

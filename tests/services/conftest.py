@@ -14,7 +14,8 @@ import numpy.typing as npt
 import pytest
 
 from palpate import clock
-from palpate.files.bundle import TASKS, Bundle, Manifest, read_bundle, write_bundle
+from palpate.files.bundle import Bundle, Manifest, read_bundle, write_bundle
+from palpate.files.tasks import TASKS
 from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,

@@ -11,8 +11,7 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from palpate.files.bundle import Manifest, write_bundle
-from palpate.files.field_mesh import FieldMesh
+from palpate.files.bundle import FieldMesh, Manifest, write_bundle
 from palpate.files.tasks import tensors_of
 from palpate.messages import FieldEstimate, FieldFrame, FloatArray, Stamp
 

@@ -345,7 +345,7 @@ def _start_floor(children: Children, model: Path, out: Path, gates: Path) -> Non
 
 def _settings(children: Children, mode: str, link: LinkConfig) -> str:
     """Palpate's own Zenoh settings as a file: the same for both sides by construction."""
-    from palpate.bus.settings import zenoh_config
+    from palpate.bus.link import zenoh_config
 
     path = children.folder / f"floor-{mode}.json5"
     path.write_text(str(zenoh_config(link, mode)), encoding="utf-8")

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from palpate.command import typed_command
 from palpate.errors import ConfigError, MissingExtraError
+from palpate.process import typed_command
 from palpate_deploy.cli.options import JsonOption, show_left_out
 
 if TYPE_CHECKING:

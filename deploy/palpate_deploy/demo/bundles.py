@@ -15,9 +15,9 @@ from rich.table import Table
 
 from palpate.bus.topics import ELECTRODES, TOPICS, sensor_key
 from palpate.errors import BundleError, PalpateError
-from palpate.extras import require
 from palpate.files.bundle import read_bundle
 from palpate.files.record import RecordWriter
+from palpate.process import require
 from palpate_deploy.cli.data import EXTRA_MODULES
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device

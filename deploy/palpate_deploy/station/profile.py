@@ -24,13 +24,13 @@ from pydantic_settings import (
 from palpate.config import (
     DEFAULT_ROUTER,
     LinkConfig,
+    Name,
     StrictConfig,
     config_error,
     endpoint_host_port,
     is_loopback,
 )
 from palpate.errors import ConfigError
-from palpate.names import Name
 from palpate_deploy.station.logs import LogFormat, LogLevel
 from palpate_fem.service.config import FemConfig
 from palpate_gateway.config import GatewayConfig

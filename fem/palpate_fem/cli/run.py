@@ -17,10 +17,10 @@ from types import FrameType
 import numpy as np
 import typer
 
-from palpate.command import typed_command
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
+from palpate.process import typed_command
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import (
     console,

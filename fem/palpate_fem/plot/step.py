@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
-from palpate.extras import require
+from palpate.process import require
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.style import (
     CORE,

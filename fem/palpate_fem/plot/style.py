@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from palpate.extras import require
+from palpate.process import require
 from palpate_fem.result import IndentationOutcome
 from palpate_fem.store.files import disk_error
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from palpate.closing import Closing
 from palpate.errors import RemoteError, SimulationError
+from palpate.process import Closing
 from palpate_fem.calibration.runs import SimulatedIndentation
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of

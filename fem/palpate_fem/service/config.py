@@ -7,8 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from palpate.config import StrictConfig
-from palpate.names import Name
+from palpate.config import Name, StrictConfig
 from palpate_fem.config import FingertipParameters
 
 DEFAULT_FACTORY = "palpate_fem.service.biotac:biotac"

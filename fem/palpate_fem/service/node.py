@@ -12,7 +12,6 @@ from collections import OrderedDict
 
 from palpate.bus import Presence, Publisher, QueryAnswer, Session, endpoints
 from palpate.bus.topics import SIMULATION_PROGRESS, caller_key
-from palpate.closing import Closing
 from palpate.config import LinkConfig
 from palpate.errors import (
     ConfigError,
@@ -33,6 +32,7 @@ from palpate.messages import (
     SimulationReply,
     SimulationRequest,
 )
+from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.config import FemConfig

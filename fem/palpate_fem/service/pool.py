@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from multiprocessing.connection import Connection
 
-from palpate.closing import Closing
 from palpate.errors import ErrorCode, RemoteError
+from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome
 from palpate_fem.service.fingertips import without_friction

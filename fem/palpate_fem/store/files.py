@@ -11,8 +11,8 @@ import fcntl
 import os
 from pathlib import Path
 
-from palpate.closing import Closing
 from palpate.errors import DatasetError, ErrorCode
+from palpate.process import Closing
 
 PART = ".part"
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from palpate.closing import Closing
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.simulation_store import FINGERTIP, SUFFIX, TRAJECTORIES, check_id
+from palpate.process import Closing
 from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.files import (

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
-from palpate.config import endpoint_host_port
+from palpate.config import check_name, endpoint_host_port
 from palpate.errors import ConfigError
-from palpate.extras import require
-from palpate.names import check_name
+from palpate.process import require
 from palpate_gateway.cli.key_values import parse_key_values
 from palpate_gateway.emulators.emulator import Emulator, WrenchSource, no_load, slow_press
 

@@ -15,7 +15,7 @@ from typing import Any
 import typer
 
 from palpate.errors import MissingExtraError, PalpateError
-from palpate.extras import require
+from palpate.process import require
 from palpate_gateway.drivers import driver_names, load_driver
 
 BY_ID = Path("/dev/serial/by-id")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any, ClassVar
 
-from palpate.extras import require
+from palpate.process import require
 from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.biotac_slots import (
     ELECTRODES,

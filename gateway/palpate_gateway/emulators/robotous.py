@@ -13,7 +13,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from palpate.extras import require
+from palpate.process import require
 from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.emulator import (
     Emulator,

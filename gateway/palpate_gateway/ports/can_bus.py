@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import ConfigError, DeviceError, DeviceLost
-from palpate.extras import require
+from palpate.process import require
 from palpate_gateway.clock.wall_clock import KernelStamps
 from palpate_gateway.ports.can_frames import (
     BUS_OFF,

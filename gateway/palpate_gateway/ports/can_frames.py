@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from palpate.extras import require
+from palpate.process import require
 from palpate_gateway.ports.datagrams import DatagramBatch
 
 BUS_OFF = 0x40

@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 from palpate.errors import DeviceError, DeviceLost
-from palpate.extras import require
+from palpate.process import require
 from palpate_gateway.ports.port import Port, silent
 
 _AT_ONCE = 65536

@@ -13,10 +13,10 @@ from pathlib import Path
 from pydantic import Field
 
 from palpate.bus.topics import POSE, ROBOT_POSE
+from palpate.config import Name
 from palpate.errors import ConfigError, RecordingError, WireError
 from palpate.files.record import RecordItem, read_record
 from palpate.messages import Origin, RobotPoseFrame
-from palpate.names import Name
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.pose.table import PoseRow, PoseSource, PoseTable

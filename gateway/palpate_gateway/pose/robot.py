@@ -9,10 +9,9 @@ from pydantic import Field, field_validator, model_validator
 
 from palpate.bus import Delivery, Received, Session, Subscriber
 from palpate.bus.topics import ROBOT_POSE
-from palpate.config import LinkConfig, TlsConfig, endpoint_host_port
+from palpate.config import LinkConfig, Name, TlsConfig, endpoint_host_port
 from palpate.errors import DeviceLost, DeviceTimeout, LinkError, StreamTimeout
 from palpate.messages import Origin, RobotPoseFrame
-from palpate.names import Name
 from palpate_gateway.device import BusDevice, DeviceIdentity, DeviceInfo
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict

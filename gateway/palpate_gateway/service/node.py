@@ -14,7 +14,7 @@ from palpate.config import LinkConfig
 from palpate.errors import ConfigError, PalpateError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
-from palpate.pauses import avoid_pauses
+from palpate.process import avoid_pauses
 from palpate_gateway.clock.wall_clock import WallClock, wall_discipline
 from palpate_gateway.condition.condition import RetareRules
 from palpate_gateway.condition.stillness import StillLimits

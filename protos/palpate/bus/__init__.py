@@ -4,13 +4,10 @@ Rules that were learned by running it (docs/adr/0004-keys-and-qos.md): callbacks
 sensor streams drop rather than block; a query is always answered; plain TCP, never ``lowlatency``.
 """
 
-from palpate.bus.link import Session
-from palpate.bus.opening import run_router
+from palpate.bus.link import Session, run_router
 from palpate.bus.presence import Alive, CallerToken, Presence
-from palpate.bus.publish import Publisher
+from palpate.bus.pubsub import Delivery, Publisher, Received, Sample, Subscriber, Tap
 from palpate.bus.query import MAX_REPLY_BYTES, QueryAnswer
-from palpate.bus.queues import Delivery
-from palpate.bus.subscribe import Received, Sample, Subscriber, Tap
 
 __all__ = [
     "MAX_REPLY_BYTES",

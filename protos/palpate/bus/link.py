@@ -1,7 +1,10 @@
-"""Joining the bus."""
+"""Joining the bus: settings of Zenoh, the session of a process, and the router."""
 
 from __future__ import annotations
 
+import json
+import re
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, Self, TypeVar
@@ -9,9 +12,8 @@ from typing import Any, Protocol, Self, TypeVar
 import zenoh
 
 from palpate.bus.endpoints import Endpoint
-from palpate.bus.opening import no_router, open_zenoh
 from palpate.bus.presence import Alive, CallerToken, CallerWatch, Presence, alive
-from palpate.bus.publish import Publisher
+from palpate.bus.pubsub import Delivery, Publisher, Subscriber, Tap
 from palpate.bus.query import (
     Queryable,
     QueryAnswer,
@@ -20,12 +22,140 @@ from palpate.bus.query import (
     raise_errors,
     single_reply,
 )
-from palpate.bus.queues import Delivery
-from palpate.bus.subscribe import Subscriber, Tap
-from palpate.bus.topics import Topic, caller_key, sensor_key, service_key
-from palpate.closing import Closing
+from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
 from palpate.config import LinkConfig
-from palpate.errors import PalpateError
+from palpate.errors import LinkError, PalpateError
+from palpate.process import Closing
+
+INDIRECT_WAIT_S = 60.0
+"""Without direct links opening blocks until the router answers; it gives up after this time [s]."""
+
+LOSSLESS_STALL_S = 60.0
+"""How long a lossless (replay) publisher may be blocked before its link is closed."""
+
+
+def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
+    """Settings of a session of ``mode`` ``"peer"``, ``"client"`` or ``"router"``."""
+    client = mode == "client"
+    wait_s = INDIRECT_WAIT_S if link.wait_for_router_s < 0 else link.wait_for_router_s
+    settings: dict[str, Any] = {
+        "mode": mode,
+        # A peer retries for ever in the background; Session.open does the waiting and names what is
+        # missing. A client cannot open without its router.
+        "connect": {
+            "endpoints": list(link.connect),
+            "timeout_ms": round(wait_s * 1000) if client else -1,
+            "exit_on_failure": client,
+            "retry": {
+                "period_init_ms": 200,
+                "period_max_ms": 1000,
+                "period_increase_factor": 1.5,
+            },
+        },
+        "listen": {
+            "endpoints": [] if client else list(link.listen),
+            "timeout_ms": 0,
+            "exit_on_failure": True,
+        },
+        # The router introduces peers to one another; their data then flows on direct links.
+        "scouting": {
+            "multicast": {"enabled": False},
+            "gossip": {
+                "enabled": True,
+                "autoconnect": {"router": [], "peer": ["router", "peer"]},
+            },
+        },
+        # Do not wait for peers that may not exist; Session.open waits for the router itself.
+        "open": {"return_conditions": {"connect_scouted": False, "declares": True}},
+        "timestamping": {"enabled": False},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {
+                "tx": {
+                    "lease": round(link.lease_s * 1000),
+                    "keep_alive": 4,
+                    "queue": {
+                        # Express messages take a batch each: with the default of two, twenty
+                        # sensors that publish in the same millisecond lose frames.
+                        "size": {"real_time": 16, "data_high": 16},
+                        "congestion_control": {
+                            "drop": {"wait_before_drop": 2000},
+                            "block": {"wait_before_close": round(LOSSLESS_STALL_S * 1e6)},
+                        },
+                    },
+                },
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+            },
+        },
+    }
+    if link.tls is not None:
+        settings["transport"]["link"]["tls"] = {
+            "root_ca_certificate": str(link.tls.root_ca_certificate),
+            "enable_mtls": True,
+            "listen_certificate": str(link.tls.certificate),
+            "listen_private_key": str(link.tls.private_key),
+            "connect_certificate": str(link.tls.certificate),
+            "connect_private_key": str(link.tls.private_key),
+        }
+    return zenoh.Config.from_json5(json.dumps(settings))
+
+
+_IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
+
+
+def no_router(link: LinkConfig) -> LinkError:
+    """The error that says that there is no router where ``link`` looks for it."""
+    return LinkError(
+        f"no router at {', '.join(link.connect)}",
+        remedy="start one with `palpate up`, or name yours with --connect",
+    )
+
+
+def open_zenoh(link: LinkConfig, mode: str) -> zenoh.Session:
+    """Open a Zenoh session and translate why it does not open.
+
+    Raises:
+        LinkError: A port is in use, or a client finds no router.
+    """
+    try:
+        return zenoh.open(zenoh_config(link, mode))
+    except zenoh.ZError as error:
+        if _IN_USE.search(str(error)):
+            raise LinkError(
+                f"port in use: {', '.join(link.listen)}",
+                remedy=(
+                    "another palpate runs there (palpate status); stop it or choose another "
+                    "port for the listener"
+                ),
+            ) from error
+        if mode == "client":
+            raise no_router(link) from error
+        raise LinkError(
+            f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
+        ) from error
+
+
+def run_router(
+    listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
+) -> None:
+    """Be the router until ``stop`` is set.
+
+    Args:
+        listen: Endpoints, e.g. ``("tcp/127.0.0.1:7447",)``.
+        stop: Set it to end.
+        link: Lease and certificates; None = defaults.
+
+    Raises:
+        LinkError: A port is in use.
+    """
+    base = link or LinkConfig()
+    config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
+    raw = open_zenoh(config, "router")
+    try:
+        stop.wait()
+    finally:
+        raw.close()
+
 
 M = TypeVar("M")
 Q = TypeVar("Q")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import zenoh
 
 from palpate.bus.topics import live_key
-from palpate.closing import Closing
+from palpate.process import Closing
 
 _LOOK_S = 1.0
 _SETTLE_S = 0.1

@@ -15,9 +15,7 @@ from typing import Any, Generic, TypeVar
 import zenoh
 
 from palpate.bus.endpoints import Endpoint
-from palpate.bus.settings import MAX_MESSAGE_BYTES
-from palpate.bus.topics import ENCODING_PREFIX, check_schema
-from palpate.closing import Closing
+from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema
 from palpate.codec import ERROR, Codec
 from palpate.errors import (
     ErrorCode,
@@ -28,6 +26,7 @@ from palpate.errors import (
     WireError,
 )
 from palpate.messages import ErrorReply
+from palpate.process import Closing
 
 Q = TypeVar("Q")
 R = TypeVar("R")

@@ -20,6 +20,7 @@ from typing import Any, Generic, TypeVar
 
 from palpate import codec
 from palpate.codec import Codec
+from palpate.config import check_name
 from palpate.errors import WireError
 from palpate.messages import (
     ElectrodeFrame,
@@ -35,7 +36,6 @@ from palpate.messages import (
     Tare,
     WrenchFrame,
 )
-from palpate.names import check_name
 
 M = TypeVar("M")
 
@@ -46,6 +46,9 @@ ROOT = f"palpate/@v{CONTRACT_VERSION}"
 LIVE_ROOT = f"{ROOT}/@live"
 ASKING_ROOT = f"{ROOT}/@asking"
 ENCODING_PREFIX = "application/protobuf;"
+
+MAX_MESSAGE_BYTES = 4 << 20
+"""Larger messages are refused on arrival; Zenoh's own limit is 1 GiB."""
 
 
 class Priority(IntEnum):

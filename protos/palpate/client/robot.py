@@ -20,7 +20,6 @@ from palpate.bus import Alive, Delivery, Received, Session, Subscriber, endpoint
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import OnProgress, OnStep, ask_simulation
-from palpate.closing import Closing
 from palpate.config import DEFAULT_ROUTER, LinkConfig, TlsConfig
 from palpate.errors import PalpateError, StaleError
 from palpate.messages import (
@@ -42,6 +41,7 @@ from palpate.messages import (
     WrenchZeroRequest,
     as_field_frame,
 )
+from palpate.process import Closing
 
 M = TypeVar("M")
 

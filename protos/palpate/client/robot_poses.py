@@ -13,11 +13,11 @@ from collections import Counter
 from collections.abc import Iterable
 
 from palpate.bus import Publisher, Session
-from palpate.bus.queues import NewestWins
+from palpate.bus.pubsub import NewestWins
 from palpate.bus.topics import ROBOT_POSE
-from palpate.closing import Closing
 from palpate.errors import LinkError, WireError
 from palpate.messages import Pose, RobotPoseFrame
+from palpate.process import Closing
 
 WAITING = 1024
 """Poses that may wait for the bus: a second at 1 kHz. Beyond that the oldest is dropped."""

@@ -6,10 +6,9 @@ from palpate.codec.frames import (
     ELECTRODE_FRAME,
     FIELD_FRAME,
     INDENTER_POSE_FRAME,
+    ROBOT_POSE_FRAME,
     WRENCH_FRAME,
 )
-from palpate.codec.robot import ROBOT_POSE_FRAME
-from palpate.codec.sensors import WRENCH_ZERO, WRENCH_ZERO_REQUEST
 from palpate.codec.service import (
     ERROR,
     FIELD_REQUEST,
@@ -18,14 +17,16 @@ from palpate.codec.service import (
     STATUS,
     TARE,
     TARE_REQUEST,
+    WRENCH_ZERO,
+    WRENCH_ZERO_REQUEST,
 )
 from palpate.codec.simulation import (
     SIMULATION_CANCEL_REPLY,
     SIMULATION_CANCEL_REQUEST,
     SIMULATION_PROGRESS,
+    SIMULATION_REPLY,
     SIMULATION_REQUEST,
 )
-from palpate.codec.simulation_reply import SIMULATION_REPLY
 
 CODECS = (
     ELECTRODE_FRAME,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.codec.base import Codec, codec_of
-from palpate.codec.checks import (
+from palpate.codec.base import (
+    Codec,
     check_digest,
     check_electrodes,
     check_field,
     check_serial,
+    codec_of,
     field_from_wire,
     reject,
     splice,

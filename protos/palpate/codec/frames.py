@@ -1,15 +1,18 @@
-"""Codec of frames: what a gateway publishes. Hot path: checks are inlined on purpose."""
+"""Codec of frames: what gateways and robots publish. Hot path: checks are inlined on purpose."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from palpate.codec.base import Codec, codec_of
-from palpate.codec.checks import (
+from palpate.codec.base import (
+    Codec,
     check_digest,
     check_field,
     check_serial,
+    codec_of,
     field_from_wire,
+    pose_from_wire,
+    pose_to_wire,
     pose_values,
     reject,
     splice,
@@ -18,16 +21,18 @@ from palpate.codec.checks import (
     vector3_from_wire,
     vector3_to_wire,
 )
-from palpate.errors import WireError
+from palpate.config import check_name
+from palpate.errors import ConfigError, WireError
 from palpate.messages import (
     COUNTS_MAX,
     ElectrodeFrame,
     FieldFrame,
     IndenterPoseFrame,
+    RobotPoseFrame,
     SensorType,
     WrenchFrame,
 )
-from palpate.v1 import frames_pb2
+from palpate.v1 import frames_pb2, robot_pb2
 
 _SENSOR_TYPES = {
     int(kind): (kind, kind.layout.electrodes, kind.layout.pac_samples, kind.layout.slots)
@@ -192,3 +197,52 @@ INDENTER_POSE_FRAME: Codec[IndenterPoseFrame] = codec_of(
     frames_pb2.IndenterPoseFrame, _pose_encode, _pose_from_wire
 )
 FIELD_FRAME: Codec[FieldFrame] = codec_of(frames_pb2.FieldFrame, _field_encode, _field_from_wire)
+
+
+_TIMES = 1 << 63
+
+
+def _check_robot(robot: str, sequence: int, time_ns: int, wall_ns: int) -> None:
+    try:
+        check_name(robot, "robot")
+    except ConfigError as error:
+        raise WireError(error.problem, remedy=error.remedy, reason="robot") from error
+    if sequence < 1:
+        reject("sequence", f"sequence is {sequence}, sequences start at 1")
+    # Beyond int64 no clock of ours can be; and consumers store times as int64.
+    if not (0 <= time_ns < _TIMES and 0 <= wall_ns < _TIMES):
+        reject("time", f"times {time_ns}, {wall_ns} ns are negative or exceed int64")
+
+
+def _robot_from_wire(msg: robot_pb2.RobotPoseFrame) -> RobotPoseFrame:
+    robot, sequence, time_ns, wall_ns = msg.robot, msg.sequence, msg.time_ns, msg.wall_ns
+    _check_robot(robot, sequence, time_ns, wall_ns)
+    pose = pose_from_wire(msg.pose_base_flange, "pose_base_flange")
+    return RobotPoseFrame(robot, sequence, time_ns, pose, msg.run_id, wall_ns)
+
+
+def _robot_encode(frame: RobotPoseFrame) -> bytes:
+    _check_robot(frame.robot, frame.sequence, frame.time_ns, frame.wall_ns)
+    try:
+        msg = robot_pb2.RobotPoseFrame(
+            robot=frame.robot,
+            run_id=frame.run_id,
+            sequence=frame.sequence,
+            time_ns=frame.time_ns,
+            wall_ns=frame.wall_ns,
+            pose_base_flange=pose_to_wire(frame.pose_base_flange, "pose_base_flange"),
+        )
+    except (TypeError, ValueError) as error:
+        if isinstance(error, WireError):
+            raise
+        raise WireError(
+            f"{frame}: {error}",
+            remedy="give whole numbers of nanoseconds, and three and four numbers of a pose",
+            reason="parse",
+        ) from error
+    return msg.SerializeToString()
+
+
+ROBOT_POSE_FRAME: Codec[RobotPoseFrame] = codec_of(
+    robot_pb2.RobotPoseFrame, _robot_encode, _robot_from_wire
+)

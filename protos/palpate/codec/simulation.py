@@ -1,21 +1,41 @@
-"""Codec of simulation request, progress and cancelling; the reply's is in ``simulation_reply``."""
+"""Codec of simulations: request, progress, cancelling, and the reply with its steps."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite
 
-from palpate.codec.base import Codec, codec_of
-from palpate.codec.checks import check_serial, pose_values, reject
+import numpy as np
+
+from palpate.codec.base import (
+    Codec,
+    check_digest,
+    check_field,
+    check_serial,
+    codec_of,
+    delimited,
+    field_from_wire,
+    pose_from_wire,
+    pose_to_wire,
+    reject,
+    splice,
+    vector3_from_wire,
+    vector3_to_wire,
+)
 from palpate.messages import (
-    Pose,
+    DoubleArray,
     SimulationCancelReply,
     SimulationCancelRequest,
+    SimulationConvergence,
+    SimulationOutcome,
     SimulationParameters,
     SimulationPhase,
     SimulationProgress,
+    SimulationReply,
     SimulationRequest,
+    SimulationStep,
 )
-from palpate.v1 import common_pb2, simulation_pb2
+from palpate.v1 import simulation_pb2
 
 _PARAMETERS = (
     "skin_thickness_m",
@@ -27,18 +47,6 @@ MAX_POSES = 10_000
 """Longest path of a request."""
 
 _PHASES = {int(phase): phase for phase in SimulationPhase}
-
-
-def pose_from_wire(msg: common_pb2.Pose, what: str) -> Pose:
-    """Check and convert a pose."""
-    p = pose_values((msg.px, msg.py, msg.pz, msg.qw, msg.qx, msg.qy, msg.qz), what)
-    return Pose((p[0], p[1], p[2]), (p[3], p[4], p[5], p[6]))
-
-
-def pose_to_wire(pose: Pose, what: str) -> common_pb2.Pose:
-    """Check and convert a pose."""
-    px, py, pz, qw, qx, qy, qz = pose_values((*pose.position, *pose.orientation), what)
-    return common_pb2.Pose(px=px, py=py, pz=pz, qw=qw, qx=qx, qy=qy, qz=qz)
 
 
 def check_positive(value: float, what: str) -> float:
@@ -144,4 +152,150 @@ SIMULATION_CANCEL_REPLY: Codec[SimulationCancelReply] = codec_of(
     simulation_pb2.SimulationCancelReply,
     lambda reply: simulation_pb2.SimulationCancelReply(found=reply.found).SerializeToString(),
     lambda msg: SimulationCancelReply(msg.found),
+)
+
+
+_OUTCOMES = {int(outcome): outcome for outcome in SimulationOutcome}
+
+
+def _doubles(values: Sequence[float], count: int, what: str) -> DoubleArray:
+    array = np.array(values, np.float64)
+    if array.shape != (count,):
+        reject("shape", f"{what} has shape {array.shape}, not ({count},)")
+    if not np.isfinite(array).all():
+        reject("non_finite", f"{what} = {array.tolist()} is not finite")
+    return array
+
+
+def _convergence_from_wire(
+    msg: simulation_pb2.SimulationConvergence, what: str
+) -> SimulationConvergence:
+    return SimulationConvergence(
+        msg.increments,
+        msg.iterations,
+        msg.factorisations,
+        check_positive(msg.residual, f"{what}.residual"),
+        check_positive(msg.volume_error, f"{what}.volume_error"),
+        check_positive(msg.penetration_m, f"{what}.penetration_m"),
+        check_positive(msg.seconds, f"{what}.seconds"),
+    )
+
+
+def _convergence_to_wire(
+    value: SimulationConvergence, what: str
+) -> simulation_pb2.SimulationConvergence:
+    return simulation_pb2.SimulationConvergence(
+        increments=value.increments,
+        iterations=value.iterations,
+        factorisations=value.factorisations,
+        residual=check_positive(value.residual, f"{what}.residual"),
+        volume_error=check_positive(value.volume_error, f"{what}.volume_error"),
+        penetration_m=check_positive(value.penetration_m, f"{what}.penetration_m"),
+        seconds=check_positive(value.seconds, f"{what}.seconds"),
+    )
+
+
+def _step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> SimulationStep:
+    displacement = contact_force = centre = convergence = None
+    if msg.displacement:
+        displacement = field_from_wire(msg.displacement, 3, f"{what}.displacement")
+    if msg.contact_force:
+        contact_force = field_from_wire(msg.contact_force, 3, f"{what}.contact_force")
+    if not isfinite(msg.fluid_pressure_pa):
+        reject("non_finite", f"{what}.fluid_pressure_pa is not finite")
+    force = vector3_from_wire(msg.force, f"{what}.force").astype(np.float64)
+    torque = vector3_from_wire(msg.torque, f"{what}.torque").astype(np.float64)
+    if msg.wrench:  # absent before it was in the contract
+        wrench = _doubles(msg.wrench, 6, f"{what}.wrench")
+        if np.abs(wrench).max() > np.finfo(np.float32).max:  # what is accepted can be said again
+            reject("non_finite", f"{what}.wrench = {wrench.tolist()} exceeds float32")
+        force, torque = wrench[:3], wrench[3:]
+    if msg.centre_of_pressure:
+        centre = _doubles(msg.centre_of_pressure, 3, f"{what}.centre_of_pressure")
+    if msg.HasField("convergence"):
+        convergence = _convergence_from_wire(msg.convergence, f"{what}.convergence")
+    return SimulationStep(
+        pose_from_wire(msg.pose_sensor_indenter, f"{what}.pose_sensor_indenter"),
+        force,
+        torque,
+        msg.fluid_pressure_pa,
+        displacement,
+        contact_force,
+        check_positive(msg.contact_area_m2, f"{what}.contact_area_m2"),
+        centre,
+        convergence,
+    )
+
+
+def _step_encode(step: SimulationStep, what: str) -> bytes:
+    if not isfinite(step.fluid_pressure_pa):
+        reject("non_finite", f"{what}.fluid_pressure_pa is not finite")
+    # Fields in order of their numbers, so that the bytes equal the official encoder's.
+    head = simulation_pb2.SimulationStep(
+        pose_sensor_indenter=pose_to_wire(step.pose_sensor_indenter, f"{what}.pose"),
+        fluid_pressure_pa=step.fluid_pressure_pa,
+    )
+    force = _doubles(step.force, 3, f"{what}.force")  # type: ignore[arg-type]
+    torque = _doubles(step.torque, 3, f"{what}.torque")  # type: ignore[arg-type]
+    vector3_to_wire(force.astype(np.float32), head.force, f"{what}.force")
+    vector3_to_wire(torque.astype(np.float32), head.torque, f"{what}.torque")
+    payload = head.SerializeToString()
+    for number, array in ((5, step.displacement), (6, step.contact_force)):
+        if array is not None:
+            payload += splice(number, check_field(array, 3, what))
+    tail = simulation_pb2.SimulationStep(
+        wrench=(*force.tolist(), *torque.tolist()),
+        contact_area_m2=check_positive(step.contact_area_m2, f"{what}.contact_area_m2"),
+    )
+    if step.centre_of_pressure is not None:
+        centre = _doubles(step.centre_of_pressure, 3, f"{what}.centre_of_pressure")  # type: ignore[arg-type]
+        tail.centre_of_pressure.extend(centre.tolist())
+    if step.convergence is not None:
+        tail.convergence.CopyFrom(_convergence_to_wire(step.convergence, f"{what}.convergence"))
+    return payload + tail.SerializeToString()
+
+
+def _reply_from_wire(msg: simulation_pb2.SimulationReply) -> SimulationReply:
+    outcome = _OUTCOMES.get(msg.outcome)
+    if outcome is None:
+        reject("outcome", f"outcome {msg.outcome} is not known")
+    return SimulationReply(
+        check_serial(msg.request_id, "request_id"),
+        _check_mesh(msg.mesh_sha256, len(msg.steps)),
+        tuple(_step_from_wire(step, f"steps[{i}]") for i, step in enumerate(msg.steps)),
+        msg.stopped_because,
+        check_positive(msg.elapsed_s, "elapsed_s"),
+        msg.more,
+        msg.first_step,
+        progress_from_wire(msg.progress) if msg.HasField("progress") else None,
+        outcome,
+        check_positive(msg.travel_m, "travel_m"),
+    )
+
+
+def _check_mesh(digest: bytes, steps: int) -> bytes:
+    return digest if not digest and not steps else check_digest(digest, "mesh_sha256")
+
+
+def _reply_encode(reply: SimulationReply) -> bytes:
+    head = simulation_pb2.SimulationReply(
+        request_id=check_serial(reply.request_id, "request_id"),
+        mesh_sha256=_check_mesh(reply.mesh_sha256, len(reply.steps)),
+    )
+    tail = simulation_pb2.SimulationReply(
+        stopped_because=reply.stopped_because,
+        elapsed_s=check_positive(reply.elapsed_s, "elapsed_s"),
+        more=reply.more,
+        first_step=reply.first_step,
+        outcome=int(reply.outcome),  # type: ignore[arg-type]
+        travel_m=check_positive(reply.travel_m, "travel_m"),
+    )
+    if reply.progress is not None:
+        tail.progress.CopyFrom(progress_to_wire(reply.progress))
+    steps = (delimited(3, _step_encode(step, f"steps[{i}]")) for i, step in enumerate(reply.steps))
+    return head.SerializeToString() + b"".join(steps) + tail.SerializeToString()
+
+
+SIMULATION_REPLY: Codec[SimulationReply] = codec_of(
+    simulation_pb2.SimulationReply, _reply_encode, _reply_from_wire
 )

@@ -16,34 +16,228 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError
-from palpate.files.field_mesh import FieldMesh, check_mesh, mesh_from_bytes, mesh_to_bytes
-from palpate.files.manifest import (
-    BUNDLE_CONTRACT_VERSION,
-    Manifest,
-    check_task,
-    parse_manifest,
-)
-from palpate.files.tasks import TASKS, check_tensors
+from palpate.files.tasks import SENSOR_TYPE, TaskContract, check_tensors
+from palpate.messages import FloatArray, SensorType, TensorInfo
 
-__all__ = [
-    "BUNDLE_CONTRACT_VERSION",
-    "TASKS",
-    "Bundle",
-    "Manifest",
-    "check_bundle_mesh",
-    "check_task",
-    "read_bundle",
-    "read_mesh",
-    "sha256_hex",
-    "write_bundle",
-]
+BUNDLE_CONTRACT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a bundle says of itself.
+
+    Attributes:
+        name: Name of the bundle.
+        version: Its version, from 1.
+        task: A key of ``TASKS``.
+        inputs: Inputs of the model.
+        outputs: Outputs of the model.
+        sensor_type: Name of the sensor type it takes.
+        contact_threshold_n: Below this estimated force [N] there is no contact.
+        training_data_sha256: Digest of the data set, hex.
+        trained_on: One line for people.
+        metrics: Held-out results; names end in the unit.
+        model_sha256: Digest of ``model.onnx``, hex.
+        golden_sha256: Digest of ``golden.npz``, hex.
+        created: UTC time, ISO 8601.
+        palpate_version: What wrote it.
+        opset: ONNX operator set.
+        normalisation: For people; the graph does it.
+        contract_version: Of the bundle contract.
+        mesh_sha256: Content hash of the mesh of its fields, hex; empty = no fields.
+        mesh_file_sha256: Digest of ``mesh.npz``, hex; empty = no fields.
+    """
+
+    name: str
+    version: int
+    task: str
+    inputs: tuple[TensorInfo, ...]
+    outputs: tuple[TensorInfo, ...]
+    sensor_type: str
+    contact_threshold_n: float
+    training_data_sha256: str
+    trained_on: str
+    metrics: Mapping[str, float]
+    model_sha256: str
+    golden_sha256: str
+    created: str
+    palpate_version: str
+    opset: int
+    normalisation: Mapping[str, Any] = field(default_factory=dict)
+    contract_version: int = BUNDLE_CONTRACT_VERSION
+    mesh_sha256: str = ""
+    mesh_file_sha256: str = ""
+
+
+def check_task(manifest: Manifest, where: str) -> TaskContract:
+    """Check that inputs, outputs and mesh are those of the manifest's task.
+
+    Raises:
+        BundleError: An unknown task, tensors that differ from its contract, or a type of sensor
+            that has other electrodes.
+    """
+    if manifest.sensor_type in SensorType.__members__ and manifest.sensor_type != SENSOR_TYPE.name:
+        raise BundleError(
+            f"{where}: a model for the sensor type {manifest.sensor_type} has "
+            f"{SensorType[manifest.sensor_type].layout.electrodes} electrodes, the tasks of this "
+            f"contract have {SENSOR_TYPE.layout.electrodes}, those of a {SENSOR_TYPE.name}",
+            remedy=f"train a bundle for a {SENSOR_TYPE.name}; there is no contract for another yet",
+        )
+    contract, _ = check_tensors(manifest.task, manifest.inputs, manifest.outputs, where)
+    return contract
+
+
+def _tensor_info(values: Mapping[str, Any]) -> TensorInfo:
+    shape = tuple(int(n) for n in values["shape"])
+    return TensorInfo(str(values["name"]), str(values["dtype"]), shape, str(values["unit"]))
+
+
+def parse_manifest(text: bytes, where: Path) -> Manifest:
+    """Read a manifest.
+
+    Args:
+        text: Bytes of ``manifest.json``.
+        where: Its path, for the error.
+
+    Raises:
+        BundleError: It is no manifest, or one of a future contract.
+    """
+    try:
+        values = json.loads(text)
+        if not isinstance(values, dict):
+            raise ValueError("not an object")
+        version = values.get("contract_version")
+        if isinstance(version, int) and version > BUNDLE_CONTRACT_VERSION:
+            raise BundleError(
+                f"{where} is written for bundle contract v{version}, this palpate knows "
+                f"v{BUNDLE_CONTRACT_VERSION}",
+                remedy="upgrade palpate on this host: pip install --upgrade palpate",
+            )
+        known = {f.name for f in fields(Manifest)}
+        if unknown := set(values) - known:
+            raise ValueError(f"unknown keys {', '.join(sorted(unknown))}")
+        for key in ("inputs", "outputs"):
+            values[key] = tuple(_tensor_info(t) for t in values[key])
+        manifest = Manifest(**values)
+        if not np.isfinite(float(manifest.contact_threshold_n)):
+            raise ValueError("contact_threshold_n is not finite")
+        if manifest.contract_version != BUNDLE_CONTRACT_VERSION:
+            raise ValueError(f"contract_version {manifest.contract_version!r} is not known")
+        if manifest.sensor_type not in SensorType.__members__:
+            raise ValueError(f"sensor_type {manifest.sensor_type!r} is not known")
+    except BundleError:
+        raise
+    except (ValueError, TypeError, KeyError) as error:
+        raise BundleError(
+            f"{where} is not a bundle manifest: {error}", remedy="export the bundle again"
+        ) from error
+    return manifest
+
+
+IndexArray = npt.NDArray[np.int32]
+
+_MESH_REMEDY = "export the bundle again with the mesh that its fields were computed on"
+
+
+@dataclass(frozen=True, slots=True)
+class FieldMesh:
+    """Nodes and surfaces of a skin; enough to draw a field, not to solve for one.
+
+    Attributes:
+        nodes: Positions in the pressurised, untouched state [m], sensor frame, float32, shape
+            ``(V, 3)``.
+        outer_faces: Triangles of the skin's outside, node ids, int32, shape ``(F, 3)``.
+        inner_faces: Triangles of its inside, int32, shape ``(G, 3)``.
+        sha256: Content hash of the mesh that the fields were computed on, 32 bytes. It covers more
+            than stands here (elements, fixed nodes), so it names the mesh and cannot be recomputed.
+    """
+
+    nodes: FloatArray
+    outer_faces: IndexArray
+    inner_faces: IndexArray
+    sha256: bytes
+
+
+def check_mesh(mesh: FieldMesh, where: str) -> None:
+    """Check shapes, types and ranges of a mesh.
+
+    Args:
+        mesh: What to check.
+        where: Where it stands, for the error.
+
+    Raises:
+        BundleError: Names ``where``, the array and what is wrong.
+    """
+    nodes = mesh.nodes
+    if nodes.dtype != np.float32 or nodes.ndim != 2 or nodes.shape[1] != 3 or not len(nodes):
+        raise BundleError(
+            f"{where}: nodes are {nodes.dtype}{list(nodes.shape)}, not float32[V, 3]",
+            remedy=_MESH_REMEDY,
+        )
+    if not np.isfinite(nodes).all():
+        raise BundleError(f"{where}: nodes hold NaN or infinity", remedy=_MESH_REMEDY)
+    for name, faces in (("outer_faces", mesh.outer_faces), ("inner_faces", mesh.inner_faces)):
+        if faces.dtype != np.int32 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise BundleError(
+                f"{where}: {name} are {faces.dtype}{list(faces.shape)}, not int32[F, 3]",
+                remedy=_MESH_REMEDY,
+            )
+        if faces.size and not 0 <= int(faces.min()) <= int(faces.max()) < len(nodes):
+            raise BundleError(
+                f"{where}: {name} name nodes {faces.min()}..{faces.max()}, there are 0.."
+                f"{len(nodes) - 1}",
+                remedy=_MESH_REMEDY,
+            )
+    if len(mesh.sha256) != 32:
+        raise BundleError(
+            f"{where}: sha256 has {len(mesh.sha256)} bytes, a SHA-256 has 32", remedy=_MESH_REMEDY
+        )
+
+
+def mesh_to_bytes(mesh: FieldMesh) -> bytes:
+    """The file ``mesh.npz``."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        nodes=mesh.nodes,
+        outer_faces=mesh.outer_faces,
+        inner_faces=mesh.inner_faces,
+        sha256=np.frombuffer(mesh.sha256, np.uint8),
+    )
+    return buffer.getvalue()
+
+
+def mesh_from_bytes(data: bytes, where: str) -> FieldMesh:
+    """Read and check ``mesh.npz``.
+
+    Args:
+        data: Its bytes.
+        where: Where it stands, for the error.
+
+    Raises:
+        BundleError: It is no NumPy archive, lacks an array, or an array is not what it must be.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            mesh = FieldMesh(
+                archive["nodes"],
+                archive["outer_faces"],
+                archive["inner_faces"],
+                archive["sha256"].astype(np.uint8).tobytes(),
+            )
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise BundleError(f"{where} is not a mesh: {error}", remedy=_MESH_REMEDY) from error
+    check_mesh(mesh, where)
+    return mesh
+
 
 MODEL, MANIFEST, GOLDEN, MESH = "model.onnx", "manifest.json", "golden.npz", "mesh.npz"
 _FILE_BYTES_MAX = 256 << 20

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.extras import require
 from palpate.files.atomic import written_whole
+from palpate.process import require
 
 if TYPE_CHECKING:
     import h5py

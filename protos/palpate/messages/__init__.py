@@ -11,43 +11,43 @@ from palpate.messages.estimates import (
     as_field_frame,
 )
 from palpate.messages.frames import (
+    BIOTAC_LAYOUT,
+    BIOTAC_SP_LAYOUT,
     COUNTS_MAX,
     NO_TARE,
     PAC_SAMPLES,
     CountArray,
+    DoubleArray,
     ElectrodeFrame,
     FieldFrame,
     FloatArray,
+    FrameLayout,
     IndenterPoseFrame,
     Origin,
+    Pose,
+    RobotPoseFrame,
     SensorType,
     Stamp,
     WrenchFrame,
 )
-from palpate.messages.layout import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
-from palpate.messages.robot import RobotPoseFrame
-from palpate.messages.sensors import (
-    ChannelFault,
-    FaultKind,
-    SensorState,
-    SensorStatus,
-    WrenchZero,
-    WrenchZeroRequest,
-)
 from palpate.messages.service import (
+    ChannelFault,
     ErrorReply,
+    FaultKind,
     FieldRequest,
     ModelMetadata,
+    SensorState,
+    SensorStatus,
     ServiceRequest,
     ServiceState,
     Status,
     Tare,
     TareRequest,
     TensorInfo,
+    WrenchZero,
+    WrenchZeroRequest,
 )
 from palpate.messages.simulation import (
-    DoubleArray,
-    Pose,
     SimulationCancelReply,
     SimulationCancelRequest,
     SimulationConvergence,

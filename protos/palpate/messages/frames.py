@@ -1,4 +1,4 @@
-"""Frames: one stamped reading of a device each."""
+"""Frames: one time-stamped reading of a sensor each, and what stands in them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,79 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from palpate.messages.layout import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
+
+@dataclass(frozen=True, slots=True)
+class FrameLayout:
+    """What one sampling round holds; every channel and every PAC sample has one validity bit.
+
+    Bits: electrodes from 0, then PDC, TAC, TDC, then the PAC samples in order of sampling. PAC is
+    sampled beside each of the others, so there are as many of it.
+
+    Attributes:
+        electrodes: Number of sensing electrodes.
+    """
+
+    electrodes: int
+
+    @property
+    def pdc_bit(self) -> int:
+        """Validity bit of PDC."""
+        return self.electrodes
+
+    @property
+    def tac_bit(self) -> int:
+        """Validity bit of TAC."""
+        return self.electrodes + 1
+
+    @property
+    def tdc_bit(self) -> int:
+        """Validity bit of TDC."""
+        return self.electrodes + 2
+
+    @property
+    def first_pac_bit(self) -> int:
+        """Validity bit of the first PAC sample."""
+        return self.electrodes + 3
+
+    @property
+    def pac_samples(self) -> int:
+        """PAC samples in one frame."""
+        return self.electrodes + 3
+
+    @property
+    def slots(self) -> int:
+        """Samples in one frame, and validity bits."""
+        return self.first_pac_bit + self.pac_samples
+
+    @property
+    def all_valid(self) -> int:
+        """Validity of a frame whose channels are all good."""
+        return (1 << self.slots) - 1
+
+    @property
+    def electrodes_valid(self) -> int:
+        """Validity bits of all electrodes."""
+        return (1 << self.electrodes) - 1
+
+    def bit_name(self, bit: int) -> str:
+        """Name of the channel at a validity bit, e.g. ``"E1"`` or ``"PAC[3]"``."""
+        if bit < self.electrodes:
+            return f"E{bit + 1}"
+        if bit < self.first_pac_bit:
+            return ("PDC", "TAC", "TDC")[bit - self.pdc_bit]
+        return f"PAC[{bit - self.first_pac_bit}]"
+
+
+BIOTAC_LAYOUT = FrameLayout(electrodes=19)
+"""44 slots: E1..E19, PDC, TAC, TDC, 22 PAC."""
+
+BIOTAC_SP_LAYOUT = FrameLayout(electrodes=24)
+"""54 slots: E1..E24, PDC, TAC, TDC, 27 PAC."""
+
 
 FloatArray = npt.NDArray[np.float32]
 CountArray = npt.NDArray[np.uint16]
+DoubleArray = npt.NDArray[np.float64]
 
 COUNTS_MAX = 4095
 """Full scale of the 12-bit ADC [counts]."""
@@ -51,6 +120,14 @@ class SensorType(IntEnum):
     def validity_bits(self) -> int:
         """Number of channels with a validity bit: electrodes, PDC, TAC, TDC, PAC samples."""
         return self.layout.slots
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Position [m] and unit quaternion w x y z; sensor frame unless its name says another."""
+
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,3 +246,24 @@ class FieldFrame:
     sensor_serial: str
     mesh_sha256: bytes
     displacement: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPoseFrame:
+    """Where the flange of a robot is, in the robot's base frame, by the robot's own clock.
+
+    Attributes:
+        robot: Name of the robot, as in the key.
+        sequence: Contiguous in one run of the robot's program, from 1; a hole = a pose was lost.
+        time_ns: When it was there, by a monotonic clock of the program's own [ns].
+        pose_base_flange: Position [m] and unit quaternion w x y z of the flange in the base.
+        run_id: Another one at each start of the program; 0 = not told.
+        wall_ns: Wall clock at the same instant [ns since the Unix epoch]; 0 = not told.
+    """
+
+    robot: str
+    sequence: int
+    time_ns: int
+    pose_base_flange: Pose
+    run_id: int = 0
+    wall_ns: int = 0

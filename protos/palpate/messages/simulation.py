@@ -7,19 +7,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-import numpy.typing as npt
 
-from palpate.messages.frames import FloatArray
-
-DoubleArray = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """Position [m] and unit quaternion w x y z; sensor frame unless its name says another."""
-
-    position: tuple[float, float, float]
-    orientation: tuple[float, float, float, float]
+from palpate.messages.frames import DoubleArray, FloatArray, Pose
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from palpate.errors import ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.files.bundle import read_bundle
 from palpate.health import Health, HealthReporter
 from palpate.messages import Origin, ServiceState, Stamp
-from palpate.pauses import avoid_pauses
+from palpate.process import avoid_pauses
 from palpate_services.config import AnswererConfig
 from palpate_services.inference.estimates import TARE_UNKNOWN, Freshness, Refusal
 from palpate_services.inference.model import Runtime, load

@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError
-from palpate.extras import require
 from palpate.files.bundle import (
     BUNDLE_CONTRACT_VERSION,
     Bundle,
@@ -27,6 +26,7 @@ from palpate.files.bundle import (
     check_task,
 )
 from palpate.messages import FloatArray, ModelMetadata, SensorType
+from palpate.process import require
 
 # Message type -> field number -> message type inside; numbers of onnx.proto, which never change.
 _INSIDE: dict[str, dict[int, str]] = {

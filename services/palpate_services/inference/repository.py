@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from palpate.errors import BundleError, ConfigError
-from palpate.files.bundle import read_mesh
-from palpate.files.field_mesh import FieldMesh
+from palpate.files.bundle import FieldMesh, read_mesh
 
 MANIFEST = "manifest.json"
 

@@ -13,7 +13,7 @@ from palpate.config import LinkConfig
 from palpate.errors import ConfigError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
-from palpate.pauses import avoid_pauses
+from palpate.process import avoid_pauses
 from palpate_services.config import RecorderConfig
 from palpate_services.recorder.writer import RecordKeeper
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.anatomy import ELECTRODE_POSITIONS, SP_ELECTRODE_POSITIONS
-from palpate.extras import require
 from palpate.messages import FloatArray, SensorType
+from palpate.process import require
 from palpate_services.viewer.simulation_file import Floats, Ints
 
 CORE_RADIUS_M = 0.0049

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from palpate.bus.topics import TOPICS
 from palpate.errors import RecordingError
-from palpate.extras import require
 from palpate.files.record import read_record
 from palpate.messages import FeatureEstimate, IndenterPoseFrame, WrenchFrame
+from palpate.process import require
 from palpate_services.viewer.timeline import Matcher, Reading
 
 Points = npt.NDArray[np.float64]

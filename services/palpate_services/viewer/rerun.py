@@ -20,10 +20,10 @@ import numpy.typing as npt
 
 from palpate.bus.topics import TOPICS
 from palpate.errors import RecordingError
-from palpate.extras import require
-from palpate.files.field_mesh import FieldMesh
+from palpate.files.bundle import FieldMesh
 from palpate.files.record import read_record
 from palpate.messages import FloatArray, SensorType
+from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.layout import (
     AXES,

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.extras import require
 from palpate.files.simulation_store import choose_trajectories
+from palpate.process import require
 from palpate_services.viewer.layout import (
     AXES,
     SIDES,

@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate.command import typed_command
 from palpate.errors import ConfigError
 from palpate.files.hdf5 import schema_of
+from palpate.process import typed_command
 from palpate_training.cli.experiment import print_trials
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features

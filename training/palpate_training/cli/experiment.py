@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate import __version__
-from palpate.command import typed_command
 from palpate.errors import ConfigError
+from palpate.process import typed_command
 from palpate.rigid import Transform
 from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.trials import TrialsContents, read_contents, write_trials

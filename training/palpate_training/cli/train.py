@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from palpate.command import typed_command
+from palpate.process import typed_command
 from palpate_training.datasets.features_file import open_dataset
 
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import DatasetError
-from palpate.extras import require
 from palpate.messages import COUNTS_MAX
+from palpate.process import require
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
 from palpate_training.datasets.features import ELECTRODES, FeatureDataset, FloatArray
 from palpate_training.datasets.published import published_file

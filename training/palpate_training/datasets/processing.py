@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.extras import require
 from palpate.messages import COUNTS_MAX
+from palpate.process import require
 from palpate_training.datasets.trials import RawTrial, TrialHeader, TrialRows, trial_name
 
 CUTOFF_HZ = 5.0

@@ -25,8 +25,8 @@ import numpy.typing as npt
 
 from palpate import __version__
 from palpate.errors import DatasetError
-from palpate.extras import require
 from palpate.files.hdf5 import opened
+from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.datasets.features import ELECTRODES, Provenance

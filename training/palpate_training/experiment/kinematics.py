@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import ConfigError
-from palpate.extras import require
+from palpate.process import require
 from palpate.rigid import Floats, Transform, quaternions_of
 
 ACCURACY_M = 0.01e-3

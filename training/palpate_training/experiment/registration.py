@@ -27,7 +27,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from palpate.errors import ConfigError
-from palpate.extras import require
+from palpate.process import require
 from palpate.rigid import Floats, Transform
 from palpate_training.experiment.plan import ARMS
 

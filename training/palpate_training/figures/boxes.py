@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from palpate.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.errors import DatasetError
-from palpate.extras import require
+from palpate.process import require
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.figures.outline import unwrap, unwrapped
 from palpate_training.figures.style import (

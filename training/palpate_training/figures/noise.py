@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.extras import require
+from palpate.process import require
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.figures.style import (
     INK,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.extras import require
+from palpate.process import require
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset, SkinMesh
 from palpate_training.figures import outline
 from palpate_training.figures.style import (

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.extras import require
 from palpate.files.atomic import written_whole
+from palpate.process import require
 
 INK = "#30343b"
 GRID = "#e4e4e8"

@@ -16,11 +16,10 @@ from torch import Tensor, nn
 
 from palpate import __version__
 from palpate.errors import BundleError
-from palpate.extras import require
-from palpate.files.bundle import Manifest, write_bundle
-from palpate.files.field_mesh import FieldMesh
+from palpate.files.bundle import FieldMesh, Manifest, write_bundle
 from palpate.files.tasks import TASKS, tensors_of
 from palpate.messages import SensorType, TensorInfo
+from palpate.process import require
 from palpate_training.datasets.experiment import SkinMesh
 from palpate_training.learning.networks import FeaturesGraph, FieldGraph, SynthesisGraph
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.extras import require
+from palpate.process import require
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 from palpate_training.learning import baselines
 from palpate_training.learning.fit import FeaturesConfig, fit_quantity

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.extras import require
+from palpate.process import require
 from palpate_training.datasets.experiment import SkinMesh
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.tasks.results import ModelResult, Picture, TaskReport, write_json

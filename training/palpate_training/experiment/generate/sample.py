@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
-from palpate.files.tape import TapePress, build_tape, tape_unit, write_tape
+from palpate.files.tape import write_tape
+from palpate.files.tape_build import TapePress, build_tape, tape_unit
 from palpate_training.datasets.basis import encode, fit_basis, subset
 from palpate_training.datasets.experiment import (
     ExperimentDataset,

@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from typing import Any, Protocol, TypeVar
 
 from palpate.errors import ErrorCode, LinkError, PalpateError
-from palpate.extras import require
+from palpate.process import require
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")

@@ -20,13 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.files.tape.content import (
-    UNIT_NUMBERS,
-    Tape,
-    TapeTrajectory,
-    TapeUnit,
-    check_tape,
-)
+from palpate.files.tape import UNIT_NUMBERS, Tape, TapeTrajectory, TapeUnit, check_tape
 from palpate.messages import FloatArray
 
 Array = npt.NDArray[Any]

@@ -1,0 +1,437 @@
+"""The record: an MCAP file of raw payloads with their schemas embedded (docs/adr/0006-record.md).
+
+A record that is being written, or whose writer was killed, is named ``NAME.mcap.part``; it becomes
+``NAME.mcap`` when it is closed whole. Keys, payload bytes and stamps are kept as they came, so a
+replay can be bit-identical.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import os
+import struct
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import zstandard
+from google.protobuf import descriptor_pb2
+from google.protobuf.message import Message as PbMessage
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, Address, parse_key
+from palpate.errors import RecordingError, WireError
+
+FLUSH_S = 0.1
+"""Messages reach the operating system after this time [s]; kill -9 costs no more than this."""
+
+METADATA = "palpate"
+"""Name of the MCAP metadata record that holds the facts of a run."""
+
+_CHUNK_BYTES = 1 << 20
+
+
+def descriptor_set(message_type: type[PbMessage]) -> bytes:
+    """Serialised ``FileDescriptorSet`` of a message's file and its imports: MCAP's schema."""
+    files = descriptor_pb2.FileDescriptorSet()
+    seen: set[str] = set()
+
+    def add(current: Any) -> None:
+        if current.name in seen:
+            return
+        seen.add(current.name)
+        for dependency in current.dependencies:
+            add(dependency)
+        current.CopyToProto(files.file.add())
+
+    add(message_type.DESCRIPTOR.file)
+    return files.SerializeToString()
+
+
+class RecordWriter:
+    """Writes a record. ``write`` and ``flush`` belong to one thread.
+
+    Args:
+        path: ``NAME.mcap``; written as ``NAME.mcap.part`` until it is closed whole.
+        metadata: Facts about the run, e.g. station and command.
+
+    Raises:
+        RecordingError: The file cannot be created or written (full disk, no permission); the
+            ``.part`` keeps what was written before.
+    """
+
+    def __init__(self, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + ".part")
+        self.counts: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._last_flush = time.monotonic()
+        self._closed = False
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: IO[bytes] = open(self.part, "xb")
+            # Alive for as long as this process: the kernel drops the lock with it, and recovery
+            # leaves a locked part alone. Whoever is looking at it lets go at once.
+            fcntl.flock(self._file, fcntl.LOCK_EX)
+        except FileExistsError as error:
+            raise RecordingError(
+                f"{self.part} exists: a record of this name is being written or was cut off",
+                remedy="choose another name, or recover it with `palpate recover`",
+            ) from error
+        except OSError as error:
+            raise self._failed(error) from error
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        try:
+            self._writer.start(profile="", library=f"palpate contract v{CONTRACT_VERSION}")
+            facts = {"contract_version": str(CONTRACT_VERSION), **(metadata or {})}
+            self._writer.add_metadata(METADATA, facts)
+            self._writer.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def write(
+        self,
+        key: str,
+        schema: str,
+        payload: bytes,
+        *,
+        log_time_ns: int,
+        publish_time_ns: int | None = None,
+        sequence: int = 0,
+    ) -> None:
+        """Add a message; flushes when ``FLUSH_S`` has passed since the last time.
+
+        Raises:
+            WireError: A schema that the contract does not know.
+            RecordingError: The disk is full or gone.
+        """
+        channel = self._channels.get((key, schema))
+        try:
+            if channel is None:
+                channel = self._register(key, schema)
+            self._writer.add_message(
+                channel,
+                log_time=log_time_ns,
+                data=payload,
+                publish_time=log_time_ns if publish_time_ns is None else publish_time_ns,
+                sequence=sequence & 0xFFFFFFFF,
+            )
+        except OSError as error:
+            raise self._failed(error) from error
+        self.counts[key] = self.counts.get(key, 0) + 1
+        if time.monotonic() - self._last_flush >= FLUSH_S:
+            self.flush()
+
+    def _register(self, key: str, schema: str) -> int:
+        codec = SCHEMAS.get(schema)
+        if codec is None:
+            raise WireError(
+                f"schema {schema!r} is not of contract v{CONTRACT_VERSION}",
+                remedy="record with the palpate that knows it",
+                reason="schema",
+            )
+        if schema not in self._schemas:
+            self._schemas[schema] = self._writer.register_schema(
+                schema, "protobuf", descriptor_set(codec.message_type)
+            )
+        channel = self._writer.register_channel(key, "protobuf", self._schemas[schema])
+        self._channels[key, schema] = channel
+        return channel
+
+    def flush(self) -> None:
+        """Hand everything to the operating system.
+
+        Raises:
+            RecordingError: The disk is full or gone.
+        """
+        try:
+            self._writer.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+        self._last_flush = time.monotonic()
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file so far [bytes]."""
+        return 0 if self._closed else self._file.tell()
+
+    def close(self) -> None:
+        """Finish the file and give it its final name.
+
+        Raises:
+            RecordingError: The disk is full or gone; the ``.part`` stays.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            os.replace(self.part, self.path)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def abandon(self) -> None:
+        """Close without finishing; the ``.part`` keeps what was flushed and can be recovered."""
+        self._closed = True
+        try:
+            self._file.close()
+        except OSError:  # the disk that failed the writer fails the closing too
+            return
+
+    def _failed(self, error: OSError) -> RecordingError:
+        return RecordingError(
+            f"cannot write {self.part}: {error.strerror or error}",
+            remedy="free space on that disk or choose another folder; what was flushed is kept",
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()
+
+
+_RECORD_BYTES_MAX = 64 << 20
+# What the MCAP reader raises on bytes that are not MCAP.
+_DAMAGED = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    EOFError,
+    ValueError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+    OSError,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordItem:
+    """One recorded message.
+
+    Attributes:
+        key: Zenoh key it was published on.
+        address: Station, sensor and topic of the key.
+        schema: Full name of its protobuf message.
+        payload: Its bytes.
+        log_time_ns: When the recorder received it, wall clock [ns].
+        publish_time_ns: Wall clock of its stamp [ns], or of arrival where it has none.
+        sequence: Sequence of its stamp (modulo 2^32), or 0.
+    """
+
+    key: str
+    address: Address
+    schema: str
+    payload: bytes
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+
+
+def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordItem]:
+    """Messages of a record in order of writing.
+
+    Args:
+        path: ``NAME.mcap``, or with ``allow_partial`` a ``NAME.mcap.part``.
+        allow_partial: Accept a file whose end is missing; its whole messages come.
+
+    Raises:
+        RecordingError: Not a record of palpate, or damaged (after the messages before the damage).
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, tuple[str, Address, str]] = {}
+    count = 0
+    complete = False
+    try:
+        with open(path, "rb") as stream:
+            for record in _reader(stream).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    if record.id not in channels:
+                        channels[record.id] = _channel(path, record, schemas)
+                elif isinstance(record, Message):
+                    key, address, schema = channels[record.channel_id]
+                    count += 1
+                    yield RecordItem(
+                        key,
+                        address,
+                        schema,
+                        record.data,
+                        record.log_time,
+                        record.publish_time,
+                        record.sequence,
+                    )
+        complete = True
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path} does not exist", remedy="check the path") from error
+    except WireError as error:
+        raise RecordingError(f"{path}: {error.problem}", remedy=error.remedy) from error
+    except _DAMAGED as error:
+        if isinstance(error, RecordingError):
+            raise
+        if not (allow_partial and channels):
+            raise RecordingError(
+                f"{path} is damaged or cut off after {count} messages: {error or 'end is missing'}",
+                remedy="recover the whole messages with `palpate recover`",
+            ) from error
+    if complete and not channels and not allow_partial:
+        raise RecordingError(
+            f"{path} holds no palpate messages", remedy="give a record written by palpate"
+        )
+
+
+def _channel(path: Path, channel: Channel, schemas: dict[int, Schema]) -> tuple[str, Address, str]:
+    schema = schemas.get(channel.schema_id)
+    if schema is None or schema.encoding != "protobuf":
+        raise RecordingError(
+            f"{path}: channel {channel.topic!r} has no protobuf schema",
+            remedy="give a record written by palpate",
+        )
+    if schema.name not in SCHEMAS:
+        raise RecordingError(
+            f"{path}: schema {schema.name!r} is not of contract v{CONTRACT_VERSION}",
+            remedy="read it with the palpate that wrote it, or upgrade palpate",
+        )
+    return channel.topic, parse_key(channel.topic), schema.name
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSummary:
+    """What a record holds.
+
+    Attributes:
+        metadata: Facts written at its start.
+        counts: Messages by key.
+        start_wall_ns: First log time [ns].
+        end_wall_ns: Last log time [ns].
+        complete: Whether it was closed whole.
+    """
+
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    start_wall_ns: int = 0
+    end_wall_ns: int = 0
+    complete: bool = True
+
+
+def summarise(path: Path) -> RecordSummary:
+    """Contents of a record.
+
+    Raises:
+        RecordingError: Not a record.
+    """
+    complete = path.suffix != ".part"
+    counts: dict[str, int] = {}
+    start = end = 0
+    for item in read_record(path, allow_partial=not complete):
+        counts[item.key] = counts.get(item.key, 0) + 1
+        start = start or item.log_time_ns
+        end = item.log_time_ns
+    return RecordSummary(metadata_of(path), counts, start, end, complete)
+
+
+def _reader(stream: IO[bytes]) -> StreamReader:
+    return StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_BYTES_MAX)
+
+
+def metadata_of(path: Path) -> dict[str, str]:
+    """Facts written at the start; none where the file is too damaged to tell."""
+    try:
+        with open(path, "rb") as stream:
+            for record in _reader(stream).records:
+                if isinstance(record, Metadata) and record.name == METADATA:
+                    return dict(record.metadata)
+                if isinstance(record, Message):
+                    break
+    except _DAMAGED:
+        return {}
+    return {}
+
+
+def check_readable(path: Path) -> None:
+    """Check with MCAP's own seeking reader that the index of a finished record is sound.
+
+    Raises:
+        RecordingError: It is not.
+    """
+    try:
+        with open(path, "rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except _DAMAGED as error:
+        raise RecordingError(f"{path}: {error}", remedy="recover it") from error
+    if summary is None or summary.statistics is None:
+        raise RecordingError(f"{path} has no summary", remedy="recover it")
+
+
+def is_being_written(part: Path) -> bool:
+    """Whether the writer of a part is alive: it holds a lock, which ends with its process.
+
+    Raises:
+        RecordingError: The part cannot be opened.
+    """
+    try:
+        with open(part, "rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+    except OSError as error:
+        raise RecordingError(
+            f"{part} cannot be opened: {error.strerror or error}", remedy="check the path"
+        ) from error
+    return False
+
+
+def recover(part: Path) -> Path:
+    """Rewrite the whole messages of a cut-off record as ``NAME.recovered.mcap``; remove the part.
+
+    Raises:
+        RecordingError: It is still being written, or nothing in it can be read.
+    """
+    if is_being_written(part):
+        raise RecordingError(
+            f"{part} is being written", remedy="stop its recorder first; it closes the record"
+        )
+    name = part.name.removesuffix(".part").removesuffix(".mcap")
+    target = part.with_name(f"{name}.recovered.mcap")
+    facts = {**metadata_of(part), "recovered_from": part.name}
+    items = read_record(part, allow_partial=True)
+    first = next(items, None)
+    if first is None:
+        raise RecordingError(
+            f"{part} holds no whole message", remedy="there is nothing to recover; delete it"
+        )
+    with RecordWriter(target, facts) as writer:
+        for item in itertools.chain((first,), items):
+            writer.write(
+                item.key,
+                item.schema,
+                item.payload,
+                log_time_ns=item.log_time_ns,
+                publish_time_ns=item.publish_time_ns,
+                sequence=item.sequence,
+            )
+    part.unlink()
+    return target
