@@ -1,8 +1,9 @@
 """Fixtures that every room's tests may use, the quick tier, and the order of a parallel run.
 
 `make quick` runs what `tests/durations.json` does not leave out: in each file the fastest tests
-until the file has used `QUICK_S`. `make durations` measures all tests and writes that file anew; a
-test that it does not know yet belongs to the quick tier.
+until the file has used `QUICK_S`, and none that needs a fixture of more than `FIXTURE_S`.
+`make durations` measures all tests and writes that file anew; a test that it does not know yet
+belongs to the quick tier.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import socket
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,9 @@ ALWAYS_QUICK_S = 0.02
 
 FIRST_S = 2.0
 """The fastest test of a file is in the quick tier if it takes no longer [s]."""
+
+FIXTURE_S = 2.0
+"""A shared fixture that takes longer leaves its tests out of the quick tier [s]."""
 
 PORTS = range(20_000, 32_000)
 """Below the ports that Linux hands out itself, so that no connection takes one meanwhile."""
@@ -72,18 +76,43 @@ class _Recording:
 
     def __init__(self) -> None:
         self._seconds: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        self._files: dict[str, float] = defaultdict(float)
+        self._fixtures: set[str] = set()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         file, _, test = report.nodeid.partition("::")
         self._seconds[file][test] += report.duration
+        self._files[file] += report.duration
+        if report.when == "setup":
+            for name, seconds in report.user_properties:
+                if name in self._fixtures or not isinstance(seconds, float):
+                    continue
+                # Whichever test needs it first pays for it.
+                self._seconds[file][test] -= seconds
+                if seconds > FIXTURE_S:
+                    self._fixtures.add(name)
 
     def pytest_sessionfinish(self) -> None:
-        table = {
-            file: {"seconds": round(sum(tests.values()), 1), "slow": slow_tests(tests)}
+        files = {
+            file: {"seconds": round(self._files[file], 1), "slow": slow_tests(tests)}
             for file, tests in sorted(self._seconds.items())
-            if sum(tests.values()) > QUICK_S
+            if self._files[file] > QUICK_S
         }
+        table = {"fixtures": sorted(self._fixtures), "files": files}
         DURATIONS.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(
+    fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest
+) -> Generator[None, object, object]:
+    """Tell the recording what a shared fixture took."""
+    began = time.monotonic()
+    value = yield
+    if fixturedef.scope != "function" and request.config.getoption("--record-durations"):
+        name = f"{fixturedef.baseid}::{fixturedef.argname}"
+        request._pyfuncitem.user_properties.append((name, time.monotonic() - began))
+    return value
 
 
 def slow_tests(seconds: dict[str, float]) -> list[str]:
@@ -102,18 +131,30 @@ def _file(item: pytest.Item) -> str:
     return item.nodeid.partition("::")[0]
 
 
+def _fixtures(item: pytest.Item) -> set[str]:
+    """Fixtures that a test needs, by where they are defined and by name."""
+    defined = item._fixtureinfo.name2fixturedefs if isinstance(item, pytest.Function) else {}
+    return {f"{found[-1].baseid}::{name}" for name, found in defined.items() if found}
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Select the quick tier; begin a parallel run with the files that take longest."""
-    recorded: dict[str, dict[str, Any]] = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    recorded: dict[str, Any] = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    files: dict[str, dict[str, Any]] = recorded["files"]
     if config.getoption("--quick"):
-        slow = {f"{file}::{test}" for file, entry in recorded.items() for test in entry["slow"]}
-        left_out = [i for i in items if i.nodeid in slow or i.get_closest_marker("slow")]
+        slow = {f"{file}::{test}" for file, entry in files.items() for test in entry["slow"]}
+        dear = set(recorded["fixtures"])
+        left_out = [
+            item
+            for item in items
+            if item.nodeid in slow or item.get_closest_marker("slow") or _fixtures(item) & dear
+        ]
         config.hook.pytest_deselected(items=left_out)
         gone = set(left_out)
         items[:] = [item for item in items if item not in gone]
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: -recorded.get(_file(item), {}).get("seconds", 0.0))
+        items.sort(key=lambda item: -files.get(_file(item), {}).get("seconds", 0.0))
 
 
 @pytest.fixture(scope="session")
