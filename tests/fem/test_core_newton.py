@@ -14,7 +14,7 @@ from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.material import NeoHooke
-from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
@@ -252,3 +252,76 @@ def test_an_inverted_start_is_reported(cup: SolidMesh) -> None:
     report, _ = newton.solve(state, None, volume=None)
     assert not report.converged
     assert report.reason
+
+
+def test_gives_up_after_as_many_iterations_as_it_says(cup: SolidMesh) -> None:
+    never = NewtonSettings(tolerance=-1.0)
+    newton = newton_of(cup, never)
+    for continued, limit in ((False, 20), (True, 40)):
+        state = SolutionState.at_rest(cup)
+        report, _ = newton.solve(state, None, volume=None, pseudo_transient=continued)
+        assert (report.iterations, report.converged) == (limit, False)
+        assert report.reason == f"no equilibrium after {limit} iterations"
+
+
+def test_continuation_factorises_once_where_nothing_is_unstable(cup: SolidMesh) -> None:
+    newton, state = newton_of(cup), SolutionState.at_rest(cup)
+    volume = 1.05 * newton.system.balance(state, None).volume
+    report, _ = newton.solve(state, None, volume=volume, pseudo_transient=True)
+    assert report.converged
+    assert report.factorisations == report.iterations
+
+
+def test_what_is_forgotten_leaves_no_trace(cup: SolidMesh) -> None:
+    """Solved after another increment, and by a solver that never did anything."""
+    fresh, used = newton_of(cup), newton_of(cup)
+    rest = fresh.system.balance(SolutionState.at_rest(cup), None).volume
+    used.solve(SolutionState.at_rest(cup), None, volume=1.15 * rest)
+    used.forget()
+    states = [SolutionState.at_rest(cup), SolutionState.at_rest(cup)]
+    for newton, state in zip((fresh, used), states, strict=True):
+        newton.solve(state, None, volume=1.05 * rest)
+    np.testing.assert_array_equal(states[0].position, states[1].position)
+    assert states[0].fluid_pressure == states[1].fluid_pressure
+
+
+def test_the_skins_share_is_made_anew_once_an_iteration_has_come_near(
+    cup: SolidMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    newton, state = newton_of(cup, NewtonSettings(keep_factor=0.0)), SolutionState.at_rest(cup)
+    rest = newton.system.balance(state, None).volume
+    anew: list[bool] = []
+    values = newton.system.tangent_values
+
+    def watched(*, elastic: bool = True, **more: float) -> Floats:
+        anew.append(elastic)
+        return values(elastic=elastic, **more)
+
+    monkeypatch.setattr(newton.system, "tangent_values", watched)
+    newton.solve(state, None, volume=1.05 * rest)
+    first = list(anew)
+    anew.clear()
+    newton.solve(state, None, volume=1.055 * rest)
+    assert first[:2] == [True, True], "none yet, then near"
+    assert anew[:2] == [False, True], "that of the last increment, then near"
+
+
+@pytest.mark.parametrize(
+    ("last", "factor"),
+    [
+        ([1.0] * 6, 1.0),  # five iterations: too early to tell
+        ([1.0] * 7, 0.75),
+        ([1.0] * 8, 0.5),
+        ([1.0] * 6 + [0.29], 1.0),  # it falls
+        ([1.0] * 6 + [0.3], 0.75),
+        ([1.0] * 3 + [0.5, 1.0, 1.0, 0.2], 0.75),  # not below 0.3 of each of the last three
+        ([1.0] * 3 + [0.5, 0.7, 0.7, 0.1], 1.0),
+        ([1.0] * 2 + [0.1, 1.0, 1.0, 1.0, 0.2], 1.0),  # the one before these does not count
+        ([1.0] * 5 + [0.01, 1.0], 0.75),
+    ],
+)
+def test_steps_are_shortened_where_the_error_goes_round_in_circles(
+    cup: SolidMesh, last: list[float], factor: float
+) -> None:
+    report = NewtonReport(iterations=len(last) - 1, residuals=last)
+    assert newton_of(cup)._damping(report) == factor
