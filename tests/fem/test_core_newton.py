@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -325,3 +326,28 @@ def test_steps_are_shortened_where_the_error_goes_round_in_circles(
 ) -> None:
     report = NewtonReport(iterations=len(last) - 1, residuals=last)
     assert newton_of(cup)._damping(report) == factor
+
+
+@pytest.mark.parametrize(("strength", "left"), [(0.02, None), (1.0, 0.1)])
+def test_frictions_unsymmetric_share_is_answered(strength: float, left: float | None) -> None:
+    """By one correction where it is small, else until a tenth of it is left over."""
+    rng = np.random.default_rng(4)
+    size = 30
+    symmetric = np.eye(size) * 4.0 + 0.1 * np.ones((size, size))
+    unsymmetric = strength * rng.normal(size=(size, size)) / np.sqrt(size)
+    solver = NewtonSolver(
+        SimpleNamespace(unsymmetric_product=lambda v: unsymmetric @ v),  # type: ignore[arg-type]
+        SimpleNamespace(solve=lambda v: np.linalg.solve(symmetric, v)),  # type: ignore[arg-type]
+        NewtonSettings(),
+    )
+    # Moves of micrometres, as in an increment.
+    answer, coupled = 1e-6 * rng.normal(size=(2, size)) * [[1.0], [6.0 if left else 0.1]]
+    found = solver._with_unsymmetric_share(answer, coupled)
+    before = np.linalg.solve(symmetric, coupled - unsymmetric @ answer)
+    if left is None:
+        np.testing.assert_allclose(found, answer + before, rtol=1e-12)
+        return
+    more = found - answer
+    after = before - more - np.linalg.solve(symmetric, unsymmetric @ more)
+    assert np.linalg.norm(before) > 0.3 * np.linalg.norm(answer)
+    assert np.linalg.norm(after) <= left * np.linalg.norm(before)
