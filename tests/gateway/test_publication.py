@@ -1,4 +1,4 @@
-"""Where a sensor's messages leave: how long they took, and what is not counted for it."""
+"""The end of a sensor's way: latency of its messages, and which of them do not count for it."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class Slow:
         self.payloads.append(payload)
 
 
-def outlet(publisher: Any, stop: threading.Event) -> MessagePublisher:
+def message_publisher(publisher: Any, stop: threading.Event) -> MessagePublisher:
     health = Health("gateway", "test")
     return MessagePublisher({"x": publisher}, health, stop=stop, claim=lambda stream: None)
 
 
-def test_the_time_from_reading_to_bus_is_told() -> None:
+def test_latency_from_reading_to_bus() -> None:
     publisher = Slow()
-    out = outlet(publisher, threading.Event())
+    out = message_publisher(publisher, threading.Event())
     assert out.gauges() == {}
     out.put_read([], time.monotonic_ns())
     assert out.gauges() == {}  # nothing became of the reading
@@ -42,8 +42,15 @@ def test_the_time_from_reading_to_bus_is_told() -> None:
     assert len(publisher.payloads) == 6
 
 
+def test_latency_begins_with_the_read_not_with_publishing() -> None:
+    """Stamping, condition and tare come before: a gateway that is slow there must show it."""
+    out = message_publisher(Slow(), threading.Event())
+    out.put_read([DueMessage("x", b"a", 0)], time.monotonic_ns() - 1_000_000_000)
+    assert out.gauges()["publish_p50_s"] >= 1.02
+
+
 def test_who_waits_for_a_recording_is_not_slow() -> None:
-    out = outlet(Slow(), threading.Event())
+    out = message_publisher(Slow(), threading.Event())
     now_ns = time.monotonic_ns()
     out.put_read([DueMessage("x", b"a", due_ns=now_ns + 30_000_000)], now_ns)
     assert out.gauges() == {}
@@ -53,7 +60,7 @@ def test_a_stop_ends_the_wait() -> None:
     stop, publisher = threading.Event(), Slow()
     stop.set()
     due_ns = time.monotonic_ns() + 60_000_000_000
-    assert not outlet(publisher, stop).put([DueMessage("x", b"a", due_ns=due_ns)])
+    assert not message_publisher(publisher, stop).put([DueMessage("x", b"a", due_ns=due_ns)])
     assert publisher.payloads == []
 
 

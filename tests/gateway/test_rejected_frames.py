@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from palpate.config import StrictConfig
 from palpate.errors import PalpateError
 from palpate.health import Health
 from palpate.messages import Origin, ServiceState
+from palpate_gateway.clock.stamps import DueMessage
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import Reading, WrenchReading
 from palpate_gateway.service.pipeline import Pipeline
@@ -93,3 +94,36 @@ def test_rejected_frames_are_counted_and_told_once(monkeypatch: pytest.MonkeyPat
 def test_a_name_too_long_for_a_frame_keeps_its_end() -> None:
     with Babbler() as device:
         assert device.identity.serial == "x" * 64
+
+
+class SlowPipeline(Pipeline):
+    """Takes 50 ms to stamp and tare."""
+
+    def push(self, readings: Iterable[Reading], arrival_ns: int) -> list[DueMessage]:
+        time.sleep(0.05)
+        return super().push(readings, arrival_ns)
+
+
+class Waiter(Babbler):
+    """Its readings come after half a second."""
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        time.sleep(0.5)
+        return super()._read(timeout_s)
+
+
+def test_latency_counts_from_the_arrival_of_the_reading() -> None:
+    """All that the gateway does with a reading counts, but not the wait for the reading."""
+    device, sink, stop = Waiter(), Sink(), threading.Event()
+    publishers: Any = {WRENCH.name: sink}
+    health = Health("gateway", "test")
+    pipeline = SlowPipeline(device.info)
+    worker = SensorWorker("w", device, pipeline, publishers, health, pace="recorded", stop=stop)
+    worker.start()
+    deadline = time.monotonic() + 20.0
+    while "publish_p50_s" not in worker.gauges():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    stop.set()
+    worker.join(5.0)
+    assert 0.05 <= worker.gauges()["publish_p50_s"] < 0.5

@@ -156,3 +156,13 @@ def test_a_biotac_sp_is_tared_by_its_24_electrodes() -> None:
     made = [collector.add(finger.frame()) for _ in range(5)]
     assert made[-1] is not None
     assert made[-1].electrodes.shape == (24,)
+
+
+def test_the_end_of_a_recording_leaves_a_cancelled_request_alone() -> None:
+    """Whoever asked gave up; the sensor's thread must not fail on the answer."""
+    made = pipeline(live=False, tare="query")
+    given_up, waiting = made.ask_tare(50), made.ask_tare(50)
+    given_up.cancel()
+    made.finish()
+    with pytest.raises(DeviceError, match="the recording has ended"):
+        waiting.result(0)

@@ -1,14 +1,13 @@
 """BioTacs behind a microcontroller bridge (format D, hardware reference 2.6): our own format.
 
-The bridge ships the words as its fingers answer, with a time of its own; there is a sketch of one
-in ``deploy/firmware/bridge``. What it says of itself tells the serial numbers and the slot rate.
+The bridge sends the words of its fingers verbatim, with times of its own clock; its HELLO packet
+brings serial numbers and slot rate. A reference firmware is in ``deploy/firmware/bridge``.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -43,23 +42,19 @@ class BridgeOptions(FingerOptions):
     Attributes:
         line: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
         baud: [bit/s]; nominal on USB-CDC.
-        source: The bridge's id; None = whatever it is, but only one on the line.
-        sequence: Order of sampling; ``learn`` = from the stream, which takes 30 ms at the start.
-        hello_s: How long to wait for what the bridge says of itself [s]; longer than it takes from
-            one time to the next. Without it serial numbers stay unknown.
+        source: The bridge's id; None = any, but only one on the line.
+        hello_s: How long to wait for a HELLO [s]; longer than the time between two of them. Without
+            it serial numbers stay unknown.
     """
 
     line: str = Field(min_length=1)
     baud: int = Field(default=460800, gt=0)
     source: int | None = Field(default=None, ge=0, le=0xFF)
-    sequence: Literal[
-        "learn", "biotac_e1_first", "biotac_pac_first", "biotac_sp_e1_first", "biotac_sp_pac_first"
-    ] = "learn"
     hello_s: float = Field(default=2.5, ge=0.0, le=60.0)
 
 
 class BridgeSource(SlotSource):
-    """The bridge as a line of slots. It is opened once; who opens again makes a new one."""
+    """The bridge as a source of slots. It is opened once; reopening needs a new object."""
 
     slot_period_s = 1.0 / ch.SLOT_RATE_HZ
 
@@ -68,7 +63,7 @@ class BridgeSource(SlotSource):
         self._wanted, self._sequence = options.source, options.sequence
         self._hello_s = options.hello_s
         self._packets = BridgeDecoder()
-        # A word for each port that can be asked for: those that the bridge lacks are absent.
+        # A word for each port that a user may name: those that the bridge lacks are absent.
         self._slots = SlotDecoder(fingers=FINGERS_MAX)
         self._clock = self._new_clock()
         self._source: int | None = None
@@ -79,7 +74,7 @@ class BridgeSource(SlotSource):
         self._end: DeviceError | None = None
         self._arrival_ns = 0
         self.fingers = 0
-        """Fingers that the bridge samples; 0 while it is not known."""
+        """Number of fingers that the bridge samples; 0 while unknown."""
 
     def _new_clock(self) -> SlotClock:
         return SlotClock(
@@ -89,7 +84,7 @@ class BridgeSource(SlotSource):
         )
 
     def open(self) -> None:
-        """See ``SlotSource``; waits until the bridge has said who it is."""
+        """See ``SlotSource``; waits for the bridge's HELLO."""
         self._port.open()
         try:
             self._wait_for_hello()
@@ -102,17 +97,17 @@ class BridgeSource(SlotSource):
         while self._hello is None:
             waited_s = time.monotonic() - began_s
             if self._source is None and waited_s >= _FIRST_S:
-                raise self._nothing_heard()
+                raise self._no_packet()
             if waited_s >= max(self._hello_s, _FIRST_S):
                 return
             try:
                 self.read(_FIRST_S / 10)
             except DeviceTimeout:
                 continue
-        # The order of sampling is learnt, and the clock begun, at the rate that is now known.
+        # Only now is the slot rate known, by which the clock works.
         self._clock = self._new_clock()
 
-    def _nothing_heard(self) -> DeviceError:
+    def _no_packet(self) -> DeviceError:
         junk = self._packets.counters["junk_bytes"] + self._packets.pending
         which = "" if self._wanted is None else f" of source {self._wanted}"
         remedy = "check its power and cable"
@@ -142,7 +137,7 @@ class BridgeSource(SlotSource):
                 slots = self._take(record)
                 placed += [slots] if slots is not None else []
             except DeviceError as error:
-                # What came before it is delivered first.
+                # The slots before the error are delivered first.
                 self._end = error
                 break
         if self._end is not None and not placed:
@@ -155,7 +150,7 @@ class BridgeSource(SlotSource):
         if isinstance(record.body, BridgeSlots):
             return self._place(record.body, record.time_us)
         if isinstance(record.body, BridgeHello):
-            self._meet(record.body)
+            self._take_hello(record.body)
         else:
             self._status = (self._status[0] if self._status else record.body, record.body)
         return None
@@ -173,17 +168,17 @@ class BridgeSource(SlotSource):
                 remedy="name one of them by source",
             )
         if record.epoch != self._epoch:
-            # Its times begin anew, and so must whatever maps them to the host's.
+            # Its clock starts again, so the map to host time must start again too.
             raise DeviceLost(
                 f"{self._port.name}: the bridge has restarted",
                 remedy="check its power; it is opened again by itself",
             )
         return True
 
-    def _meet(self, hello: BridgeHello) -> None:
+    def _take_hello(self, hello: BridgeHello) -> None:
         if hello.slot_rate_hz == 0:
             raise DeviceError(
-                f"{self._port.name}: the bridge tells a rate of 0 slots per second",
+                f"{self._port.name}: the bridge reports a rate of 0 slots per second",
                 remedy="correct its firmware",
             )
         known, self._hello = self._hello, hello
@@ -214,22 +209,22 @@ class BridgeSource(SlotSource):
         return fingers[finger].serial if finger < len(fingers) else ""
 
     def counters(self, finger: int) -> Mapping[str, int]:
-        """See ``SlotSource``; those that begin with ``bridge`` are what the bridge has counted."""
-        told = {"bridge_parity_errors": 0, "bridge_error_words": 0, "bridge_overruns": 0}
+        """See ``SlotSource``; those that begin with ``bridge`` were counted by the bridge."""
+        counted = {"bridge_parity_errors": 0, "bridge_error_words": 0, "bridge_overruns": 0}
         if self._status is not None:
             first, last = self._status
             if finger < min(len(first.parity_errors), len(last.parity_errors)):
                 errors = last.parity_errors[finger] - first.parity_errors[finger]
-                told["bridge_parity_errors"] = errors % _WRAP
-            told["bridge_error_words"] = (last.error_words - first.error_words) % _WRAP
-            told["bridge_overruns"] = (last.overruns - first.overruns) % _WRAP
+                counted["bridge_parity_errors"] = errors % _WRAP
+            counted["bridge_error_words"] = (last.error_words - first.error_words) % _WRAP
+            counted["bridge_overruns"] = (last.overruns - first.overruns) % _WRAP
         return {
             **self._packets.counters,
             **self._slots.counters,
             **self._clock.counters,
             **self._slots.finger_counters[finger],
             "other_sources": self._foreign,
-            **told,
+            **counted,
         }
 
 

@@ -1,14 +1,10 @@
-"""BioTacs on a CAN bus, a frame for each sampled channel (format A, hardware reference 2.1).
-
-Whether SynTouch's interface sends exactly this is a well-founded inference, never confirmed by a
-public capture of a BioTac: the public driver of the format is for the NumaTac.
-"""
+"""BioTacs on a CAN bus, a frame for each sampled channel (format A, hardware reference 2.1)."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -24,13 +20,13 @@ from palpate_gateway.protocols.slot_clock import SlotClock
 from palpate_gateway.readings import ClockObservation
 
 _LATE_S = 2e-4
-"""Whoever waits for the end of a round wakes by so much after it [s]."""
+"""Added to the expected end of a round, so that its last slot has arrived at the wake-up [s]."""
 
 _SCATTER_S = 3e-3
-"""The slots of a round are not waited for longer than this, however late the last ones came [s]."""
+"""Longest wait for late slots of a round, however much earlier ones were late [s]."""
 
 _UNKNOWN_S = 2e-3
-"""How long slots wait for more while nobody knows where in the round they stand [s]."""
+"""How long slots wait for more while their place in the round is unknown [s]."""
 
 
 class CanOptions(FingerOptions):
@@ -40,13 +36,12 @@ class CanOptions(FingerOptions):
         interface: python-can's kind of bus.
         channel: Which bus.
         bitrate: [bit/s]; 0 = as the bus is set up.
-        bus_options: More of python-can's options.
+        bus_options: Further options of python-can.
         can_id: Identifier of the BioTacs' frames; None = any frame that holds a sampled channel.
         fingers: Words in each frame.
         slot_rate_hz: Slots each second.
-        sequence: Order of sampling; ``learn`` = from the stream, which takes 30 ms at the start.
-        gather_s: How long slots may wait for the end of their sampling round [s]: who wakes for
-            each of 4400 does little else. 0 = not at all.
+        gather_s: How long slots may wait for the end of their sampling round [s]: waking up for
+            each of 4400 slots a second would take most of the processor time. 0 = not at all.
     """
 
     interface: str = "socketcan"
@@ -56,14 +51,11 @@ class CanOptions(FingerOptions):
     can_id: int | None = Field(default=None, ge=0, le=0x7FF)
     fingers: int = Field(default=CAN_FINGERS_MAX, ge=1, le=CAN_FINGERS_MAX)
     slot_rate_hz: float = Field(default=ch.SLOT_RATE_HZ, gt=0.0, le=10_000.0)
-    sequence: Literal[
-        "learn", "biotac_e1_first", "biotac_pac_first", "biotac_sp_e1_first", "biotac_sp_pac_first"
-    ] = "learn"
     gather_s: float = Field(default=0.02, ge=0.0, le=0.1)
 
 
 class CanSource(SlotSource):
-    """The bus as a line of slots."""
+    """The CAN bus as a source of slots."""
 
     def __init__(self, options: CanOptions) -> None:
         self.slot_period_s = 1.0 / options.slot_rate_hz
@@ -116,12 +108,12 @@ class CanSource(SlotSource):
         self._ends_s = ends_s + float(late_s[soonest]) + scatter_s + _LATE_S
 
     def _until_the_end_s(self) -> float:
-        """How long it takes until the sampling round that has begun is over [s]."""
+        """Time until the sampling round that has begun ends [s]."""
         left_s = self._ends_s - time.monotonic()
         return min(left_s if left_s > 0.0 else _UNKNOWN_S, self._gather_s)
 
     def serial(self, finger: int) -> str:
-        """The format does not tell serial numbers."""
+        """Empty: the format has no serial numbers."""
         return ""
 
     def counters(self, finger: int) -> Mapping[str, int]:

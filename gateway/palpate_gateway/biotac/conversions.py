@@ -1,7 +1,7 @@
 """Counts to physical units, by the maker's formulas (hardware reference 1.9).
 
-Counts are what palpate publishes and learns from; units are for people and plots. The formulas are
-the maker's nominal ones: nobody calibrated the single sensor by them.
+palpate publishes counts and learns from counts; physical units are for people and plots. The
+formulas are the maker's nominal ones, not a calibration of the single sensor.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _BETA_K, _UPPER, _LOWER = 4025.0, 155183.0, 46555.0
 
 @dataclass(frozen=True, slots=True)
 class PressureScale:
-    """What a count of pressure is worth in one model.
+    """Pressure per count of one model.
 
     Attributes:
         pdc_pa: Static pressure per count [Pa].
@@ -49,10 +49,10 @@ PRESSURE_SCALES: dict[str, PressureScale] = {
 
 
 def tared(counts: npt.ArrayLike, baseline: npt.ArrayLike) -> Floats:
-    """Counts minus their untouched mean [counts]; TAC has no other unit.
+    """Counts minus their untouched mean [counts].
 
-    The maker's formula for TAC, taken literally, gives a nearly constant negative rate at rest
-    where there is no change of temperature, so TAC stays raw or tared and is never called K/s.
+    TAC has no other unit: the maker's formula gives a nearly constant negative rate at rest, where
+    the temperature does not change, so it is not given in K/s.
 
     Args:
         counts: Raw counts, any shape.
@@ -105,7 +105,7 @@ def pac_pressure(
 def tdc_temperature(counts: npt.ArrayLike) -> Floats:
     """Temperature of the heated core [K], in the shape of the counts; NaN at 0 counts.
 
-    Three public sets of data disagree by 20 K at rest, so differences mean more than the level.
+    Three public data sets disagree by 20 K at rest: differences mean more than levels.
 
     Args:
         counts: Raw counts, not tared, any shape.

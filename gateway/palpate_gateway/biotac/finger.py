@@ -1,11 +1,4 @@
-"""BioTac or BioTac SP: by the electrodes that answer, or as the user says.
-
-The serial number does not tell: the public capture of an SP (BTSP...) is sampled as a BioTac, with
-19 electrodes in 44 slots (hardware reference 1.7).
-
-
-A BioTac at one port of a line that several fingers may share.
-"""
+"""A BioTac or BioTac SP at one port of a line that several fingers may share."""
 
 from __future__ import annotations
 
@@ -28,25 +21,34 @@ from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import Reading
 
 TypeOption = Literal["auto", "biotac", "biotac_sp"]
-"""What a user may say; ``auto`` = by the electrodes that answer."""
+"""Setting of the sensor type; ``auto`` = by the electrodes that answer."""
+
+SequenceOption = Literal[
+    "learn", "biotac_e1_first", "biotac_pac_first", "biotac_sp_e1_first", "biotac_sp_pac_first"
+]
+"""Setting of the order of sampling; ``learn`` = from the stream."""
 
 LEARNT_FROM = 2 * BIOTAC_SP_LAYOUT.slots
-"""Slots that hold a whole frame of either kind, wherever they begin."""
+"""So many slots hold a whole frame of either type, wherever they begin."""
 
 
 def answering_type(slots: SlotBlock) -> SensorType:
-    """The type whose electrodes answer; one that is only asked for them answers by error words."""
+    """BioTac or BioTac SP, by the electrodes that answer; missing ones answer by error words.
+
+    The serial number is no guide: the public capture of an SP (BTSP...) is sampled as a BioTac,
+    with 19 electrodes in 44 slots (hardware reference 1.7).
+    """
     more = (slots.channel >= ch.FIRST_ELECTRODE + ch.ELECTRODES) & slots.good
     return SensorType.BIOTAC_SP if more.any() else SensorType.BIOTAC
 
 
 def agreed_type(wanted: TypeOption, slots: SlotBlock, what: str) -> SensorType:
-    """The type to read a finger as.
+    """The sensor type by which to read a finger.
 
     Args:
-        wanted: What the user says.
-        slots: At least ``LEARNT_FROM`` slots of the finger, unless it ceased to answer.
-        what: The finger, for errors.
+        wanted: The setting.
+        slots: At least ``LEARNT_FROM`` slots of the finger, unless it stopped answering.
+        what: Name of the finger, for errors.
 
     Raises:
         DeviceError: The finger answers as another type.
@@ -62,10 +64,10 @@ def agreed_type(wanted: TypeOption, slots: SlotBlock, what: str) -> SensorType:
 
 
 ABSENT_SLOTS = ch.SLOTS_PER_FRAME
-"""After a whole frame of words that say "no finger here" there is none."""
+"""A whole frame of absent words (00 00 or FF FF) shows that no finger is plugged in."""
 
 _FIRST_S = 2.0
-"""How long a line may take to bring the first word of a finger [s]."""
+"""Longest time to the first word of a finger [s]."""
 
 
 class FingerOptions(StrictConfig):
@@ -73,29 +75,31 @@ class FingerOptions(StrictConfig):
 
     Attributes:
         port: Which finger of the line, from 1.
-        serial: Serial number to publish; empty = what the line tells, else line and port.
-        sensor_type: Kind of finger; ``auto`` = by the electrodes that answer, which takes 25 ms at
+        serial: Serial number to publish; empty = the one that the line sends, else line and port.
+        sensor_type: Type of finger; ``auto`` = by the electrodes that answer, which takes 25 ms at
             the start.
+        sequence: Order of sampling; ``learn`` = from the stream, which takes 30 ms at the start.
     """
 
     port: int = Field(default=1, ge=1, le=5)
     serial: str = Field(default="", max_length=SERIAL_MAX, pattern=r"^[ -~]*$")
-    # No setting of the line, whose fingers may differ: left out of what they must agree on.
+    # Excluded from the settings of the line: its fingers may be of different types.
     sensor_type: TypeOption = Field(default="auto", exclude=True)
+    sequence: SequenceOption = "learn"
 
 
 class FingerDevice(Device):
-    """A live BioTac whose slots come over a shared line. Subclasses say which.
+    """A live BioTac whose slots come over a shared line. Subclasses open the line.
 
     Args:
         driver: Name in the driver table.
-        model: One line for people.
+        model: One line that names the device.
         options: Port and serial.
     """
 
     def __init__(self, driver: str, model: str, options: FingerOptions) -> None:
-        told = options.sensor_type
-        kind = SensorType.BIOTAC if told == "auto" else SensorType[told.upper()]
+        wanted = options.sensor_type
+        kind = SensorType.BIOTAC if wanted == "auto" else SensorType[wanted.upper()]
         super().__init__(
             DeviceInfo(
                 driver=driver,
@@ -114,11 +118,11 @@ class FingerDevice(Device):
 
     @abstractmethod
     def _line(self) -> tuple[object, object, SlotSource, int]:
-        """Key and settings of the line, the line itself for the first that opens it, its ports."""
+        """Key of the line, its settings, a source if it is not open yet, number of ports."""
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters of frames, of the line, and of what this process was too slow to take."""
+        """Counters of frames, of the line, and of slots that this process was too slow to take."""
         finger = self._finger
         if finger is None:
             return self._assembler.counters
@@ -140,10 +144,10 @@ class FingerDevice(Device):
             self._close()
             raise
         self._assembler = FrameAssembler(finger.source.slot_period_s, kind.layout)
-        told = finger.source.serial(port - 1)
+        known = finger.source.serial(port - 1)
         name = "-".join(str(part) for part in key) if isinstance(key, tuple) else str(key)
         return DeviceIdentity(
-            self._options.serial or told or f"{name}-port{port}",
+            self._options.serial or known or f"{name}-port{port}",
             finger.source.slot_period_s,
             sensor_type=kind,
         )
@@ -179,9 +183,9 @@ class FingerDevice(Device):
                 )
 
     def _wait_for_words(self, finger: FingerQueue) -> SlotBlock:
-        """Wait until the finger has answered, so that an empty port is not taken for a sensor.
+        """Wait until the finger has answered and all of its electrodes have been sampled.
 
-        And until all of its electrodes have been asked.
+        An empty port must not count as a sensor.
         """
         came: list[SlotBlock] = []
         answered = False

@@ -1,4 +1,4 @@
-"""Slots to frames: decode by channel id, tolerate loss, count everything."""
+"""Slots to readings: decoded by channel id, with every loss counted."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading
 
 TIME_JUMP_S = 1e-3
-"""A slot later than its place on the slot grid by more than this is a time jump [s]."""
+"""A slot that is later than its place on the slot grid by more is a time jump [s]."""
 
 _BELIEVABLE_LOSS = 1_000_000
-"""A frame counter that leaps further than this has restarted or is damaged [frames]."""
+"""A frame counter that jumps by more has restarted or is damaged [frames]."""
 
 _KNOWN = np.zeros(256, np.bool_)
 _KNOWN[list(ch.CHANNEL_NAMES)] = True
@@ -39,18 +39,18 @@ _COUNTERS = (
 class FrameAssembler:
     """Groups slots of equal (batch, frame) into readings.
 
-    A frame is delivered when the next one begins, or at once when it is whole. Channels that are
-    absent or of bad parity keep their validity bit clear; an absent one holds 0. A PAC sample goes
-    where its position says, or else where the channels beside it say, by the order of sampling of
-    the last whole frame; one of which that is not certain is left out and counted.
+    A frame is delivered when the next one begins, or at once when it is whole. The validity bit of
+    a channel that is absent or has bad parity stays clear; an absent one holds 0. A PAC sample is
+    placed by its position, or else by the channels beside it, in the order of sampling of the last
+    whole frame; a sample whose place is uncertain is dropped and counted.
 
     ``counters["other_electrodes"]`` counts answers of electrodes that the layout does not have.
 
     Args:
         slot_period_s: Time between two slots [s].
         layout: What a frame holds.
-        timed: The slots' times are the device's, so that they tell where a slot is lost; False =
-            they were made by counting.
+        timed: The slots have times of the device's clock, which show where a slot is lost; False =
+            their times were made by counting.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class FrameAssembler:
     ) -> None:
         self._slot_period_s = slot_period_s
         self.layout = layout
-        # Validity bit of each channel id; -1 = another kind.
+        # Validity bit of each channel id; -1 = it has none.
         self._column = np.full(256, -1, np.int64)
         self._column[[*ch.channels_of(layout)]] = np.arange(layout.first_pac_bit)
         self._bits = np.uint64(1) << np.arange(layout.slots, dtype=np.uint64)
@@ -80,16 +80,16 @@ class FrameAssembler:
 
     @property
     def ends_inside_frame(self) -> bool:
-        """Whether the frame that has begun is cut: it does not end as the one before did.
+        """Whether the frame that has begun is cut off: it does not end as the one before did.
 
-        A frame that lost a slot on the way still ends as the others do.
+        A frame that lost a slot inside still ends as the others do.
         """
         if not len(self._pending) or self._holds_frame(self._pending):
             return False
         return self._last_ending is None or self._last_ending != _ending(self._pending)
 
     def push(self, block: SlotBlock) -> list[ElectrodeReading]:
-        """Take slots in order of time; return the frames that are now whole or over."""
+        """Take slots in order of time; return the frames that are now whole or have ended."""
         if not len(block):
             return []
         self._count(block)
@@ -130,7 +130,7 @@ class FrameAssembler:
             counters["time_jumps"] += not -TIME_JUMP_S <= first_s <= most_s
         self._last_time_s = float(times_s[-1])
         steps = times_s[1:] - times_s[:-1]
-        # Of most blocks the extremes say all, and this is done for each.
+        # For most blocks the extremes are enough; this runs for every block.
         if len(steps) and (steps.max() > most_s or steps.min() < -TIME_JUMP_S):
             jumps = (steps > most_s) | (steps < -TIME_JUMP_S)
             counters["time_jumps"] += int(np.count_nonzero(jumps))
@@ -150,7 +150,7 @@ class FrameAssembler:
     def _take_usual(self, slots: SlotBlock, readings: list[ElectrodeReading]) -> int:
         """Deliver whole frames at the start, in the order of the last one; return their slots.
 
-        Of a live sensor nearly all frames are such; the longer way would take most of its time.
+        Nearly all frames of a live sensor are like that; ``_assemble`` would take far longer.
         """
         usual, size = self._pac_numbers.round, self.layout.slots
         if usual is None or len(slots) < size or len(usual.channels) != size:
@@ -183,7 +183,7 @@ class FrameAssembler:
         return at
 
     def _without_late(self, slots: SlotBlock) -> SlotBlock:
-        """Drop slots of the frame that was delivered because it was whole already."""
+        """Drop slots of a frame that has been delivered already, because it was whole."""
         if self._last_key is None or not len(slots):
             return slots
         batch, frame = self._last_key
@@ -218,7 +218,7 @@ class FrameAssembler:
         counters["unplaced_slots"] += int(np.count_nonzero(number == UNPLACED))
         surplus = int(np.count_nonzero(number == SURPLUS))
 
-        # np.unique gives the first slot of each channel in each frame: repetitions lose.
+        # np.unique finds the first slot of each channel in each frame; repetitions are dropped.
         cell, first = np.unique(row[usable] * 64 + column[usable], return_index=True)
         at = cell // 64, cell % 64
         counts = np.zeros((frames, layout.slots), np.uint16)
@@ -236,7 +236,7 @@ class FrameAssembler:
         readings = []
         for k, start in enumerate(starts.tolist()):
             missed = self._advance(int(slots.batch[start]), int(slots.frame[start]))
-            # Of the first slot of the round, though that may be lost.
+            # Time of the first slot of the round, even if that slot was lost.
             before = max(int(slots.position[start]), 0)
             time_s = float(slots.time_s[start]) - before * self._slot_period_s
             readings.append(self._reading(counts[k], int(validity[k]), time_s, missed))
@@ -245,7 +245,7 @@ class FrameAssembler:
     def _reading(
         self, counts: CountArray, validity: int, time_s: float, missed: int
     ) -> ElectrodeReading:
-        """A frame's counts in order of their validity bits as a reading."""
+        """A reading from counts in order of their validity bits."""
         layout = self.layout
         pdc, tac, tdc = counts[layout.pdc_bit : layout.first_pac_bit].tolist()
         return ElectrodeReading(
@@ -261,12 +261,12 @@ class FrameAssembler:
         )
 
     def _holds_frame(self, slots: SlotBlock) -> bool:
-        """Whether one frame's slots hold all that it has."""
+        """Whether these slots of one frame hold all of its channels."""
         enough = len(slots) >= self.layout.slots
         return enough and holds_frame(slots.channel.tolist(), self.layout)
 
     def _advance(self, batch: int, frame: int) -> int:
-        """Move the unwrapped tick to this frame; return how many frames were lost before it."""
+        """Advance the unwrapped tick to this frame; return how many frames were lost before it."""
         if self._last_key is None:
             self._last_key = (batch, frame)
             self._tick = max(frame, 0)
@@ -288,5 +288,5 @@ def _frame_starts(slots: SlotBlock) -> npt.NDArray[np.int64]:
 
 
 def _ending(slots: SlotBlock) -> tuple[int, ...]:
-    """Channel ids of the last two slots: one alone is often PAC, which is every other slot."""
+    """Channel ids of the last two slots: a single one is often PAC, which is every other slot."""
     return tuple(slots.channel[-2:].tolist())

@@ -1,8 +1,9 @@
 """A BioTac polled by a PIC32 board (format B, hardware reference 2.2): a legacy route.
 
-Its records have neither sync bytes nor a checksum, and the words lost their parity on the board. A
-stream out of step shows only by impossible values or times, often a record late: so each record is
-delivered when the next one has proved to be in step. Then the stream is stopped, drained, started.
+Its records have neither sync bytes nor a checksum, and the board strips the parity of the words. A
+misaligned stream shows only by impossible values or times, often one record late: so a record is
+delivered only when the next one has proved to be aligned. A misaligned stream is stopped, drained
+and started again.
 """
 
 from __future__ import annotations
@@ -46,10 +47,10 @@ class Pic32Options(StrictConfig):
         port: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
         baud: [bit/s].
         rts_cts: Hardware flow control, which the board uses.
-        layout: Order of the values, which changed between versions of the firmware and which
-            nothing in the stream tells: older ones have ``electrodes_first``.
-        serial: Serial number to publish, which the board does not tell; empty = the port.
-        sensor_type: Kind of finger; the board polls 19 electrodes only, so never ``biotac_sp``.
+        layout: Order of the values, which changed between versions of the firmware and does not
+            show in the stream: older ones have ``electrodes_first``.
+        serial: Serial number to publish, since the board sends none; empty = the port.
+        sensor_type: Type of finger; never ``biotac_sp``, for the board polls 19 electrodes only.
     """
 
     port: str = Field(min_length=1)
@@ -64,8 +65,8 @@ class BiotacPic32(Device):
     """One BioTac at 100 Hz.
 
     The board polls every channel once a frame: ``pac[0]`` is that one PAC sample, the other 21 are
-    0 and their validity bits clear. When in a frame each channel is polled is not known; the slot
-    period is the one that shares a frame's 10 ms among 44 slots.
+    0 with their validity bits clear. The times of polling inside a frame are unknown; the slot
+    period stated is a 44th of a frame's 10 ms.
     """
 
     options_class = Pic32Options
@@ -93,7 +94,7 @@ class BiotacPic32(Device):
         self._begin()
 
     def _begin(self) -> None:
-        """Forget what an earlier connection told."""
+        """Forget the earlier connection."""
         self._decoder = Pic32Decoder(self._options.layout)
         self._clock = SampleClock(1e6 / ask.RATE_HZ, _WRAP_US)
         self._counts: Counter[str] = Counter(
@@ -102,13 +103,13 @@ class BiotacPic32(Device):
         self._absent = False
         self._held: tuple[Pic32Sample, int, float] | None = None
         self._last_tick: int | None = None
-        self._heard_s = time.monotonic()
+        self._arrived_s = time.monotonic()
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Events since it was opened last.
 
-        ``doubted`` records were dropped to be sure, ``absent`` ones because nobody was there.
+        ``doubted`` records were dropped as perhaps misaligned, ``absent`` ones without a finger.
         """
         return {**self._decoder.counters, **self._clock.counters, **self._counts}
 
@@ -125,20 +126,20 @@ class BiotacPic32(Device):
         return DeviceIdentity(name, 1.0 / ch.SLOT_RATE_HZ)
 
     def _start(self) -> None:
-        """Stop whatever runs, drain the line, start."""
+        """Stop the stream, drain the line, start the stream."""
         self._port.write(ask.stop_request())
         began_s = time.monotonic()
         settle(self._port, _QUIET_S, _DRAIN_S)
         if time.monotonic() - began_s >= _DRAIN_S:
             raise DeviceError(
-                f"{self.info.model}: it goes on sending after command 'q'",
+                f"{self.info.model}: it keeps sending after command 'q'",
                 remedy="check the direction host to board, and RTS/CTS",
             )
         self._decoder.reset()
         self._held = None
         self._clock.pause()
         self._port.write(ask.start_request())
-        self._heard_s = time.monotonic()
+        self._arrived_s = time.monotonic()
 
     def _wait_for_record(self) -> None:
         until = time.monotonic() + _FIRST_S
@@ -146,7 +147,7 @@ class BiotacPic32(Device):
             left_s = until - time.monotonic()
             if left_s <= 0.0:
                 if self._absent:
-                    raise self._nobody()
+                    raise self._no_finger()
                 raise DeviceError(
                     f"{self.info.model}: no record within {_FIRST_S:g} s of command 'r' "
                     f"({self._decoder.pending} bytes came)",
@@ -155,9 +156,9 @@ class BiotacPic32(Device):
             try:
                 self._receive(min(left_s, _SILENCE_S))
             except DeviceTimeout:
-                self._start()  # a board that is booting does not hear
+                self._start()  # a board that is booting ignores commands
 
-    def _nobody(self) -> DeviceLost:
+    def _no_finger(self) -> DeviceLost:
         return DeviceLost(
             f"{self.info.model}: no finger answers (every value is 0)",
             remedy="check its plug and cable; it is looked for again by itself",
@@ -172,14 +173,14 @@ class BiotacPic32(Device):
         until = time.monotonic() + timeout_s
         while True:
             left_s = max(until - time.monotonic(), 0.0)
-            patience_s = max(self._heard_s + _SILENCE_S - time.monotonic(), 0.0)
+            patience_s = max(self._arrived_s + _SILENCE_S - time.monotonic(), 0.0)
             try:
                 readings = self._receive(min(left_s, patience_s))
             except DeviceTimeout:
-                if time.monotonic() - self._heard_s < _SILENCE_S:
+                if time.monotonic() - self._arrived_s < _SILENCE_S:
                     raise
                 if self._absent:
-                    raise self._nobody() from None
+                    raise self._no_finger() from None
                 raise DeviceLost(
                     f"{self.info.model}: no record for {_SILENCE_S:g} s",
                     remedy="check its power and cable; it is started again by itself",
@@ -189,16 +190,16 @@ class BiotacPic32(Device):
             if time.monotonic() >= until:
                 raise DeviceTimeout(
                     f"{self.info.model}: no record within {timeout_s:g} s",
-                    remedy="bytes come, but no record in step: check baud and cable",
+                    remedy="bytes come, but no aligned record: check baud and cable",
                 )
 
     def _receive(self, timeout_s: float) -> list[Reading]:
-        """Read the port once; the readings that are sure now."""
+        """Read the port once; returns the readings that are certain now."""
         readings: list[Reading] = []
         records = self._decoder.feed(self._port.read(timeout_s))
         in_step = all(self._take(record, readings) for record in records)
         if self._decoder.ended and in_step:
-            self._release(readings)  # the end record proves it
+            self._release(readings)  # the end record proves the alignment
         if not in_step or self._decoder.misaligned or self._decoder.ended:
             self._counts["doubted"] += self._held is not None
             self._counts["realigned"] += 1
@@ -206,13 +207,13 @@ class BiotacPic32(Device):
         return readings
 
     def _take(self, record: Pic32Record, readings: list[Reading]) -> bool:
-        """Hold a record and release the one before it; False if the stream is out of step."""
+        """Hold a record and release the one before it; False if the stream is misaligned."""
         now_s = time.monotonic()
         verdict = self._clock.take(record.tick // _TICKS_PER_US % _WRAP_US, now_s)
         if verdict in (SampleVerdict.DOUBTFUL, SampleVerdict.RESTARTED):
             return False
         if verdict is SampleVerdict.NEW:
-            # The reading waited for this record, whose arrival tells the clock.
+            # The reading waited for this record, whose arrival is the newest observation.
             self._release(readings, ClockObservation(self._clock.time_s, time.monotonic_ns()))
             self._absent = _is_absent(record.sample)
             self._counts["absent"] += self._absent
@@ -220,7 +221,7 @@ class BiotacPic32(Device):
                 self._counts["saturated_samples"] += _saturated(record.sample)
                 self._held = (record.sample, self._clock.tick, self._clock.time_s)
         if not self._absent:
-            self._heard_s = now_s
+            self._arrived_s = now_s
         return True
 
     def _release(self, readings: list[Reading], observed: ClockObservation | None = None) -> None:
@@ -253,7 +254,7 @@ def _values(sample: Pic32Sample) -> tuple[int, ...]:
 
 
 def _is_absent(sample: Pic32Sample) -> bool:
-    """Whether no finger answered: its words are 00 00, and the board strips the wrong parity."""
+    """Whether no finger answered: its words are then 00 00, and the board ignores their parity."""
     return not any(_values(sample))
 
 

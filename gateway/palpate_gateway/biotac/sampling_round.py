@@ -1,7 +1,7 @@
 """The order in which a frame's channels are sampled, and the number of each PAC sample in it.
 
-PAC samples look alike, so which of them a slot holds follows from its place: from the position that
-the source tells, or else from the channels beside it.
+PAC samples look alike, so their number follows from the place of the slot: from its position if the
+source sends it, or else from the channels beside it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from palpate_gateway.protocols import channels as ch
 
 NOT_PAC = -1
 SURPLUS = -2
-"""Number of a PAC sample for which its neighbours leave no room: it came twice."""
+"""Number of a PAC sample that came twice: its neighbours leave no room for it."""
 UNPLACED = -3
 """Number of a PAC sample that may be one of several."""
 
 _FAR = 1e6
-"""No slot of a frame is so many slots after another."""
+"""More slots than any frame has."""
 
 Ints = npt.NDArray[np.int64]
 
@@ -47,7 +47,7 @@ class SamplingRound:
         own = [self._places[channel] for channel in ch.channels_of(layout)]
         self.places: Ints = np.array([*own, *np.flatnonzero(is_pac)], np.int64)
         """Place of the slot that belongs to each validity bit."""
-        # PAC samples before each place, and before the end.
+        # Number of PAC samples before each place, and in all.
         self._before = [0, *np.cumsum(is_pac).tolist()]
 
     def agrees(self, channels: Ints, positions: Ints) -> bool:
@@ -61,12 +61,12 @@ class SamplingRound:
     ) -> list[int]:
         """Number of the PAC sample in each slot of a frame whose positions are not known.
 
-        Between two other channels there is room for so many. If fewer came, their times say which,
-        provided that those of the other channels are on the grid of slots.
+        Between two other channels there are so many PAC slots. If fewer samples came, their times
+        show which, provided that the times of the other channels are on the grid of slots.
 
         Args:
             channels: Channel ids in order of time; slots may be lost or have come twice.
-            times_s: Their times [s]; None = not known.
+            times_s: Their times [s]; None = unknown.
             slot_period_s: Time between two slots [s].
         """
         anchors = [(-1, -1)]  # slot and place
@@ -93,11 +93,11 @@ class SamplingRound:
 def _places_by_time(
     anchors: Sequence[tuple[int, int]], times_s: Sequence[float] | None, slot_period_s: float
 ) -> list[int]:
-    """Place of each slot on the grid that the anchors make; empty if they make none.
+    """Place of each slot by its time, on the grid of the anchors; empty if they form no grid.
 
     Args:
-        anchors: Slots that are known, and their places.
-        times_s: Times of all slots [s]; None = not known.
+        anchors: Slots with a known place, and their places.
+        times_s: Times of all slots [s]; None = unknown.
         slot_period_s: Time between two slots [s].
     """
     if times_s is None or not anchors:
@@ -110,18 +110,18 @@ def _places_by_time(
 
 
 class PacNumbers:
-    """Numbers PAC samples, by the order of sampling that whole frames have shown.
+    """Numbers PAC samples by the order of sampling, which it learns from whole frames.
 
     Args:
         layout: What a frame holds.
         slot_period_s: Time between two slots [s].
-        timed: The slots' times are the device's.
+        timed: The slots have times of the device's clock.
     """
 
     def __init__(self, layout: FrameLayout, slot_period_s: float, *, timed: bool) -> None:
         self._layout, self._slot_period_s, self._timed = layout, slot_period_s, timed
         self._usual = {
-            # By whether a frame begins and ends with PAC.
+            # Keys: whether a frame begins, and whether it ends with PAC.
             (first, not first): SamplingRound(layout, ch.interleaved(layout, pac_first=first))
             for first in (False, True)
         }
@@ -173,7 +173,7 @@ class PacNumbers:
         told = bool((frame.position >= 0).all())
         in_order = np.argsort(frame.position, kind="stable") if told else np.arange(len(frame))
         if told and not np.diff(frame.position[in_order]).all():
-            return None  # one came twice, so another may be missing
+            return None  # a position came twice, so another may be missing
         channels = frame.channel[in_order]
         if self.round is None or channels.tobytes() != self.round.channel_bytes:
             if not is_whole(channels.tolist(), self._layout):
@@ -185,13 +185,13 @@ class PacNumbers:
 
 
 def is_whole(channels: Sequence[int], layout: FrameLayout) -> bool:
-    """Whether these slots hold all of a frame, each once; others of no use may be among them."""
+    """Whether these slots hold each channel of a frame once, and perhaps unused channels."""
     return channels.count(ch.PAC) == layout.pac_samples and all(
         channels.count(channel) == 1 for channel in ch.channels_of(layout)
     )
 
 
 def holds_frame(channels: Sequence[int], layout: FrameLayout) -> bool:
-    """Whether these slots hold all of a frame; some may have come twice."""
+    """Whether these slots hold each channel of a frame; some may have come twice."""
     wanted = {*ch.channels_of(layout)}
     return channels.count(ch.PAC) >= layout.pac_samples and wanted <= {*channels}

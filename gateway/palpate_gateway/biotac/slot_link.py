@@ -1,8 +1,8 @@
 """One line that several fingers share: read once, by one thread, for all of them.
 
 A CAN frame, or a packet of a bridge, holds the words of up to five fingers, and each finger is a
-sensor of its own with a thread of its own. Whoever is first opens the line, whoever is last closes
-it; what came is kept for each finger until it asks, at most ``KEPT`` slots.
+sensor with its own thread. The first finger that joins opens the line, the last one that leaves
+closes it. Each finger has a queue of at most ``KEPT`` slots.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from palpate_gateway.readings import ClockObservation
 _log = logging.getLogger(__name__)
 
 KEPT = 8800
-"""Slots that wait for a finger's thread: two seconds; older ones are dropped and counted."""
+"""Most slots in a finger's queue: two seconds; older ones are dropped and counted."""
 
 _READ_S = 0.1
 
 
 class SlotSource(ABC):
-    """Where placed slots come from: a CAN bus or a bridge."""
+    """A source of slots with their places: a CAN bus or a bridge."""
 
     slot_period_s: float
     """Time between two slots [s]."""
     observed: ClockObservation | None = None
-    """The slot of the last ones that was least under way: its time, and when it arrived."""
+    """Of the last slots the one with the smallest delay: its time, and when it arrived."""
 
     @abstractmethod
     def open(self) -> None:
@@ -47,19 +47,19 @@ class SlotSource(ABC):
 
     @abstractmethod
     def read(self, timeout_s: float) -> LineSlots | None:
-        """Slots that came; None = none of them has a place. Raises DeviceTimeout, DeviceLost."""
+        """Slots that arrived; None = none has a place. Raises DeviceTimeout, DeviceLost."""
 
     @abstractmethod
     def serial(self, finger: int) -> str:
-        """Serial number of a finger, from 0; empty if the line does not tell."""
+        """Serial number of a finger, from 0; empty if the line does not send it."""
 
     @abstractmethod
     def counters(self, finger: int) -> Mapping[str, int]:
-        """What went wrong on the line, and with the words of this finger."""
+        """Counters of the line, and of this finger's words."""
 
 
 class FingerQueue:
-    """One finger's end of a shared line."""
+    """Slots of one finger of a shared line, from the line's thread to the finger's."""
 
     def __init__(self, link: SlotLink, index: int) -> None:
         self._link, self.index = link, index
@@ -68,7 +68,7 @@ class FingerQueue:
         self._error: DeviceError | None = None
         self.dropped = 0
         self.absent = 0
-        """Words in a row that say that no finger is there."""
+        """Number of absent words in a row, up to now."""
 
     @property
     def source(self) -> SlotSource:
@@ -76,9 +76,9 @@ class FingerQueue:
         return self._link.source
 
     def take(self, timeout_s: float) -> SlotBlock:
-        """All frames that wait, one at least, with what is left of a frame that lost its end.
+        """All frames that wait, at least one; the last may be incomplete.
 
-        A thread that woke for each of 4400 slots a second would do little else.
+        Whole frames, because a wake-up for each of 4400 slots a second would cost too much.
 
         Raises:
             DeviceTimeout: None came.
@@ -102,7 +102,7 @@ class FingerQueue:
 
         Args:
             slots: Of all fingers.
-            all_there: No word of any finger says that none is there.
+            all_there: No word of any finger is absent.
         """
         self.absent = 0 if all_there else self._absent_behind(slots)
         self._blocks.append(slots.of(self.index))
@@ -117,16 +117,16 @@ class FingerQueue:
         return len(slots) - 1 - int(there[-1]) if len(there) else self.absent + len(slots)
 
     def fail(self, error: DeviceError) -> None:
-        """The line is gone; told after what came before it. Called by the link."""
+        """The line is gone; raised after the slots before it are taken. Called by the link."""
         self._error = error
 
     def leave(self) -> None:
-        """Stop listening; the last one closes the line."""
+        """Leave the line; the last finger closes it."""
         self._link.leave(self)
 
 
 class SlotLink:
-    """A line and who listens to it; `join` is the way in."""
+    """An open line and the fingers on it; fingers join by ``join``."""
 
     _open: ClassVar[dict[Hashable, SlotLink]] = {}
     _guard: ClassVar[threading.Lock] = threading.Lock()
@@ -137,27 +137,27 @@ class SlotLink:
         self._fingers: dict[int, FingerQueue] = {}
         self._stop = threading.Event()
         self._failed = False
-        self._begun: list[LineSlots] = []  # of the frame that is not over
+        self._begun: list[LineSlots] = []  # slots of the frame that has not ended
         self._thread = threading.Thread(target=self._run, name=f"line {key}", daemon=True)
 
     @classmethod
     def join(cls, key: Hashable, settings: object, source: SlotSource, index: int) -> FingerQueue:
-        """Listen to one finger of a line, which is opened if nobody listens yet.
+        """Join a line as one of its fingers; the first one opens it.
 
         Args:
-            key: Names the line, e.g. interface and channel.
-            settings: How the line is read; all fingers of it must agree.
-            source: The line, if this is the first to listen.
+            key: Identifies the line, e.g. interface and channel.
+            settings: Settings of the line, the same for all of its fingers.
+            source: The line, used if it is not open yet.
             index: Which finger, from 0.
 
         Raises:
-            ConfigError: The finger is listened to already, or the settings differ.
+            ConfigError: The finger has been joined already, or the settings differ.
             DeviceError: The line cannot be opened.
         """
         with cls._guard:
             link = cls._open.get(key)
             if link is not None and link._failed:
-                link = None  # its fingers have yet to leave
+                link = None  # broken; its fingers will leave it
             if link is None:
                 source.open()
                 link = cls(key, settings, source)
@@ -180,7 +180,7 @@ class SlotLink:
             return finger
 
     def leave(self, finger: FingerQueue) -> None:
-        """A finger stops listening."""
+        """A finger leaves."""
         with self._guard:
             with self.news:
                 if self._fingers.get(finger.index) is finger:
@@ -203,7 +203,7 @@ class SlotLink:
         except DeviceError as error:
             self._fail(error)
         except BaseException as error:
-            # A thread would die unseen: the fingers' own threads carry it on.
+            # Nobody would see this thread die: the threads of the fingers raise the error.
             _log.exception("line %s: defect", self._key)
             self._fail(DeviceError(f"line {self._key}: {error!r}", remedy="report this defect"))
         finally:
@@ -217,7 +217,7 @@ class SlotLink:
             self.news.notify_all()
 
     def _share(self, slots: LineSlots | None) -> None:
-        """Hand on what is over: whole frames, and those that the next one ends."""
+        """Put frames that have ended into the queues: whole ones, and those ended by the next."""
         if slots is None:
             return
         over = slots.over()

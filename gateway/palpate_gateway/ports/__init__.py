@@ -1,1 +1,1 @@
-"""Serial lines, sockets and CAN buses: bytes in and out, with typed errors, and nothing else."""
+"""Serial lines, sockets and CAN buses: bytes in and out, with typed errors."""

@@ -1,8 +1,8 @@
-"""A CAN bus by python-can, whatever carries it: SocketCAN, a serial adapter, multicast, a log.
+"""A CAN bus by python-can: SocketCAN, a serial adapter, multicast, a log.
 
-Messages come in batches, since a BioTac sends 4400 of them a second. Where the bus is a socket they
-are taken from it directly; python-can's own reading costs three times as much, and loses them when
-other threads are busy (see ``datagrams``).
+Messages are read in batches, since a BioTac sends 4400 of them a second. Where the bus is a socket
+they are read from it directly: python-can needs three times as much processor time, and loses
+messages when other threads are busy (see ``datagrams``).
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from palpate_gateway.ports.datagrams import BATCH, Datagrams, available
 from palpate_gateway.ports.port import silent
 
 _BUFFER = 4 << 20
-"""What the system shall keep while this process does not read [bytes]: its usual 0.2 MB are full
-after 60 ms of three BioTacs."""
+"""Size of the system's receive buffer [bytes]: its default of 0.2 MB is full after 60 ms of three
+BioTacs."""
 
 
 @dataclass(frozen=True, slots=True)
 class CanBatch:
-    """Data frames in order of their coming, as arrays.
+    """Data frames in order of arrival, as arrays.
 
     Attributes:
         can_id: Identifiers, int64, shape ``(N,)``.
         size: Bytes of data, int64, shape ``(N,)``.
-        data: Data, zeros behind them, uint8, shape ``(N, 8)``.
-        arrival_ns: When they came by the host's monotonic clock [ns], int64, shape ``(N,)``.
+        data: Data, padded with zeros, uint8, shape ``(N, 8)``.
+        arrival_ns: Times of arrival by the host's monotonic clock [ns], int64, shape ``(N,)``.
     """
 
     can_id: npt.NDArray[np.int64]
@@ -67,10 +67,10 @@ class CanBatch:
 
 
 class CanBus:
-    """One bus; opening and closing twice is harmless.
+    """One bus; opening or closing it twice is harmless.
 
     Args:
-        interface: python-can's name of the kind of bus, e.g. ``socketcan``.
+        interface: Kind of bus as python-can names it, e.g. ``socketcan``.
         channel: E.g. ``can0``.
         bitrate: [bit/s]; 0 = as the bus is set up.
         options: More of python-can's options.
@@ -124,7 +124,7 @@ class CanBus:
         self._direct = self._find_socket()
 
     def _find_socket(self) -> tuple[Datagrams, Reader] | None:
-        """The bus's socket with a larger buffer, and how to read it; None if it must be asked."""
+        """The bus's socket, with a larger buffer, and its reader; None = python-can must read."""
         kind = self._arguments["interface"]
         known = kind in ("socketcan", "udp_multicast")
         if not known or self._arguments.get("fd") or not available():
@@ -141,16 +141,16 @@ class CanBus:
         if direct is not None:
             direct[0].close()
         if bus is not None:
-            # Whatever a driver of an unplugged adapter raises: it is closed.
+            # The driver of an unplugged adapter may raise anything; the bus is closed all the same.
             with contextlib.suppress(Exception):
                 bus.shutdown()
 
     def read(self, timeout_s: float, *, gather_s: float = 0.0) -> CanBatch:
-        """At least one data frame, and those that came with it.
+        """At least one data frame, and those that arrived with it.
 
         Args:
             timeout_s: How long to wait for the first [s].
-            gather_s: Let so much time pass first [s]; the bus keeps meanwhile what comes.
+            gather_s: Wait for so long first [s]; meanwhile the system buffers what arrives.
 
         Raises:
             DeviceTimeout: None came.
@@ -179,18 +179,18 @@ class CanBus:
                 raise silent(self.name, timeout_s)
 
     def _frames(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
-        """Frames of any kind that came, with their times of arrival; none if none came."""
+        """Frames of any kind that have arrived, with their times of arrival; may be none."""
         if self._direct is None:
-            return self._asked(wait_s)
+            return self._frames_by_python_can(wait_s)
         datagrams, reader = self._direct
         ready, _, _ = select.select([datagrams], [], [], wait_s)
         if not ready:
             return CanFrames.of([]), np.zeros(0, np.int64)
-        waiting = datagrams.take()
+        batch = datagrams.take()
         now_ns = time.monotonic_ns()
-        return reader(waiting), self._stamps.monotonic_of_all(waiting.stamp_ns, now_ns)
+        return reader(batch), self._stamps.monotonic_of_all(batch.stamp_ns, now_ns)
 
-    def _asked(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
+    def _frames_by_python_can(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
         frames: list[CanFrame] = []
         arrivals_ns: list[int] = []
         while len(frames) < BATCH:
@@ -199,7 +199,7 @@ class CanBus:
             except (self._can.CanError, OSError, ValueError) as error:
                 if not frames:
                     raise
-                # What came before it is delivered first.
+                # The frames before the error are delivered first.
                 self._end = self._lost(str(error))
                 break
             if message is None:
@@ -215,7 +215,7 @@ class CanBus:
         self.counters["other_frames"] += int((frames.kind == FrameKind.OTHER).sum())
         self.counters["error_frames"] += int(errors.sum())
         if (frames.can_id[errors] & BUS_OFF).any() or (errors.any() and self._is_off()):
-            # It says so once and is then silent for ever: it must be opened again.
+            # Reported once, then the bus stays silent: it must be opened again.
             self._end = self._lost("it is off after too many errors (bus off)")
 
     def _is_off(self) -> bool:
@@ -227,7 +227,7 @@ class CanBus:
         """Send a data frame with a standard identifier.
 
         Raises:
-            DeviceLost: The bus is gone, or takes nothing.
+            DeviceLost: The bus is gone, or accepts nothing.
         """
         bus = self._opened()
         message = self._can.Message(arbitration_id=can_id, data=data, is_extended_id=False)

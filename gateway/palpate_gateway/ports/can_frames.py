@@ -1,4 +1,4 @@
-"""CAN frames as they lie in a socket: Linux' own, and those of python-can's multicast bus."""
+"""CAN frames as a socket delivers them: Linux' own, and those of python-can's multicast bus."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from palpate.process import require
 from palpate_gateway.ports.datagrams import DatagramBatch
 
 BUS_OFF = 0x40
-"""Class of an error frame that says that the interface has left the bus (linux/can/error.h)."""
+"""Class of an error frame: the interface has left the bus (linux/can/error.h)."""
 
 DATA_MAX = 8
 """Bytes of a classic CAN frame."""
@@ -27,12 +27,12 @@ _FRAME = np.dtype([("word", "=u4"), ("size", "u1"), ("pad", "u1", 3), ("data", "
 
 
 class FrameKind(IntEnum):
-    """What a frame is."""
+    """Kinds of frames."""
 
     DATA = 0
     ERROR = 1
     OTHER = 2
-    """Remote, of CAN FD, or nothing of CAN at all."""
+    """A remote frame, CAN FD, or no CAN frame at all."""
 
 
 class CanFrame(NamedTuple):
@@ -48,13 +48,13 @@ NOTHING = CanFrame(FrameKind.OTHER, 0, b"")
 
 @dataclass(frozen=True, slots=True)
 class CanFrames:
-    """Frames in order of their coming, as arrays of shape ``(N,)``; data ``(N, 8)``.
+    """Frames in order of arrival, as arrays of shape ``(N,)``; data ``(N, 8)``.
 
     Attributes:
         kind: ``FrameKind`` numbers, uint8.
         can_id: Identifiers, int64.
         size: Bytes of data, int64.
-        data: Data with zeros behind them, uint8.
+        data: Data, padded with zeros, uint8.
     """
 
     kind: npt.NDArray[np.uint8]
@@ -81,26 +81,26 @@ class CanFrames:
 Reader = Callable[[DatagramBatch], CanFrames]
 
 
-def from_socketcan(waiting: DatagramBatch) -> CanFrames:
+def from_socketcan(batch: DatagramBatch) -> CanFrames:
     """Frames of Linux' CAN sockets."""
-    told = np.ascontiguousarray(waiting.data[:, : _FRAME.itemsize]).view(_FRAME)[:, 0]
-    word = told["word"]
-    kind = np.full(len(waiting), FrameKind.DATA, np.uint8)
+    fields = np.ascontiguousarray(batch.data[:, : _FRAME.itemsize]).view(_FRAME)[:, 0]
+    word = fields["word"]
+    kind = np.full(len(batch), FrameKind.DATA, np.uint8)
     kind[(word & _ERROR) != 0] = FrameKind.ERROR
-    other = (waiting.size != _FRAME.itemsize) | (told["size"] > DATA_MAX)
+    other = (batch.size != _FRAME.itemsize) | (fields["size"] > DATA_MAX)
     kind[other | ((word & (_REMOTE | _ERROR)) == _REMOTE)] = FrameKind.OTHER
     short = (word & (_EXTENDED | _ERROR)) == 0
     can_id = word & np.where(short, np.uint32(_STANDARD_MASK), np.uint32(_EXTENDED_MASK))
-    size = np.where(other, 0, told["size"]).astype(np.int64)
-    data = told["data"] * (np.arange(DATA_MAX) < size[:, None])
+    size = np.where(other, 0, fields["size"]).astype(np.int64)
+    data = fields["data"] * (np.arange(DATA_MAX) < size[:, None])
     return CanFrames(kind, can_id.astype(np.int64), size, data.astype(np.uint8))
 
 
 class MulticastReader:
-    """Reads what python-can's ``udp_multicast`` bus sends: a map in msgpack.
+    """Reads datagrams of python-can's ``udp_multicast`` bus: a map in msgpack.
 
-    To unpack each takes longer than all that follows. A sender's frames differ in their time and
-    data only, at the same places: what equals the last unpacked one elsewhere need not be unpacked.
+    Unpacking each takes longer than all that follows. A sender's frames differ only in time and
+    data, at fixed offsets; one that otherwise equals the last unpacked one is read by offset.
 
     Raises:
         MissingExtraError: msgpack is not installed.
@@ -110,42 +110,45 @@ class MulticastReader:
         self._unpack: Callable[[bytes], Any] = require("msgpack", extra="gateway").unpackb
         self._like: CanFrame = NOTHING
         self._raw = np.zeros(0, np.uint8)
-        self._same = np.zeros(0, np.bool_)  # of each byte, whether it must be the same
-        self._at = 0  # where data begin
+        self._same = np.zeros(0, np.bool_)  # whether each byte must be the same
+        self._at = 0  # offset of the data
 
-    def __call__(self, waiting: DatagramBatch) -> CanFrames:
+    def __call__(self, batch: DatagramBatch) -> CanFrames:
         """Frames of datagrams."""
-        alike = self._alike(waiting)
+        alike = self._alike(batch)
         if not alike.all():
             first = int(np.argmin(alike))
-            self._learn(waiting.data[first, : waiting.size[first]].tobytes())
-            alike = self._alike(waiting)
+            self._learn(batch.data[first, : batch.size[first]].tobytes())
+            alike = self._alike(batch)
         if alike.all():
             size = len(self._like.data)
-            data = np.zeros((len(waiting), DATA_MAX), np.uint8)
-            data[:, :size] = waiting.data[:, self._at : self._at + size]
-            count = len(waiting)
+            data = np.zeros((len(batch), DATA_MAX), np.uint8)
+            data[:, :size] = batch.data[:, self._at : self._at + size]
+            count = len(batch)
             return CanFrames(
                 np.full(count, self._like.kind, np.uint8),
                 np.full(count, self._like.can_id, np.int64),
                 np.full(count, size, np.int64),
                 data,
             )
-        sizes = waiting.size.tolist()
-        rows = zip(waiting.data, sizes, strict=True)
+        sizes = batch.size.tolist()
+        rows = zip(batch.data, sizes, strict=True)
         return CanFrames.of([self._one(row[:size].tobytes()) for row, size in rows])
 
-    def _alike(self, waiting: DatagramBatch) -> npt.NDArray[np.bool_]:
-        """Which are like the one that was learnt."""
+    def _alike(self, batch: DatagramBatch) -> npt.NDArray[np.bool_]:
+        """Which datagrams differ from the learnt one in time and data only."""
         length = len(self._raw)
         if not length:
-            return np.zeros(len(waiting), np.bool_)
-        differs = (waiting.data[:, :length] != self._raw) & self._same
-        alike: npt.NDArray[np.bool_] = (waiting.size == length) & ~differs.any(axis=1)
+            return np.zeros(len(batch), np.bool_)
+        differs = (batch.data[:, :length] != self._raw) & self._same
+        alike: npt.NDArray[np.bool_] = (batch.size == length) & ~differs.any(axis=1)
         return alike
 
     def _learn(self, raw: bytes) -> None:
-        """Take one for what others are like, if it is shown where its time and data stand."""
+        """Learn the offsets of time and data from one datagram.
+
+        To prove them, both fields are changed and the datagram is unpacked again.
+        """
         frame = self._one(raw)
         size = len(frame.data)
         at = raw.find(b"\xa4data\xc4" + bytes([size])) + len(b"\xa4data\xc4n")
@@ -162,22 +165,22 @@ class MulticastReader:
 
     def _one(self, raw: bytes) -> CanFrame:
         try:
-            told = self._unpack(raw)
-            can_id, data = told["arbitration_id"], told["data"]
-            if told["is_error_frame"]:
+            fields = self._unpack(raw)
+            can_id, data = fields["arbitration_id"], fields["data"]
+            if fields["is_error_frame"]:
                 return CanFrame(FrameKind.ERROR, int(can_id), bytes(data or b"")[:DATA_MAX])
-            if told["is_remote_frame"] or told["is_fd"]:
+            if fields["is_remote_frame"] or fields["is_fd"]:
                 return NOTHING
             if type(can_id) is int and type(data) is bytes and len(data) <= DATA_MAX:
                 return CanFrame(FrameKind.DATA, can_id & _EXTENDED_MASK, data)
-        # Anybody may send to the group, anything: msgpack alone has six kinds of errors for it.
+        # Any host may send anything to the group; msgpack alone has six kinds of errors for that.
         except Exception:
             return NOTHING
         return NOTHING
 
 
 def from_message(message: Any) -> CanFrame:
-    """A message of python-can, whatever bus it came by."""
+    """A message of python-can, from any bus."""
     data = bytes(message.data)
     if message.is_error_frame:
         return CanFrame(FrameKind.ERROR, message.arbitration_id, data[:DATA_MAX])

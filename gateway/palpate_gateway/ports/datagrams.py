@@ -1,8 +1,8 @@
-"""Everything that waits at a datagram socket, in one system call that keeps the interpreter.
+"""All datagrams that wait at a socket, by one system call that keeps the interpreter lock.
 
-``socket.recv`` lets go of the interpreter for each datagram, and whoever of a dozen threads takes
-it gives it back half a millisecond later: a CAN bus of 4400 frames a second then falls behind at
-any load. ``recvmmsg`` fetches what is there, stamps included, without letting go.
+``socket.recv`` releases the lock for each datagram, and gets it back from a dozen other threads
+half a millisecond later: a CAN bus of 4400 frames a second then falls behind at any load.
+``recvmmsg`` fetches all datagrams with their stamps without releasing it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ BATCH = 256
 """Most datagrams at once."""
 
 NO_STAMP = -1
-"""Where the kernel has told no time of reception."""
+"""Stands for a missing time of reception."""
 
 LARGEST = 512
-"""Larger datagrams are none of ours [bytes]."""
+"""Longest datagram that is accepted [bytes]."""
 
 _CONTROL = 64
 _MSG_DONTWAIT = 0x40
@@ -46,7 +46,7 @@ _HEADERS = np.dtype(
 
 
 def available() -> bool:
-    """Whether this system has it as it is used here: Linux, 64 bits, little-endian."""
+    """Whether this system has ``recvmmsg`` as used here: Linux, 64 bits, little-endian."""
     return (
         sys.platform.startswith("linux")
         and ctypes.sizeof(ctypes.c_void_p) == 8
@@ -55,11 +55,11 @@ def available() -> bool:
 
 
 class DatagramBatch(NamedTuple):
-    """Datagrams in order of their coming.
+    """Datagrams in order of arrival.
 
     Attributes:
         data: Their bytes, uint8, shape ``(N, LARGEST)``; overwritten by the next ``take``.
-        size: How many each has, shape ``(N,)``; 0 for one that is too large to be one of ours.
+        size: Length of each, shape ``(N,)``; 0 for one that is longer than ``LARGEST``.
         stamp_ns: When the kernel received each [ns since the Unix epoch], or ``NO_STAMP``.
     """
 
@@ -72,7 +72,7 @@ class DatagramBatch(NamedTuple):
 
 
 class Datagrams:
-    """Takes batches from a socket that belongs to somebody else.
+    """Reads batches from a socket that another object owns.
 
     Args:
         descriptor: The socket's file descriptor; it stays open here until ``close``.
@@ -91,7 +91,7 @@ class Datagrams:
         parts = np.zeros((BATCH, 2), np.uint64)  # struct iovec: address and size
         parts[:, 0] = self._data.ctypes.data + LARGEST * np.arange(BATCH)
         parts[:, 1] = LARGEST
-        self._parts = parts  # the kernel reads it: it must live as long as this
+        self._parts = parts  # the headers point to it, so it must stay alive
         self._headers = np.zeros(BATCH, _HEADERS)
         self._headers["iov"] = parts.ctypes.data + 16 * np.arange(BATCH)
         self._headers["iov_count"] = 1
@@ -103,7 +103,7 @@ class Datagrams:
         return self._socket.fileno()
 
     def take(self) -> DatagramBatch:
-        """What waits, at most ``BATCH``.
+        """The datagrams that wait, at most ``BATCH``.
 
         Raises:
             OSError: The socket is gone.
@@ -123,6 +123,6 @@ class Datagrams:
         return DatagramBatch(self._data[:count], taken["size"] * whole, stamps_ns)
 
     def close(self) -> None:
-        """Let go of the socket; never raises."""
+        """Close this handle of the socket; never raises."""
         with contextlib.suppress(OSError):
             self._socket.close()

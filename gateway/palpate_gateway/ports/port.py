@@ -2,9 +2,9 @@
 
 Rules of ``read``, the same for serial lines and sockets:
 
-* at least one byte, as soon as there is one;
+* at least one byte, as soon as one has arrived;
 * ``DeviceTimeout`` if nothing came in time: try again;
-* ``DeviceLost`` if the port is gone: close, open again.
+* ``DeviceLost`` if the port is gone: close it and open it again.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from palpate.errors import DeviceTimeout
 
 
 class Port(ABC):
-    """A way to a device. Opening and closing twice is harmless; a closed one opens afresh.
+    """A way to a device. Opening or closing it twice is harmless; a closed one can be reopened.
 
     Attributes:
-        name: What a person calls it, e.g. ``/dev/ttyUSB0`` or ``192.168.1.30:1000``.
+        name: Its name for people, e.g. ``/dev/ttyUSB0`` or ``192.168.1.30:1000``.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Port(ABC):
 
     @abstractmethod
     def read(self, timeout_s: float) -> bytes:
-        """What has come; see the rules at the top of this file.
+        """Bytes that have arrived; see the rules at the top of this file.
 
         Args:
             timeout_s: How long to wait for the first byte [s].
@@ -54,7 +54,7 @@ class Port(ABC):
         """
 
     def discard_input(self) -> int:
-        """Throw away what has come and was not read; how many bytes."""
+        """Throw away unread input; returns the number of bytes."""
         count = 0
         while True:
             try:
@@ -74,5 +74,5 @@ def silent(name: str, timeout_s: float) -> DeviceTimeout:
     """The error of a port on which nothing came."""
     return DeviceTimeout(
         f"{name}: nothing came within {timeout_s:g} s",
-        remedy="check power and cable; it is read again by itself",
+        remedy="check power and cable; reading goes on by itself",
     )

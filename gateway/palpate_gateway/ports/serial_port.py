@@ -14,7 +14,7 @@ from palpate.process import require
 from palpate_gateway.ports.port import Port, silent
 
 _AT_ONCE = 65536
-"""Largest piece of input that is taken in one go [bytes]."""
+"""Most bytes of one read."""
 
 _REMEDIES = {
     errno.ENOENT: "plug it in, or name another port (palpate gateway list shows what is there)",
@@ -46,7 +46,7 @@ class SerialPort(Port):
         if self._line is not None:
             return
         serial = require("serial", extra="gateway")
-        # Unplugging shows as either of them (pyserial issues 341, 331, 86).
+        # Unplugging raises any of these (pyserial issues 341, 331, 86).
         self._broken = (serial.SerialException, OSError, TypeError)
         options: dict[str, Any] = {"baudrate": self._baud, "timeout": 0, "rtscts": self._rts_cts}
         if "://" not in self.name:
@@ -59,7 +59,7 @@ class SerialPort(Port):
                 f"{self.name}: cannot be opened: {error}",
                 remedy=_REMEDIES.get(number, "check its name, and that nothing else has it open"),
             ) from error
-        # USB adapters else hold bytes back for 16 ms; pseudo terminals and URLs know no such mode.
+        # Otherwise USB adapters hold bytes back for 16 ms; not every kind of line has this mode.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             line.set_low_latency_mode(True)
         self._line = line
@@ -86,16 +86,16 @@ class SerialPort(Port):
         return data
 
     def _take(self, line: Any, timeout_s: float) -> bytes:
-        """What has come, at least one byte; nothing if none came in time."""
+        """Bytes that have arrived, at least one; none if none came in time."""
         if self._file:
-            # pyserial sets the whole line up anew for each other timeout: it stays 0.
+            # The timeout stays 0: pyserial configures the whole line again whenever it changes.
             ready, _, _ = select.select([line], [], [], timeout_s)
             return bytes(line.read(_AT_ONCE)) if ready else b""
         waiting = line.in_waiting
         if waiting:
             line.timeout = 0
             return bytes(line.read(min(waiting, _AT_ONCE)))
-        # One byte wakes us; the rest of what came with it is taken along below.
+        # Wait for one byte, then read the rest that came with it.
         line.timeout = timeout_s
         first = line.read(1)
         line.timeout = 0
@@ -123,7 +123,7 @@ class SerialPort(Port):
 
 
 def settle(port: Port, quiet_s: float, longest_s: float) -> int:
-    """Throw away input until the line is quiet; how many bytes.
+    """Throw away input until the line is quiet; returns the number of bytes.
 
     Args:
         port: Open.

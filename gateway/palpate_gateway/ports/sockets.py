@@ -21,17 +21,17 @@ from palpate_gateway.clock.wall_clock import KernelStamps
 from palpate_gateway.ports.port import Port, silent
 
 CONNECT_S = 0.5
-"""How long a device may take to accept a connection [s]: to one that is off, a request is repeated
-after a second only, and a new one is there sooner."""
+"""Longest time to connect [s]. The system repeats an unanswered request only after a second; a new
+attempt is faster when the device is switched on."""
 
 _WRITE_S = 2.0
 
 _AT_ONCE = 65536
 _RECEIVE_BUFFER = 1 << 20
-"""Datagrams of a second at 7 kHz fit: a pause of this process must not lose any."""
+"""Holds the datagrams of a second at 7 kHz, so that a pause of this process loses none."""
 
 _STAMP = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Asks Linux for the wall time at which it received what is read; also the type of its answer."""
+"""Option by which Linux adds the wall time of reception; also the type of that control message."""
 _TIMESPEC = struct.Struct("@ll")
 _STAMP_SPACE = 64
 
@@ -39,14 +39,14 @@ _PAGE_REMEDY = "open this address in a browser: check address, cable and that th
 
 
 class ReceivedBytes(NamedTuple):
-    """What has come, and when by the host's monotonic clock [ns]; of a stream the end of it."""
+    """Bytes, and when the last of them arrived, by the host's monotonic clock [ns]."""
 
     data: bytes
     arrival_ns: int
 
 
 class _SocketPort(Port):
-    """What both kinds share."""
+    """TCP and UDP alike: opening, reading with the time of arrival, writing."""
 
     def __init__(self, host: str, port: int) -> None:
         self.name = f"{host}:{port}"
@@ -143,13 +143,13 @@ class TcpPort(_SocketPort):
         link = socket.create_connection(self._address, timeout=CONNECT_S)
         link.settimeout(_WRITE_S)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # A device whose power is cut never closes its connection; the kernel asks after it.
+        # A device without power never closes its connection; keep-alive notices that.
         link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         return link
 
 
 class UdpPort(_SocketPort):
-    """Datagrams to and from one device; those of others are not seen."""
+    """Datagrams to and from one device; the system drops those of others."""
 
     def _connect(self) -> socket.socket:
         link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -163,23 +163,23 @@ class UdpPort(_SocketPort):
 
 
 def read_page(url: str, *, timeout_s: float, most_bytes: int) -> bytes:
-    """What the page holds.
+    """The content of a page.
 
     Args:
         url: Its address.
-        timeout_s: How long its head may keep silent, and how long all of it may take [s].
+        timeout_s: Longest time until its header, and longest time for all of it [s].
         most_bytes: A longer page is refused.
 
     Raises:
         DeviceError: There is no such page, or it is too long, or takes too long.
     """
     until = time.monotonic() + timeout_s
-    # A proxy of this host's user knows no sensor in the laboratory.
+    # No proxy: a sensor is in the local network.
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     page = bytearray()
     try:
         with opener.open(url, timeout=timeout_s) as reply:
-            # Piece by piece: the socket's timeout starts anew with every byte that trickles in.
+            # Piece by piece: the socket's timeout starts again with every byte that arrives.
             while piece := reply.read1(_AT_ONCE):
                 page += piece
                 if len(page) > most_bytes:
