@@ -115,6 +115,13 @@ def test_guard_is_as_wide_as_it_says_on_either_side() -> None:
     assert first.guard.tolist() == [10, 11, 18, 19, 28, 29, 40, 41]
 
 
+def test_guard_after_a_block_of_a_single_row() -> None:
+    block = np.repeat(np.arange(6, dtype=np.int32), [1, 10, 10, 10, 10, 10])
+    first, *_ = contiguous_folds(block, np.zeros(51, np.int32), folds=3, guard_rows=2)
+    assert first.test.tolist() == [0, *range(21, 31)]
+    assert first.train.tolist() == [*range(3, 9), *range(33, 51)]
+
+
 def test_without_being_asked_five_folds_a_hundred_rows_apart() -> None:
     block, recording = labels([4000], blocks=10)
     made = contiguous_folds(block, recording)
