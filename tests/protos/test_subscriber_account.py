@@ -1,0 +1,171 @@
+"""What a subscriber counts, message by message, without a bus: drops here, losses there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from palpate.bus import Delivery
+from palpate.bus.pubsub import Fifo, NewestWins, Subscriber
+from palpate.bus.topics import ELECTRODES, sensor_key
+from palpate.errors import StaleError, StreamTimeout
+from palpate.messages import ElectrodeFrame, Origin
+
+FrameOf = Callable[..., ElectrodeFrame]
+SECOND_NS = 1_000_000_000
+
+
+class Bus:
+    """Stands for the session; tests hand over messages as its thread would."""
+
+    def __init__(self, delivery: Delivery, *, capacity: int = 100, depth: int | None = None):
+        self._callback: Callable[[Any], None] | None = None
+        more = {} if depth is None else {"depth": depth}
+        self.subscriber: Subscriber[ElectrodeFrame] = Subscriber(
+            self,  # type: ignore[arg-type]
+            ELECTRODES,
+            "any",
+            delivery=delivery,
+            capacity=capacity,
+            **more,
+        )
+
+    def declare_subscriber(self, key: str, callback: Callable[[Any], None]) -> object:
+        assert key == "any"
+        self._callback = callback
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def send(self, frame: ElectrodeFrame, sensor: str = "finger") -> None:
+        assert self._callback is not None
+        self._callback(
+            SimpleNamespace(
+                key_expr=sensor_key("lab", sensor, "electrodes"),
+                encoding=ELECTRODES.encoding,
+                payload=SimpleNamespace(to_bytes=lambda: ELECTRODES.codec.encode(frame)),
+            )
+        )
+
+    def come(self, frames: int) -> list[int]:
+        """Sequences of the next messages."""
+        return [self.subscriber.next(0.0).message.stamp.sequence for _ in range(frames)]
+
+    def count(self, name: str) -> int:
+        return self.subscriber.counters.get(name, 0)
+
+
+def test_newest_wins_counts_what_it_drops_of_each_key() -> None:
+    counters: Counter[str] = Counter()
+    waiting: NewestWins[int] = NewestWins(counters, depth=2)
+    for item in range(5):
+        waiting.put("a", item)
+    waiting.put("b", 10)
+    assert [waiting.get(0.0) for _ in range(3)] == [(3, 3), (4, 3), (10, 0)]
+    assert waiting.get(0.0) is None
+    assert counters == {"dropped": 3}
+
+
+def test_a_full_queue_counts_what_it_refuses_of_each_key() -> None:
+    counters: Counter[str] = Counter()
+    waiting: Fifo[int] = Fifo(counters, 2, sender_waits=False)
+    for item in range(4):
+        waiting.put("a", item)
+    waiting.put("b", 10)
+    assert [waiting.get(0.0), waiting.get(0.0)] == [(0, 0), (1, 0)]
+    waiting.put("a", 4)
+    waiting.put("b", 11)
+    assert [waiting.get(0.0), waiting.get(0.0)] == [(4, 2), (11, 1)]
+    assert counters == {"overflow": 3}
+
+
+@pytest.mark.parametrize("delivery", [Delivery.NEWEST, Delivery.QUEUE])
+def test_what_is_dropped_here_is_not_lost_on_the_bus(delivery: Delivery, frame_of: FrameOf) -> None:
+    """Before the first message that is taken, and after each one."""
+    bus = Bus(delivery, capacity=1)
+    sequence = 0
+    for dropped in (2, 3, 0, 1):
+        for _ in range(dropped + 1):
+            sequence += 1
+            bus.send(frame_of(sequence))
+        bus.come(1)
+    assert bus.count("lost_on_bus") == 0
+    assert bus.count("dropped") + bus.count("overflow") == 6
+    assert (bus.count("received"), bus.count("delivered")) == (10, 4)
+
+
+def test_holes_in_the_sequence_are_lost_on_the_bus(frame_of: FrameOf) -> None:
+    bus = Bus(Delivery.NEWEST)
+    for sequence in (4, 5, 8):  # 6 and 7 never came; 4 is dropped here, before anything is known
+        bus.send(frame_of(sequence))
+        if sequence != 4:
+            bus.come(1)
+    assert bus.count("lost_on_bus") == 2
+    for sequence in (9, 10, 13):  # 9 and 10 are dropped here, 11 and 12 never came
+        bus.send(frame_of(sequence))
+    assert bus.come(1) == [13]
+    assert (bus.count("lost_on_bus"), bus.count("dropped")) == (4, 3)
+
+
+def test_each_sender_has_an_account_of_its_own(frame_of: FrameOf) -> None:
+    bus = Bus(Delivery.QUEUE)
+    for sequence, sensor in ((1, "finger"), (70, "thumb"), (2, "finger"), (71, "thumb")):
+        bus.send(frame_of(sequence), sensor)
+    assert bus.come(4) == [1, 70, 2, 71]
+    assert bus.count("lost_on_bus") == bus.count("reordered") == bus.count("restarts") == 0
+
+
+@pytest.mark.parametrize(
+    ("origin", "first", "second", "counted"),
+    [
+        (Origin.LIVE, (7, 5), (7, 5), "reordered"),  # the same message again
+        (Origin.LIVE, (7, 5), (6, 4), "reordered"),  # a late one
+        (Origin.LIVE, (7, 5), (6, 5), "reordered"),
+        (Origin.LIVE, (7, 5), (1, 6), "restarts"),  # counts from 1, by a later clock
+        (Origin.LIVE, (7, 5), (7, 6), "restarts"),
+        (Origin.LIVE, (1500, 5), (499, 4), "restarts"),  # farther back than messages are reordered
+        (Origin.LIVE, (1500, 5), (500, 4), "reordered"),
+        (Origin.REPLAYED, (7, 5), (1, 1), "restarts"),  # a record that starts over
+        (Origin.REPLAYED, (7, 5), (7, 5), "reordered"),
+    ],
+)
+def test_a_sequence_that_falls_is_a_restart_or_out_of_order(
+    frame_of: FrameOf,
+    origin: Origin,
+    first: tuple[int, int],
+    second: tuple[int, int],
+    counted: str,
+) -> None:
+    bus = Bus(Delivery.QUEUE)
+    for sequence, at_s in (first, second):
+        bus.send(frame_of(sequence, monotonic_ns=at_s * SECOND_NS, origin=origin))
+    if counted == "restarts":
+        assert bus.come(2) == [first[0], second[0]]
+    else:
+        assert bus.come(1) == [first[0]]
+        with pytest.raises(StreamTimeout):
+            bus.subscriber.next(0.0)
+    assert {name: bus.count(name) for name in ("restarts", "reordered", "lost_on_bus")} == {
+        "restarts": 0, "reordered": 0, "lost_on_bus": 0, counted: 1,
+    }  # fmt: skip
+
+
+def test_newest_keeps_one_unless_told_otherwise(frame_of: FrameOf) -> None:
+    for depth, kept in ((None, [3]), (2, [2, 3])):
+        bus = Bus(Delivery.NEWEST, depth=depth)
+        for sequence in (1, 2, 3):
+            bus.send(frame_of(sequence))
+        assert bus.come(len(kept)) == kept
+
+
+def test_latest_is_the_newest_of_all_or_of_one_sensor(frame_of: FrameOf) -> None:
+    bus = Bus(Delivery.NEWEST)
+    with pytest.raises(StaleError, match="has ever arrived"):
+        bus.subscriber.latest(10.0)
+    bus.send(frame_of(1), "finger")
+    bus.send(frame_of(2), "thumb")
+    assert bus.subscriber.latest(10.0).message.stamp.sequence == 2
+    assert bus.subscriber.latest(10.0, sensor="finger").message.stamp.sequence == 1
+    assert bus.come(2) == [1, 2], "nothing is consumed"
