@@ -1,7 +1,7 @@
-"""Dense routines on given memory that let other Python threads run meanwhile.
+"""BLAS and LAPACK routines on given memory, without the interpreter lock.
 
-SciPy's own wrappers hold the interpreter; the same routines are reached through the addresses that
-``scipy.linalg.cython_blas`` publishes for compiled callers.
+SciPy's own wrappers hold the lock while they run. The same routines are called here by the
+addresses that ``scipy.linalg.cython_blas`` publishes for compiled code.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _LIBRARIES = ThreadpoolController()
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """Keep the dense routines, NumPy's too, on the thread that calls them.
+    """Keep BLAS, NumPy's too, on the calling thread.
 
-    Their own threads would wait for those that work on the two halves of the tree, and waking them
-    up costs more than vectors of our length take.
+    Its own threads would compete with the two that work on the halves of the tree, and starting
+    them takes longer than our short vectors do.
     """
     return _LIBRARIES.limit(limits=1, user_api="blas")  # type: ignore[no-any-return]
 
@@ -57,7 +57,7 @@ _ROUTINES = {
 
 
 class BoundRoutine:
-    """A routine with all its arguments, to be called many times.
+    """A routine with its arguments, prepared to be called many times.
 
     Args:
         name: Without the letter of the precision.
@@ -92,7 +92,7 @@ class BoundRoutine:
 
 
 class Cholesky:
-    """Lower Cholesky factor of a matrix in place."""
+    """Cholesky factorisation of a matrix, in place: its lower factor."""
 
     def __init__(self, matrix: Array) -> None:
         self._info = np.zeros(1, np.int32)
@@ -100,7 +100,7 @@ class Cholesky:
         self._call = BoundRoutine("potrf", matrix.dtype, "L", len(matrix), matrix, size, self._info)
 
     def __call__(self) -> bool:
-        """Run it; whether the matrix was positive definite."""
+        """Run it; returns whether the matrix was positive definite."""
         self._call()
         return not self._info[0]
 

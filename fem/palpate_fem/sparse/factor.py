@@ -13,7 +13,7 @@ from scipy.sparse.linalg import splu
 from palpate.errors import ConfigError, SimulationError
 from palpate_fem.sparse.fronts import FrontalFactor, FrontAssembly, UnsafePivotError
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.integer[Any]]
@@ -22,7 +22,7 @@ SOLVERS = ("auto", "fronts", "fronts-double", "superlu")
 
 
 class SparseFactor(Protocol):
-    """A matrix with a fixed pattern (upper triangle in CSR) that is factorised again and again."""
+    """Factor of a symmetric matrix with a fixed pattern (upper triangle in CSR)."""
 
     name: str
 
@@ -45,10 +45,9 @@ def make_factor(
     Args:
         indptr: Upper triangle in CSR, every diagonal entry present.
         indices: Its columns, sorted.
-        groups: Node of each unknown, (n,); None = each its own.
-        solver: ``fronts`` works in single precision and falls back to double for the matrices that
-            need it, ``fronts-double`` always in double, ``superlu`` is SciPy's; ``auto`` is the
-            first.
+        groups: Node of each unknown, (n,); None = each unknown is a node.
+        solver: ``fronts`` works in single precision, and in double for matrices that need it;
+            ``fronts-double`` always in double; ``superlu`` is SciPy's; ``auto`` = ``fronts``.
 
     Raises:
         ConfigError: The named solver is not known.
@@ -63,7 +62,11 @@ def make_factor(
 
 
 class Multifrontal:
-    """Fronts in single precision, and in double for matrices that need it."""
+    """Multifrontal factor in single precision, and in double for matrices that need it.
+
+    Single precision is faster, and its rounding errors only slow Newton's method down a little:
+    the residual is always evaluated in double precision.
+    """
 
     name = "fronts"
 
@@ -81,7 +84,9 @@ class Multifrontal:
             try:
                 self._single.factorise(values)
             except UnsafePivotError:
-                logger.debug("a pivot is lost in single precision; this matrix is done in double")
+                _log.debug(
+                    "a pivot is lost in single precision; this matrix is factorised in double"
+                )
             else:
                 self._current = self._single
                 return
@@ -104,17 +109,17 @@ class Multifrontal:
 
     @property
     def negative(self) -> int:
-        """Negative eigenvalues of the last matrix: directions in which the body is unstable."""
+        """See `SparseFactor`."""
         return 0 if self._current is None else self._current.negative
 
     @property
     def redone(self) -> int:
-        """Fronts that the last factorisation had to redo."""
+        """Number of fronts that the last factorisation repeated."""
         return 0 if self._current is None else self._current.redone
 
     @property
     def statistics(self) -> dict[str, float]:
-        """Entries of the factor, its operations [GFlop], and the bytes of its fronts [MiB]."""
+        """Size of the factor: entries, operations [GFlop], memory [MiB] and number of fronts."""
         elimination = self._places.elimination
         shares = sum(len(front.border) ** 2 for front in elimination.fronts)
         width = 4.0 if self._current is self._single else 8.0
@@ -127,7 +132,7 @@ class Multifrontal:
 
 
 class SuperLu:
-    """SciPy's SuperLU: without symmetry, on one core; what the fronts are tested against."""
+    """SciPy's SuperLU: unsymmetric, on one core; reference for tests of the fronts."""
 
     name = "superlu"
 
@@ -170,7 +175,7 @@ class SuperLu:
 
 
 def check_finite(values: Floats) -> None:
-    """Refuse what no factorisation can use."""
+    """Raise SimulationError for entries that are not finite."""
     if not np.isfinite(values).all():
         raise SimulationError(
             "the tangent has entries that are not numbers", remedy="use smaller increments"

@@ -1,6 +1,9 @@
-"""One front in numbers: dense, filled, eliminated, and applied to a right-hand side.
+"""Multifrontal factorisation that repeats only the fronts whose entries have changed.
 
-Multifrontal factorisation that redoes only the fronts whose entries have changed.
+A front is a dense block of the factor: the unknowns that are eliminated together, and the later
+ones that they are coupled with (``ordering``). What its elimination leaves at the later ones, the
+Schur complement, is added to its parent ("extend-add"). From one Newton iteration to the next only
+the fronts near the contact change, so most of the factor is kept (ADR 0015).
 """
 
 from __future__ import annotations
@@ -14,35 +17,82 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.device import DEVICE
-from palpate_fem.sparse import blas, kernels
+from palpate_fem.sparse import blas
 from palpate_fem.sparse.ordering import plan_elimination
 
+wp.set_module_options({"enable_backward": False})
+
 Array = NDArray[Any]
+Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 LOST = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 2e-14}
-"""Share of a diagonal entry below which what elimination leaves of it may be rounding alone."""
+"""Share of a diagonal entry below which its remainder after elimination may be rounding error."""
 
 
 class UnsafePivotError(ArithmeticError):
-    """A pivot is lost in the rounding of this precision."""
+    """A pivot cannot be told from rounding errors in this precision."""
+
+
+@wp.kernel
+def extend_add(
+    # Child: its complement, ``size`` columns one after the other, and their places in the parent.
+    size: int,
+    share: wp.array(dtype=Any),  # type: ignore[valid-type]
+    place: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    # Parent: unknowns that it eliminates, unknowns of its border.
+    own: int,
+    border: int,
+    # Out, column after column; only lower triangles are read and written:
+    lower_out: wp.array(dtype=Any),  # type: ignore[valid-type]
+    below_out: wp.array(dtype=Any),  # type: ignore[valid-type]
+    share_out: wp.array(dtype=Any),  # type: ignore[valid-type]
+) -> None:
+    """Add one column of a child's Schur complement to its parent's front."""
+    j = wp.tid()
+    q = place[j]
+    for i in range(j, size):
+        p = place[i]
+        value = share[j * size + i]
+        if q < own:
+            if p < own:
+                lower_out[q * own + p] = lower_out[q * own + p] + value
+            else:
+                k = q * border + p - own
+                below_out[k] = below_out[k] + value
+        else:
+            k = (q - own) * border + p - own
+            share_out[k] = share_out[k] + value
+
+
+for _kind in (wp.float32, wp.float64):
+    wp.overload(
+        extend_add,
+        {
+            "share": wp.array(dtype=_kind),
+            "lower_out": wp.array(dtype=_kind),
+            "below_out": wp.array(dtype=_kind),
+            "share_out": wp.array(dtype=_kind),
+        },
+    )
 
 
 class DenseFront:
     """Storage and elimination of one front.
 
-    The unknowns of its own are eliminated: ``A11 = L L^T``, ``B = A21 L^-T``, and ``A22 - B B^T``
-    is its share for the parent. Where A11 is not positive definite, ``A11^-1 = W D W^T`` from its
-    eigenvectors, with D of signs, takes the place of L.
+    The front's own unknowns are eliminated: ``A11 = L L^T``, ``B = A21 L^-T``, and the Schur
+    complement ``A22 - B B^T`` is its share for the parent. Where A11 is not positive definite, its
+    eigenvectors give ``A11^-1 = W D W^T`` with a diagonal D of signs: W takes the place of L^-T,
+    and the signs are the inertia that pseudo-transient continuation asks for.
     """
 
     def __init__(self, answers: list[Array], border: Ints) -> None:
         """Prepare an empty front.
 
         Args:
-            answers: Where the front's own unknowns stand in each vector that is solved for, (own,).
-            border: Its other unknowns, (border,).
+            answers: Views of the front's own unknowns in each solution vector, (own,).
+            border: Numbers of its other unknowns, (border,).
         """
         kind, own = answers[0].dtype, len(answers[0])
         self.border = border
@@ -61,11 +111,11 @@ class DenseFront:
         self._lanes = [_Lane(self.lower, self.below, answer) for answer in answers]
 
     def take(self, child: DenseFront, place: Ints) -> None:
-        """Prepare the addition of a child's share, whose columns have these places here."""
+        """Prepare the extend-add of a child's share, whose columns have these places here."""
         arrays = [_flat(a) for a in (child.share, self.lower, self.below, self.share)]
         self._additions.append(
             wp.launch(
-                kernels.extend_add,
+                extend_add,
                 dim=len(place),
                 inputs=[
                     len(place),
@@ -81,7 +131,7 @@ class DenseFront:
         )
 
     def fill(self, own: tuple[Ints, Array], below: tuple[Ints, Array]) -> None:
-        """Entries of the matrix by flat place, then what the children add."""
+        """Enter the entries of the matrix by flat place, then add the shares of the children."""
         self.lower.fill(0.0)
         self.below.fill(0.0)
         self.share.fill(0.0)
@@ -125,7 +175,7 @@ class DenseFront:
             self.below[:] = self.below @ self.lower
 
     def forward(self, lane: int, later: Array) -> None:
-        """Divide the own part of the right-hand side by L, and take it off the ``later`` ones."""
+        """Forward substitution of the own part of a right-hand side; updates the ``later`` part."""
         on = self._lanes[lane]
         if self._signs is None:
             on.down()
@@ -136,7 +186,7 @@ class DenseFront:
             later[self.border] -= on.far
 
     def backward(self, lane: int, later: Array) -> None:
-        """The own part of the answer, from what the ``later`` unknowns are."""
+        """Backward substitution: the own part of a solution from its ``later`` part."""
         on = self._lanes[lane]
         if self._signs is None:
             if len(self.border):
@@ -152,7 +202,7 @@ class DenseFront:
 
 
 class _Lane:
-    """What a front does to one of the vectors."""
+    """The substitutions of a front in one of the solution vectors, ready to be called."""
 
     def __init__(self, lower: Array, below: Array, answer: Array) -> None:
         self.answer, self.far = answer, np.zeros(len(below), answer.dtype)
@@ -167,8 +217,6 @@ def _flat(array: Array) -> wp.array:
     return wp.array(array.reshape(-1, order="F"), dtype=kind, device=DEVICE, copy=False)
 
 
-Floats = NDArray[np.float64]
-
 LANES = 2
 """Right-hand sides that are solved for together."""
 
@@ -176,7 +224,7 @@ POOL = ThreadPoolExecutor(1, thread_name_prefix="palpate-fronts")
 
 
 class FrontAssembly:
-    """Where each entry of the matrix goes; the same for every precision."""
+    """Where each entry of the matrix goes in the fronts; the same for each precision."""
 
     def __init__(self, indptr: NDArray[Any], indices: NDArray[Any], groups: NDArray[Any]) -> None:
         self.elimination = plan_elimination(indptr, indices, groups)
@@ -188,7 +236,7 @@ class FrontAssembly:
         high = np.maximum(new[rows], new[indices])
         front_of = np.repeat(np.arange(len(fronts)), [f.last - f.first for f in fronts])[low]
         own = high < np.array([f.last for f in fronts], np.int64)[front_of]
-        # Entries front after front, those among own unknowns first.
+        # Entries front after front; in each, those between own unknowns first.
         self.sorted = np.lexsort((~own, front_of))
         self.begins = np.searchsorted(front_of[self.sorted], np.arange(len(fronts) + 1))
         self.own: list[Ints] = []
@@ -203,7 +251,7 @@ class FrontAssembly:
             self.below.append((low[outside] - front.first) * len(front.border) + row)
 
     def in_parent(self, child: int) -> Ints:
-        """Places of a child's border among its parent's own unknowns and border."""
+        """Place of each unknown of a child's border in its parent: own unknowns, then border."""
         fronts = self.elimination.fronts
         border, parent = fronts[child].border, fronts[fronts[child].parent]
         size = parent.last - parent.first
@@ -212,7 +260,7 @@ class FrontAssembly:
 
 
 class FrontalFactor:
-    """Factor of one matrix in one precision; two threads work on two halves of the tree."""
+    """Factor of one matrix in one precision; two host threads work on two halves of the tree."""
 
     def __init__(self, places: FrontAssembly, kind: type[np.floating[Any]]) -> None:
         self.places = places
@@ -220,8 +268,8 @@ class FrontalFactor:
         middle, top = tree.first, tree.first + tree.second
         self._halves = (range(middle), range(middle, top))
         self._top = range(top, len(tree.fronts))
-        # Right-hand sides and answers in order of elimination, LANES of them at a time. The second
-        # half has vectors of its own, as both add to what stands above them.
+        # Right-hand sides and solutions in order of elimination, LANES of them at a time. The
+        # second half has vectors of its own, because both halves add to the fronts above them.
         self._vectors = [np.zeros((LANES, len(tree.order)), kind) for _ in range(2)]
         self._begin_of_top = tree.fronts[top].first if top < len(tree.fronts) else len(tree.order)
         self._dense = [
@@ -234,7 +282,7 @@ class FrontalFactor:
         for child, front in enumerate(tree.fronts):
             if front.parent >= 0:
                 self._dense[front.parent].take(self._dense[child], places.in_parent(child))
-        self._values: NDArray[Any] | None = None  # that the fronts were made of, front after front
+        self._values: NDArray[Any] | None = None  # of the present factor, front after front
         self.redone = 0  # fronts of the last factorisation
 
     @property
@@ -243,7 +291,7 @@ class FrontalFactor:
         return sum(front.negative for front in self._dense)
 
     def factorise(self, values: Floats) -> None:
-        """Factorise, or bring the factor up to date: fronts whose entries are the same are kept.
+        """Factorise, or update the factor: fronts whose entries have not changed are kept.
 
         Args:
             values: Entries of the upper triangle.
@@ -254,7 +302,7 @@ class FrontalFactor:
         places = self.places
         arranged = values[places.sorted].astype(self._vectors[0].dtype)
         changed = self._changed(arranged)
-        self._values = None  # not to be trusted if this fails half-way
+        self._values = None  # invalid if this fails half-way
 
         def redo(fronts: range) -> None:
             for i in fronts:
@@ -312,7 +360,7 @@ class FrontalFactor:
         return answer
 
     def _touched(self, right: NDArray[Any]) -> NDArray[np.bool_]:
-        """Fronts with something in the right-hand sides, or above such."""
+        """Fronts with a non-zero right-hand side, and those above them."""
         marks = np.concatenate(([0], np.cumsum(right.any(axis=0))))
         fronts = self.places.elimination.fronts
         ends = np.array([front.last for front in fronts])
@@ -331,7 +379,7 @@ class FrontalFactor:
         other.result()
 
     def _changed(self, arranged: NDArray[Any]) -> NDArray[np.bool_]:
-        """Fronts with new entries, or above such."""
+        """Fronts with changed entries, and those above them."""
         places, fronts = self.places, self.places.elimination.fronts
         if self._values is None:
             return np.ones(len(fronts), np.bool_)
@@ -339,6 +387,7 @@ class FrontalFactor:
         return self._with_parents(np.diff(different[places.begins]) > 0)
 
     def _with_parents(self, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Marks and those of all ancestors; children stand before their parents."""
         for i, front in enumerate(self.places.elimination.fronts):
             if marked[i] and front.parent >= 0:
                 marked[front.parent] = True

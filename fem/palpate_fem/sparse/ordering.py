@@ -1,8 +1,8 @@
-"""In which order a sparse symmetric matrix is eliminated, and in which dense fronts.
+"""Elimination order of a sparse symmetric matrix, and its dense fronts.
 
-Nested dissection by METIS on the graph of the nodes, then the elimination tree, whose neighbouring
-columns are gathered into fronts (supernodes). A front eliminates its own unknowns and hands what
-that does to its border to its parent.
+METIS orders the graph of the nodes by nested dissection, which keeps the factor sparse. Columns of
+the elimination tree with nearly the same pattern are merged into fronts (supernodes). A front
+eliminates its own unknowns; the Schur complement at its border is added to its parent.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 Ints = NDArray[np.int64]
 
 SMALL = 24
-"""Nodes of a front below which any child is taken in: many small fronts cost more than zeros."""
+"""Up to so many nodes a front takes in any child: small fronts cost more than stored zeros."""
 
 LARGE = 4 * SMALL
-"""Nodes of a front above which children are taken in only where that adds no zeros."""
+"""Above so many nodes a front takes in only children that add no zeros."""
 
 ZEROS = 0.15
-"""Share of zeros that taking in a child may add in between."""
+"""Between the two, share of zeros that a child may add."""
 
 MOST_ON_TOP = 40
-"""Fronts that may stand above both halves."""
+"""Most fronts above both halves of the tree."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +34,10 @@ class Front:
     """Unknowns that are eliminated together.
 
     Attributes:
-        first: Of its own unknowns, in order of elimination.
+        first: First of its own unknowns, in order of elimination.
         last: One past the last of them.
-        border: Later unknowns it is coupled with, ascending.
-        parent: The front that its border's share is handed to; -1 at a root.
+        border: Later unknowns that it is coupled with, ascending.
+        parent: Front that its Schur complement is added to; -1 at a root.
     """
 
     first: int
@@ -52,9 +52,9 @@ class EliminationTree:
 
     Attributes:
         order: Old number of each unknown, in order of elimination.
-        fronts: The tree: two halves that do not touch, then what stands above both.
-        first: Fronts of the first half.
-        second: Fronts of the second half.
+        fronts: Two halves of the tree that are independent, then the fronts above both.
+        first: Number of fronts in the first half.
+        second: Number of fronts in the second half.
     """
 
     order: Ints
@@ -107,7 +107,7 @@ def _graph_of_nodes(indptr: Ints, indices: Ints, groups: Ints, count: int) -> sp
 
 
 def _dissect(graph: sp.csr_matrix) -> Ints:
-    """Place of each node in METIS' order, (N,)."""
+    """Place of each node in the order by METIS, (N,)."""
     if not graph.nnz:
         return np.arange(graph.shape[0])
     adjacency = pymetis.CSRAdjacency(
@@ -120,10 +120,10 @@ def _dissect(graph: sp.csr_matrix) -> Ints:
 def _gather(
     graph: sp.csr_matrix, position: Ints
 ) -> tuple[dict[int, list[int]], dict[int, set[int]], dict[int, list[int]]]:
-    """Fronts by their last node: own nodes, border nodes and children, all as places in the order.
+    """Fronts by their last node: own nodes, border nodes and children, as places in the order.
 
-    Nodes are taken in order of elimination. The border of one is what it is coupled with later on,
-    itself or through its children; its parent is the first of these.
+    Nodes are visited in order of elimination. The border of a node are the later nodes that it is
+    coupled with, directly or through its children; its parent is the first of them.
     """
     order = np.argsort(position)
     own: dict[int, list[int]] = {}
