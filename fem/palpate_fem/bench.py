@@ -1,4 +1,4 @@
-"""What one trajectory costs, and where the time goes: ``palpate fem bench``."""
+"""Cost of one indentation and its parts (``palpate fem bench``)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from palpate_fem.trajectory import angled_path, normal_path, sample_targets
 Metrics = dict[str, float | str]
 
 TARGET_S = 8.0
-"""Goal for a 20-step trajectory on two cores at 30,000 unknowns [s]."""
+"""Goal for an indentation of 20 steps on two cores with 30,000 unknowns [s]."""
 
 INDENTER = "sphere_medium"
 """The indenter of the paper's calibration."""
@@ -35,16 +35,16 @@ def run(
     repeats: int = 2,
     on_progress: Callable[[str], None] | None = None,
 ) -> Metrics:
-    """Press the parametric finger and say what it cost.
+    """Indent the parametric fingertip and measure the time.
 
-    Two trajectories of 20 steps with friction and core contact: 3 mm normal, and 1.5 mm at 30
-    degrees. The best of the repeats counts, since other work can only slow one down.
+    Two indentations of 20 steps with friction and core contact: 3 mm normal, and 1.5 mm at 30
+    degrees. The best of the repeats counts, since other processes can only slow one down.
 
     Args:
         edge_m: Edge of the elements on the pad [m]; None = the default mesh.
         layers: Elements through the skin.
-        repeats: How often each trajectory is run.
-        on_progress: Called with what is being measured.
+        repeats: Number of runs of each indentation.
+        on_progress: Called with the name of the measurement.
 
     Returns:
         Metrics by dotted name; times in seconds, memory in MiB.
@@ -107,7 +107,7 @@ def _of_factor(tip: Fingertip, peak: float) -> Metrics:
     with one_thread():
         for k in range(6):
             started = time.perf_counter()
-            factor.factorise((1.0 + 1e-3 * k) * values)  # the same values would be kept
+            factor.factorise((1.0 + 1e-3 * k) * values)  # fronts with the same values would be kept
             whole = min(whole, time.perf_counter() - started)
             started = time.perf_counter()
             factor.solve(right)
@@ -142,7 +142,7 @@ def _of_trajectory(name: str, trajectory: IndentationResult, parts: dict[str, fl
 
 
 def _watch(tip: Fingertip) -> dict[str, float]:
-    """Clock the parts of a fingertip's solver; the sums are in the returned dictionary."""
+    """Measure the time of each part of a solver; returns a dictionary that sums it up."""
     spent: dict[str, float] = defaultdict(float)
 
     def clocked(part: str, function: Callable[..., Any]) -> Callable[..., Any]:

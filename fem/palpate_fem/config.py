@@ -10,8 +10,8 @@ from palpate.errors import ConfigError
 EDGE_M = 0.47e-3
 """Edge of the parametric mesh's elements on the pad, by default [m]: 31,581 unknowns."""
 
-# Range of each parameter that the model is made for; the paper's optimisation bounds (Table
-# "Optimization parameters") lie inside. Outside, a mesh folds or the number is a slip of units.
+# Range of each parameter for which the model is made; the paper's optimisation bounds (Table
+# "Optimization parameters") lie inside. Outside, meshes fold or the unit of measure is wrong.
 LIMITS = {
     "skin_thickness_m": (0.5e-3, 3.0e-3),
     "shear_modulus_pa": (1e4, 1e7),

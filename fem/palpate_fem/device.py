@@ -1,4 +1,4 @@
-"""Where kernels run, and NumPy arrays as Warp sees them, without a copy."""
+"""The device of the Warp kernels, and NumPy arrays as Warp arrays without a copy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-# Warp announces itself, its devices and each kernel it loads on standard output; errors still come.
+# Otherwise Warp prints its version, the devices and each kernel that it loads on standard output.
 wp.config.log_level = wp.LOG_ERROR
 
 DEVICE = "cpu"
@@ -18,14 +18,14 @@ _NO_GPU = b"GPU execution will not be available"
 
 
 def _start() -> None:
-    """Start Warp, without its warning that this machine has no GPU, which nobody asked for.
+    """Start Warp without its warning that this machine has no GPU, which is not needed.
 
-    Its native code writes the warning straight to descriptor 2, whatever the log level, and no
-    setting of it says otherwise (Warp 1.19, `init_cuda_driver`). What else it writes is passed on.
+    Its native code writes the warning to file descriptor 2 at every log level (Warp 1.19,
+    `init_cuda_driver`). Everything else that it writes is passed on.
     """
     try:
         stderr = os.dup(2)
-    except OSError:  # closed, so nobody would see it
+    except OSError:  # stderr is closed, so there is nothing to filter
         wp.init()
         return
     with tempfile.TemporaryFile() as said:

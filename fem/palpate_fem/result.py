@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 class IndentationOutcome(StrEnum):
-    """How a trajectory ended."""
+    """How an indentation ended."""
 
     COMPLETE = "complete"
     FORCE_LIMIT = "force limit"  # the skin is pinched on the core
@@ -23,7 +23,7 @@ class IndentationOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """How a step was solved: Newton iterations, cut-backs, factorisations, residual, time."""
+    """How a step was solved: cost and remaining errors."""
 
     increments: int
     iterations: int
@@ -39,17 +39,17 @@ class IndentationStep:
     """One converged step; all in the sensor frame, SI.
 
     Attributes:
-        pose: Indenter: position and quaternion w x y z, shape (7,).
+        pose: Pose of the indenter: position [m] and quaternion w x y z, shape (7,).
         displacement: Nodal displacement from the pressurised, untouched state [m], shape (V, 3).
         fluid_pressure_pa: Above ambient [Pa].
         force: Net force of the indenter on the skin, friction included [N], shape (3,).
         torque: Its moment about the origin [N m], shape (3,).
         indenter_force: Nodal forces of the indenter on the skin [N], shape (V, 3).
         core_force: Nodal forces of the core on the skin [N], shape (V, 3).
-        contact_area_m2: Area of skin under the indenter [m^2].
+        contact_area_m2: Area of the skin that touches the indenter [m^2].
         centre_of_pressure: Of the indenter's normal forces [m], shape (3,); NaN without contact.
-        stress: Cauchy stress per element, mean over it: xx yy zz yz xz xy [Pa], shape (E, 6).
-        convergence: How it was solved.
+        stress: Mean Cauchy stress of each element: xx yy zz yz xz xy [Pa], shape (E, 6).
+        convergence: Cost and remaining errors.
     """
 
     pose: Floats
@@ -67,19 +67,20 @@ class IndentationStep:
 
 @dataclass(frozen=True, slots=True)
 class IndentationResult:
-    """The converged steps of one indentation, and why there are no more.
+    """The converged steps of one indentation, and how it ended.
 
-    The first pose is where it starts, untouched; each further one makes a step, so a complete
-    trajectory of K poses has K - 1 steps.
+    The first pose is the start, without contact; each further one is a step, so a complete
+    indentation with K poses has K - 1 steps.
 
     Attributes:
-        indenter: Its name.
+        indenter: Name of the indenter.
         path: Requested poses, shape (K, 7).
-        steps: Converged ones, in order of the path; K - 1 of them if the outcome is COMPLETE.
+        steps: Converged steps, in order of the path; K - 1 of them if the outcome is COMPLETE.
         outcome: How it ended.
-        reason: One sentence where it did not complete: what, where, at which travel.
+        reason: One sentence if it is not complete: what happened, and at which travel.
         travel_m: Path length of the indenter at the last *converged* increment, which may lie
             between two poses [m].
+        seconds: Computing time.
     """
 
     indenter: str

@@ -1,7 +1,7 @@
-"""How much of a result is the mesh and how much the steps: ``palpate fem study``.
+"""Convergence study of mesh and steps (``palpate fem study``).
 
-Three presses of 3 mm up into the pad, 4 mm from the middle of the finger: a sphere, the cube tilted
-by 30 degrees so that its edge presses, and the ring.
+Three indentations of 3 mm up into the pad, 4 mm from the middle of the finger: a sphere, the cube
+tilted by 30 degrees so that its edge presses, and the ring.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ TARGET_M = (-4e-3, 0.0, -7.5e-3)
 DEPTH_M = 3e-3
 
 SCALE_M = 1e-3
-"""Length by which the interpolation divides, lest its system be ill-conditioned [m]."""
+"""Unit of length of the interpolation, for a well-conditioned system [m]."""
 
 FORCE_CHANGE = 0.02
-"""Accepted change of the force by the last refinement."""
+"""Accepted relative change of the force by the last refinement."""
 
 DISPLACEMENT_CHANGE_M = 0.02e-3
 """Accepted mean change of the skin's displacement by the last refinement [m]."""
@@ -45,22 +45,22 @@ DISPLACEMENT_CHANGE_M = 0.02e-3
 
 @dataclass(frozen=True, slots=True)
 class StudyRow:
-    """One press in a study.
+    """One indentation of a study.
 
     Attributes:
-        indenter: Its name.
+        indenter: Name of the indenter.
         edge_m: Edge of the mesh [m].
         steps: Steps of the path.
-        unknowns: Of the system.
-        outcome: How the press ended.
-        force_n: Force at the end.
-        force_change: To the row before, over this force; NaN in the first.
-        displacement_change_m: Mean over the outer nodes of the coarser mesh [m].
-        largest_change_m: The largest of these [m].
-        iterations: Newton's, all steps.
-        seconds: Of the press.
-        factor_gflop: Of one whole factorisation.
-        peak_mib: Memory of the process until now.
+        unknowns: Number of unknowns.
+        outcome: How the indentation ended.
+        force_n: Force at the end [N].
+        force_change: Relative change of the force to the row before; NaN in the first.
+        displacement_change_m: Mean change over the outer nodes of the coarser mesh [m].
+        largest_change_m: Largest change of a node [m].
+        iterations: Newton iterations of all steps.
+        seconds: Computing time of the indentation.
+        factor_gflop: Operations of one whole factorisation.
+        peak_mib: Peak memory of the process so far.
     """
 
     indenter: str
@@ -86,18 +86,18 @@ class StudyRow:
         )
 
     def plain(self) -> dict[str, object]:
-        """For JSON."""
+        """As values for JSON; NaN becomes null."""
         values = asdict(self)
         return {k: None if v != v else v for k, v in values.items()} | {"accepted": self.accepted}
 
 
-Told = Callable[[StudyRow], None]
-
-
 def mesh_study(
-    *, edges_m: Sequence[float] = EDGES_M, steps: int = 20, on_row: Told | None = None
+    *,
+    edges_m: Sequence[float] = EDGES_M,
+    steps: int = 20,
+    on_row: Callable[[StudyRow], None] | None = None,
 ) -> list[StudyRow]:
-    """The presses on finer and finer meshes."""
+    """The indentations on finer and finer meshes."""
     rows: list[StudyRow] = []
     last: dict[str, _SkinDisplacement] = {}
     for edge in edges_m:
@@ -110,9 +110,12 @@ def mesh_study(
 
 
 def step_study(
-    *, edge_m: float = 0.5e-3, steps: Sequence[int] = STEPS, on_row: Told | None = None
+    *,
+    edge_m: float = 0.5e-3,
+    steps: Sequence[int] = STEPS,
+    on_row: Callable[[StudyRow], None] | None = None,
 ) -> list[StudyRow]:
-    """The presses in smaller and smaller steps."""
+    """The indentations in smaller and smaller steps."""
     tip = Fingertip.pressurised(biotac(edge_m=edge_m))
     rows: list[StudyRow] = []
     last: dict[str, _SkinDisplacement] = {}
@@ -126,7 +129,7 @@ def step_study(
 
 @dataclass(frozen=True, slots=True)
 class _SkinDisplacement:
-    """Displacement of the outer skin in the last refinement."""
+    """Displacement of the outer skin at the last refinement."""
 
     nodes: Floats
     displacement: Floats

@@ -1,8 +1,8 @@
-"""The paper's indentations: where they aim, how they move, and the whole set of them.
+"""The paper's indentations: targets, straight paths, and the whole campaign.
 
-Of each of 10 points in a region of the pad there is one indentation along the inward normal, 3 mm
-deep, and four at 30 degrees to it, 1.5 mm deep (paper, "Experimental testing procedure"). The paper
-leaves open and we choose:
+At each of 10 points of the pad there is one indentation along the inward normal, 3 mm deep, and
+four at 30 degrees to it, 1.5 mm deep (paper, "Experimental testing procedure"). The paper
+leaves the following open; we chose:
 
 * the *sampled region*: x from -11 to 1 mm, at most 4 mm to the side, where the skin faces down:
   from the core's distal facet over the pad, well within the skin's ends at x = -21 and 7 mm;
@@ -45,14 +45,14 @@ CLEARANCE_M = 0.05e-3  # more than the reach of the softened contact law, which 
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Part of the outer surface that is aimed at [m], sensor frame; our choice, see above."""
+    """Part of the outer surface in which targets lie [m], sensor frame; our choice, see above."""
 
     x_from_m: float = -11e-3
     x_to_m: float = 1e-3
     half_width_m: float = 4e-3
 
     def holds(self, points: Floats, normals: Floats) -> NDArray[np.bool_]:
-        """Which points are in it, shape (N,): below the axis and facing down."""
+        """Whether each point lies in it, below the axis and facing down, shape (N,)."""
         x, y, z = points.T
         held = (x >= self.x_from_m) & (x <= self.x_to_m) & (np.abs(y) <= self.half_width_m)
         return np.asarray(held & (z < 0.0) & (normals[:, 2] < -0.5))
@@ -65,9 +65,9 @@ class PlannedIndentation:
     Attributes:
         name: ``<indenter>/<point>/<normal|angled-0..3>``.
         indenter: Name of the indenter.
-        target: Point that it aims at [m], shape (3,).
+        target: Point on the line of the tip [m], shape (3,).
         normal: Outward normal there, shape (3,).
-        direction: Where it moves, shape (3,).
+        direction: Direction of travel, shape (3,).
         contact_m: Travel of the tip beyond the target at first contact [m]; mostly negative.
         depth_m: Travel from first contact to the last pose [m].
         path: Poses, the first clear of the skin, shape (K + 1, 7).
@@ -108,10 +108,10 @@ def press_path(
         Poses, shape (K + 1, 7).
 
     Raises:
-        ConfigError: A value that makes no path.
-        SimulationError: The indenter misses.
+        ConfigError: A value is out of range.
+        SimulationError: The indenter passes the skin.
     """
-    return _press(indenter, target, direction, surface, depth_m, steps, clearance_m)[0]
+    return _straight_path(indenter, target, direction, surface, depth_m, steps, clearance_m)[0]
 
 
 def normal_path(
@@ -170,12 +170,12 @@ def sample_targets(
     seed: int | Sequence[int] = 0,
     region: Region | None = None,
 ) -> tuple[Floats, Floats]:
-    """Random points of a region of the surface, evenly by area.
+    """Random points of a region of the surface, uniform by area.
 
     Args:
         surface: Outer surface of the pressurised skin.
         count: Number of points.
-        seed: Same seed and surface, same points; more of them begin with the same.
+        seed: The same seed and surface give the same points; a larger count adds to them.
         region: Where; None = the sampled region.
 
     Returns:
@@ -202,7 +202,7 @@ def sample_targets(
     )
     random = np.random.default_rng(seed)
     points, normals = np.empty((0, 3)), np.empty((0, 3))
-    while len(points) < count:  # faces at the border stick out: draw again what lies there
+    while len(points) < count:  # faces at the border reach out of the region: draw again
         face = random.choice(len(corner), size=_BATCH, p=area / area.sum())
         weights = random.dirichlet((1.0, 1.0, 1.0), size=_BATCH)
         drawn = np.einsum("nk,nki->ni", weights, corner[face])
@@ -215,10 +215,10 @@ def sample_targets(
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """All indentations of the paper on a surface, in order; 450 by default, made when asked for.
+    """All indentations of the paper on a surface, in order, made one by one; 450 by default.
 
-    The points of an indenter depend on the seed, the surface and its name alone, and the first ones
-    stay where they are when there are more of them.
+    The points of an indenter depend only on the seed, the surface and its name; a larger number of
+    points adds to them.
 
     Attributes:
         surface: Outer surface of the pressurised skin.
@@ -226,11 +226,10 @@ class Campaign:
         points: Points for each indenter.
         seed: Of the points.
         steps: Steps of each path.
-        region: Where to aim; None = the sampled region.
-        angled: Angled paths at each point, of the ``AZIMUTHS`` that there are.
+        region: Where the targets lie; None = the sampled region.
+        angled: Number of angled paths at each point, at most ``AZIMUTHS``.
         increment_m: Length of a step [m] instead of ``steps``, as a robot moves; None = ``steps``.
-        overtravel_m: How much deeper than the paper's depths [m]: what a robot that stands wrong by
-            its registration error may reach.
+        overtravel_m: Depth beyond the paper's [m], which a robot with a registration error reaches.
     """
 
     surface: OuterSurface
@@ -274,7 +273,7 @@ class Campaign:
     ) -> PlannedIndentation:
         depth_m += self.overtravel_m
         steps = self.steps if self.increment_m is None else round(depth_m / self.increment_m)
-        path, contact_m = _press(
+        path, contact_m = _straight_path(
             indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
         )
         return PlannedIndentation(
@@ -282,7 +281,7 @@ class Campaign:
         )
 
 
-def _press(
+def _straight_path(
     indenter: Indenter,
     target: ArrayLike,
     direction: ArrayLike,
@@ -310,7 +309,7 @@ def _press(
     return path, contact_m
 
 
-_FACES_DOWN = -0.3  # of the normal's z: what is steeper is a side, not the pad
+_FACES_DOWN = -0.3  # z of the normal of the pad; steeper skin belongs to a side
 _NEAR_M = 1.0e-3  # twice the edge of a coarse mesh
 
 
@@ -318,7 +317,7 @@ def pad_point(surface: OuterSurface, x_m: float, y_m: float) -> tuple[Floats, Fl
     """Point and outward unit normal of the pad nearest to (x, y), both shape (3,), sensor frame.
 
     Raises:
-        ConfigError: The pad does not reach there; says how far it does.
+        ConfigError: The pad does not reach there; names its extent.
     """
     normals = node_normals(surface.nodes, surface.faces)
     on_skin = np.unique(surface.faces)

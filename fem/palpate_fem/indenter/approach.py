@@ -1,7 +1,7 @@
-"""Where an indenter first touches a surface, and whether it is clear of it.
+"""First contact of a moving indenter with a surface, and the check that it starts outside.
 
-A gap shrinks by no more than the indenter moves. So it may always move by the smallest gap, and a
-point whose gap is larger than what is left of the way need not be looked at again.
+A gap shrinks by no more than the indenter moves (sphere tracing). So the indenter may always move
+by the smallest gap, and points with a gap larger than the remaining travel can be dropped.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from palpate_fem.indenter.shape import Indenter, PrimitiveKind, signed_distance
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-_TOUCH = 1e-9  # [m]; gap that counts as none
+_TOUCH = 1e-9  # [m]; a smaller gap counts as contact
 _LARGE_M = 1.5e-3  # a face from this size on may be touched far from its corners
-_MOVES = 2000  # a touch at a glancing angle is approached slowly
+_MOVES = 2000  # contact at a glancing angle is approached slowly
 _LEVELS = (3, 9, 25)  # points along a face's edge
 
 
@@ -70,7 +70,7 @@ def first_contact(
         Travel [m], negative where it touches before its tip reaches the target.
 
     Raises:
-        SimulationError: It passes the surface.
+        SimulationError: It passes the surface without contact.
     """
     turn = rotation_matrices(quaternion)
     target = np.asarray(target, np.float64)
@@ -87,7 +87,7 @@ def first_contact(
     start = float(along.min()) - _reach(indenter)
     end = float(along.max()) + _reach(indenter)
 
-    # A few points tell about how far it can go; the rest then is quick.
+    # A few points give an upper limit of the travel, with which most of the others are dropped.
     limit = _trace(indenter, points[:: max(1, len(points) // 200)], move, start, end)
     limit = _trace(indenter, points, move, start, limit)
     faces, spacing = np.arange(len(surface.faces)), 2.0 * sizes
@@ -108,7 +108,7 @@ def first_contact(
 
 
 def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> float:
-    """Check that an indenter neither touches the skin nor is within the finger.
+    """Check that an indenter is outside the fingertip and does not touch it.
 
     Args:
         indenter: The indenter.
@@ -116,10 +116,10 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
         surface: Outer surface of the pressurised skin.
 
     Returns:
-        Gap [m], positive: at corners, middles and edge middles of faces, so a little too large.
+        Smallest gap [m] at corners, middles and edge middles of faces: a little too large.
 
     Raises:
-        SimulationError: It does; says by how much.
+        SimulationError: It touches or is inside; says by how much.
     """
     points = surface.samples(_LEVELS[0]).reshape(-1, 3)
     gap = float(signed_distance(indenter, to_local(pose, points)).min())
@@ -130,7 +130,7 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
             else f"at the first pose indenter {indenter.name!r} touches the skin",
             remedy=f"begin the path at least {-gap * 1e3 + 0.05:.2f} mm further out",
         )
-    # Clear of all skin: then all of it is on the same side of the skin as any point of it.
+    # It is clear of the skin, so all of it is on one side: test one of its points.
     inner = rotation_matrices(pose[3:]) @ _point_of(indenter) + pose[:3]
     corner = surface.nodes[surface.faces]
     away = inner - corner.mean(axis=1)
@@ -147,7 +147,7 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
 
 
 def _point_of(indenter: Indenter) -> Floats:
-    """A point within the indenter [m], indenter frame; the tip of a ring is not."""
+    """A point inside the indenter [m], indenter frame (the tip of a ring lies outside)."""
     part = indenter.primitives[0]
     point = np.array(part.centre)
     if part.kind == PrimitiveKind.REVOLVED:
@@ -169,7 +169,7 @@ def _reach(indenter: Indenter) -> float:
 
 
 def _trace(indenter: Indenter, points: Floats, move: Floats, start: float, limit: float) -> float:
-    """Travel at which the first of some points is touched [m]; ``limit`` if none before."""
+    """Travel at which the indenter touches the first of the points [m], at most ``limit``."""
     travel = start
     for _ in range(_MOVES):
         gap = signed_distance(indenter, points - travel * move)

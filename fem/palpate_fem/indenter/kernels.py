@@ -1,4 +1,4 @@
-"""Signed distance to an indenter with its first two derivatives; Warp. NumPy twin: `distance`.
+"""Signed distance to an indenter with two derivatives in Warp; NumPy twin: `shape.distance`.
 
 ``primitives`` are the rows of `Indenter.packed`: kind, axis, centre (3), sizes (4), rounding.
 """
@@ -197,13 +197,13 @@ def indenter_distance(
 ) -> IndenterGap:
     """Gap, normal and hessian where the gap is below ``margin``.
 
-    Elsewhere, which is most of a finger, cheap: normal and hessian are zero and the gap is a lower
-    bound of the true one that is not below ``margin``.
+    Elsewhere, which is most of the skin, the result is cheap: normal and hessian are zero, and the
+    gap is a lower bound of the true one that is at least ``margin``.
 
     Args:
         primitives: Rows of `Indenter.packed`, shape (P, 10).
         x: Position [m], indenter frame.
-        margin: Gap from which on nothing more is needed [m].
+        margin: Gap beyond which a lower bound suffices [m].
     """
     near = IndenterGap()
     nearest = wp.int32(-1)

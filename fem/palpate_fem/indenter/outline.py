@@ -1,4 +1,4 @@
-"""The surface of an indenter as triangles: for pictures only, contact is solved with distances."""
+"""The surface of an indenter as triangles, for pictures; contact uses the exact distance."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 SPACING_M = 0.4e-3
-"""Of the grid: the smallest tip, 3.5 mm wide, looks round, and the largest indenter has 18,000
-triangles, about 100 kB in a store."""
+"""Spacing of the grid: the smallest tip, 3.5 mm wide, looks round, and the largest indenter has
+18,000 triangles, about 100 kB in a store."""
 
-# A grid plane in a flat face would give triangles without area, so they keep off round numbers.
+# Grid planes must not lie in flat faces, which would give triangles without area.
 _OFF_ROUND = np.array([0.37, 0.41, 0.43])
 _MARGIN = 2  # cells between the box and the surface
 

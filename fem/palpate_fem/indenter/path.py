@@ -1,4 +1,4 @@
-"""Paths of an indenter: what a valid one is, and their files."""
+"""Paths of an indenter: their validation and their CSV files."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from palpate.errors import ConfigError
 Floats = NDArray[np.float64]
 
 COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-REACH_M = 0.2  # farther from the sensor's origin a position is a slip of units
+REACH_M = 0.2  # a position farther from the origin is a mistake of units
 _UNIT = 1e-6  # deviation of a quaternion's length that rounding may explain
 
 
 def check_path(path: ArrayLike, *, source: str = "path", first_line: int | None = None) -> Floats:
-    """A path as the solver takes it.
+    """Validate a path.
 
     Args:
         path: Poses: position [m] and unit quaternion w x y z, sensor frame, shape (K + 1, 7).
-        source: What to call it in errors.
+        source: Its name in errors.
         first_line: Line of the first pose if it is a file.
 
     Returns:

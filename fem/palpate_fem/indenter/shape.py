@@ -1,6 +1,4 @@
-"""What an indenter is: a union of rounded primitives, in its own frame.
-
-Signed distance to an indenter with its first two derivatives; NumPy.
+"""Indenters as unions of rounded primitives, and their signed distance with two derivatives.
 
 A rounded primitive is a sharp one K grown by rho. With c(x) the point of K closest to x and
 L = |x - c|::
@@ -9,7 +7,7 @@ L = |x - c|::
 
 For a box dc/dx is diagonal, 1 where a coordinate is within. For a solid of revolution the same
 holds in the half plane (r, t) of distance from and position along the axis, and the circumference
-adds (d gap / d r) / r. Inside K, where L = 0, the nearest face of K replaces c, so the sign stays
+adds (d gap / d r) / r. Inside K, where L = 0, the nearest face of K replaces c, so that the sign is
 right.
 
 The distance to the union is the smallest of its parts': exact outside; inside, where parts overlap,
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 
 
 class PrimitiveKind(IntEnum):
-    """Kinds of primitives; the numbers are read by the kernels."""
+    """Kinds of primitives; the kernels use the numbers."""
 
     BOX = 0  # |x - c| <= (a, b, c) per axis
     REVOLVED = 1  # a <= distance from the axis <= b, c <= along the axis <= d
@@ -41,7 +39,7 @@ class Primitive:
     a > 0, and a rounding below a.
 
     Attributes:
-        kind: Which.
+        kind: Box or solid of revolution.
         centre: Centre, or a point on the axis that is the zero of c and d [m], indenter frame.
         axis: Axis of revolution, 0..2 for x, y, z; ignored for a box.
         sizes: BOX half lengths (hx, hy, hz, 0); REVOLVED (radius from, to, along from, to) [m].

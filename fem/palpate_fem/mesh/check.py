@@ -1,7 +1,4 @@
-"""How good the elements of a solid mesh are.
-
-Is a solid mesh fit to be simulated? A refusal says what is wrong, of which element, where.
-"""
+"""Quality of solid meshes, and the check that one can be simulated."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ QUADS = {
     6: ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
 }
 CAPS = ((0, 2, 1), (3, 4, 5))  # of a wedge
-# An element flatter than this is called degenerate: its Jacobian loses six digits.
+# A flatter element is degenerate: its Jacobian loses six digits.
 LEAST_SCALED_JACOBIAN = 1e-6
 
 FOLDED = "make the skin thinner or the edges longer: columns cross where the surface is bent"
@@ -90,7 +87,7 @@ def _at(position: Floats) -> str:
 
 
 def _well_formed(mesh: SolidMesh) -> bool:
-    """Shapes and kinds of all arrays."""
+    """Whether all arrays have the right shape and type."""
     sides = {8: 4, 6: 3}.get(mesh.elements.shape[-1], 0)
     surfaces = ((mesh.outer_faces, mesh.outer_elements), (mesh.inner_faces, mesh.inner_elements))
     return (
@@ -205,7 +202,7 @@ def _check_boundary(mesh: SolidMesh) -> None:
 
 
 def _keys(faces: Ints, turned: bool = False) -> NDArray[np.void]:
-    """Each face as one comparable value, whichever node it starts with."""
+    """Each face as one comparable value that does not depend on the node it starts with."""
     if turned:
         faces = faces[:, ::-1]
     first = faces.argmin(axis=1)
@@ -217,10 +214,10 @@ def _keys(faces: Ints, turned: bool = False) -> NDArray[np.void]:
 
 
 def _solid_boundary(elements: Ints) -> NDArray[np.void]:
-    """Keys of the faces, of the surfaces' kind, that belong to one element only.
+    """Keys of the faces that belong to one element only.
 
-    The sides of wedges are quads that no surface may name, so one of them on the boundary is
-    counted too: its key cannot be among those of triangles.
+    No surface may name a side of a wedge, which is a quad. One on the boundary is counted with a
+    key that no triangle has.
     """
     kinds = [QUADS[8]] if elements.shape[1] == 8 else [CAPS, QUADS[6]]
     size = elements.shape[1] // 2

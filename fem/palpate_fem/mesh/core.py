@@ -1,6 +1,7 @@
-"""The rigid core: a tabulated signed distance that is twice continuously differentiable.
+"""The rigid core as a tabulated signed distance, and the tabulation of triangle surfaces.
 
-Signed distance to a closed triangle surface, tabulated on a grid.
+The distance is a tricubic B-spline, because Newton's method needs its second derivative to be
+continuous.
 """
 
 from __future__ import annotations
@@ -42,9 +43,10 @@ class DistanceGrid:
     if u = (x - origin) / spacing lies in [1, n - 2] on each axis, so that the four coefficients
     floor(u) - 1 .. floor(u) + 2 exist (at u = n - 2 the cell below is used).
 
-    Outside, the value is that of the nearest inside point plus the way there, with that point's
-    gradient and a zero Hessian: good to see that there is no contact, not to differentiate. The
-    makers of grids leave a margin of several mm around the core, so the value is far from zero.
+    Outside, the value is that of the nearest inside point plus the distance to it, with that
+    point's gradient and a zero Hessian: enough to see that there is no contact, but not its
+    derivative. Grids have a margin of several mm around the core, so the value there is far from
+    zero.
 
     Attributes:
         origin: Position of coefficient (0, 0, 0) [m], shape (3,), sensor frame.
@@ -89,17 +91,10 @@ class DistanceGrid:
             )
 
         distance = contract(value, value, value)
-        gradient = (
-            np.stack(
-                [
-                    contract(slope, value, value),
-                    contract(value, slope, value),
-                    contract(value, value, slope),
-                ],
-                axis=1,
-            )
-            / self.spacing
-        )
+        x = contract(slope, value, value)
+        y = contract(value, slope, value)
+        z = contract(value, value, slope)
+        gradient = np.stack([x, y, z], axis=1) / self.spacing
         xx = contract(curvature, value, value)
         yy = contract(value, curvature, value)
         zz = contract(value, value, curvature)
@@ -121,7 +116,7 @@ class RigidCore:
         vertices: Surface for pictures [m], shape (P, 3), sensor frame.
         faces: Triangles, normals out of the core, shape (Q, 3).
         volume_m3: Volume inside the zero level of the grid [m^3].
-        name: For people.
+        name: Shown to users.
     """
 
     grid: DistanceGrid
@@ -141,13 +136,13 @@ def volume_inside(values: Floats, spacing: float) -> float:
     return float(share.sum() * spacing**3)
 
 
-CANDIDATES = 8  # nearest sample points whose triangles are tried; samples are SAMPLE apart
+CANDIDATES = 8  # nearest sample points whose triangles are tried; samples are SAMPLE_M apart
 SAMPLE_M = 0.25e-3
 CHUNK = 20_000  # points at once: about 100 MB
 
 
 def _samples(points: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Points all over the surface, no further apart than SAMPLE_M, and the triangle of each."""
+    """Sample points of the surface, at most SAMPLE_M apart, and the triangle of each."""
     corner = points[faces]
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
     parts = np.maximum(1, np.ceil(longest / SAMPLE_M).astype(int))
@@ -193,8 +188,8 @@ def _nearest_on_triangles(p: Floats, a: Floats, b: Floats, c: Floats) -> tuple[F
 def signed_distance(points: Floats, vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     """Signed distance of points to a closed surface, by its triangles.
 
-    The sign is that of the angle-weighted pseudo-normal of the nearest face, edge or node, which is
-    right for every closed surface that does not cut itself.
+    The sign follows from the angle-weighted pseudo-normal of the nearest face, edge or node, which
+    is correct for each closed surface that does not intersect itself (Baerentzen, Aanaes 2005).
 
     Args:
         points: Positions [m], shape (N, 3).
@@ -265,8 +260,8 @@ def box_around(
 def spread(at: Floats, near: NDArray[np.bool_], foot: Floats, sign: Floats) -> Floats:
     """Distance at all nodes of a grid from the nearest surface points of those in a band.
 
-    A node outside the band takes the surface point of the nearest node in the band for its own,
-    which errs by less than 1 % of the spacing at a smooth surface (Danielsson's propagation).
+    A node outside the band uses the surface point of the nearest node in the band, with an error
+    below 1 % of the spacing at a smooth surface (Danielsson's propagation).
 
     Args:
         at: Nodes of the grid [m], shape (nx, ny, nz, 3).

@@ -1,10 +1,11 @@
-"""Quads of a closed bag: a tube of rings with a rectangular patch at either end.
+"""A grid of quads over a closed bag: a tube of rings with a rectangular patch at either end.
 
 A ring has 2 (a + b) nodes; a and b are the quads along the sides of the patches: a ventrally and
 dorsally, b on either flank. So all nodes have four quads, but the eight corners of the patches
 three. Everything is symmetric to the plane of the midline.
 
-Places for the nodes of a bag on a smooth body: graded, mirror-symmetric, without slivers.
+`lay` places the nodes on a smooth body by rays from inside, graded by the wanted edge length, and
+relaxes them; positions are mirror-symmetric to the bit.
 """
 
 from __future__ import annotations
@@ -103,15 +104,15 @@ def bag(rings: int, a: int, b: int) -> BagTopology:
 Floats = NDArray[np.float64]
 
 REACH_M = 15e-3  # every ray leaves the body within
-DENSE = 401  # samples of a curve that is cut into equal parts
-PATCH_SHARE = 0.26  # of half a ring lies on the dorsal half side of a patch: keeps patches square
-ROUNDS = 60  # of relaxation: nodes still move by less than 1 um then
-ANCHOR = 0.06  # share of a spring to its first place: without, rings would slip over the dome
+DENSE = 401  # samples of a curve
+PATCH_SHARE = 0.26  # of half a ring along the dorsal half side of a patch, so that it is square
+ROUNDS = 60  # of relaxation; nodes then move by less than 1 um
+ANCHOR = 0.06  # weight of a node's first position; without it, rings slip over the dome
 
 
 @dataclass(frozen=True, slots=True)
 class RayOrigins:
-    """Where rays start from that lay a bag over a body [m], sensor frame.
+    """Start points of the rays that lay a bag over a body [m], sensor frame.
 
     Attributes:
         axis_z_m: Height of the axis.
@@ -142,7 +143,7 @@ Line = tuple[Ints, int, float | Floats]
 
 
 def _cut(curve: Floats, size: Spacing, parts: int) -> Floats:
-    """Fractional sample indices that cut a curve (S, 3) into parts of equal length over size."""
+    """Fractional sample indices that cut a curve (S, 3) into parts of equal length / size."""
     step = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     load = np.concatenate([[0.0], np.cumsum(step / size((curve[1:] + curve[:-1]) / 2))])
     wanted = np.linspace(0.0, load[-1], parts + 1)
@@ -279,7 +280,7 @@ def lay(field: Field, frame: RayOrigins, size: Spacing) -> tuple[BagTopology, Fl
 
 
 def _along(curve: Floats, ends: list[float], parts: list[int], size: Spacing) -> Floats:
-    """Nodes of one meridian, shape (rings, 3) [m]: each piece between two ends is cut evenly."""
+    """Nodes of one meridian [m], shape (rings, 3); each piece between two ends is cut evenly."""
     sample = np.arange(len(curve), dtype=np.float64)
 
     def at(index: Floats) -> Floats:
@@ -296,10 +297,11 @@ def _along(curve: Floats, ends: list[float], parts: list[int], size: Spacing) ->
 def relax(
     field: Field, places: Floats, sheet: BagTopology, size: Spacing, lines: tuple[Line, ...]
 ) -> Floats:
-    """Even out the places on the body, exactly symmetric.
+    """Smooth the grid on the body, exactly symmetric.
 
     Each node moves towards the mean of its neighbours, weighted with 1 / wanted edge, and a little
-    back to where it came from, and is put on the body again. Those of a line keep one coordinate.
+    towards its first position, and is projected on the body again. Nodes of a line keep a
+    coordinate.
     """
     pairs, _ = edges(sheet.faces)
     own, twin = np.arange(len(places)), sheet.mirror

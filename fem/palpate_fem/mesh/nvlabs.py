@@ -1,9 +1,7 @@
-"""Readers for the two text formats of the public BioTac meshes: ``.tet`` and ``.obj``.
-
-The public BioTac of NVlabs/biotac_sim (MIT) as a solid mesh of wedges, with its core.
+"""The public BioTac of NVlabs/biotac_sim (MIT) as a solid mesh of wedges, with its core.
 
 The public tetrahedra lock (they inflate at twice the pressure), so only their *inner surface* is
-kept, and the skin is grown from it along smooth normals. Nothing of the files is stored here.
+used: the skin is extruded from it along smoothed normals. palpate ships none of these files.
 """
 
 from __future__ import annotations
@@ -106,7 +104,9 @@ def boundary(tets: Ints, points: Floats) -> Ints:
     return np.ascontiguousarray(faces[np.sort(index[times == 1])], np.int32)
 
 
-Surface = tuple[Floats, Ints]  # vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3)
+TriangleSurface = tuple[
+    Floats, Ints
+]  # vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3)
 
 SKIN = Path("meshes/biotac/int_ext_skin/int_ext_skin_combined_ftw.tet")
 PARTS = Path("meshes/biotac/bc/top_side_core_bc.obj")
@@ -114,9 +114,9 @@ PARTS = Path("meshes/biotac/bc/top_side_core_bc.obj")
 # Mesh axes (X proximal, Y dorsal, Z lateral) to the sensor frame: x = -X + X0, y = Z, z = Y.
 # X0 is the centre of the sphere that fits the core's tip (radius 5.33 mm, r.m.s. 0.016 mm).
 X0_M = -13.96e-3
-DRAWN_THICKNESS_M = 1.57e-3  # of the public skin: what nail and clamp touch is decided with it
-ATTACH_M = 1e-5  # the public model's attachDistance: its skin is glued to what lies so near
-SMOOTHING = 4  # rounds; fewer let the columns cross at the proximal edge, more round it off
+DRAWN_THICKNESS_M = 1.57e-3  # of the public skin; decides what nail and clamp touch
+ATTACH_M = 1e-5  # attachDistance of the public model: skin nearer than this is held
+SMOOTHING = 4  # rounds; with fewer, columns cross at the proximal edge, more round it off
 SPACING_M = 0.25e-3
 MARGIN_M = 2.0e-3  # around the core: more than the fluid film is thick anywhere
 ROUNDING_M = 0.15e-3  # standard deviation of the blur that rounds the core's facets
@@ -168,13 +168,13 @@ def read_nvlabs(
     return FingertipGeometry(mesh, _core(core, cavity))
 
 
-def _compact(points: Floats, faces: Ints) -> Surface:
+def _compact(points: Floats, faces: Ints) -> TriangleSurface:
     """Some of a file's faces with only the vertices they use."""
     used, compact = np.unique(faces, return_inverse=True)
     return points[used], compact.reshape(-1, 3).astype(np.int32)
 
 
-def _surfaces(points: Floats, faces: Ints, path: Path) -> tuple[Surface, Surface]:
+def _surfaces(points: Floats, faces: Ints, path: Path) -> tuple[TriangleSurface, TriangleSurface]:
     """Of the cavity, normals out of it, and of the skin's outside."""
     loose = open_edges(faces)
     if len(loose):
@@ -188,7 +188,9 @@ def _surfaces(points: Floats, faces: Ints, path: Path) -> tuple[Surface, Surface
     return _compact(points, faces[cavity][:, ::-1]), _compact(points, faces[~cavity])
 
 
-def _parts(points: Floats, faces: Ints, path: Path) -> tuple[list[Surface], Surface]:
+def _parts(
+    points: Floats, faces: Ints, path: Path
+) -> tuple[list[TriangleSurface], TriangleSurface]:
     """Nail and clamp, and the core."""
     label = components(faces, len(points))
     ids = np.unique(label)
@@ -213,12 +215,12 @@ def smooth_normals(points: Floats, faces: Ints, rounds: int) -> Floats:
     return normal
 
 
-def _held(outer: Floats, skin: Surface, slabs: list[Surface]) -> Ints:
+def _held(outer: Floats, skin: TriangleSurface, slabs: list[TriangleSurface]) -> Ints:
     """Columns that end where the public skin touches nail or clamp.
 
-    It is asked of the point of the public skin next to a column's outer node, not of the node: the
-    grown skin lies up to 0.1 mm off the public one, which would need a tolerance of its own. Not of
-    the nearest vertex either: those are 0.9 mm apart, and each would hold or free all around it.
+    The test point is the point of the public skin nearest to a column's outer node. The node itself
+    lies up to 0.1 mm off the public skin, which would need a tolerance. The nearest vertex would be
+    too coarse: vertices are 0.9 mm apart.
     """
     _, foot = signed_distance(outer, *skin)
     touching = [np.abs(signed_distance(foot, *slab)[0]) < ATTACH_M for slab in slabs]
@@ -227,8 +229,8 @@ def _held(outer: Floats, skin: Surface, slabs: list[Surface]) -> Ints:
     return np.flatnonzero(np.any(touching, axis=0)).astype(np.int32)
 
 
-def _core(body: Surface, cavity: Surface) -> RigidCore:
-    """The public core, kept within the cavity less a clearance, as a smooth distance."""
+def _core(body: TriangleSurface, cavity: TriangleSurface) -> RigidCore:
+    """The public core, cut back to a clearance from the skin, as a smooth distance."""
     from scipy import ndimage
 
     vertices, triangles = body

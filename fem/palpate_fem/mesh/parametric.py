@@ -1,4 +1,4 @@
-"""An open parametric BioTac: hexahedra between two smooth surfaces, from dimensions alone."""
+"""An open parametric BioTac: hexahedra between two smooth surfaces, from dimensions only."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FRAME = RayOrigins(
     mark_y_m=NAIL_Y_M,
     section_x_m=-6.8e-3,
 )
-# Dorsal edges over ventral ones, and the longest that still follow the rounded edge of the flat.
+# Ratio of dorsal to ventral edges, and the longest that follow the rounded edge of the flat.
 COARSENING, LONGEST_M = 1.8, 1.1e-3
 # Edges at the proximal end: their share of the others, the longest that still follow its rounded
 # edge (else the skin would cut into the core), and how far it reaches.
@@ -98,7 +98,7 @@ def biotac(
 
 
 def spacing(edge_m: float) -> Spacing:
-    """Wanted edges: edge_m on the pad and the flanks, longer on the back, smooth between.
+    """Wanted edge length: edge_m on the pad and the flanks, longer on the back, smooth between.
 
     Shorter at the proximal edge, which opens like a fan from the inner to the outer surface.
     """
@@ -136,7 +136,7 @@ def _held(bag: BagTopology, inner: Floats, normal: Floats) -> Ints:
 
 @lru_cache(maxsize=4)
 def _surface(cavity: CavityShape, edge_m: float) -> tuple[BagTopology, Floats, Floats]:
-    """Inner surface and its normals: the same for every thickness, so a calibration needs one."""
+    """Inner surface and its normals, which do not depend on the thickness."""
     bag, inner = lay(cavity, FRAME, spacing(edge_m))
     return bag, inner, _normals(cavity, inner, bag)
 

@@ -1,10 +1,10 @@
-"""Bodies as scalar fields: negative inside, zero on the surface, about a distance near it.
+"""Implicit bodies, and with them the cavity of the BioTac's skin and its core.
 
-The shapes of an open BioTac: the cavity of its skin and its core, from published dimensions.
+A body is a scalar field: negative inside, zero on the surface, and near it about the distance.
 
-Numbers marked [M] were measured on the public mesh of NVlabs/biotac_sim (sections, fitted circles,
-extents), those marked [T] come from the electrode table in docs/conventions.md. Everything is in
-the sensor frame, in metres, unpressurised.
+The shapes are made from published dimensions. Numbers marked [M] were measured on the public mesh
+of NVlabs/biotac_sim (sections, fitted circles, extents), those marked [T] come from the electrode
+table in docs/conventions.md. Everything is in the sensor frame, in metres, unpressurised.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ def softplus(x: Floats, width: float) -> Value:
 
 
 def rounded(a: Value, b: Value, radius: float) -> Value:
-    """What two bodies have in common, the edge between them rounded.
+    """Intersection of two bodies with a rounded edge.
 
-    At a right angle the edge becomes a circle of the radius; at another one an ellipse. Surfaces
-    further than the radius from the edge stay what they are.
+    At a right angle the edge becomes a circle of that radius, else an ellipse. Surfaces further
+    than the radius from the edge do not change.
     """
     u, v = np.maximum(a[0] + radius, 0.0), np.maximum(b[0] + radius, 0.0)
     length = np.hypot(u, v)
@@ -44,14 +44,14 @@ def rounded(a: Value, b: Value, radius: float) -> Value:
 
 
 def offset(a: Value, distance: float) -> Value:
-    """The body grown by a distance."""
+    """A body grown by a distance."""
     return a[0] - distance, a[1]
 
 
 def plane(points: Floats, normal: tuple[float, float, float], distance: float) -> Value:
     """Half-space behind a plane: normal . x <= distance."""
     gradient = np.broadcast_to(np.array(normal, np.float64), points.shape)
-    # Not a matrix product: its last bit may depend on the number of threads, and so would hashes.
+    # Not a matrix product, whose last bit may depend on the number of threads: meshes are hashed.
     along = points[:, 0] * normal[0] + points[:, 1] * normal[1] + points[:, 2] * normal[2]
     return along - distance, gradient
 
@@ -66,10 +66,10 @@ def project(field: Field, points: Floats, *, steps: int = 6) -> Floats:
 
 
 def cast(field: Field, start: Floats, direction: Floats, *, reach: float) -> Floats:
-    """Points of the surface on rays from inside: bisection, then Newton kept within the bracket.
+    """Intersect rays from inside with the surface: bisection, then bracketed Newton iterations.
 
     Args:
-        field: The body; along each ray it is left only once.
+        field: The body; each ray leaves it only once.
         start: Points inside [m], shape (N, 3).
         direction: Unit vectors, shape (N, 3).
         reach: Length within which each ray leaves the body [m].
@@ -94,8 +94,8 @@ def cast(field: Field, start: Floats, direction: Floats, *, reach: float) -> Flo
 def nearest(field: Field, points: Floats, *, steps: int = 15) -> Floats:
     """Nearest points of the surface to points not far from it, shape (N, 3).
 
-    Alternates a Newton step onto the surface with the tangential part of the way back to the point,
-    which is at rest only where that way is normal to the surface.
+    Alternates Newton steps onto the surface with the tangential part of the vector to the point; it
+    comes to rest where that vector is normal to the surface.
     """
     foot = project(field, points, steps=3)
     for _ in range(steps):

@@ -1,9 +1,4 @@
-"""A solid mesh with named surfaces: what the solver needs to know of geometry.
-
-A solid mesh grown from a surface: columns of elements between an inner and an outer surface.
-
-A fingertip as the solver sees it: the skin's mesh and the rigid core inside.
-"""
+"""The skin as a solid mesh with named surfaces, its extrusion, and the geometry of a fingertip."""
 
 from __future__ import annotations
 
@@ -40,7 +35,7 @@ class SolidMesh:
         fixed: Ids of the nodes held by nail and clamp.
         mirror: mirror[i] is the node at the mirror image (y -> -y) of node i; empty if the mesh is
             not mirror-symmetric.
-        name: For people.
+        name: Shown to users.
     """
 
     nodes: Floats
@@ -55,7 +50,7 @@ class SolidMesh:
 
     @cached_property
     def sha256(self) -> bytes:
-        """Digest of everything that a solution depends on, 32 bytes."""
+        """Digest of all that a solution depends on, 32 bytes."""
         digest = hashlib.sha256()
         for array in (self.nodes, self.elements, self.outer_faces, self.inner_faces, self.fixed):
             digest.update(str((array.dtype.str, array.shape)).encode())
@@ -100,10 +95,10 @@ def extrude(
         layers: Elements through the thickness, at least 1.
         fixed_columns: Columns whose *outer* node is held by nail or clamp.
         mirror_columns: Column at the mirror image y -> -y of each column, or empty.
-        name: For people.
+        name: Shown to users.
 
     Returns:
-        The solid; `check_mesh` says whether it is a good one.
+        The solid; `check_mesh` says whether it can be simulated.
     """
     if layers < 1:
         raise ValueError(f"layers = {layers}: at least one is needed")
@@ -133,9 +128,9 @@ def extrude(
     )
 
 
-# What the builders take. Thinner skins than these lose their meaning, thicker ones fold at the
-# proximal edge; finer meshes are beyond a direct solver, coarser ones miss the shape.
-LIMITS = {"thickness_m": (0.5e-3, 3.0e-3), "edge_m": (0.25e-3, 1.5e-3), "layers": (1, 6)}
+# Arguments that the mesh builders accept. Thinner skins are not realistic, thicker ones fold at the
+# proximal edge; finer meshes are too large for a direct solver, coarser ones miss the shape.
+BUILDER_LIMITS = {"thickness_m": (0.5e-3, 3.0e-3), "edge_m": (0.25e-3, 1.5e-3), "layers": (1, 6)}
 
 
 @dataclass(frozen=True)
@@ -147,13 +142,13 @@ class FingertipGeometry:
 
 
 def check_limits(**arguments: float) -> None:
-    """Refuse arguments of a builder that are not finite or out of `LIMITS`.
+    """Refuse arguments of a builder that are not finite or outside `BUILDER_LIMITS`.
 
     Raises:
         ConfigError: Names the argument and its limits.
     """
     for name, value in arguments.items():
-        low, high = LIMITS[name]
+        low, high = BUILDER_LIMITS[name]
         if not low <= value <= high:
             raise ConfigError(
                 f"{name} = {value} is not within [{low:g}, {high:g}]",

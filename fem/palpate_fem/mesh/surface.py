@@ -53,7 +53,7 @@ def node_normals(points: Floats, faces: Ints) -> Floats:
     """Unit normals at the nodes: mean of the adjacent faces weighted with their angle there.
 
     The angle as weight makes the normal independent of how a flat region is cut into faces, and is
-    the one for which "in front of or behind the nearest node" is right (Baerentzen, Aanaes 2005).
+    gives the right sign of the distance at a node (Baerentzen, Aanaes 2005).
 
     Returns:
         Normals, shape (V, 3); zero for a node without a face.
