@@ -104,9 +104,8 @@ def boundary(tets: Ints, points: Floats) -> Ints:
     return np.ascontiguousarray(faces[np.sort(index[times == 1])], np.int32)
 
 
-TriangleSurface = tuple[
-    Floats, Ints
-]  # vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3)
+# Vertices [m], shape (P, 3), all in use; triangles, shape (Q, 3).
+TriangleSurface = tuple[Floats, Ints]
 
 SKIN = Path("meshes/biotac/int_ext_skin/int_ext_skin_combined_ftw.tet")
 PARTS = Path("meshes/biotac/bc/top_side_core_bc.obj")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -36,18 +36,19 @@ class UnsafePivotError(ArithmeticError):
 
 
 @wp.kernel
+@no_type_check  # Warp's annotations are not types
 def extend_add(
     # Child: its complement, ``size`` columns one after the other, and their places in the parent.
     size: int,
-    share: wp.array(dtype=Any),  # type: ignore[valid-type]
-    place: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    share: wp.array(dtype=Any),
+    place: wp.array(dtype=wp.int32),
     # Parent: unknowns that it eliminates, unknowns of its border.
     own: int,
     border: int,
     # Out, column after column; only lower triangles are read and written:
-    lower_out: wp.array(dtype=Any),  # type: ignore[valid-type]
-    below_out: wp.array(dtype=Any),  # type: ignore[valid-type]
-    share_out: wp.array(dtype=Any),  # type: ignore[valid-type]
+    lower_out: wp.array(dtype=Any),
+    below_out: wp.array(dtype=Any),
+    share_out: wp.array(dtype=Any),
 ) -> None:
     """Add one column of a child's Schur complement to its parent's front."""
     j = wp.tid()
