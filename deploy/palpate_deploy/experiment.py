@@ -205,7 +205,7 @@ class FemStore:
 
     def start_pose(self, name: str) -> Floats:
         """First pose of a trajectory's path."""
-        return self._store.summary(name).path[0]
+        return np.asarray(self._store.summary(name).path[0])
 
 
 @dataclass(frozen=True, slots=True)

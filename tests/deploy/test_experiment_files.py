@@ -19,8 +19,8 @@ from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, read_experiment, read_mixed
-from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.processing import process
 from palpate_training.datasets.trials import (
     RawTrial,
@@ -30,7 +30,13 @@ from palpate_training.datasets.trials import (
     write_trials,
 )
 from palpate_training.experiment import stand_in_arm as stand_in
-from palpate_training.experiment.plan import Motion, Plan, Station, Trajectory, make_plan
+from palpate_training.experiment.plan import (
+    ArmBase,
+    ArmMotion,
+    PlannedTrajectory,
+    RobotPlan,
+    make_plan,
+)
 from palpate_training.experiment.trajectory_file import write_trajectories
 from palpate_training.experiment.virtual_testbed import perform
 
@@ -61,11 +67,11 @@ def fingertip() -> StoredFingertip:
     return sample_fingertip()
 
 
-def trajectories(fingertip: StoredFingertip) -> list[Trajectory]:
+def trajectories(fingertip: StoredFingertip) -> list[PlannedTrajectory]:
     """Where the made-up simulation presses: side by side, along z."""
     start = sample_trajectory(fingertip, steps=1).path[0, :3]
     return [
-        Trajectory(
+        PlannedTrajectory(
             name,
             "sphere_medium",
             "left",
@@ -79,12 +85,12 @@ def trajectories(fingertip: StoredFingertip) -> list[Trajectory]:
 
 
 @pytest.fixture(scope="module")
-def plan(fingertip: StoredFingertip) -> Plan:
-    made, _ = make_plan(trajectories(fingertip), {"left": Station(stand_in.sensor_robot("left"))})
+def plan(fingertip: StoredFingertip) -> RobotPlan:
+    made, _ = make_plan(trajectories(fingertip), {"left": ArmBase(stand_in.sensor_robot("left"))})
     return made
 
 
-def executed(motion: Motion, *, newton_per_m: float, seed: int = 0, unit: str = "u") -> RawTrial:
+def executed(motion: ArmMotion, *, newton_per_m: float, seed: int = 0, unit: str = "u") -> RawTrial:
     """A press on a spring, as the testbed records it, thinned out."""
     item = motion.trajectory
     travel = np.linspace(0.0, DEPTH_M, 5)
@@ -110,7 +116,7 @@ def executed(motion: Motion, *, newton_per_m: float, seed: int = 0, unit: str = 
 
 
 @pytest.fixture(scope="module")
-def trials(plan: Plan) -> list[RawTrial]:
+def trials(plan: RobotPlan) -> list[RawTrial]:
     """Two presses, and one that misses the finger."""
     strength = (1e4, 2e4, 100.0)
     return [
@@ -153,7 +159,7 @@ def assert_rows(data: ExperimentDataset, expected: Sequence[TrialRows], *, atol:
 
 
 def test_from_plan_to_data_set_by_commands(
-    plan: Plan, trials: list[RawTrial], tmp_path: Path
+    plan: RobotPlan, trials: list[RawTrial], tmp_path: Path
 ) -> None:
     """The rows are those of the trials as they were before any file."""
     planned = write_trajectories(plan, tmp_path / "plan.jsonl")
@@ -179,7 +185,7 @@ def test_from_plan_to_data_set_by_commands(
 
 
 def test_process_takes_several_files_and_tells_people(
-    plan: Plan, trials: list[RawTrial], trials_file: Path, tmp_path: Path
+    plan: RobotPlan, trials: list[RawTrial], trials_file: Path, tmp_path: Path
 ) -> None:
     other = [executed(plan.motions[0], newton_per_m=1.5e4, seed=9, unit="v")]
     write_trials(tmp_path / "v.h5", other, replace(PROVENANCE, licence="mine"))

@@ -22,7 +22,7 @@ from palpate_fem.store.writer import StoreWriter
 from palpate_fem.trajectory import Campaign
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.plan import APPROACH_M
-from palpate_training.experiment.registration import Registration, write_registrations
+from palpate_training.experiment.registration import ArmRegistration, write_registrations
 from palpate_training.experiment.trajectory_file import read_trajectories
 
 
@@ -46,7 +46,7 @@ def empty(fingertip: StoredFingertip, tmp_path: Path) -> Path:
 def registration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("registration") / "r.json"
     found = {
-        side: Registration(stand_in.sensor_robot(side), ("a", "b", "c"), np.zeros(3), 1)
+        side: ArmRegistration(stand_in.sensor_robot(side), ("a", "b", "c"), np.zeros(3), 1)
         for side in stand_in.SIDES
     }
     return write_registrations(path, found)
@@ -85,7 +85,7 @@ def test_plan_is_the_papers_on_the_simulated_skin(
         assert item.arm == ("left" if item.target[1] >= 0 else "right")
         assert motion.joints is not None
     assert found["arms"] == {
-        arm: sum(m.trajectory.arm == arm for m in plan.motions) for arm in plan.stations
+        arm: sum(m.trajectory.arm == arm for m in plan.motions) for arm in plan.bases
     }
 
 

@@ -27,7 +27,7 @@ from palpate_training.experiment.generate.pipeline import (
     MIXED,
     STORE,
     TRIALS,
-    Generated,
+    GeneratedExperiment,
     generate,
     provenance_sha256,
 )
@@ -56,18 +56,18 @@ def specimens() -> tuple[FemSpecimen, ...]:
     )
 
 
-def run(folder: Path, *, ray: str | None = None) -> Generated:
+def run(folder: Path, *, ray: str | None = None) -> GeneratedExperiment:
     done = generate(folder, SPEC, specimens(), FemSimulator(), workers=1, ray=ray)
     assert done is not None
     return done
 
 
 @pytest.fixture(scope="module")
-def generated(tmp_path_factory: pytest.TempPathFactory) -> Generated:
+def generated(tmp_path_factory: pytest.TempPathFactory) -> GeneratedExperiment:
     return run(tmp_path_factory.mktemp("twin") / "one")
 
 
-def test_both_data_sets_hold_what_was_executed(generated: Generated) -> None:
+def test_both_data_sets_hold_what_was_executed(generated: GeneratedExperiment) -> None:
     experiment = read_experiment(generated.folder / EXPERIMENT)
     mixed = read_mixed(generated.folder / MIXED)
     assert experiment.unit_names == ("biotac-1", "biotac-2")
@@ -90,7 +90,7 @@ def test_both_data_sets_hold_what_was_executed(generated: Generated) -> None:
     assert len(mixed.mesh.subset) == 128
 
 
-def test_a_unit_that_stands_wrong_is_pressed_deeper(generated: Generated) -> None:
+def test_a_unit_that_stands_wrong_is_pressed_deeper(generated: GeneratedExperiment) -> None:
     data = generated.data.experiment
     largest = [np.linalg.norm(data.force[data.row_unit == unit], axis=1).max() for unit in range(2)]
     assert largest[0] > 1.02 * largest[1]
@@ -101,7 +101,7 @@ def test_a_unit_that_stands_wrong_is_pressed_deeper(generated: Generated) -> Non
     assert abs(last[0] - last[1]) < 0.15e-3  # both believe to have gone as far
 
 
-def test_rows_carry_the_digest_of_all_that_decides_them(generated: Generated) -> None:
+def test_rows_carry_the_digest_of_all_that_decides_them(generated: GeneratedExperiment) -> None:
     key = SimulationStore.open(generated.folder / STORE).fingertip().key
     digest = provenance_sha256(SPEC, specimens(), key)
     assert generated.data.mixed.experiment.provenance.input_sha256 == digest
@@ -110,13 +110,13 @@ def test_rows_carry_the_digest_of_all_that_decides_them(generated: Generated) ->
 
 
 @pytest.fixture
-def again(generated: Generated) -> Iterator[Generated]:
+def again(generated: GeneratedExperiment) -> Iterator[GeneratedExperiment]:
     """The same folder; what a test damages is made again."""
     yield generated
     run(generated.folder)
 
 
-def test_a_killed_run_goes_on_with_the_same_rows(again: Generated) -> None:
+def test_a_killed_run_goes_on_with_the_same_rows(again: GeneratedExperiment) -> None:
     before = again.data.experiment
     trial = next((again.folder / TRIALS).glob("*normal.npz"))
     kept = next((again.folder / TRIALS).glob("*angled-0.npz"))
@@ -131,7 +131,7 @@ def test_a_killed_run_goes_on_with_the_same_rows(again: Generated) -> None:
     assert (again.folder / EXPERIMENT).exists()
 
 
-def test_a_cluster_gives_the_same_rows(generated: Generated, tmp_path: Path) -> None:
+def test_a_cluster_gives_the_same_rows(generated: GeneratedExperiment, tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="needs palpate[cluster]")
     there = run(tmp_path / "cluster", ray="local").data
     here = generated.data
@@ -140,14 +140,16 @@ def test_a_cluster_gives_the_same_rows(generated: Generated, tmp_path: Path) -> 
     assert there.experiment.trajectories == here.experiment.trajectories
 
 
-def test_another_experiment_does_not_go_into_the_same_folder(generated: Generated) -> None:
+def test_another_experiment_does_not_go_into_the_same_folder(
+    generated: GeneratedExperiment,
+) -> None:
     with pytest.raises(ConfigError, match="seed 3 is not 0"):
         generate(generated.folder, replace(SPEC, seed=3), specimens(), FemSimulator(), workers=1)
     with pytest.raises(ConfigError, match="members"):
         generate(generated.folder, SPEC, specimens()[:1], FemSimulator(), workers=1)
 
 
-def test_damaged_files_are_named(again: Generated) -> None:
+def test_damaged_files_are_named(again: GeneratedExperiment) -> None:
     trial = next((again.folder / TRIALS).glob("*normal.npz"))
     whole = trial.read_bytes()
     trial.write_bytes(whole[: len(whole) // 2])
@@ -227,7 +229,7 @@ def test_ray_that_is_not_there_is_said() -> None:
 
 
 def test_sample_is_small_and_playable_and_the_rest_lacks_it(
-    generated: Generated, tmp_path: Path
+    generated: GeneratedExperiment, tmp_path: Path
 ) -> None:
     """One normal and one angled press: here that is all there is, so nothing is left."""
     with pytest.raises(DatasetError):

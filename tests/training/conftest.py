@@ -9,8 +9,9 @@ import pytest
 
 from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed
 from palpate_training.datasets.basis import fit_basis
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset, SkinMesh
-from palpate_training.datasets.features import FeatureDataset, Provenance
+from palpate_training.datasets.features import FeatureDataset
 from palpate_training.datasets.trials import MixedRows, TrialHeader, TrialRows
 
 TRIALS = [

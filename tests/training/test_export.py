@@ -14,8 +14,7 @@ import torch
 
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
-from palpate_training.datasets.features import FeatureDataset
-from palpate_training.datasets.features_file import write_dataset
+from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.learning import export
 from palpate_training.learning.export import (
     check_parity,
@@ -23,12 +22,12 @@ from palpate_training.learning.export import (
     features_scale,
     onnx_bytes,
 )
-from palpate_training.learning.fit import FeaturesConfig
+from palpate_training.learning.fit import FeaturesFitConfig
 from palpate_training.learning.networks import FeaturesGraph, Mlp
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
-QUICK = FeaturesConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
+QUICK = FeaturesFitConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
 
 
 def make_graph(*, location: bool = True) -> FeaturesGraph:

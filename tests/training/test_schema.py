@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.features import FeatureDataset
-from palpate_training.datasets.features_file import open_dataset, write_dataset
+from palpate_training.datasets.features import FeatureDataset, open_dataset, write_dataset
 
 MakeData = Callable[..., FeatureDataset]
 

@@ -13,14 +13,14 @@ from palpate.errors import DatasetError
 from palpate_training.datasets.features import cut_into_blocks
 from palpate_training.learning import splits
 from palpate_training.learning.splits import (
-    Split,
+    RowSplit,
     by_group,
     contiguous_folds,
     unseen_sensor,
 )
 
 
-def check(split: Split, rows: int) -> None:
+def check(split: RowSplit, rows: int) -> None:
     """Disjoint and, with the guard, exhaustive."""
     parts = [split.train, split.validation, split.test, split.guard]
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(rows))
@@ -84,7 +84,7 @@ def test_unseen_sensor() -> None:
     assert len(split.validation)
 
 
-def by_block(split: Split, block: splits.Labels) -> dict[str, list[int]]:
+def by_block(split: RowSplit, block: splits.Labels) -> dict[str, list[int]]:
     """Blocks of each side; a block with rows in the guard is listed with its side, too."""
     sides = ("train", "validation", "test", "guard")
     return {side: np.unique(block[getattr(split, side)]).tolist() for side in sides}

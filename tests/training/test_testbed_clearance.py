@@ -11,7 +11,7 @@ import pytest
 from palpate.errors import ConfigError
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.clearance import (
-    ErrorModel,
+    RegistrationErrorModel,
     RegistrationErrors,
     link_sensitivity,
     pad_poses,
@@ -19,20 +19,22 @@ from palpate_training.experiment.clearance import (
     plate_holes,
     simulate_registrations,
 )
-from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.registration import register
 
 Floats = npt.NDArray[np.float64]
-NONE = ErrorModel(0.0, 0.0, 0.0, 0.0, 0.0)
+NONE = RegistrationErrorModel(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def left(tmp_path_factory: pytest.TempPathFactory) -> Arm:
+def left(tmp_path_factory: pytest.TempPathFactory) -> ArmKinematics:
     path = stand_in.write_arm_urdf("left", tmp_path_factory.mktemp("arm") / "left.urdf")
-    return Arm.from_urdf(path, stand_in.FLANGE, stand_in.tool())
+    return ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
 
 
-def simulate(arm: Arm, model: ErrorModel, draws: int = 100, seed: int = 0) -> RegistrationErrors:
+def simulate(
+    arm: ArmKinematics, model: RegistrationErrorModel, draws: int = 100, seed: int = 0
+) -> RegistrationErrors:
     return simulate_registrations(
         arm,
         stand_in.sensor_robot("left"),
@@ -57,19 +59,19 @@ def test_poses_on_the_pad_are_on_the_side_of_their_arm() -> None:
     assert (left[:, 2] < 0).all()
 
 
-def test_without_errors_there_is_none(left: Arm) -> None:
+def test_without_errors_there_is_none(left: ArmKinematics) -> None:
     found = simulate(left, NONE, draws=3)
     assert np.abs(found.error).max() < 1e-9
     assert found.residual_m.max() < 1e-9
 
 
-def test_links_move_the_tip_as_a_wrong_urdf_does(left: Arm, tmp_path: Path) -> None:
+def test_links_move_the_tip_as_a_wrong_urdf_does(left: ArmKinematics, tmp_path: Path) -> None:
     """The linear sensitivity against an arm that is built wrong."""
     random = np.random.default_rng(0)
     errors = random.normal(size=(7, 6)) * ([0.2e-3] * 3 + [1e-3] * 3)
     path = tmp_path / "wrong.urdf"
     path.write_text(stand_in.arm_urdf("left", errors))
-    wrong = Arm.from_urdf(path, stand_in.FLANGE, stand_in.tool())
+    wrong = ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
     joints = random.uniform(left.lower, left.upper, (6, 7))
     moved = wrong.tip(joints)[0] - left.tip(joints)[0]
     assert np.linalg.norm(moved, axis=1).min() > 0.1e-3
@@ -78,10 +80,10 @@ def test_links_move_the_tip_as_a_wrong_urdf_does(left: Arm, tmp_path: Path) -> N
 
 
 def test_a_wrong_arm_that_is_led_into_the_holes_is_off_as_the_model_says(
-    left: Arm, tmp_path: Path
+    left: ArmKinematics, tmp_path: Path
 ) -> None:
     """The whole procedure by hand, with an arm that is built wrong, against the Monte Carlo."""
-    model = ErrorModel(0.0, 0.0, 0.0, 0.2e-3, 1.5e-3)
+    model = RegistrationErrorModel(0.0, 0.0, 0.0, 0.2e-3, 1.5e-3)
     draws = simulate(left, model, draws=1, seed=5)
     random = np.random.default_rng(5)
     errors = (random.normal(size=(1, 42)) * np.tile(np.repeat([0.2e-3, 1.5e-3], 3), 7)).reshape(
@@ -89,7 +91,7 @@ def test_a_wrong_arm_that_is_led_into_the_holes_is_off_as_the_model_says(
     )
     path = tmp_path / "wrong.urdf"
     path.write_text(stand_in.arm_urdf("left", errors))
-    wrong = Arm.from_urdf(path, stand_in.FLANGE, stand_in.tool())
+    wrong = ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
     truth = stand_in.sensor_robot("left")
 
     def believed(poses: Floats) -> Floats:
@@ -109,8 +111,8 @@ def test_a_wrong_arm_that_is_led_into_the_holes_is_off_as_the_model_says(
     np.testing.assert_allclose(draws.error[0, ::15], error, atol=0.06e-3)
 
 
-def test_clearance_alone_is_a_tenth_of_a_millimetre(left: Arm) -> None:
-    found = simulate(left, ErrorModel(link_sd_m=0.0, joint_sd_rad=0.0))
+def test_clearance_alone_is_a_tenth_of_a_millimetre(left: ArmKinematics) -> None:
+    found = simulate(left, RegistrationErrorModel(link_sd_m=0.0, joint_sd_rad=0.0))
     quantiles = found.quantiles_m()
     assert 0.05e-3 < quantiles[0.5] < 0.12e-3
     assert quantiles[0.95] < 0.25e-3
@@ -118,13 +120,13 @@ def test_clearance_alone_is_a_tenth_of_a_millimetre(left: Arm) -> None:
     # over to the fourth
     assert found.residual_m.mean() < 0.15e-3
     assert found.residual_m.max() < 3 * 0.15e-3 + 0.1e-3
-    doubled = simulate(left, ErrorModel(0.6e-3, link_sd_m=0.0, joint_sd_rad=0.0))
+    doubled = simulate(left, RegistrationErrorModel(0.6e-3, link_sd_m=0.0, joint_sd_rad=0.0))
     assert 1.7 < doubled.residual_m.mean() / found.residual_m.mean() < 2.1
 
 
-def test_with_the_arm_it_is_the_papers_millimetre(left: Arm) -> None:
+def test_with_the_arm_it_is_the_papers_millimetre(left: ArmKinematics) -> None:
     """Paper: 0.5 to 1.5 mm over all poses. Ours: typical and worst pose of a registration."""
-    found = simulate(left, ErrorModel(), draws=200)
+    found = simulate(left, RegistrationErrorModel(), draws=200)
     length = np.linalg.norm(found.error, axis=-1)
     assert 0.5e-3 < np.median(length) < 0.7e-3
     assert 0.5e-3 < np.median(np.median(length, axis=1)) < 0.7e-3
@@ -135,16 +137,18 @@ def test_with_the_arm_it_is_the_papers_millimetre(left: Arm) -> None:
     assert 0.2e-3 < np.median(shared) < np.median(length)
 
 
-def test_draws_are_those_of_their_seed(left: Arm) -> None:
-    one, same, other = (simulate(left, ErrorModel(), draws=3, seed=s).error for s in (1, 1, 2))
+def test_draws_are_those_of_their_seed(left: ArmKinematics) -> None:
+    one, same, other = (
+        simulate(left, RegistrationErrorModel(), draws=3, seed=s).error for s in (1, 1, 2)
+    )
     np.testing.assert_array_equal(one, same)
     assert np.abs(one - other).max() > 1e-5
 
 
-def test_poses_out_of_reach_and_senseless_models_are_refused(left: Arm) -> None:
+def test_poses_out_of_reach_and_senseless_models_are_refused(left: ArmKinematics) -> None:
     away = pad_poses(1.0)[:1]
     away[0, 0] += 2.0
     with pytest.raises(ConfigError, match="does not reach pose"):
         simulate_registrations(left, stand_in.sensor_robot("left"), away, draws=1)
     with pytest.raises(ConfigError, match="clearance_m"):
-        ErrorModel(clearance_m=-1e-3)
+        RegistrationErrorModel(clearance_m=-1e-3)

@@ -17,8 +17,8 @@ from palpate_training.cli import data_app
 from palpate_training.datasets.trials import RawTrial, read_contents, read_trials
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.clearance import plate_holes
-from palpate_training.experiment.kinematics import Arm
-from palpate_training.experiment.plan import Plan, commanded_travel
+from palpate_training.experiment.kinematics import ArmKinematics
+from palpate_training.experiment.plan import RobotPlan, commanded_travel
 from palpate_training.experiment.registration import COLUMNS, read_registrations
 
 sys.path.append(str(Path(__file__).parent))
@@ -127,7 +127,7 @@ def test_a_registration_that_is_no_pose_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def record(plan: Plan, played: list[RawTrial], tmp_path: Path) -> Path:
+def record(plan: RobotPlan, played: list[RawTrial], tmp_path: Path) -> Path:
     recorded: Path = write(streams_of([thin(one) for one in played], plan), tmp_path / "r.mcap")
     return recorded
 
@@ -171,7 +171,7 @@ def test_inspect_knows_trials(record: Path, plan_file: Path, tmp_path: Path) -> 
 
 
 def test_ingest_takes_starts_of_trajectories(
-    record: Path, plan: Plan, plan_file: Path, tmp_path: Path
+    record: Path, plan: RobotPlan, plan_file: Path, tmp_path: Path
 ) -> None:
     times, out = tmp_path / "starts.csv", tmp_path / "t.h5"
     second = plan.motions[1]
@@ -193,7 +193,7 @@ def test_ingest_takes_starts_of_trajectories(
 
 
 def test_ingest_takes_joint_angles(
-    plan: Plan, plan_file: Path, played: list[RawTrial], arm: Arm, tmp_path: Path
+    plan: RobotPlan, plan_file: Path, played: list[RawTrial], arm: ArmKinematics, tmp_path: Path
 ) -> None:
     streams = streams_of([thin(one) for one in played], plan)
     streams["pose"] = []

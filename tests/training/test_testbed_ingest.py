@@ -16,8 +16,8 @@ from palpate.rigid import Transform
 from palpate_training.datasets.trials import RawTrial
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.executed_plan import JointLog, ingest_experiment, read_joint_log
-from palpate_training.experiment.kinematics import Arm
-from palpate_training.experiment.plan import Plan, commanded_travel
+from palpate_training.experiment.kinematics import ArmKinematics
+from palpate_training.experiment.plan import RobotPlan, commanded_travel
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")
@@ -40,7 +40,7 @@ def assert_same(read: RawTrial, written: RawTrial) -> None:
 
 
 def test_a_performance_comes_back_from_its_record(
-    plan: Plan, plan_file: Path, played: list[RawTrial], tmp_path: Path
+    plan: RobotPlan, plan_file: Path, played: list[RawTrial], tmp_path: Path
 ) -> None:
     trials = [played[0], thin(played[1])]
     record = write(streams_of(trials, plan), tmp_path / "r.mcap")
@@ -55,7 +55,7 @@ def test_a_performance_comes_back_from_its_record(
 
 
 def test_trajectories_have_starts_of_their_own(
-    plan: Plan, plan_file: Path, played: list[RawTrial], tmp_path: Path
+    plan: RobotPlan, plan_file: Path, played: list[RawTrial], tmp_path: Path
 ) -> None:
     record = write(streams_of([thin(t) for t in played], plan), tmp_path / "r.mcap")
     second = plan.motions[1]
@@ -75,7 +75,12 @@ def test_trajectories_have_starts_of_their_own(
 
 @pytest.mark.parametrize("own", [False, True])
 def test_joints_stand_for_poses(
-    plan: Plan, plan_file: Path, played: list[RawTrial], arm: Arm, tmp_path: Path, own: bool
+    plan: RobotPlan,
+    plan_file: Path,
+    played: list[RawTrial],
+    arm: ArmKinematics,
+    tmp_path: Path,
+    own: bool,
 ) -> None:
     streams = streams_of([thin(t) for t in played], plan)
     streams[POSE.name] = []
@@ -130,7 +135,7 @@ def test_joints_stand_for_poses(
     ],
 )
 def test_a_joint_log_that_is_none_is_refused(
-    arm: Arm, tmp_path: Path, text: str, match: str
+    arm: ArmKinematics, tmp_path: Path, text: str, match: str
 ) -> None:
     path = tmp_path / "log.csv"
     path.write_text(text)
@@ -141,7 +146,7 @@ def test_a_joint_log_that_is_none_is_refused(
 
 
 def test_joints_outside_their_limits_name_the_log(
-    plan: Plan, plan_file: Path, played: list[RawTrial], arm: Arm, tmp_path: Path
+    plan: RobotPlan, plan_file: Path, played: list[RawTrial], arm: ArmKinematics, tmp_path: Path
 ) -> None:
     record = write(streams_of([thin(t) for t in played], plan), tmp_path / "r.mcap")
     log = tmp_path / "left.csv"

@@ -17,7 +17,7 @@ from palpate.errors import DatasetError, RecordingError
 from palpate.messages import ElectrodeFrame, IndenterPoseFrame, SensorType, WrenchFrame
 from palpate_training.datasets.trials import RawTrial
 from palpate_training.experiment.executed_plan import ingest_experiment
-from palpate_training.experiment.plan import Plan
+from palpate_training.experiment.plan import RobotPlan
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")
@@ -101,7 +101,7 @@ def exchange(streams: Streams) -> None:
     ],
 )
 def test_what_a_record_lacks_is_named(
-    plan: Plan,
+    plan: RobotPlan,
     plan_file: Path,
     played: list[RawTrial],
     tmp_path: Path,
@@ -126,7 +126,7 @@ def test_what_a_record_lacks_is_named(
     ],
 )
 def test_a_wrong_start_shows(
-    plan: Plan,
+    plan: RobotPlan,
     plan_file: Path,
     played: list[RawTrial],
     tmp_path: Path,
@@ -141,14 +141,14 @@ def test_a_wrong_start_shows(
 
 @pytest.mark.parametrize("increments", [-1, 1])
 def test_a_schedule_that_is_off_by_one_increment_shows(
-    plan: Plan, plan_file: Path, played: list[RawTrial], tmp_path: Path, increments: int
+    plan: RobotPlan, plan_file: Path, played: list[RawTrial], tmp_path: Path, increments: int
 ) -> None:
     """Even where the record goes on before and after, the tip standing still."""
     (trial, _) = (thin(t) for t in played)
     shift_s = -159.97 if increments < 0 else 160.0  # samples where the wrong schedule starts
     edge = trial.tip[0 if increments < 0 else -1]
     rest = replace(trial, time_s=trial.time_s + shift_s, tip=np.tile(edge, (len(trial.tip), 1)))
-    first = Plan(plan.motions[:1], plan.stations)
+    first = RobotPlan(plan.motions[:1], plan.bases)
     streams = streams_of([trial], first)
     for name, extra in streams_of([rest], first).items():
         streams[name] = sorted(streams[name] + extra, key=lambda m: m.stamp.wall_ns)
@@ -166,7 +166,7 @@ def test_a_schedule_that_is_off_by_one_increment_shows(
 
 
 def test_another_sensor_and_a_broken_record_are_named(
-    plan: Plan, plan_file: Path, played: list[RawTrial], tmp_path: Path
+    plan: RobotPlan, plan_file: Path, played: list[RawTrial], tmp_path: Path
 ) -> None:
     record = write(streams_of([thin(t) for t in played], plan), tmp_path / "r.mcap")
     with pytest.raises(DatasetError, match="no stream of sensor 'thumb'"):

@@ -11,7 +11,7 @@ import pytest
 from palpate.errors import ConfigError, MissingExtraError
 from palpate.rigid import Transform, rotation_matrices
 from palpate_training.experiment import stand_in_arm as stand_in
-from palpate_training.experiment.kinematics import ACCURACY_M, Arm
+from palpate_training.experiment.kinematics import ACCURACY_M, ArmKinematics
 from palpate_training.experiment.plan import facing
 
 PLANAR = """<robot name="planar">
@@ -30,19 +30,19 @@ TOOL = Transform(np.eye(3), np.array([0.05, 0.0, -0.02]))
 
 
 @pytest.fixture
-def planar(tmp_path: Path) -> Arm:
+def planar(tmp_path: Path) -> ArmKinematics:
     path = tmp_path / "planar.urdf"
     path.write_text(PLANAR.format(kind="revolute"))
-    return Arm.from_urdf(path, "hand", TOOL)
+    return ArmKinematics.from_urdf(path, "hand", TOOL)
 
 
 @pytest.fixture(params=stand_in.SIDES)
-def seven(request: pytest.FixtureRequest, tmp_path: Path) -> Arm:
+def seven(request: pytest.FixtureRequest, tmp_path: Path) -> ArmKinematics:
     path = stand_in.write_arm_urdf(request.param, tmp_path / "arm.urdf")
-    return Arm.from_urdf(path, stand_in.FLANGE, stand_in.tool())
+    return ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
 
 
-def test_tip_is_where_trigonometry_has_it(planar: Arm) -> None:
+def test_tip_is_where_trigonometry_has_it(planar: ArmKinematics) -> None:
     joints = np.array([[0.0, 0.0], [0.4, -1.1], [-1.9, 0.7]])
     positions, quaternions = planar.tip(joints)
     first, both = joints[:, 0], joints.sum(axis=1)
@@ -61,7 +61,7 @@ def test_tip_is_where_trigonometry_has_it(planar: Arm) -> None:
     assert planar.joint_names == ("j1", "j2")
 
 
-def test_link_frames_turn_with_their_joints(planar: Arm) -> None:
+def test_link_frames_turn_with_their_joints(planar: ArmKinematics) -> None:
     origins, rotations = planar.link_frames([[0.4, -1.1]])
     np.testing.assert_allclose(
         origins[0], [[0, 0, 0.1], [0.3 * np.cos(0.4), 0.3 * np.sin(0.4), 0.1]], atol=1e-15
@@ -71,7 +71,7 @@ def test_link_frames_turn_with_their_joints(planar: Arm) -> None:
     )
 
 
-def test_inverse_is_the_inverse(seven: Arm) -> None:
+def test_inverse_is_the_inverse(seven: ArmKinematics) -> None:
     random = np.random.default_rng(1)
     joints = random.uniform(0.8 * seven.lower, 0.8 * seven.upper, (10, 7))
     poses = np.hstack(seven.tip(joints))
@@ -87,7 +87,7 @@ def test_inverse_is_the_inverse(seven: Arm) -> None:
         )
 
 
-def test_a_path_keeps_the_posture(seven: Arm) -> None:
+def test_a_path_keeps_the_posture(seven: ArmKinematics) -> None:
     start = np.hstack(seven.tip([stand_in.HOME]))[0]
     path = np.tile(start, (61, 1))
     path[:, 2] -= 1e-4 * np.arange(61)
@@ -98,7 +98,7 @@ def test_a_path_keeps_the_posture(seven: Arm) -> None:
     assert (found.joints <= seven.upper).all()
 
 
-def test_what_is_out_of_reach_is_said_and_stays_within_limits(seven: Arm) -> None:
+def test_what_is_out_of_reach_is_said_and_stays_within_limits(seven: ArmKinematics) -> None:
     far = np.array([[0.9, 0, 0.3, *facing([1, 0, 0])]])
     found = seven.solve(far)
     assert not found.reached
@@ -109,7 +109,7 @@ def test_what_is_out_of_reach_is_said_and_stays_within_limits(seven: Arm) -> Non
 
 def test_the_arms_are_mirror_images(tmp_path: Path) -> None:
     left, right = (
-        Arm.from_urdf(stand_in.write_arm_urdf(side, tmp_path / side), stand_in.FLANGE)
+        ArmKinematics.from_urdf(stand_in.write_arm_urdf(side, tmp_path / side), stand_in.FLANGE)
         for side in stand_in.SIDES
     )
     random = np.random.default_rng(2)
@@ -122,7 +122,7 @@ def test_the_arms_are_mirror_images(tmp_path: Path) -> None:
         stand_in.arm_urdf("middle")
 
 
-def test_every_joint_moves_the_tip(seven: Arm) -> None:
+def test_every_joint_moves_the_tip(seven: ArmKinematics) -> None:
     bent = np.full(7, 0.3)
     still = seven.tip([bent])[0]
     moved = seven.tip(bent + 0.1 * np.eye(7))[0]
@@ -140,18 +140,18 @@ def test_every_joint_moves_the_tip(seven: Arm) -> None:
     ],
 )
 def test_joints_that_cannot_be_are_refused(
-    planar: Arm, joints: list[list[float]], match: str
+    planar: ArmKinematics, joints: list[list[float]], match: str
 ) -> None:
     with pytest.raises(ConfigError, match=match):
         planar.tip(joints)
 
 
-def test_limits_have_a_margin_and_can_be_left(planar: Arm) -> None:
+def test_limits_have_a_margin_and_can_be_left(planar: ArmKinematics) -> None:
     planar.tip([[2.0005, 0.0]])
     assert planar.tip([[3.0, 0.0]], check_limits=False)[0][0, 0] < 0
 
 
-def test_poses_to_solve_are_checked(planar: Arm) -> None:
+def test_poses_to_solve_are_checked(planar: ArmKinematics) -> None:
     with pytest.raises(ConfigError, match="shape"):
         planar.solve(np.zeros((0, 7)))
     with pytest.raises(ConfigError, match="pose 0"):
@@ -161,16 +161,16 @@ def test_poses_to_solve_are_checked(planar: Arm) -> None:
 def test_a_file_that_is_no_arm_is_named(tmp_path: Path) -> None:
     path = tmp_path / "robot.urdf"
     with pytest.raises(ConfigError, match=r"robot\.urdf cannot be read"):
-        Arm.from_urdf(path, "hand")
+        ArmKinematics.from_urdf(path, "hand")
     path.write_text("<robot")
     with pytest.raises(ConfigError, match=r"robot\.urdf is not a readable URDF"):
-        Arm.from_urdf(path, "hand")
+        ArmKinematics.from_urdf(path, "hand")
     path.write_text(PLANAR.format(kind="revolute"))
     with pytest.raises(ConfigError, match=r"no frame 'tool0'.*hand"):
-        Arm.from_urdf(path, "tool0")
+        ArmKinematics.from_urdf(path, "tool0")
     path.write_text(PLANAR.format(kind="continuous"))
     with pytest.raises(ConfigError, match="revolute with limits"):
-        Arm.from_urdf(path, "hand")
+        ArmKinematics.from_urdf(path, "hand")
 
 
 def test_without_pinocchio_the_install_line_is_given(
@@ -178,4 +178,4 @@ def test_without_pinocchio_the_install_line_is_given(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pinocchio", None)
     with pytest.raises(MissingExtraError, match=r"palpate\[training\]"):
-        Arm.from_urdf(tmp_path / "any.urdf", "hand")
+        ArmKinematics.from_urdf(tmp_path / "any.urdf", "hand")

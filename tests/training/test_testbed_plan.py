@@ -17,9 +17,9 @@ from palpate.rigid import rotation_matrices
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.kinematics import ACCURACY_M
 from palpate_training.experiment.plan import (
-    Plan,
-    Station,
-    Trajectory,
+    ArmBase,
+    PlannedTrajectory,
+    RobotPlan,
     assign_arm,
     commanded_travel,
     increments_of,
@@ -28,7 +28,7 @@ from palpate_training.experiment.plan import (
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")
-stations, two_arms = fakes.stations, fakes.two_arms
+bases, two_arms = fakes.bases, fakes.two_arms
 trajectory = fakes.trajectory
 
 
@@ -103,17 +103,19 @@ def test_a_trajectory_that_is_none_is_refused(change: dict[str, Any], match: str
         "depth_m": 1e-3,
     }
     with pytest.raises(ConfigError, match=f"a/00/normal.*{match}"):
-        Trajectory(**{**values, **change})
+        PlannedTrajectory(**{**values, **change})
 
 
-def test_joints_bring_the_tip_to_the_commands(two_arms: Plan, stations: dict[str, Station]) -> None:
+def test_joints_bring_the_tip_to_the_commands(
+    two_arms: RobotPlan, bases: dict[str, ArmBase]
+) -> None:
     assert [motion.trajectory.arm for motion in two_arms.motions] == ["left", "right"]
     for motion in two_arms.motions:
-        station = stations[motion.trajectory.arm]
-        assert station.arm is not None
+        base = bases[motion.trajectory.arm]
+        assert base.arm is not None
         assert motion.joints is not None
-        tips, _ = station.arm.tip(motion.joints)
-        missed = station.sensor_robot.apply(tips) - motion.trajectory.poses[:, :3]
+        tips, _ = base.arm.tip(motion.joints)
+        missed = base.sensor_robot.apply(tips) - motion.trajectory.poses[:, :3]
         assert np.linalg.norm(missed, axis=1).max() <= ACCURACY_M
     first, second = two_arms.motions
     assert first.time_s[0] == 0
@@ -121,22 +123,22 @@ def test_joints_bring_the_tip_to_the_commands(two_arms: Plan, stations: dict[str
     assert second.start_s > first.time_s[-1]
 
 
-def test_what_an_arm_cannot_follow_is_eliminated(stations: dict[str, Station]) -> None:
+def test_what_an_arm_cannot_follow_is_eliminated(bases: dict[str, ArmBase]) -> None:
     far = trajectory("far/00/normal", target=(-1.2, 0.0, 0.0))
-    made, eliminated = make_plan([far, trajectory("near/00/normal", depth_m=1e-4)], stations)
+    made, eliminated = make_plan([far, trajectory("near/00/normal", depth_m=1e-4)], bases)
     assert [motion.trajectory.trajectory for motion in made.motions] == ["near/00/normal"]
     assert [item.trajectory for item in eliminated] == ["far/00/normal"]
     assert "misses by" in eliminated[0].reason
-    assert set(made.stations) == {"left"}
+    assert set(made.bases) == {"left"}
     # without kinematics nobody can tell
-    bare = {"left": Station(stand_in.sensor_robot("left"))}
+    bare = {"left": ArmBase(stand_in.sensor_robot("left"))}
     made, eliminated = make_plan([far], bare)
     assert not eliminated
     assert made.motions[0].joints is None
 
 
-def test_plans_that_cannot_be_are_refused(stations: dict[str, Station]) -> None:
+def test_plans_that_cannot_be_are_refused(bases: dict[str, ArmBase]) -> None:
     with pytest.raises(ConfigError, match="planned twice"):
-        make_plan([trajectory(depth_m=1e-4)] * 2, stations)
-    with pytest.raises(ConfigError, match="right arm, which has no station"):
-        make_plan([trajectory(lateral_m=-1e-3)], {"left": stations["left"]})
+        make_plan([trajectory(depth_m=1e-4)] * 2, bases)
+    with pytest.raises(ConfigError, match="right arm, which is not registered"):
+        make_plan([trajectory(lateral_m=-1e-3)], {"left": bases["left"]})

@@ -16,18 +16,18 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_training.experiment import stand_in_arm as stand_in
-from palpate_training.experiment.plan import Plan
+from palpate_training.experiment.plan import RobotPlan
 from palpate_training.experiment.trajectory_file import read_trajectories, write_trajectories
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")
-stations, two_arms = fakes.stations, fakes.two_arms
+bases, two_arms = fakes.bases, fakes.two_arms
 
 PRINTED = 1e-9
 """What is computed again on reading may differ by rounding [m, rad, s]."""
 
 
-def test_a_plan_comes_back_from_its_file(two_arms: Plan, tmp_path: Path) -> None:
+def test_a_plan_comes_back_from_its_file(two_arms: RobotPlan, tmp_path: Path) -> None:
     path = write_trajectories(two_arms, tmp_path / "plan.jsonl")
     assert [p.name for p in tmp_path.iterdir()] == ["plan.jsonl"]
     back = read_trajectories(path)
@@ -42,14 +42,14 @@ def test_a_plan_comes_back_from_its_file(two_arms: Plan, tmp_path: Path) -> None
         assert read.trajectory.depth_m == written.trajectory.depth_m
     for arm in ("left", "right"):
         np.testing.assert_allclose(
-            back.stations[arm].sensor_robot.pose, stand_in.sensor_robot(arm).pose, atol=PRINTED
+            back.bases[arm].sensor_robot.pose, stand_in.sensor_robot(arm).pose, atol=PRINTED
         )
     # the same plan makes the same bytes
     again = write_trajectories(two_arms, tmp_path / "again.jsonl")
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_a_file_says_all_that_a_robot_needs(two_arms: Plan, tmp_path: Path) -> None:
+def test_a_file_says_all_that_a_robot_needs(two_arms: RobotPlan, tmp_path: Path) -> None:
     lines = write_trajectories(two_arms, tmp_path / "p").read_text("utf-8").splitlines()
     header, first = json.loads(lines[0]), json.loads(lines[1])
     assert header["schema"] == "palpate.testbed.trajectories"
@@ -78,7 +78,7 @@ def rewrite(path: Path, change: Change) -> None:
     path.write_bytes(json.dumps(header).encode() + b"\n" + body)
 
 
-def test_rewriting_alone_harms_nothing(two_arms: Plan, tmp_path: Path) -> None:
+def test_rewriting_alone_harms_nothing(two_arms: RobotPlan, tmp_path: Path) -> None:
     path = write_trajectories(two_arms, tmp_path / "plan.jsonl")
     rewrite(path, lambda header, rows: None)
     assert len(read_trajectories(path).motions) == 2
@@ -113,7 +113,7 @@ def test_rewriting_alone_harms_nothing(two_arms: Plan, tmp_path: Path) -> None:
     ],
 )
 def test_a_changed_file_is_refused_by_name(
-    two_arms: Plan, tmp_path: Path, change: Change, match: str
+    two_arms: RobotPlan, tmp_path: Path, change: Change, match: str
 ) -> None:
     path = write_trajectories(two_arms, tmp_path / "plan.jsonl")
     rewrite(path, change)
@@ -121,7 +121,7 @@ def test_a_changed_file_is_refused_by_name(
         read_trajectories(path)
 
 
-def test_a_damaged_file_is_refused(two_arms: Plan, tmp_path: Path) -> None:
+def test_a_damaged_file_is_refused(two_arms: RobotPlan, tmp_path: Path) -> None:
     path = write_trajectories(two_arms, tmp_path / "plan.jsonl")
     content = path.read_bytes()
     for damaged in (content[:-100], content.replace(b"0.2", b"0.3", 1), b"", b"\x00\xff\n"):
@@ -133,7 +133,7 @@ def test_a_damaged_file_is_refused(two_arms: Plan, tmp_path: Path) -> None:
 
 
 def test_an_interrupted_write_leaves_the_old_file(
-    two_arms: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two_arms: RobotPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_trajectories(two_arms, tmp_path / "plan.jsonl")
     before = path.read_bytes()
@@ -143,11 +143,11 @@ def test_an_interrupted_write_leaves_the_old_file(
 
     monkeypatch.setattr(os, "replace", die)
     with pytest.raises(KeyboardInterrupt):
-        write_trajectories(Plan(two_arms.motions[:1], two_arms.stations), path)
+        write_trajectories(RobotPlan(two_arms.motions[:1], two_arms.bases), path)
     assert path.read_bytes() == before
 
 
 def test_an_empty_plan_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="empty"):
-        write_trajectories(Plan((), {}), tmp_path / "plan.jsonl")
+        write_trajectories(RobotPlan((), {}), tmp_path / "plan.jsonl")
     assert not list(tmp_path.iterdir())

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from palpate_training.datasets.features import FeatureDataset
-from palpate_training.learning.fit import FeaturesConfig, drift, fit_quantity
+from palpate_training.learning.fit import FeaturesFitConfig, drift, fit_quantity
 from palpate_training.learning.networks import Mlp, predict
 from palpate_training.learning.splits import by_group
 
 MakeData = Callable[..., FeatureDataset]
-QUICK = FeaturesConfig(widths=(32, 32), epochs=30, batch_rows=64)
+QUICK = FeaturesFitConfig(widths=(32, 32), epochs=30, batch_rows=64)
 
 
 def test_the_papers_network_has_54915_parameters() -> None:
@@ -59,7 +59,7 @@ def test_patience_stops_and_the_best_weights_are_kept(press_data: MakeData) -> N
     data = press_data(presses=4)
     x, y = data.tared_counts, data.force
     shuffled = np.random.default_rng(0).permutation(y)  # nothing to learn
-    config = FeaturesConfig(widths=(16,), epochs=60, patience=3, batch_rows=64)
+    config = FeaturesFitConfig(widths=(16,), epochs=60, patience=3, batch_rows=64)
     trained = fit_quantity(x, shuffled, (x, y), config=config)
     outcome = trained.outcome
     assert outcome.epochs < 60
@@ -84,4 +84,4 @@ def test_drift_needs_the_baseline(press_data: MakeData) -> None:
     data = press_data(presses=3)
     x, y = data.tared_counts, data.force
     with pytest.raises(ValueError, match="baseline"):
-        fit_quantity(x, y, (x, y), config=FeaturesConfig(drift_sd=0.1))
+        fit_quantity(x, y, (x, y), config=FeaturesFitConfig(drift_sd=0.1))

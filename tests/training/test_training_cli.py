@@ -12,10 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate_training.cli import data_app, train_app
-from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
-from palpate_training.datasets.features_file import write_dataset
+from palpate_training.datasets.features import FeatureDataset, cut_into_blocks, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
-from palpate_training.learning.fit import FeaturesConfig
+from palpate_training.learning.fit import FeaturesFitConfig
 from palpate_training.tasks.force_real import (
     experiment_count,
     run_force_real,
@@ -26,7 +25,7 @@ MakeData = Callable[..., FeatureDataset]
 MAGNITUDE, ANGLE = "force_magnitude_median_n", "force_angle_median_rad"
 TARGET_MAGNITUDE_N = 0.13
 TARGET_ANGLE_RAD = 0.06
-SHORT = FeaturesConfig(epochs=25, batch_rows=512)
+SHORT = FeaturesFitConfig(epochs=25, batch_rows=512)
 SHORT_ALLOWANCE = 1.25
 """What a single, short training may be worse than the mean of five full ones."""
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
@@ -73,7 +72,7 @@ def test_experiment_reports_every_model_beside_the_baselines(
         nonlocal count
         count += 1
 
-    config = FeaturesConfig(widths=(16,), epochs=3, batch_rows=256)
+    config = FeaturesFitConfig(widths=(16,), epochs=3, batch_rows=256)
     report = run_force_real(
         two_sensors, seeds=2, config=config, other_blocks=(20,), draws=50, on_network=tick
     )
@@ -98,7 +97,9 @@ def test_experiment_reports_every_model_beside_the_baselines(
     facts = json.loads((tmp_path / "out" / "force-real.json").read_text())
     assert facts["blocks"] == {"one": 10, "two": 10}
     assert len(facts["results"]) == 4 * 4 + 2 * 3
-    assert len(report.panels[0].truth) == 4000, "every row is tested once"
+    assert len(report.panels[0].truth) == 2 * 4000, "both networks test every row once"
+    shown = next(one for one in report.results if one.model == "MLP").metrics
+    assert f"{shown[MAGNITUDE]:.3f} N, angle {shown[ANGLE]:.3f} rad" in report.panels[0].title
 
 
 def test_published_results_meet_the_target() -> None:

@@ -12,9 +12,9 @@ import pytest
 from palpate.errors import DatasetError
 from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed
 from palpate_training.datasets.basis import subset
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset, content_sha256
 from palpate_training.datasets.export import features
-from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.trials import MixedRows, TrialRows
 
 MakeRows = Callable[..., TrialRows]

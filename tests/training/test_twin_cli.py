@@ -19,8 +19,7 @@ from palpate_training.datasets.experiment import (
     write_mixed,
 )
 from palpate_training.datasets.export import export_published
-from palpate_training.datasets.features import FeatureDataset
-from palpate_training.datasets.features_file import open_dataset, write_dataset
+from palpate_training.datasets.features import FeatureDataset, open_dataset, write_dataset
 from palpate_training.datasets.published import read_published
 
 

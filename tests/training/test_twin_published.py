@@ -14,9 +14,9 @@ import pytest
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.assembly import assemble_experiment
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
 from palpate_training.datasets.export import export_csv, export_published
-from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.published import read_published
 from palpate_training.datasets.trials import TrialRows
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.processing import process
 from palpate_training.datasets.trials import (
     COLUMNS,

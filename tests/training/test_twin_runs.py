@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.published import Floats, Run, Texts, find_runs, name_trajectories
+from palpate_training.datasets.published import (
+    Floats,
+    PublishedRun,
+    Texts,
+    find_runs,
+    name_trajectories,
+)
 
 
 def _rows(force: list[float], z_mm: list[float], kinds: str) -> list[tuple[int, int]]:
@@ -51,10 +57,12 @@ def test_travel_is_along_the_path_and_never_runs_backward() -> None:
     np.testing.assert_allclose(run.start, [1e-3, 2e-3, 3e-3])
 
 
-def _run(x_mm: float, angle_deg: float = 0.0, indenter: str = "a") -> Run:
+def _run(x_mm: float, angle_deg: float = 0.0, indenter: str = "a") -> PublishedRun:
     angle = np.radians(angle_deg)
     direction: Floats = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    return Run(slice(0, 2), indenter, np.array([x_mm * 1e-3, 0.0, 0.0]), direction, np.zeros(2))
+    return PublishedRun(
+        slice(0, 2), indenter, np.array([x_mm * 1e-3, 0.0, 0.0]), direction, np.zeros(2)
+    )
 
 
 def test_the_same_place_and_direction_is_the_same_trajectory() -> None:
@@ -67,7 +75,7 @@ def test_the_same_place_and_direction_is_the_same_trajectory() -> None:
 @pytest.mark.parametrize(
     "other", [_run(2.0), _run(0.0, 30), _run(0.0, indenter="b")], ids=["place", "direction", "tip"]
 )
-def test_another_place_direction_or_indenter_is_another_trajectory(other: Run) -> None:
+def test_another_place_direction_or_indenter_is_another_trajectory(other: PublishedRun) -> None:
     (first,), (second,) = name_trajectories([[_run(0.0)], [other]])
     assert first != second
 

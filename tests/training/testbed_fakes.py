@@ -21,8 +21,14 @@ from palpate.messages import (
 )
 from palpate_training.datasets.trials import RawTrial, TrialHeader
 from palpate_training.experiment import stand_in_arm as stand_in
-from palpate_training.experiment.kinematics import Arm
-from palpate_training.experiment.plan import Plan, Station, Trajectory, assign_arm, make_plan
+from palpate_training.experiment.kinematics import ArmKinematics
+from palpate_training.experiment.plan import (
+    ArmBase,
+    PlannedTrajectory,
+    RobotPlan,
+    assign_arm,
+    make_plan,
+)
 from palpate_training.experiment.trajectory_file import write_trajectories
 from palpate_training.experiment.virtual_testbed import perform
 
@@ -32,32 +38,39 @@ ERROR_M = np.array([0.5e-3, -0.8e-3, 0.3e-3])
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Arm:
+def arm(tmp_path_factory: pytest.TempPathFactory) -> ArmKinematics:
     path = stand_in.write_arm_urdf("left", tmp_path_factory.mktemp("arm") / "left.urdf")
-    return Arm.from_urdf(path, stand_in.FLANGE, stand_in.tool())
+    return ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
 
 
 @pytest.fixture(scope="module")
-def plan(arm: Arm) -> Plan:
+def plan(arm: ArmKinematics) -> RobotPlan:
     direction = np.array([0.0, 0.0, 1.0])
     made, _ = make_plan(
         [
-            Trajectory(f"s/0{i}/normal", "s", "left", np.array([-5e-3 + i * 1e-3, 1e-3, -8e-3]),
-                       direction, 0.0, 0.2e-3)
+            PlannedTrajectory(
+                f"s/0{i}/normal",
+                "s",
+                "left",
+                np.array([-5e-3 + i * 1e-3, 1e-3, -8e-3]),
+                direction,
+                0.0,
+                0.2e-3,
+            )
             for i in range(2)
         ],
-        {"left": Station(stand_in.sensor_robot("left"), arm, stand_in.HOME)},
+        {"left": ArmBase(stand_in.sensor_robot("left"), arm, stand_in.HOME)},
     )  # fmt: skip
     return made
 
 
 @pytest.fixture(scope="module")
-def plan_file(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def plan_file(plan: RobotPlan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_trajectories(plan, tmp_path_factory.mktemp("plan") / "plan.jsonl")
 
 
 @pytest.fixture(scope="module")
-def played(plan: Plan) -> list[RawTrial]:
+def played(plan: RobotPlan) -> list[RawTrial]:
     """The plan on a virtual finger, by a robot that stands wrong."""
     travel = np.linspace(0, 0.2e-3, 3)
     trials = []
@@ -96,7 +109,7 @@ def thin(trial: RawTrial, kept: int = 6) -> RawTrial:
 Streams = dict[str, list[ElectrodeFrame | WrenchFrame | IndenterPoseFrame]]
 
 
-def streams_of(trials: list[RawTrial], plan: Plan) -> Streams:
+def streams_of(trials: list[RawTrial], plan: RobotPlan) -> Streams:
     """What a gateway would have published while the plan ran, stamped by one clock."""
     streams: Streams = {ELECTRODES.name: [], WRENCH.name: [], POSE.name: []}
     sequence = 0
@@ -155,33 +168,33 @@ def trajectory(
     depth_m: float = 3e-3,
     tilt_rad: float = 0.0,
     target: tuple[float, float, float] | None = None,
-) -> Trajectory:
+) -> PlannedTrajectory:
     at = (-5e-3, lateral_m, -8e-3) if target is None else target
     direction = np.array([np.sin(tilt_rad), 0.0, np.cos(tilt_rad)])
-    return Trajectory(
+    return PlannedTrajectory(
         name, name.split("/")[0], assign_arm(at), np.array(at), direction, -0.4e-3, depth_m
     )
 
 
 @pytest.fixture(scope="module")
-def stations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Station]:
+def bases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ArmBase]:
     folder = tmp_path_factory.mktemp("arms")
     made = {}
     for side in stand_in.SIDES:
         path = stand_in.write_arm_urdf(side, folder / f"{side}.urdf")
-        arm = Arm.from_urdf(path, stand_in.FLANGE, stand_in.tool())
-        made[side] = Station(stand_in.sensor_robot(side), arm, stand_in.HOME)
+        arm = ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
+        made[side] = ArmBase(stand_in.sensor_robot(side), arm, stand_in.HOME)
     return made
 
 
 @pytest.fixture
-def two_arms(stations: dict[str, Station]) -> Plan:
+def two_arms(bases: dict[str, ArmBase]) -> RobotPlan:
     made, eliminated = make_plan(
         [
             trajectory("a/00/normal", lateral_m=2e-3, depth_m=0.3e-3),
             trajectory("b/01/angled-0", lateral_m=-2e-3, depth_m=0.2e-3, tilt_rad=np.pi / 6),
         ],
-        stations,
+        bases,
     )
     assert not eliminated
     return made

@@ -20,8 +20,8 @@ from palpate_deploy.cli.options import JsonOption, show_left_out
 
 if TYPE_CHECKING:
     from palpate_training.experiment.generate.measured import Dropped, ProcessedExperiment
-    from palpate_training.experiment.generate.pipeline import Generated
-    from palpate_training.experiment.plan import Eliminated, Plan
+    from palpate_training.experiment.generate.pipeline import GeneratedExperiment
+    from palpate_training.experiment.plan import EliminatedTrajectory, RobotPlan
 
 twin_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -203,7 +203,7 @@ def data_sample(
     )
 
 
-def _generated_summary(result: Generated) -> dict[str, object]:
+def _generated_summary(result: GeneratedExperiment) -> dict[str, object]:
     experiment, mixed = result.data.experiment, result.data.mixed
     return {
         "folder": str(result.folder),
@@ -222,7 +222,7 @@ def _generated_summary(result: Generated) -> dict[str, object]:
     }
 
 
-def _show_generated(result: Generated) -> None:
+def _show_generated(result: GeneratedExperiment) -> None:
     summary = _generated_summary(result)
     dropped = result.data.dropped
     for key, value in summary.items():
@@ -277,7 +277,7 @@ def data_plan(
     from palpate_fem.cli.terminal import console, progress_bar
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_training.cli.experiment import arms_of, by_arm
-    from palpate_training.experiment.generate.planning import plan_experiment, stations_of
+    from palpate_training.experiment.generate.planning import bases_of, plan_experiment
     from palpate_training.experiment.generate.simulator import (
         EDGE_M,
         FLUID_VOLUME_M3,
@@ -299,7 +299,7 @@ def data_plan(
         fluid_volume_m3=FLUID_VOLUME_M3 if fill_ml is None else fill_ml * 1e-6,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),
     )
-    stations = stations_of(
+    bases = bases_of(
         arms_of(by_arm(urdf or (), "--urdf"), tip_frame, tool_mm * 1e-3),
         None if registration is None else read_registrations(registration),
     )
@@ -314,7 +314,7 @@ def data_plan(
             bar.update(task, completed=done, total=total, info=word)
 
         found, eliminated = plan_experiment(
-            spec, fingertip, stations, simulator, store=opened, on_progress=on_progress
+            spec, fingertip, bases, simulator, store=opened, on_progress=on_progress
         )
     if not found.motions:
         raise ConfigError(
@@ -328,7 +328,9 @@ def data_plan(
         _show_planned(out, found, eliminated)
 
 
-def _planned_summary(out: Path, found: Plan, eliminated: list[Eliminated]) -> dict[str, object]:
+def _planned_summary(
+    out: Path, found: RobotPlan, eliminated: list[EliminatedTrajectory]
+) -> dict[str, object]:
     return {
         "plan": str(out),
         "trajectories": len(found.motions),
@@ -339,7 +341,7 @@ def _planned_summary(out: Path, found: Plan, eliminated: list[Eliminated]) -> di
     }
 
 
-def _show_planned(out: Path, found: Plan, eliminated: list[Eliminated]) -> None:
+def _show_planned(out: Path, found: RobotPlan, eliminated: list[EliminatedTrajectory]) -> None:
     arms = Counter(motion.trajectory.arm for motion in found.motions)
     who = ", ".join(f"{arm} {count}" for arm, count in sorted(arms.items()))
     hours = found.motions[-1].time_s[-1] / 3600.0

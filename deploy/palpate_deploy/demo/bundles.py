@@ -187,7 +187,7 @@ def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
     """
     for module in EXTRA_MODULES:
         require(module, extra="training")
-    from palpate_training.datasets.features_file import write_dataset
+    from palpate_training.datasets.features import write_dataset
     from palpate_training.datasets.ingest import ingest_record
     from palpate_training.tasks.features import train_features
 

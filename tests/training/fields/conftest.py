@@ -9,14 +9,14 @@ import numpy.typing as npt
 import pytest
 
 from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     FieldBasis,
     MixedDataset,
     SkinMesh,
 )
-from palpate_training.datasets.features import Provenance
-from palpate_training.tasks.fields import FieldConfig
+from palpate_training.tasks.fields import FieldFitConfig
 
 Floats = npt.NDArray[np.float64]
 
@@ -140,6 +140,6 @@ def mixed(make_mixed: Callable[..., MixedDataset]) -> MixedDataset:
 
 
 @pytest.fixture(scope="session")
-def quick() -> FieldConfig:
+def quick() -> FieldFitConfig:
     """Short trainings of narrow networks."""
-    return FieldConfig(widths=(48, 48), epochs=40, patience=40, batch_rows=64)
+    return FieldFitConfig(widths=(48, 48), epochs=40, patience=40, batch_rows=64)

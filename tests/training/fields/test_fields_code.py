@@ -18,22 +18,22 @@ from palpate_training.learning.field_code import (
     fit_code,
     pooling,
 )
-from palpate_training.learning.splits import Split, by_trajectory
+from palpate_training.learning.splits import RowSplit, by_trajectory
 from palpate_training.tasks.synthesis import synthesis_features
 
 
 @pytest.fixture(scope="module")
-def split(mixed: MixedDataset) -> Split:
+def split(mixed: MixedDataset) -> RowSplit:
     return by_trajectory(mixed.experiment)
 
 
 @pytest.fixture(scope="module")
-def code(mixed: MixedDataset, split: Split) -> FieldCode:
+def code(mixed: MixedDataset, split: RowSplit) -> FieldCode:
     return fit_code(mixed, split.train, split.validation, limit_m=2e-6)
 
 
 def test_modes_are_orthonormal_and_carry_the_nodal_norm(
-    mixed: MixedDataset, split: Split, code: FieldCode
+    mixed: MixedDataset, split: RowSplit, code: FieldCode
 ) -> None:
     modes = code.modes.astype(float) * code.scale[:, None]
     np.testing.assert_allclose(modes @ modes.T, np.eye(code.size), atol=2e-3)  # half precision
@@ -48,7 +48,7 @@ def test_modes_are_orthonormal_and_carry_the_nodal_norm(
 
 
 def test_projection_of_a_field_is_its_code(
-    mixed: MixedDataset, split: Split, code: FieldCode
+    mixed: MixedDataset, split: RowSplit, code: FieldCode
 ) -> None:
     rows = split.test[::5]
     known = code.encode(mixed.coefficients[rows])
@@ -57,7 +57,7 @@ def test_projection_of_a_field_is_its_code(
 
 
 def test_truncation_falls_and_the_fewest_modes_are_taken(
-    mixed: MixedDataset, split: Split, code: FieldCode
+    mixed: MixedDataset, split: RowSplit, code: FieldCode
 ) -> None:
     lost = code.truncation_m
     assert list(lost) == sorted(lost)
@@ -71,7 +71,7 @@ def test_truncation_falls_and_the_fewest_modes_are_taken(
     assert few.truncation_m == pytest.approx({4: distance}, rel=0.1)
 
 
-def test_held_out_rows_shape_no_mode(mixed: MixedDataset, split: Split, code: FieldCode) -> None:
+def test_held_out_rows_shape_no_mode(mixed: MixedDataset, split: RowSplit, code: FieldCode) -> None:
     changed = mixed.coefficients.copy()
     changed[split.test] *= 5
     changed[split.validation[1:]] += 1
@@ -83,7 +83,7 @@ def test_held_out_rows_shape_no_mode(mixed: MixedDataset, split: Split, code: Fi
     np.testing.assert_array_equal(other.mean, code.mean)
 
 
-def test_a_skin_that_never_moves_is_refused(mixed: MixedDataset, split: Split) -> None:
+def test_a_skin_that_never_moves_is_refused(mixed: MixedDataset, split: RowSplit) -> None:
     still = replace(mixed, coefficients=np.zeros_like(mixed.coefficients))
     with pytest.raises(DatasetError, match="are the same"):
         fit_code(still, split.train, split.validation)
@@ -127,7 +127,7 @@ def test_pooling_looks_near_its_own_electrode(mixed: MixedDataset) -> None:
 
 
 def test_features_are_what_the_fields_give(
-    mixed: MixedDataset, split: Split, code: FieldCode
+    mixed: MixedDataset, split: RowSplit, code: FieldCode
 ) -> None:
     film = pooling(mixed.mesh)
     rows = split.test[::9]

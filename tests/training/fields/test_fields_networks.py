@@ -18,9 +18,9 @@ from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import export
 from palpate_training.learning.export import onnx_bytes
 from palpate_training.learning.networks import FieldGraph, SynthesisGraph
-from palpate_training.learning.splits import Held, by_trajectory, of_units
+from palpate_training.learning.splits import HeldOut, by_trajectory, of_units
 from palpate_training.tasks.fields import (
-    FieldConfig,
+    FieldFitConfig,
     FieldModel,
     field_bundle,
     fit_field,
@@ -30,17 +30,17 @@ from palpate_training.tasks.synthesis import fit_synthesis, synthesis_bundle, sy
 
 
 @pytest.fixture(scope="module")
-def held(mixed: MixedDataset) -> Held:
+def held(mixed: MixedDataset) -> HeldOut:
     return of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-1"])
 
 
 @pytest.fixture(scope="module")
-def model(mixed: MixedDataset, held: Held, quick: FieldConfig) -> FieldModel:
+def model(mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig) -> FieldModel:
     return fit_field(mixed, held, config=quick)
 
 
 def test_field_network_beats_the_mean_and_repeats(
-    mixed: MixedDataset, held: Held, quick: FieldConfig, model: FieldModel
+    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig, model: FieldModel
 ) -> None:
     counts, test = tared_counts(mixed), held.split.test
     truth = mixed.displacement(test)
@@ -54,7 +54,7 @@ def test_field_network_beats_the_mean_and_repeats(
 
 
 def test_untouched_electrodes_give_no_field(
-    mixed: MixedDataset, held: Held, quick: FieldConfig, model: FieldModel
+    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig, model: FieldModel
 ) -> None:
     def untouched(fitted: FieldModel) -> float:
         field = fitted.code.decode(fitted.coefficients(np.zeros((1, 19), np.float32)))
@@ -67,14 +67,16 @@ def test_untouched_electrodes_give_no_field(
 
 
 def test_standardisation_comes_from_the_training_rows(
-    mixed: MixedDataset, held: Held, model: FieldModel
+    mixed: MixedDataset, held: HeldOut, model: FieldModel
 ) -> None:
     counts = tared_counts(mixed)[held.split.train]
     np.testing.assert_allclose(model.net.input_mean.numpy(), counts.mean(axis=0), rtol=1e-4)
     assert np.abs(counts).max() > 500, "counts, not parts of full scale"
 
 
-def test_synthesis_follows_the_film(mixed: MixedDataset, held: Held, quick: FieldConfig) -> None:
+def test_synthesis_follows_the_film(
+    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig
+) -> None:
     fitted = fit_synthesis(mixed, held, config=quick)
     x, y = synthesis_features(mixed, fitted.code, fitted.pooling), tared_counts(mixed)
     test, train = held.split.test, held.split.train
@@ -83,7 +85,9 @@ def test_synthesis_follows_the_film(mixed: MixedDataset, held: Held, quick: Fiel
     assert np.sqrt(np.mean(residual**2)) < 0.5 * np.sqrt(np.mean(rival**2))
 
 
-def test_small_modes_are_not_blown_up(mixed: MixedDataset, held: Held, quick: FieldConfig) -> None:
+def test_small_modes_are_not_blown_up(
+    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig
+) -> None:
     net = fit_synthesis(mixed, held, config=replace(quick, epochs=1)).net
     sd = net.mlp.input_sd.numpy()
     modes, film = sd[: net.modes], sd[net.modes :]
@@ -92,7 +96,7 @@ def test_small_modes_are_not_blown_up(mixed: MixedDataset, held: Held, quick: Fi
 
 
 def test_graphs_compute_what_the_models_do(
-    mixed: MixedDataset, held: Held, quick: FieldConfig, model: FieldModel
+    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig, model: FieldModel
 ) -> None:
     counts, rows = tared_counts(mixed), held.split.test[:5]
     sd = np.arange(len(mixed.mesh.nodes), dtype=np.float32)
@@ -111,7 +115,7 @@ def test_graphs_compute_what_the_models_do(
     np.testing.assert_allclose(answer, fitted.counts(features), atol=0.5)
 
 
-def test_field_bundle(mixed: MixedDataset, quick: FieldConfig, tmp_path: Path) -> None:
+def test_field_bundle(mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path) -> None:
     epochs = []
     metrics = field_bundle(
         mixed, tmp_path / "f", name="field-test", config=quick, on_epoch=lambda: epochs.append(1)
@@ -139,7 +143,7 @@ def test_field_bundle(mixed: MixedDataset, quick: FieldConfig, tmp_path: Path) -
 
 
 def test_synthesis_bundle_is_of_one_unit(
-    mixed: MixedDataset, quick: FieldConfig, tmp_path: Path
+    mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path
 ) -> None:
     metrics = synthesis_bundle(mixed, tmp_path / "s", unit="biotac-2", config=quick)
     bundle = read_bundle(tmp_path / "s")
@@ -204,7 +208,7 @@ def test_a_model_that_differs_is_refused(
 
 
 def test_a_test_row_is_never_trained_on(
-    make_mixed: Callable[..., MixedDataset], quick: FieldConfig
+    make_mixed: Callable[..., MixedDataset], quick: FieldFitConfig
 ) -> None:
     data = make_mixed(units=1, trajectories=10, steps=5)
     held = of_units(data.experiment, by_trajectory(data.experiment), ["biotac-1"])

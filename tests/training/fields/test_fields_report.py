@@ -14,9 +14,9 @@ from palpate_training.cli import train_app
 from palpate_training.cli.train import EPOCHS
 from palpate_training.datasets.experiment import MixedDataset, write_experiment, write_mixed
 from palpate_training.learning.baselines import constant, ridge, zero
-from palpate_training.learning.fit import FeaturesConfig
+from palpate_training.learning.fit import FeaturesFitConfig
 from palpate_training.tasks.features import evaluate_features, features_networks
-from palpate_training.tasks.fields import FieldConfig, evaluate_field
+from palpate_training.tasks.fields import FieldFitConfig, evaluate_field
 from palpate_training.tasks.report import (
     by_force,
     headline_table,
@@ -36,7 +36,7 @@ from palpate_training.tasks.results import (
 )
 from palpate_training.tasks.synthesis import evaluate_synthesis
 
-SHORT = FeaturesConfig(widths=(32,), epochs=15, batch_rows=64)
+SHORT = FeaturesFitConfig(widths=(32,), epochs=15, batch_rows=64)
 
 
 def by_model(report: TaskReport, test: str) -> dict[str, ModelResult]:
@@ -44,7 +44,7 @@ def by_model(report: TaskReport, test: str) -> dict[str, ModelResult]:
 
 
 @pytest.fixture(scope="module")
-def reports(mixed: MixedDataset, quick: FieldConfig) -> list[TaskReport]:
+def reports(mixed: MixedDataset, quick: FieldFitConfig) -> list[TaskReport]:
     trained: list[int] = []
 
     def tick() -> None:
@@ -152,7 +152,7 @@ def test_one_command_writes_the_table(mixed: MixedDataset, tmp_path: Path) -> No
 
 
 def test_the_commands_train_as_long_as_the_library() -> None:
-    assert FieldConfig().epochs == EPOCHS
+    assert FieldFitConfig().epochs == EPOCHS
 
 
 def test_typical_row_is_the_median_of_the_harder_half() -> None:

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     FieldBasis,
     MixedDataset,
     SkinMesh,
 )
-from palpate_training.datasets.features import Provenance
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from palpate_training.datasets.experiment import (
     write_mixed,
 )
 from palpate_training.figures.noise import IdleStream
-from palpate_training.figures.page import PAGE, Sources, write_page
+from palpate_training.figures.page import PAGE, PageSources, write_page
 from palpate_training.figures.plate import PlateLog
 
 pytest.importorskip("matplotlib", reason="matplotlib not installed (extra training)")
@@ -53,7 +53,7 @@ def test_page_with_everything(
         np.tile([0.0, 0, 1], (40, 1)),
     )
     steps: list[str] = []
-    sources = Sources(
+    sources = PageSources(
         experiment=trials_data(),
         mixed=fields_data(),
         idle=(
@@ -82,7 +82,7 @@ def test_page_with_everything(
 
 
 def test_page_leaves_out_what_is_not_given(trials_data: MakeTrials, tmp_path: Path) -> None:
-    write_page(tmp_path, Sources(trials_data(units=1)), command="test")
+    write_page(tmp_path, PageSources(trials_data(units=1)), command="test")
     assert _pictures(tmp_path) == {"contacts.png", "force.png", "electrodes.png"}
     page = (tmp_path / PAGE).read_text(encoding="utf-8")
     assert "nominal fingertip" in page
@@ -94,7 +94,7 @@ def test_page_says_when_the_twin_has_no_idle_stream(
     trials_data: MakeTrials, tmp_path: Path
 ) -> None:
     stream = IdleStream("real", 100.0, np.random.default_rng(0).normal(size=(6000, 19)), real=True)
-    write_page(tmp_path, Sources(trials_data(), idle=(stream,)), command="test")
+    write_page(tmp_path, PageSources(trials_data(), idle=(stream,)), command="test")
     assert "No idle stream of the twin" in (tmp_path / PAGE).read_text(encoding="utf-8")
 
 
@@ -104,20 +104,20 @@ def test_unit_without_trials_is_named_and_nothing_is_written(
     data = trials_data(units=2)
     data = replace(data, unit_names=(*data.unit_names, "biotac-9"))
     with pytest.raises(DatasetError, match="biotac-9"):
-        write_page(tmp_path / "page", Sources(data), command="test")
+        write_page(tmp_path / "page", PageSources(data), command="test")
     assert not (tmp_path / "page").exists()
 
 
 def test_folder_that_cannot_be_made_is_named(trials_data: MakeTrials, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file", encoding="utf-8")
     with pytest.raises(DatasetError, match="taken"):
-        write_page(tmp_path / "taken", Sources(trials_data()), command="test")
+        write_page(tmp_path / "taken", PageSources(trials_data()), command="test")
 
 
 def test_more_units_than_the_paper_stand_without_its_numbers(
     trials_data: MakeTrials, tmp_path: Path
 ) -> None:
-    write_page(tmp_path, Sources(trials_data(units=7)), command="test")
+    write_page(tmp_path, PageSources(trials_data(units=7)), command="test")
     page = (tmp_path / PAGE).read_text(encoding="utf-8")
     (line,) = [line for line in page.splitlines() if line.startswith("| largest force")]
     assert line.count("(") == 3

@@ -9,26 +9,20 @@ from palpate_training.cli import data, experiment, train
 train_app = typer.Typer(
     no_args_is_help=True, help="Train networks and write model bundles.", rich_markup_mode=None
 )
-for name, command in (
-    ("force-real", train.train_force_real),
-    ("features", train.train_features_command),
-    ("field", train.train_field),
-    ("synthesis", train.train_synthesis),
-    ("twin", train.train_twin),
-):
-    train_app.command(name)(command)
+train_app.command("force-real")(train.train_force_real)
+train_app.command("features")(train.train_features_command)
+train_app.command("field")(train.train_field)
+train_app.command("synthesis")(train.train_synthesis)
+train_app.command("twin")(train.train_twin)
 
 data_app = typer.Typer(
     no_args_is_help=True, help="Make data sets and look into them.", rich_markup_mode=None
 )
-for name, command in (
-    ("ingest-lasa", data.data_ingest_lasa),
-    ("ingest-record", data.data_ingest_record),
-    ("register", experiment.data_register),
-    ("ingest", experiment.data_ingest),
-    ("inspect", data.data_inspect),
-    ("export", data.data_export),
-    ("features", data.data_features),
-    ("figures", data.data_figures),
-):
-    data_app.command(name)(command)
+data_app.command("ingest-lasa")(data.data_ingest_lasa)
+data_app.command("ingest-record")(data.data_ingest_record)
+data_app.command("register")(experiment.data_register)
+data_app.command("ingest")(experiment.data_ingest)
+data_app.command("inspect")(data.data_inspect)
+data_app.command("export")(data.data_export)
+data_app.command("features")(data.data_features)
+data_app.command("figures")(data.data_figures)

@@ -18,10 +18,10 @@ from palpate.process import typed_command
 from palpate_training.cli.experiment import print_trials
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
-from palpate_training.datasets.features import FeatureDataset
-from palpate_training.datasets.features_file import (
+from palpate_training.datasets.features import (
     FEATURES_SCHEMA,
     UNITS,
+    FeatureDataset,
     open_dataset,
     write_dataset,
 )
@@ -31,7 +31,7 @@ from palpate_training.datasets.ingest import (
     ingest_lasa,
     ingest_record,
 )
-from palpate_training.datasets.inspect import Contents, load
+from palpate_training.datasets.inspect import ExperimentContents, load
 from palpate_training.datasets.inspect import contents as experiment_contents
 from palpate_training.datasets.trials import TRIALS_SCHEMA
 
@@ -164,7 +164,7 @@ def data_features(
     console.print(contents(rows, str(out)))
 
 
-def experiment_table(found: Contents, title: str) -> Table:
+def experiment_table(found: ExperimentContents, title: str) -> Table:
     """What a data set of the experiment holds, by unit."""
     lines = [
         f"{found.kind}: {found.trajectories} trajectories, {found.trials} trials,"
@@ -277,7 +277,7 @@ def data_figures(
     """
     from palpate_training.datasets.experiment import read_experiment, read_mixed
     from palpate_training.figures.noise import read_idle_real, read_idle_twin
-    from palpate_training.figures.page import PAGE, Sources, write_page
+    from palpate_training.figures.page import PAGE, PageSources, write_page
     from palpate_training.figures.plate import read_plate_logs
 
     if public_data is not None and not public_data.is_dir():
@@ -288,7 +288,7 @@ def data_figures(
     console = Console()
     folder = public_data or PUBLIC_DATA
     with console.status("reading") as status:
-        sources = Sources(
+        sources = PageSources(
             experiment=read_experiment(experiment),
             mixed=read_mixed(mixed) if mixed is not None else None,
             idle=(

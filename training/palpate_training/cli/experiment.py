@@ -20,9 +20,9 @@ from palpate import __version__
 from palpate.errors import ConfigError
 from palpate.process import typed_command
 from palpate.rigid import Transform
-from palpate_training.datasets.features import Provenance
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.trials import TrialsContents, read_contents, write_trials
-from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import ARMS
 
 console = Console()
@@ -166,7 +166,9 @@ def by_arm(words: Sequence[str], flag: str) -> dict[str, Path]:
     return found
 
 
-def arms_of(urdf: Mapping[str, Path], tip_frame: str | None, tool_m: float) -> dict[str, Arm]:
+def arms_of(
+    urdf: Mapping[str, Path], tip_frame: str | None, tool_m: float
+) -> dict[str, ArmKinematics]:
     """Kinematics of arms with their tool.
 
     Args:
@@ -182,7 +184,7 @@ def arms_of(urdf: Mapping[str, Path], tip_frame: str | None, tool_m: float) -> d
             "--urdf without --tip-frame", remedy="name the frame of the URDF that carries the tool"
         )
     tool = Transform(np.eye(3), np.array([0.0, 0.0, tool_m]))
-    return {arm: Arm.from_urdf(path, tip_frame or "", tool) for arm, path in urdf.items()}
+    return {arm: ArmKinematics.from_urdf(path, tip_frame or "", tool) for arm, path in urdf.items()}
 
 
 def trials_table(found: TrialsContents, title: str) -> Table:

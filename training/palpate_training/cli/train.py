@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from palpate.process import typed_command
-from palpate_training.datasets.features_file import open_dataset
+from palpate_training.datasets.features import open_dataset
 
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
 Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
@@ -21,7 +21,7 @@ Epochs = Annotated[int, typer.Option(min=1, help="Passes over the training rows 
 Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
 
 EPOCHS = 150
-"""The default of ``FieldConfig``, whose module needs torch."""
+"""The default of ``FieldFitConfig``, whose module needs torch."""
 
 console = Console()
 
@@ -42,9 +42,9 @@ def train_field(
     palpate train field mixed.h5 models/field-twin/1 --name field-twin
     """
     from palpate_training.datasets.experiment import read_mixed
-    from palpate_training.tasks.fields import FieldConfig, field_bundle
+    from palpate_training.tasks.fields import FieldFitConfig, field_bundle
 
-    config = FieldConfig(epochs=epochs)
+    config = FieldFitConfig(epochs=epochs)
     chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
     with _progress() as progress:
         task = progress.add_task("field", total=config.epochs)
@@ -75,10 +75,10 @@ def train_synthesis(
     palpate train synthesis mixed.h5 models/synthesis-twin/1 --unit biotac-2 --name synthesis-twin
     """
     from palpate_training.datasets.experiment import read_mixed
-    from palpate_training.tasks.fields import FieldConfig
+    from palpate_training.tasks.fields import FieldFitConfig
     from palpate_training.tasks.synthesis import synthesis_bundle
 
-    config = FieldConfig(epochs=epochs)
+    config = FieldFitConfig(epochs=epochs)
     with _progress() as progress:
         task = progress.add_task("synthesis", total=config.epochs)
         metrics = synthesis_bundle(
@@ -112,7 +112,7 @@ def train_twin(
         evaluate_features,
         features_networks,
     )
-    from palpate_training.tasks.fields import FieldConfig, evaluate_field
+    from palpate_training.tasks.fields import FieldFitConfig, evaluate_field
     from palpate_training.tasks.report import write_report
     from palpate_training.tasks.results import networks
     from palpate_training.tasks.synthesis import evaluate_synthesis
@@ -125,7 +125,7 @@ def train_twin(
         def tick() -> None:
             progress.advance(task)
 
-        config = FieldConfig(epochs=epochs)
+        config = FieldFitConfig(epochs=epochs)
         paper = replace(PAPER_CONFIG, epochs=min(epochs, PAPER_CONFIG.epochs))
         reports = [
             evaluate(fields, seeds=seeds, split_seed=split_seed, config=config, on_network=tick)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.basis import encode
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     FieldBasis,
@@ -23,7 +24,7 @@ from palpate_training.datasets.experiment import (
     MixedDataset,
     SkinMesh,
 )
-from palpate_training.datasets.features import ELECTRODES, Provenance
+from palpate_training.datasets.features import ELECTRODES
 from palpate_training.datasets.processing import (
     THRESHOLD_N,
     DroppedTrial,
@@ -200,13 +201,13 @@ def assemble_mixed(
 
 
 @dataclass(frozen=True, slots=True)
-class _Compressed:
+class _CompressedTrial:
     rows: TrialRows
     simulated_force: FloatArray
     coefficients: FloatArray
 
 
-def _compress(mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh) -> _Compressed:
+def _compress(mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh) -> _CompressedTrial:
     count = len(mixed.rows.travel_m)
     for what, shape, expected in (
         ("displacement", mixed.displacement.shape, (count, *mesh.nodes.shape)),
@@ -222,7 +223,7 @@ def _compress(mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh) -> _Compresse
         ("simulated force", mixed.simulated_force),
     ):
         _check_finite(mixed.rows, what, values)
-    return _Compressed(
+    return _CompressedTrial(
         mixed.rows,
         mixed.simulated_force.astype(np.float32),
         encode(basis, mixed.displacement),

@@ -1,8 +1,4 @@
-"""HDF5 files of arrays with units, a schema and a content hash, written whole or not at all.
-
-What ``palpate_training.datasets.features_file`` is to rows of features, this is to the data sets
-of the experiment, which have several tables of different lengths.
-"""
+"""HDF5 files of arrays with units, a schema, provenance and a content hash."""
 
 from __future__ import annotations
 
@@ -25,19 +21,39 @@ from palpate.files.hdf5 import (
     read_array,
     text,
 )
-from palpate_training.datasets.features import Provenance
 
 if TYPE_CHECKING:
     import h5py
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _CHUNK_BYTES = 1 << 18
 """256 KiB: small enough to stream, large enough to compress."""
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class Provenance:
+    """Where a data set comes from.
+
+    Attributes:
+        source: What was measured or simulated, one line for people.
+        command: The command that wrote the data set.
+        input_sha256: SHA-256 of the input file, hex; empty where there was none.
+        licence: What may be done with the rows.
+        palpate_version: Version of palpate that wrote it.
+        notes: Assumptions made on the way in, e.g. how axes were matched.
+    """
+
+    source: str
+    command: str
+    input_sha256: str
+    licence: str
+    palpate_version: str
+    notes: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredColumn:
     """An array of a schema: its unit and its type; ``str`` means a list of texts."""
 
     unit: str
@@ -45,7 +61,7 @@ class Column:
 
 
 @dataclass(frozen=True, slots=True)
-class Tables:
+class StoredTables:
     """What a file holds.
 
     Attributes:
@@ -77,7 +93,7 @@ class Tables:
 
 
 def write_tables(
-    path: Path, schema: Hdf5Schema, columns: Mapping[str, Column], tables: Tables
+    path: Path, schema: Hdf5Schema, columns: Mapping[str, StoredColumn], tables: StoredTables
 ) -> str:
     """Write a file; it appears complete or not at all.
 
@@ -98,7 +114,7 @@ def write_tables(
         write_header(file, schema, digest, tables.provenance, tables.numbers)
         for name, column in columns.items():
             write_array(file, name, column, tables.arrays[name])
-    logger.info("wrote %s: content %s", path, digest[:12])
+    _log.info("wrote %s: content %s", path, digest[:12])
     return digest
 
 
@@ -126,7 +142,7 @@ def write_provenance(file: h5py.File, provenance: Provenance) -> None:
 
 
 def write_array(
-    file: h5py.File | h5py.Group, name: str, column: Column, array: npt.NDArray[Any]
+    file: h5py.File | h5py.Group, name: str, column: StoredColumn, array: npt.NDArray[Any]
 ) -> None:
     """Write an array with its unit, in chunks and compressed."""
     if column.dtype is str:
@@ -150,9 +166,9 @@ def write_array(
 def read_tables(
     path: Path,
     schema: Hdf5Schema,
-    columns: Mapping[str, Column],
+    columns: Mapping[str, StoredColumn],
     numbers: tuple[str, ...] = (),
-) -> Tables:
+) -> StoredTables:
     """Read a file and check its schema, units, types and content hash.
 
     Raises:
@@ -169,7 +185,7 @@ def read_tables(
     for name in (*numbers, "content_sha256"):
         if name not in attributes:
             raise DatasetError(f"{path}: attribute {name} is missing", remedy="make the file again")
-    tables = Tables(
+    tables = StoredTables(
         arrays,
         {name: _plain(attributes[name]) for name in numbers},
         read_provenance(attributes),

@@ -12,8 +12,14 @@ import numpy.typing as npt
 
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import Hdf5Schema
-from palpate_training.datasets.container import Column, Tables, read_tables, write_tables
-from palpate_training.datasets.features import ELECTRODES, Provenance
+from palpate_training.datasets.container import (
+    Provenance,
+    StoredColumn,
+    StoredTables,
+    read_tables,
+    write_tables,
+)
+from palpate_training.datasets.features import ELECTRODES
 
 FloatArray = npt.NDArray[np.float32]
 IndexArray = npt.NDArray[np.int32]
@@ -258,24 +264,24 @@ MIXED_SCHEMA = Hdf5Schema("palpate.mixed", 1, "`palpate data inspect` says what 
 UNITS = {"trial_rest": "counts", "travel_m": "m", "force": "N", "location": "m"}
 """Units of the arrays of a trial or row; all others are numbers."""
 
-EXPERIMENT_COLUMNS: dict[str, Column] = {
-    **{name: Column("1", str) for name in ("unit_names", "trajectories", "indenters")},
+EXPERIMENT_COLUMNS: dict[str, StoredColumn] = {
+    **{name: StoredColumn("1", str) for name in ("unit_names", "trajectories", "indenters")},
     **{
-        name: Column(UNITS.get(name, "1"), dtype)
+        name: StoredColumn(UNITS.get(name, "1"), dtype)
         for name, (_, _, dtype) in EXPERIMENT_ARRAYS.items()
     },
 }
 
-MIXED_COLUMNS: dict[str, Column] = {
+MIXED_COLUMNS: dict[str, StoredColumn] = {
     **EXPERIMENT_COLUMNS,
-    "simulated_force": Column("N", np.float32),
-    "coefficients": Column("m", np.float32),
-    "basis/mean": Column("m", np.float32),
-    "basis/modes": Column("1", np.float32),
-    "mesh/nodes": Column("m", np.float64),
-    "mesh/outer_faces": Column("1", np.int32),
-    "mesh/inner_faces": Column("1", np.int32),
-    "mesh/subset": Column("1", np.int32),
+    "simulated_force": StoredColumn("N", np.float32),
+    "coefficients": StoredColumn("m", np.float32),
+    "basis/mean": StoredColumn("m", np.float32),
+    "basis/modes": StoredColumn("1", np.float32),
+    "mesh/nodes": StoredColumn("m", np.float64),
+    "mesh/outer_faces": StoredColumn("1", np.int32),
+    "mesh/inner_faces": StoredColumn("1", np.int32),
+    "mesh/subset": StoredColumn("1", np.int32),
 }
 
 _MIXED_NUMBERS = ("loss_mean_m", "loss_max_m", "mesh_sha256")
@@ -366,8 +372,8 @@ def _named(path: Path, build: Callable[[], Data]) -> Data:
         raise DatasetError(f"{path}: {error.problem}", remedy=error.remedy) from error
 
 
-def _experiment_tables(data: ExperimentDataset) -> Tables:
-    return Tables(
+def _experiment_tables(data: ExperimentDataset) -> StoredTables:
+    return StoredTables(
         {
             name: np.array(getattr(data, name), dtype=object)
             if column.dtype is str
@@ -379,9 +385,9 @@ def _experiment_tables(data: ExperimentDataset) -> Tables:
     )
 
 
-def _mixed_tables(data: MixedDataset) -> Tables:
+def _mixed_tables(data: MixedDataset) -> StoredTables:
     experiment = _experiment_tables(data.experiment)
-    return Tables(
+    return StoredTables(
         {
             **experiment.arrays,
             "simulated_force": data.simulated_force,
@@ -402,7 +408,7 @@ def _mixed_tables(data: MixedDataset) -> Tables:
     )
 
 
-def _experiment(tables: Tables) -> ExperimentDataset:
+def _experiment(tables: StoredTables) -> ExperimentDataset:
     arrays = tables.arrays
     return ExperimentDataset(
         unit_names=tuple(arrays["unit_names"]),

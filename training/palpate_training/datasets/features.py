@@ -1,15 +1,24 @@
-"""A data set for learning features, in memory: arrays, what they mean, and the checks they pass."""
+"""Rows of features: the arrays, what they mean, the checks they pass, and the file that holds them.
+
+On disk: HDF5 schema ``palpate.features`` version 1, written whole or not at all.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.container import Provenance, read_provenance, write_provenance
+
+_log = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 CountArray = npt.NDArray[np.uint16]
@@ -19,27 +28,6 @@ BoolArray = npt.NDArray[np.bool_]
 
 ELECTRODES = 19
 """Sensing electrodes of a BioTac."""
-
-
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """Where a data set comes from.
-
-    Attributes:
-        source: What was measured or simulated, one line for people.
-        command: The command that wrote the data set.
-        input_sha256: SHA-256 of the input file, hex; empty where there was none.
-        licence: What may be done with the rows.
-        palpate_version: Version of palpate that wrote it.
-        notes: Assumptions made on the way in, e.g. how axes were matched.
-    """
-
-    source: str
-    command: str
-    input_sha256: str
-    licence: str
-    palpate_version: str
-    notes: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,3 +189,96 @@ def _check_values(data: FeatureDataset) -> None:
             f" {group[mixed[0] + 1]}",
             remedy="number blocks uniquely over all groups",
         )
+
+
+FEATURES_SCHEMA = Hdf5Schema("palpate.features", 1, "use a file made by `palpate data ingest-...`")
+
+UNITS: dict[str, str] = {
+    "electrodes": "counts",
+    "baseline": "counts",
+    "force": "N",
+    "group": "1",
+    "block": "1",
+    "sensor": "1",
+    "contact_location": "m",
+    "in_contact": "1",
+    "time_ns": "ns",
+}
+
+OPTIONAL = ("contact_location", "in_contact", "time_ns")
+"""Datasets a file may lack."""
+
+_CHUNK_ROWS = 4096
+"""One chunk of electrodes is 150 KiB: small enough to stream, large enough to compress."""
+
+
+def write_dataset(path: Path, data: FeatureDataset) -> str:
+    """Write a data set; the file appears complete or not at all.
+
+    Args:
+        path: File to write (``.h5``).
+        data: What to write.
+
+    Returns:
+        The content's SHA-256, hex.
+
+    Raises:
+        DatasetError: The disk refused.
+    """
+    digest = data.content_sha256()
+    with hdf5_written_whole(path, extra="training") as file:
+        names = {"sensor_names": list(data.sensor_names)}
+        file.attrs.update({**FEATURES_SCHEMA.facts, **names, "content_sha256": digest})
+        write_provenance(file, data.provenance)
+        for name, array in data.arrays().items():
+            dataset = file.create_dataset(
+                name,
+                data=array,
+                chunks=(min(_CHUNK_ROWS, len(data)), *array.shape[1:]),
+                compression="gzip",
+                compression_opts=4,
+                shuffle=True,
+            )
+            dataset.attrs["unit"] = UNITS[name]
+    _log.info("wrote %s: %d rows, content %s", path, len(data), digest[:12])
+    return digest
+
+
+def open_dataset(path: Path) -> FeatureDataset:
+    """Read a data set and check everything about it.
+
+    Args:
+        path: File written by ``write_dataset``, or by anyone to the same schema.
+
+    Returns:
+        The data set, in memory.
+
+    Raises:
+        DatasetError: The file is missing, damaged, of another schema or version, or its content
+            breaks the schema; the message names the dataset inside the file.
+    """
+    with opened(path, extra="training", missing="make it: palpate data ingest-record") as file:
+        FEATURES_SCHEMA.check(path, file)
+        if "sensor_names" not in file.attrs:
+            raise DatasetError(
+                f"{path}: attribute sensor_names is missing", remedy="name every sensor, in order"
+            )
+        arrays = {
+            name: read_array(path, file, name, UNITS[name])
+            for name in SHAPES
+            if name in file or name not in OPTIONAL
+        }
+        attributes = dict(file.attrs)
+    data = FeatureDataset(
+        **arrays,
+        sensor_names=tuple(text(name) for name in attributes["sensor_names"]),
+        provenance=read_provenance(attributes),
+        name=str(path),
+    )
+    expected = text(attributes.get("content_sha256", ""))
+    if expected and expected != data.content_sha256():
+        raise DatasetError(
+            f"{path}: the content does not match its content_sha256",
+            remedy="the rows were changed after writing; make the file again",
+        )
+    return data

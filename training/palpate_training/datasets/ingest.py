@@ -40,9 +40,10 @@ from palpate.messages import (
     WrenchFrame,
 )
 from palpate.sampling import sample_offsets
-from palpate_training.datasets.features import FeatureDataset, Provenance, cut_into_blocks
+from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 TOUCH_N = 0.2
 """Where no pose says so, a force above this is contact [N]; above the noise of a 6-axis sensor."""
@@ -52,7 +53,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(slots=True)
-class Streams:
+class SensorStreams:
     """What a record holds of one sensor."""
 
     frames: list[ElectrodeFrame] = field(default_factory=list)
@@ -117,19 +118,19 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
     )
 
 
-def read_streams(path: Path) -> dict[str, Streams]:
+def read_streams(path: Path) -> dict[str, SensorStreams]:
     """Streams of every sensor of a record, by name, in order of writing.
 
     Raises:
         RecordingError: Not a whole record.
     """
-    sensors: dict[str, Streams] = {}
+    sensors: dict[str, SensorStreams] = {}
     for item in read_record(path):
         sensor = item.address.sensor
         topic = item.address.topic
         if topic not in (ELECTRODES.name, WRENCH.name, POSE.name, TARE.name):
             continue
-        streams = sensors.setdefault(sensor, Streams())
+        streams = sensors.setdefault(sensor, SensorStreams())
         if topic == ELECTRODES.name:
             streams.frames.append(ELECTRODES.codec.decode(item.payload))
         elif topic == WRENCH.name:
@@ -142,7 +143,7 @@ def read_streams(path: Path) -> dict[str, Streams]:
     return sensors
 
 
-def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any]]:
+def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArray[Any]]:
     if not streams.wrenches:
         raise DatasetError(
             f"{path}: sensor {name!r} has no wrench stream",
@@ -189,7 +190,7 @@ def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any
             f"{path}: no frame of {name!r} has a wrench (and pose) within three periods",
             remedy="check that all streams were stamped by the same clock",
         )
-    logger.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
+    _log.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
 
     baseline = np.array([streams.tares[frame.tare_id].electrodes for frame in frames])
     columns: dict[str, npt.NDArray[Any]] = {
@@ -206,7 +207,7 @@ def _align(path: Path, name: str, streams: Streams) -> dict[str, npt.NDArray[Any
     return columns
 
 
-def refuse_other_types(path: Path, name: str, streams: Streams) -> None:
+def refuse_other_types(path: Path, name: str, streams: SensorStreams) -> None:
     """Refuse frames of a sensor that has other electrodes than a data set.
 
     Raises:
@@ -222,7 +223,7 @@ def refuse_other_types(path: Path, name: str, streams: Streams) -> None:
         )
 
 
-def time_of(stamp: Stamp, streams: Streams) -> int:
+def time_of(stamp: Stamp, streams: SensorStreams) -> int:
     """Monotonic time [ns] where the streams' first readings share the clock, else wall time."""
     shared = all(
         stamps[0].stamp.clock_id == streams.frames[0].stamp.clock_id

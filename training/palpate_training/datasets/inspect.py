@@ -26,7 +26,7 @@ PUBLISHED = "published layout"
 
 
 @dataclass(frozen=True, slots=True)
-class UnitContents:
+class SpecimenContents:
     """What a data set holds of one BioTac.
 
     Attributes:
@@ -51,7 +51,7 @@ class UnitContents:
 
 
 @dataclass(frozen=True, slots=True)
-class Contents:
+class ExperimentContents:
     """What a data set holds.
 
     Attributes:
@@ -73,7 +73,7 @@ class Contents:
     trajectories: int
     trials: int
     rows: int
-    units: tuple[UnitContents, ...]
+    units: tuple[SpecimenContents, ...]
     content_sha256: str
     provenance: dict[str, str]
     modes: int = 0
@@ -126,10 +126,10 @@ def load(
     )
 
 
-def contents(kind: str, data: ExperimentDataset | MixedDataset) -> Contents:
+def contents(kind: str, data: ExperimentDataset | MixedDataset) -> ExperimentContents:
     """Count and measure a data set."""
     rows = data.experiment if isinstance(data, MixedDataset) else data
-    plain = Contents(
+    plain = ExperimentContents(
         kind=kind,
         trajectories=len(rows.trajectories),
         trials=rows.trials,
@@ -150,12 +150,12 @@ def contents(kind: str, data: ExperimentDataset | MixedDataset) -> Contents:
     )
 
 
-def _unit(data: ExperimentDataset, unit: int) -> UnitContents:
+def _unit(data: ExperimentDataset, unit: int) -> SpecimenContents:
     mine = data.row_unit == unit
     trials = data.trial_unit == unit
     tared = data.tared[mine].astype(np.float64)
     trajectories = data.trial_trajectory[trials]
-    return UnitContents(
+    return SpecimenContents(
         unit=data.unit_names[unit],
         trials=int(trials.sum()),
         indenters=len({data.indenters[i] for i in trajectories}),

@@ -239,7 +239,7 @@ def from_half_newton(rows: TrialRows) -> TrialRows:
     return prepend_threshold_row(above_threshold(rows), rows)
 
 
-def _onset(rows: TrialRows) -> Onset:
+def _onset(rows: TrialRows) -> ForceOnset:
     start = from_threshold(rows.force)
     if start is not None:
         return start
@@ -332,7 +332,7 @@ def crossing(before: Floats, after: Floats, *, threshold_n: float = THRESHOLD_N)
 
 
 @dataclass(frozen=True, slots=True)
-class Onset:
+class ForceOnset:
     """Where a press reaches 0.5 N, and its rows from there on.
 
     Attributes:
@@ -360,7 +360,7 @@ class Onset:
         return np.concatenate([self.row(values), values[self.kept[int(self.exact) :]]])
 
 
-def from_threshold(force: Floats, *, threshold_n: float = THRESHOLD_N) -> Onset | None:
+def from_threshold(force: Floats, *, threshold_n: float = THRESHOLD_N) -> ForceOnset | None:
     """Which rows to keep and which to prepend, of forces in order of travel.
 
     Rows below the threshold are left out wherever they are, as the paper says, a late dip included.
@@ -378,4 +378,4 @@ def from_threshold(force: Floats, *, threshold_n: float = THRESHOLD_N) -> Onset 
         return None
     kept = first + np.flatnonzero(np.linalg.norm(force[first:], axis=1) >= threshold_n)
     share = crossing(force[first - 1], force[first], threshold_n=threshold_n)
-    return Onset(first - 1, share, kept)
+    return ForceOnset(first - 1, share, kept)

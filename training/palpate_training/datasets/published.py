@@ -28,8 +28,9 @@ from palpate.errors import DatasetError
 from palpate.files.hdf5 import opened
 from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset
-from palpate_training.datasets.features import ELECTRODES, Provenance
+from palpate_training.datasets.features import ELECTRODES
 from palpate_training.datasets.processing import THRESHOLD_N
 from palpate_training.datasets.trials import TrialHeader, TrialRows
 
@@ -87,7 +88,9 @@ def read_published(
             or frame, or rows are there twice; names the file.
     """
     wanted = _present(folder, units)
-    files = [_File(published_file(folder, unit), axes, force_on_indenter) for unit in wanted]
+    files = [
+        _PublishedFile(published_file(folder, unit), axes, force_on_indenter) for unit in wanted
+    ]
     _check_frame(folder, files)
     digests: dict[str, Path] = {}
     for file in files:
@@ -130,7 +133,7 @@ def _present(folder: Path, units: Sequence[int] | None) -> list[int]:
     return wanted
 
 
-class _File:
+class _PublishedFile:
     """Rows of one published file, checked and converted."""
 
     def __init__(self, path: Path, axes: Sequence[str], force_on_indenter: bool) -> None:
@@ -272,7 +275,7 @@ def _check_unique(path: Path, rows: Floats) -> None:
         )
 
 
-def _check_frame(folder: Path, files: list[_File]) -> None:
+def _check_frame(folder: Path, files: list[_PublishedFile]) -> None:
     where = np.median(np.concatenate([f.location for f in files]), axis=0)
     push = np.median(np.concatenate([f.force for f in files]), axis=0)
     if where[2] >= 0.0 or push[2] <= 0.0:
@@ -283,7 +286,7 @@ def _check_frame(folder: Path, files: list[_File]) -> None:
         )
 
 
-def _trial(unit: str, file: _File, run: Run, trajectory: str) -> TrialRows:
+def _trial(unit: str, file: _PublishedFile, run: PublishedRun, trajectory: str) -> TrialRows:
     return TrialRows(
         header=TrialHeader(unit, trajectory, run.indenter, arm=""),
         rest=np.full(ELECTRODES, np.nan),
@@ -314,7 +317,7 @@ MIN_PATH_M = 0.3e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class PublishedRun:
     """Rows of one trajectory on one BioTac.
 
     Attributes:
@@ -332,7 +335,7 @@ class Run:
     travel_m: Floats
 
 
-def find_runs(name: str, force: Floats, location: Floats, indenter: Texts) -> list[Run]:
+def find_runs(name: str, force: Floats, location: Floats, indenter: Texts) -> list[PublishedRun]:
     """Cut the rows of a file into trajectories.
 
     A trajectory begins where the indenter changes, where the force falls back to 0.5 N, or where
@@ -369,17 +372,17 @@ def find_runs(name: str, force: Floats, location: Floats, indenter: Texts) -> li
     ]
 
 
-def _run(rows: slice, indenter: str, tip: Floats) -> Run:
+def _run(rows: slice, indenter: str, tip: Floats) -> PublishedRun:
     way = tip[-1] - tip[0]
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.zeros(3)
     # Noise of the tip must not make travel run backward.
     travel_m = np.maximum.accumulate((tip - tip[0]) @ along)
     direction = along if length >= MIN_PATH_M else np.zeros(3)
-    return Run(rows, indenter, tip[0], direction, travel_m)
+    return PublishedRun(rows, indenter, tip[0], direction, travel_m)
 
 
-def name_trajectories(units: list[list[Run]]) -> list[list[str]]:
+def name_trajectories(units: list[list[PublishedRun]]) -> list[list[str]]:
     """Give the same id to runs of different BioTacs that are the same trajectory.
 
     Such have the same indenter, begin in nearly the same place and go in nearly the same direction;
@@ -393,7 +396,7 @@ def name_trajectories(units: list[list[Run]]) -> list[list[str]]:
         Ids ``<indenter>/<number>``, in the same order.
     """
     assign = require("scipy.optimize", extra="training").linear_sum_assignment
-    known: dict[str, list[Run]] = {}
+    known: dict[str, list[PublishedRun]] = {}
     names: list[list[str]] = []
     for runs in units:
         ids = [""] * len(runs)
@@ -415,7 +418,7 @@ def name_trajectories(units: list[list[Run]]) -> list[list[str]]:
     return names
 
 
-def _distance(one: Run, other: Run) -> float:
+def _distance(one: PublishedRun, other: PublishedRun) -> float:
     """How unlike two runs are, in metres; infinite where they cannot be the same trajectory."""
     apart_m = float(np.linalg.norm(one.start - other.start))
     cosine = float(one.direction @ other.direction)

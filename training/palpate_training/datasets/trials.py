@@ -27,13 +27,14 @@ from palpate.errors import DatasetError
 from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.container import (
-    Column,
-    Tables,
+    Provenance,
+    StoredColumn,
+    StoredTables,
     read_provenance,
     write_array,
     write_header,
 )
-from palpate_training.datasets.features import ELECTRODES, Provenance
+from palpate_training.datasets.features import ELECTRODES
 
 if TYPE_CHECKING:
     import h5py
@@ -146,18 +147,18 @@ class MixedRows:
     displacement: npt.NDArray[np.float32]
 
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 TRIALS_SCHEMA = Hdf5Schema("palpate.trials", 1, "`palpate data inspect` says what the file is")
 GROUP = "trials"
 
-COLUMNS: dict[str, Column] = {
-    "time_s": Column("s", np.float64),
-    "electrodes": Column("counts", np.uint16),
-    "force": Column("N", np.float64),
-    "tip": Column("m", np.float64),
-    "travel_m": Column("m", np.float64),
-    "increment_end": Column("1", np.int64),
+COLUMNS: dict[str, StoredColumn] = {
+    "time_s": StoredColumn("s", np.float64),
+    "electrodes": StoredColumn("counts", np.uint16),
+    "force": StoredColumn("N", np.float64),
+    "tip": StoredColumn("m", np.float64),
+    "travel_m": StoredColumn("m", np.float64),
+    "increment_end": StoredColumn("1", np.int64),
 }
 """Streams of a trial; what they mean: ``RawTrial``."""
 
@@ -212,7 +213,7 @@ def write_trials(path: Path, trials: Iterable[RawTrial], provenance: Provenance)
             raise DatasetError(f"{path}: no trials to write", remedy="execute or ingest some")
         digest = _digest_of_all(digests)
         write_header(file, TRIALS_SCHEMA, digest, provenance, {"trial_count": len(digests)})
-    logger.info("wrote %s: %d trials, content %s", path, len(digests), digest[:12])
+    _log.info("wrote %s: %d trials, content %s", path, len(digests), digest[:12])
     return digest
 
 
@@ -297,7 +298,7 @@ def _name(number: int) -> str:
 def _digest(trial: RawTrial) -> str:
     """Over header and streams of a trial, hex."""
     arrays = {name: getattr(trial, name) for name in COLUMNS}
-    return Tables(arrays, asdict(trial.header), _NO_PROVENANCE).content_sha256()
+    return StoredTables(arrays, asdict(trial.header), _NO_PROVENANCE).content_sha256()
 
 
 def _digest_of_all(digests: list[str]) -> str:

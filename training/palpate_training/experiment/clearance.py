@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.rigid import Floats, Transform
-from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import facing
 from palpate_training.experiment.registration import register
 
@@ -39,7 +39,7 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorModel:
+class RegistrationErrorModel:
     """What is not as it should be.
 
     Attributes:
@@ -102,7 +102,7 @@ def pin_poses(holes: Floats) -> Floats:
     return np.hstack([holes, np.tile([1.0, 0.0, 0.0, 0.0], (len(holes), 1))])
 
 
-def link_sensitivity(arm: Arm, joints: npt.ArrayLike) -> Floats:
+def link_sensitivity(arm: ArmKinematics, joints: npt.ArrayLike) -> Floats:
     """How errors of the links move the tip: shape (T, 3, 6 n), robot frame.
 
     Error j of n, displacement [m] and rotation vector [rad] of the far end of link j in the frame
@@ -123,11 +123,11 @@ def link_sensitivity(arm: Arm, joints: npt.ArrayLike) -> Floats:
 
 
 def simulate_registrations(
-    arm: Arm,
+    arm: ArmKinematics,
     sensor_robot: Transform,
     poses: Floats,
     *,
-    model: ErrorModel | None = None,
+    model: RegistrationErrorModel | None = None,
     draws: int = 200,
     seed: int = 0,
     start: npt.ArrayLike | None = None,
@@ -149,7 +149,7 @@ def simulate_registrations(
     Raises:
         ConfigError: The arm does not reach a hole or a pose.
     """
-    model = ErrorModel() if model is None else model
+    model = RegistrationErrorModel() if model is None else model
     random = np.random.default_rng(seed)
     holes = plate_holes()
     robot_sensor = sensor_robot.inverse()
@@ -210,7 +210,7 @@ def _press_directions(out: Floats) -> list[Floats]:
     return [-out, *(-math.cos(tilt) * out + math.sin(tilt) * way for way in aside)]
 
 
-def _reach(arm: Arm, pose: Floats, start: npt.ArrayLike | None, what: str) -> Floats:
+def _reach(arm: ArmKinematics, pose: Floats, start: npt.ArrayLike | None, what: str) -> Floats:
     found = arm.solve(pose[None], start=start)
     if not found.reached:
         raise ConfigError(
@@ -220,7 +220,9 @@ def _reach(arm: Arm, pose: Floats, start: npt.ArrayLike | None, what: str) -> Fl
     return np.asarray(found.joints[0])
 
 
-def _play(random: np.random.Generator, model: ErrorModel, shape: tuple[int, int]) -> Floats:
+def _play(
+    random: np.random.Generator, model: RegistrationErrorModel, shape: tuple[int, int]
+) -> Floats:
     """Where the pin stands in its liner [m], shape (*shape, 3): x and y along the plate."""
     radius = model.clearance_m / 2 * np.sqrt(random.uniform(size=shape))
     angle = random.uniform(0.0, 2.0 * np.pi, size=shape)
@@ -228,5 +230,7 @@ def _play(random: np.random.Generator, model: ErrorModel, shape: tuple[int, int]
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), lift], axis=-1)
 
 
-def _missed(random: np.random.Generator, model: ErrorModel, shape: tuple[int, int]) -> Floats:
+def _missed(
+    random: np.random.Generator, model: RegistrationErrorModel, shape: tuple[int, int]
+) -> Floats:
     return random.normal(0.0, model.repeatability_m / math.sqrt(3.0), size=(*shape, 3))

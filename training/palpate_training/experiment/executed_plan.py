@@ -25,15 +25,15 @@ from palpate.alignment import linear
 from palpate.errors import ConfigError, DatasetError
 from palpate.rigid import Floats, Transform
 from palpate_training.datasets.ingest import (
-    Streams,
+    SensorStreams,
     middles,
     read_streams,
     refuse_other_types,
     time_of,
 )
 from palpate_training.datasets.trials import RawTrial, TrialHeader
-from palpate_training.experiment.kinematics import Arm
-from palpate_training.experiment.plan import DWELL_S, Motion, commanded_travel
+from palpate_training.experiment.kinematics import ArmKinematics
+from palpate_training.experiment.plan import DWELL_S, ArmMotion, commanded_travel
 from palpate_training.experiment.trajectory_file import read_trajectories
 
 GAP_S = 0.05
@@ -51,7 +51,7 @@ Times = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class _Stream:
+class _AlignedSamples:
     """Samples that have electrodes and a wrench, and times at which they were taken."""
 
     time_ns: Times
@@ -107,7 +107,7 @@ def ingest_experiment(
             if joint_logs is None:
                 tips[item.arm] = _tip_of_poses(record, sensor, streams, samples)
             elif item.arm in joint_logs:
-                registered = planned.stations[item.arm].sensor_robot
+                registered = planned.bases[item.arm].sensor_robot
                 tips[item.arm] = _tip_of_joints(joint_logs[item.arm], registered, samples)
             else:
                 raise DatasetError(
@@ -120,7 +120,7 @@ def ingest_experiment(
     return trials
 
 
-def _samples(record: Path, sensor: str, streams: Streams) -> _Stream:
+def _samples(record: Path, sensor: str, streams: SensorStreams) -> _AlignedSamples:
     if not streams.wrenches:
         raise DatasetError(
             f"{record}: sensor {sensor!r} has no wrench stream",
@@ -145,7 +145,7 @@ def _samples(record: Path, sensor: str, streams: Streams) -> _Stream:
         np.array([w.force for w in streams.wrenches], dtype=np.float64),
     )
     walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
-    return _Stream(
+    return _AlignedSamples(
         at[known],
         (walls + at - times)[known],
         np.array([frame.electrodes for frame in frames], dtype=np.uint16)[known],
@@ -154,7 +154,7 @@ def _samples(record: Path, sensor: str, streams: Streams) -> _Stream:
 
 
 def _tip_of_poses(
-    record: Path, sensor: str, streams: Streams, samples: _Stream
+    record: Path, sensor: str, streams: SensorStreams, samples: _AlignedSamples
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
     if not streams.poses:
         raise DatasetError(
@@ -169,7 +169,7 @@ def _tip_of_poses(
 
 
 def _tip_of_joints(
-    log: JointLog, registered: Transform, samples: _Stream
+    log: JointLog, registered: Transform, samples: _AlignedSamples
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
     times, joints = read_joint_log(log.path, log.arm)
     try:
@@ -181,7 +181,7 @@ def _tip_of_joints(
 
 
 def _starts(
-    plan: Path, motions: tuple[Motion, ...], start_wall_ns: int | Mapping[str, int]
+    plan: Path, motions: tuple[ArmMotion, ...], start_wall_ns: int | Mapping[str, int]
 ) -> dict[str, int]:
     if not isinstance(start_wall_ns, Mapping):
         return {
@@ -199,10 +199,10 @@ def _starts(
 
 def _cut(
     record: Path,
-    motion: Motion,
+    motion: ArmMotion,
     unit: str,
     start_ns: int,
-    samples: _Stream,
+    samples: _AlignedSamples,
     tip: Floats,
     known: npt.NDArray[np.bool_],
 ) -> RawTrial:
@@ -286,11 +286,11 @@ class JointLog:
     """
 
     path: Path
-    arm: Arm
+    arm: ArmKinematics
     sensor_robot: Transform | None = None
 
 
-def read_joint_log(path: Path, arm: Arm) -> tuple[Times, Floats]:
+def read_joint_log(path: Path, arm: ArmKinematics) -> tuple[Times, Floats]:
     """Wall clock [ns], shape (T,), and joints [rad or m], shape (T, n), of a CSV file.
 
     Raises:

@@ -34,7 +34,7 @@ _RESTARTS = 30
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class JointSolution:
     """Joints that bring the tip to poses.
 
     Attributes:
@@ -56,7 +56,7 @@ class Solution:
         )
 
 
-class Arm:
+class ArmKinematics:
     """Kinematics of an arm with a tool.
 
     Attributes:
@@ -158,7 +158,7 @@ class Arm:
 
     def solve(
         self, poses: Floats, *, start: npt.ArrayLike | None = None, seed: int = 0
-    ) -> Solution:
+    ) -> JointSolution:
         """Joints along a path of poses, by damped least squares within the limits.
 
         Each pose starts from the joints of the one before, so that the arm keeps its posture. Where
@@ -180,7 +180,7 @@ class Arm:
         random = np.random.default_rng(seed)
         middle = (self.lower + self.upper) / 2
         first = middle if start is None else self._checked(np.atleast_2d(start), True)[0]
-        best: Solution | None = None
+        best: JointSolution | None = None
         for _ in range(1 + _RESTARTS):
             found = self._follow(targets, first)
             if found.reached:
@@ -191,7 +191,7 @@ class Arm:
         assert best is not None  # the loop runs at least once
         return best
 
-    def _follow(self, targets: list[Any], joints: Floats) -> Solution:
+    def _follow(self, targets: list[Any], joints: Floats) -> JointSolution:
         rows = np.empty((len(targets), len(joints)))
         errors = np.empty((len(targets), 2))
         for i, target in enumerate(targets):
@@ -205,7 +205,7 @@ class Arm:
             if i == 0 and errors[0, 0] > 100 * ACCURACY_M:  # hopeless: spare the rest of the path
                 rows[:], errors[:] = rows[0], errors[0]
                 break
-        return Solution(rows, errors[:, 0], errors[:, 1])
+        return JointSolution(rows, errors[:, 0], errors[:, 1])
 
     def _reach(self, target: Any, joints: Floats) -> Floats:
         pin = self._pin

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.rigid import Floats, Transform
-from palpate_training.experiment.kinematics import ACCURACY_M, ANGLE_ACCURACY_RAD, Arm
+from palpate_training.experiment.kinematics import ACCURACY_M, ANGLE_ACCURACY_RAD, ArmKinematics
 
 APPROACH_M = 3.0e-3
 """Travel from the start to first contact as planned [m]; paper."""
@@ -38,7 +38,7 @@ ARMS = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectory:
+class PlannedTrajectory:
     """One planned trajectory, sensor frame.
 
     Attributes:
@@ -135,7 +135,7 @@ def assign_arm(target: npt.ArrayLike) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Station:
+class ArmBase:
     """An arm as it stands.
 
     Attributes:
@@ -145,12 +145,12 @@ class Station:
     """
 
     sensor_robot: Transform
-    arm: Arm | None = None
+    arm: ArmKinematics | None = None
     home: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ArmMotion:
     """A trajectory as a robot executes it.
 
     Attributes:
@@ -161,7 +161,7 @@ class Motion:
         joints: That bring it there [rad or m], shape (I + 1, n), or None.
     """
 
-    trajectory: Trajectory
+    trajectory: PlannedTrajectory
     start_s: float
     poses_robot: Floats
     joints: Floats | None
@@ -173,7 +173,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Eliminated:
+class EliminatedTrajectory:
     """A trajectory that an arm cannot follow.
 
     Attributes:
@@ -186,35 +186,35 @@ class Eliminated:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class RobotPlan:
     """What a robot executes, in order.
 
     Attributes:
         motions: All of them.
-        stations: By arm; those that execute something.
+        bases: By arm; those that execute something.
     """
 
-    motions: tuple[Motion, ...]
-    stations: Mapping[str, Station]
+    motions: tuple[ArmMotion, ...]
+    bases: Mapping[str, ArmBase]
 
 
 def make_plan(
-    trajectories: Iterable[Trajectory], stations: Mapping[str, Station]
-) -> tuple[Plan, list[Eliminated]]:
+    trajectories: Iterable[PlannedTrajectory], bases: Mapping[str, ArmBase]
+) -> tuple[RobotPlan, list[EliminatedTrajectory]]:
     """Turn trajectories into motions of the arms; eliminate what an arm cannot follow.
 
     Args:
         trajectories: In order of execution.
-        stations: By arm.
+        bases: By arm.
 
     Returns:
         The plan, and what was eliminated from it (nothing where no kinematics are given).
 
     Raises:
-        ConfigError: An arm has no station, or an id comes twice.
+        ConfigError: An arm is not registered, or an id comes twice.
     """
-    motions: list[Motion] = []
-    eliminated: list[Eliminated] = []
+    motions: list[ArmMotion] = []
+    eliminated: list[EliminatedTrajectory] = []
     seen: set[str] = set()
     start_s = 0.0
     for item in trajectories:
@@ -223,19 +223,19 @@ def make_plan(
                 f"trajectory {item.trajectory!r} is planned twice", remedy="give each its own id"
             )
         seen.add(item.trajectory)
-        station = stations.get(item.arm)
-        if station is None:
+        base = bases.get(item.arm)
+        if base is None:
             raise ConfigError(
-                f"trajectory {item.trajectory!r} needs the {item.arm} arm, which has no station",
-                remedy="register that arm and pass its station",
+                f"trajectory {item.trajectory!r} needs the {item.arm} arm, which is not registered",
+                remedy="register that arm: palpate data register",
             )
-        poses = station.sensor_robot.inverse().apply_poses(item.poses)
+        poses = base.sensor_robot.inverse().apply_poses(item.poses)
         joints = None
-        if station.arm is not None:
-            found = station.arm.solve(poses, start=station.home)
+        if base.arm is not None:
+            found = base.arm.solve(poses, start=base.home)
             if not found.reached:
                 eliminated.append(
-                    Eliminated(
+                    EliminatedTrajectory(
                         item.trajectory,
                         f"the {item.arm} arm misses by"
                         f" {found.position_error_m.max() * 1e3:.3g} mm and"
@@ -245,10 +245,10 @@ def make_plan(
                 )
                 continue
             joints = found.joints
-        motions.append(Motion(item, start_s, poses, joints))
+        motions.append(ArmMotion(item, start_s, poses, joints))
         start_s += item.duration_s + TRANSIT_S
     used = {motion.trajectory.arm for motion in motions}
-    return Plan(tuple(motions), {k: v for k, v in stations.items() if k in used}), eliminated
+    return RobotPlan(tuple(motions), {k: v for k, v in bases.items() if k in used}), eliminated
 
 
 # `unit` and `facing` of `palpate.rigid` differ from these in the last bit. Stored plans and their

@@ -24,12 +24,13 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from palpate.errors import ConfigError
 from palpate.process import require
 from palpate.rigid import Floats, Transform
 from palpate_training.experiment.plan import ARMS
+from palpate_training.experiment.trajectory_file import StrictModel
 
 CONGRUENCE_M = 2.0e-3
 """How much the distance of two holes may differ between robot and drawing [m]: twice the worst
@@ -44,7 +45,7 @@ HOLES_MAX = 7
 
 
 @dataclass(frozen=True, slots=True)
-class Registration:
+class ArmRegistration:
     """Result of a registration.
 
     Attributes:
@@ -67,7 +68,7 @@ def register(
     names: Sequence[str] | None = None,
     tolerance_m: float = CONGRUENCE_M,
     allow_symmetric: bool = False,
-) -> Registration:
+) -> ArmRegistration:
     """Register a robot by the holes that its pin was led into.
 
     Args:
@@ -113,7 +114,7 @@ def register(
             " one set of holes is the mirror image of the other",
             remedy="check the signs of the axes in the drawing's coordinates",
         )
-    return Registration(mean, labels, residual, len(triples))
+    return ArmRegistration(mean, labels, residual, len(triples))
 
 
 def frame_of(holes: Floats) -> Transform:
@@ -247,7 +248,7 @@ _Pose = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Holes:
+class MeasuredHoles:
     """Holes that one arm led its pin into.
 
     Attributes:
@@ -261,26 +262,22 @@ class Holes:
     sensor: Floats
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
-
-
-class _Arm(_Strict):
+class _RegisteredArm(StrictModel):
     sensor_robot: _Pose
     holes: tuple[str, ...]
     residual_m: tuple[float, ...]
     triples: int
 
 
-class _File(_Strict):
+class _RegistrationFile(StrictModel):
     schema_name: Literal["palpate.testbed.registration"] = Field(alias="schema")
     version: Literal[1]
     frame: Literal["sensor"]
     units: Literal["m; quaternions w x y z"]
-    arms: dict[_Side, _Arm]
+    arms: dict[_Side, _RegisteredArm]
 
 
-def read_holes(path: Path) -> dict[str, Holes]:
+def read_holes(path: Path) -> dict[str, MeasuredHoles]:
     """Measured holes of each arm, from a CSV file with the header ``COLUMNS``.
 
     Raises:
@@ -314,7 +311,7 @@ def read_holes(path: Path) -> dict[str, Holes]:
             )
         found.setdefault(arm, []).append((hole, values))
     return {
-        arm: Holes(
+        arm: MeasuredHoles(
             names=tuple(hole for hole, _ in lines),
             robot=np.array([values[:3] for _, values in lines]),
             sensor=np.array([values[3:] for _, values in lines]),
@@ -323,7 +320,7 @@ def read_holes(path: Path) -> dict[str, Holes]:
     }
 
 
-def write_registrations(path: Path, found: Mapping[str, Registration]) -> Path:
+def write_registrations(path: Path, found: Mapping[str, ArmRegistration]) -> Path:
     """Write registrations by arm; the file appears whole or not at all.
 
     Raises:
@@ -331,13 +328,13 @@ def write_registrations(path: Path, found: Mapping[str, Registration]) -> Path:
     """
     if not found:
         raise ConfigError(f"{path}: no arm is registered", remedy="measure holes of at least one")
-    content = _File(
+    content = _RegistrationFile(
         schema="palpate.testbed.registration",
         version=1,
         frame="sensor",
         units="m; quaternions w x y z",
         arms={
-            "left" if arm == "left" else "right": _Arm(
+            "left" if arm == "left" else "right": _RegisteredArm(
                 sensor_robot=_pose(item.sensor_robot),
                 holes=item.holes,
                 residual_m=tuple(item.residual_m.tolist()),
@@ -357,7 +354,7 @@ def write_registrations(path: Path, found: Mapping[str, Registration]) -> Path:
     return path
 
 
-def read_registrations(path: Path) -> dict[str, Registration]:
+def read_registrations(path: Path) -> dict[str, ArmRegistration]:
     """Registrations by arm.
 
     Raises:
@@ -365,7 +362,7 @@ def read_registrations(path: Path) -> dict[str, Registration]:
             names file and key.
     """
     try:
-        content = _File.model_validate_json(path.read_bytes())
+        content = _RegistrationFile.model_validate_json(path.read_bytes())
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error}", remedy="check the path") from error
     except ValidationError as error:
@@ -375,7 +372,7 @@ def read_registrations(path: Path) -> dict[str, Registration]:
             f"{path}: {key}: {first['msg']}", remedy="make it with: palpate data register"
         ) from error
     return {
-        arm: Registration(
+        arm: ArmRegistration(
             sensor_robot=Transform.from_pose(item.sensor_robot, f"{path}: {arm}.sensor_robot"),
             holes=item.holes,
             residual_m=np.array(item.residual_m),

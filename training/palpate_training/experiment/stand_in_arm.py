@@ -23,7 +23,7 @@ import numpy.typing as npt
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate.rigid import Floats, Transform
-from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.kinematics import ArmKinematics
 
 SIDES = ("left", "right")
 FLANGE = "flange"
@@ -34,7 +34,7 @@ TOOL_LENGTH_M = 0.06
 
 
 @dataclass(frozen=True, slots=True)
-class _Joint:
+class _ArmJoint:
     """Place in the link before [m], axis, limits [rad]; of the right arm."""
 
     origin: tuple[float, float, float]
@@ -43,13 +43,13 @@ class _Joint:
 
 
 _JOINTS = (
-    _Joint((0.0, 0.0, 0.16), (0, 0, 1), (-2.9, 2.9)),
-    _Joint((0.03, 0.0, 0.09), (0, 1, 0), (-1.9, 2.3)),
-    _Joint((-0.03, 0.0, 0.11), (0, 0, 1), (-2.9, 2.9)),
-    _Joint((0.04, 0.0, 0.14), (0, 1, 0), (-0.3, 2.6)),
-    _Joint((-0.04, 0.0, 0.12), (0, 0, 1), (-2.9, 2.9)),
-    _Joint((0.025, 0.0, 0.13), (0, 1, 0), (-2.2, 2.2)),
-    _Joint((0.025, 0.0, 0.05), (0, 0, 1), (-3.1, 3.1)),
+    _ArmJoint((0.0, 0.0, 0.16), (0, 0, 1), (-2.9, 2.9)),
+    _ArmJoint((0.03, 0.0, 0.09), (0, 1, 0), (-1.9, 2.3)),
+    _ArmJoint((-0.03, 0.0, 0.11), (0, 0, 1), (-2.9, 2.9)),
+    _ArmJoint((0.04, 0.0, 0.14), (0, 1, 0), (-0.3, 2.6)),
+    _ArmJoint((-0.04, 0.0, 0.12), (0, 0, 1), (-2.9, 2.9)),
+    _ArmJoint((0.025, 0.0, 0.13), (0, 1, 0), (-2.2, 2.2)),
+    _ArmJoint((0.025, 0.0, 0.05), (0, 0, 1), (-3.1, 3.1)),
 )
 _FLANGE_M = 0.03  # from the last joint to the flange
 JOINTS = len(_JOINTS)
@@ -112,11 +112,11 @@ def write_arm_urdf(side: str, path: Path) -> Path:
     return path
 
 
-def stand_in_arm(side: str) -> Arm:
+def stand_in_arm(side: str) -> ArmKinematics:
     """The open stand-in arm of a side, with its tool."""
     with tempfile.TemporaryDirectory() as folder:
         urdf = write_arm_urdf(side, Path(folder) / f"{side}.urdf")
-        return Arm.from_urdf(urdf, FLANGE, tool())
+        return ArmKinematics.from_urdf(urdf, FLANGE, tool())
 
 
 def tool() -> Transform:

@@ -27,10 +27,10 @@ from palpate_training.experiment.plan import (
     DWELL_S,
     INCREMENT_M,
     MOVE_S,
-    Motion,
-    Plan,
-    Station,
-    Trajectory,
+    ArmBase,
+    ArmMotion,
+    PlannedTrajectory,
+    RobotPlan,
 )
 
 SCHEMA = "palpate.testbed.trajectories"
@@ -41,12 +41,14 @@ _Pose = tuple[float, float, float, float, float, float, float]
 _Point = tuple[float, float, float]
 
 
-class _Strict(BaseModel):
+class StrictModel(BaseModel):
+    """A part of a JSON file of the testbed: an unknown key or another type is an error."""
+
     # strict would refuse JSON's lists as tuples; lax floats would take "1.0" for a number
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
-class _Header(_Strict):
+class _TrajectoryFileHeader(StrictModel):
     schema_name: Literal["palpate.testbed.trajectories"] = Field(alias="schema")
     version: int
     frame: Literal["sensor"]
@@ -60,7 +62,7 @@ class _Header(_Strict):
     content_sha256: str
 
 
-class _Increment(_Strict):
+class _TrajectoryIncrement(StrictModel):
     time_s: float
     travel_m: float
     pose_sensor: _Pose
@@ -68,7 +70,7 @@ class _Increment(_Strict):
     joints: tuple[float, ...] | None
 
 
-class _Line(_Strict):
+class _TrajectoryLine(StrictModel):
     trajectory: str
     indenter: str
     arm: Literal["left", "right"]
@@ -77,10 +79,10 @@ class _Line(_Strict):
     contact_m: float
     depth_m: float
     start_s: float
-    increments: tuple[_Increment, ...]
+    increments: tuple[_TrajectoryIncrement, ...]
 
 
-def write_trajectories(plan: Plan, path: Path) -> Path:
+def write_trajectories(plan: RobotPlan, path: Path) -> Path:
     """Write a plan; the file appears whole or not at all.
 
     Raises:
@@ -97,8 +99,8 @@ def write_trajectories(plan: Plan, path: Path) -> Path:
         "increment_m": INCREMENT_M,
         "dwell_s": DWELL_S,
         "move_s": MOVE_S,
-        "sensor_robot": {k: v.sensor_robot.pose.tolist() for k, v in plan.stations.items()},
-        "joint_names": {k: v.arm.joint_names for k, v in plan.stations.items() if v.arm},
+        "sensor_robot": {k: v.sensor_robot.pose.tolist() for k, v in plan.bases.items()},
+        "joint_names": {k: v.arm.joint_names for k, v in plan.bases.items() if v.arm},
         "trajectories": len(plan.motions),
         "content_sha256": hashlib.sha256(body).hexdigest(),
     }
@@ -107,8 +109,8 @@ def write_trajectories(plan: Plan, path: Path) -> Path:
     return path
 
 
-def read_trajectories(path: Path) -> Plan:
-    """Read a plan; its stations have no kinematics.
+def read_trajectories(path: Path) -> RobotPlan:
+    """Read a plan; its bases have no kinematics.
 
     Raises:
         DatasetError: It cannot be read, is of another schema or version, was changed, or does not
@@ -131,7 +133,7 @@ def read_trajectories(path: Path) -> Plan:
             f"{path}: {len(lines)} trajectories, the header says {header.trajectories}",
             remedy="write the plan anew",
         )
-    motions: list[Motion] = []
+    motions: list[ArmMotion] = []
     seen: set[str] = set()
     end_s = -np.inf
     for number, text in enumerate(lines, 2):
@@ -149,14 +151,14 @@ def read_trajectories(path: Path) -> Plan:
         end_s = float(motion.time_s[-1])
         seen.add(motion.trajectory.trajectory)
         motions.append(motion)
-    stations: dict[str, Station] = {
-        arm: Station(_transform(pose, f"{path}: sensor_robot.{arm}"))
+    bases: dict[str, ArmBase] = {
+        arm: ArmBase(_transform(pose, f"{path}: sensor_robot.{arm}"))
         for arm, pose in header.sensor_robot.items()
     }
-    return Plan(tuple(motions), stations)
+    return RobotPlan(tuple(motions), bases)
 
 
-def _header(path: Path, text: bytes) -> _Header:
+def _header(path: Path, text: bytes) -> _TrajectoryFileHeader:
     try:
         raw = json.loads(text)
     except ValueError as error:
@@ -173,7 +175,7 @@ def _header(path: Path, text: bytes) -> _Header:
             remedy="upgrade palpate, or write the plan anew",
         )
     try:
-        header = _Header.model_validate_json(text)
+        header = _TrajectoryFileHeader.model_validate_json(text)
     except ValidationError as error:
         raise _invalid(f"{path}, line 1", error) from error
     for key, wanted in (("increment_m", INCREMENT_M), ("dwell_s", DWELL_S), ("move_s", MOVE_S)):
@@ -185,10 +187,10 @@ def _header(path: Path, text: bytes) -> _Header:
     return header
 
 
-def _motion(where: str, text: str, header: _Header) -> Motion:
+def _motion(where: str, text: str, header: _TrajectoryFileHeader) -> ArmMotion:
     try:
-        line = _Line.model_validate_json(text)
-        item = Trajectory(
+        line = _TrajectoryLine.model_validate_json(text)
+        item = PlannedTrajectory(
             trajectory=line.trajectory,
             indenter=line.indenter,
             arm=line.arm,
@@ -209,7 +211,7 @@ def _motion(where: str, text: str, header: _Header) -> Motion:
     sensor_robot = _transform(header.sensor_robot[line.arm], f"{where}: sensor_robot.{line.arm}")
     rows = line.increments
     poses_robot = sensor_robot.inverse().apply_poses(item.poses)
-    motion = Motion(item, line.start_s, poses_robot, _joints(where, line, header))
+    motion = ArmMotion(item, line.start_s, poses_robot, _joints(where, line, header))
     for key, wanted in (
         ("time_s", motion.time_s),
         ("travel_m", item.travel_m),
@@ -233,7 +235,7 @@ def _same(given: Floats, wanted: Floats) -> bool:
     return bool(np.abs(given - wanted).max() <= _SAME)
 
 
-def _joints(where: str, line: _Line, header: _Header) -> Floats | None:
+def _joints(where: str, line: _TrajectoryLine, header: _TrajectoryFileHeader) -> Floats | None:
     names = header.joint_names.get(line.arm)
     if names is None:
         if all(row.joints is None for row in line.increments):
@@ -246,10 +248,10 @@ def _joints(where: str, line: _Line, header: _Header) -> Floats | None:
     )
 
 
-def _line(motion: Motion) -> _Line:
+def _line(motion: ArmMotion) -> _TrajectoryLine:
     item = motion.trajectory
     joints = [None] * len(motion.poses_robot) if motion.joints is None else motion.joints.tolist()
-    return _Line(
+    return _TrajectoryLine(
         trajectory=item.trajectory,
         indenter=item.indenter,
         arm="left" if item.arm == "left" else "right",
@@ -259,7 +261,7 @@ def _line(motion: Motion) -> _Line:
         depth_m=float(item.depth_m),
         start_s=motion.start_s,
         increments=tuple(
-            _Increment(
+            _TrajectoryIncrement(
                 time_s=time_s,
                 travel_m=travel_m,
                 pose_sensor=tuple(pose_sensor),

@@ -42,7 +42,7 @@ FENCE_IQR = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class BoxStatistics:
     """What a box shows, in the unit of the values.
 
     Attributes:
@@ -62,7 +62,7 @@ class Box:
     high: float
 
 
-def box_of(values: Floats) -> Box:
+def box_of(values: Floats) -> BoxStatistics:
     """The box of some values, shape (N,).
 
     Fences are 1.5 IQR long, rounded down to the nearest value; what lies beyond is not shown.
@@ -81,10 +81,10 @@ def box_of(values: Floats) -> Box:
     # Where no value lies between box and fence, the fence is the edge of the box.
     low = min(float(exact[exact >= q1 - reach].min()), float(q1))
     high = max(float(exact[exact <= q3 + reach].max()), float(q3))
-    return Box(low, float(q1), float(median), float(exact.mean()), float(q3), high)
+    return BoxStatistics(low, float(q1), float(median), float(exact.mean()), float(q3), high)
 
 
-def draw_boxes(axes: Any, groups: Sequence[Sequence[Box]], names: Sequence[str]) -> None:
+def draw_boxes(axes: Any, groups: Sequence[Sequence[BoxStatistics]], names: Sequence[str]) -> None:
     """Groups of boxes side by side, one colour for each unit.
 
     Args:

@@ -141,7 +141,7 @@ _SEGMENT_S = 10.24
 
 
 @dataclass(frozen=True, slots=True)
-class Spectrum:
+class NoiseSpectrum:
     """One-sided power spectral density.
 
     Attributes:
@@ -160,7 +160,7 @@ class Spectrum:
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class ElectrodeDrift:
     """Slow change from the first mean on.
 
     Attributes:
@@ -183,7 +183,7 @@ class Drift:
         return float(power[0] / power.sum()) if power.sum() > 0 else float("nan")
 
 
-def spectrum(counts: Floats, rate_hz: float, *, segment_s: float = _SEGMENT_S) -> Spectrum:
+def spectrum(counts: Floats, rate_hz: float, *, segment_s: float = _SEGMENT_S) -> NoiseSpectrum:
     """Welch's power spectral density of each electrode.
 
     Hann windows that overlap by half; a line is taken out of each, so that drift does not leak
@@ -213,10 +213,10 @@ def spectrum(counts: Floats, rate_hz: float, *, segment_s: float = _SEGMENT_S) -
         densities.append(density)
     # The first holds what is left of the removed line, and is no place on a logarithmic axis; the
     # last one's density is halved where the window is even.
-    return Spectrum(frequency[1:-1], np.stack(densities, axis=1)[1:-1])
+    return NoiseSpectrum(frequency[1:-1], np.stack(densities, axis=1)[1:-1])
 
 
-def drift(counts: Floats, rate_hz: float, *, mean_s: float = 1.0) -> Drift:
+def drift(counts: Floats, rate_hz: float, *, mean_s: float = 1.0) -> ElectrodeDrift:
     """Means over so many seconds, from the first one on.
 
     Args:
@@ -237,7 +237,7 @@ def drift(counts: Floats, rate_hz: float, *, mean_s: float = 1.0) -> Drift:
     whole = np.asarray(counts[: means * length], np.float64)
     level: Floats = whole.reshape(means, length, -1).mean(axis=1)
     middle = np.asarray((np.arange(means) + 0.5) * length / rate_hz, np.float64)
-    return Drift(middle, level - level[0])
+    return ElectrodeDrift(middle, level - level[0])
 
 
 def draw_noise(path: Path, streams: Sequence[IdleStream]) -> str:

@@ -37,15 +37,16 @@ from palpate_training.figures.statistics import (
     PAPER_UNITS,
     SHEARED,
     DatasetStatistics,
-    UnitStatistics,
+    SpecimenStatistics,
     dataset_statistics,
 )
+from palpate_training.figures.style import markdown_table
 
 PAGE = "statistics.md"
 
 
 @dataclass(frozen=True, slots=True)
-class Sources:
+class PageSources:
     """What a page is made from.
 
     Attributes:
@@ -63,7 +64,7 @@ class Sources:
 
 def write_page(
     folder: Path,
-    sources: Sources,
+    sources: PageSources,
     *,
     command: str,
     on_step: Callable[[str], None] = lambda step: None,
@@ -195,16 +196,9 @@ def _write(path: Path, text: str) -> None:
 _SIGN_WORDS = {1: "rises", -1: "falls", 0: "-"}
 
 
-def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first column is words, the others are numbers."""
-    lines = ["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 1)]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
-
-
 def size_table(statistics: DatasetStatistics) -> str:
     """Counts of the whole data set beside the paper's."""
-    return table(
+    return markdown_table(
         ["", "this data set", "paper"],
         [
             ["unique trajectories", f"{statistics.trajectories:,}", f"{PAPER_TRAJECTORIES:,}"],
@@ -219,7 +213,7 @@ def size_table(statistics: DatasetStatistics) -> str:
     )
 
 
-def unit_table(units: Sequence[UnitStatistics], paper: Sequence[int | None]) -> str:
+def unit_table(units: Sequence[SpecimenStatistics], paper: Sequence[int | None]) -> str:
     """What the paper tells of each BioTac, and ours.
 
     Args:
@@ -254,10 +248,10 @@ def unit_table(units: Sequence[UnitStatistics], paper: Sequence[int | None]) -> 
             *(_percent(unit.sheared_share) for unit in units),
         ],
     ]
-    return table(["in brackets: the paper", *(unit.name for unit in units)], rows)
+    return markdown_table(["in brackets: the paper", *(unit.name for unit in units)], rows)
 
 
-def group_table(units: Sequence[UnitStatistics]) -> str:
+def group_table(units: Sequence[SpecimenStatistics]) -> str:
     """Mean standard deviation of the tared values by group of electrodes, and the target."""
     rows = [
         [
@@ -279,10 +273,12 @@ def group_table(units: Sequence[UnitStatistics]) -> str:
             *(f"{u.electrode_mean.min():.3f} to {u.electrode_mean.max():.3f}" for u in units),
         ]
     )
-    return table(["standard deviation [1]", "target", *(unit.name for unit in units)], rows)
+    return markdown_table(
+        ["standard deviation [1]", "target", *(unit.name for unit in units)], rows
+    )
 
 
-def electrode_table(units: Sequence[UnitStatistics]) -> str:
+def electrode_table(units: Sequence[SpecimenStatistics]) -> str:
     """Mean and standard deviation of each electrode."""
     headings = ["electrode", *(f"{u.name}: {what}" for u in units for what in ("mean", "sd"))]
     rows = [
@@ -296,7 +292,7 @@ def electrode_table(units: Sequence[UnitStatistics]) -> str:
         ]
         for i, name in enumerate(ELECTRODE_NAMES)
     ]
-    return table(headings, rows)
+    return markdown_table(headings, rows)
 
 
 def noise_table(streams: Sequence[IdleStream]) -> str:
@@ -318,7 +314,7 @@ def noise_table(streams: Sequence[IdleStream]) -> str:
         "sensor", "minutes", "noise above 1 Hz, sd [counts]", "drift [counts/min]",
         "drift in common",
     ]  # fmt: skip
-    return table(headings, rows)
+    return markdown_table(headings, rows)
 
 
 def sign_table(real: PlateResponse, presses: Sequence[FlatPress]) -> str:
@@ -336,7 +332,9 @@ def sign_table(real: PlateResponse, presses: Sequence[FlatPress]) -> str:
             *(f"{press.rows} rows, {press.trials} trials" for press in presses),
         ]
     )  # fmt: skip
-    return table(["electrode", "real, plate", *(f"{press.name}, cube" for press in presses)], rows)
+    return markdown_table(
+        ["electrode", "real, plate", *(f"{press.name}, cube" for press in presses)], rows
+    )
 
 
 def _percent(share: float) -> str:

@@ -19,7 +19,7 @@ SHEARED = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class PaperUnit:
+class PaperSpecimen:
     """What the captions of the paper's figures say of a BioTac."""
 
     tared_min: float
@@ -28,9 +28,9 @@ class PaperUnit:
 
 
 PAPER_UNITS = (
-    PaperUnit(-0.65, 0.13, 23.4),
-    PaperUnit(-0.78, 0.11, 32.1),
-    PaperUnit(-0.51, 0.17, 29.0),
+    PaperSpecimen(-0.65, 0.13, 23.4),
+    PaperSpecimen(-0.78, 0.11, 32.1),
+    PaperSpecimen(-0.51, 0.17, 29.0),
 )
 """BioTac 1, 2 and 3 (captions of the paper's force and electrode figures)."""
 
@@ -42,7 +42,7 @@ PAPER_SHEARED = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class ElectrodeGroup:
+class ElectrodeGroupTarget:
     """Electrodes that share a target of the standard deviation of their tared values.
 
     Attributes:
@@ -63,9 +63,9 @@ class ElectrodeGroup:
 
 
 ELECTRODE_GROUPS = (
-    ElectrodeGroup("E1-E6, E11-E14", (0, 1, 2, 3, 4, 5, 10, 11, 12, 13), 0.041, 0.059),
-    ElectrodeGroup("E7-E10", (6, 7, 8, 9), 0.016, 0.020),
-    ElectrodeGroup("E15-E19", (14, 15, 16, 17, 18), 0.025, 0.034),
+    ElectrodeGroupTarget("E1-E6, E11-E14", (0, 1, 2, 3, 4, 5, 10, 11, 12, 13), 0.041, 0.059),
+    ElectrodeGroupTarget("E7-E10", (6, 7, 8, 9), 0.016, 0.020),
+    ElectrodeGroupTarget("E15-E19", (14, 15, 16, 17, 18), 0.025, 0.034),
 )
 """Of real sensors, dominated by light contacts (learning notes, section 4.5)."""
 
@@ -74,7 +74,7 @@ ELECTRODE_MEANS = (-0.016, 0.009)
 
 
 @dataclass(frozen=True, slots=True)
-class UnitStatistics:
+class SpecimenStatistics:
     """One BioTac's part of a data set.
 
     Attributes:
@@ -120,7 +120,7 @@ class DatasetStatistics:
         angled_share: Share of unique trajectories that were planned angled, see `angled_share`.
     """
 
-    units: tuple[UnitStatistics, ...]
+    units: tuple[SpecimenStatistics, ...]
     trajectories: int
     trials: int
     rows: int
@@ -177,7 +177,7 @@ def _unit(
     data: ExperimentDataset,
     unit: int,
     last: npt.NDArray[np.int64],
-) -> UnitStatistics:
+) -> SpecimenStatistics:
     """One unit, whose trials end at rows ``last``."""
     rows = data.row_unit == unit
     tared = data.tared[rows].astype(np.float64)
@@ -185,7 +185,7 @@ def _unit(
     lengths = np.unique(data.trial[rows], return_counts=True)[1]
     trajectory = data.row_trajectory[last]
     ratio = shear_ratio(data.force[last].astype(np.float64), data.location[last].astype(np.float64))
-    return UnitStatistics(
+    return SpecimenStatistics(
         name=data.unit_names[unit],
         trials=len(last),
         trajectories=len(np.unique(trajectory)),

@@ -1,4 +1,4 @@
-"""How the pictures of a data set look. matplotlib is loaded when the first one is drawn."""
+"""How pictures and tables look. matplotlib is loaded when the first picture is drawn."""
 
 from __future__ import annotations
 
@@ -86,3 +86,10 @@ def unit_legend(where: Any, names: Sequence[str], **options: Any) -> None:
         for i, name in enumerate(names)
     ]
     where.legend(handles=handles, frameon=False, fontsize=9, labelcolor=INK, **options)
+
+
+def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
+    """A Markdown table; the first ``words`` columns are words, the others are numbers."""
+    lines = [headings, ["---"] * words + ["---:"] * (len(headings) - words)]
+    first, rule, *rest = ("| " + " | ".join(cells) + " |" for cells in (*lines, *rows))
+    return "\n".join([first, rule.replace(" ", ""), *rest]) + "\n"

@@ -15,7 +15,7 @@ RIDGE_STRENGTHS = (1e-6, 1e-4, 1e-2, 1e-1, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Affine:
+class AffineModel:
     """``y = x @ weight + offset``.
 
     Attributes:
@@ -31,29 +31,29 @@ class Affine:
         return np.asarray(inputs @ self.weight + self.offset, dtype=np.float64)
 
 
-def zero(inputs: Float, targets: Float) -> Affine:
+def zero(inputs: Float, targets: Float) -> AffineModel:
     """Always zero: no force, no motion, no electrode changes."""
     width = targets.shape[1]
-    return Affine(np.zeros((inputs.shape[1], width)), np.zeros(width))
+    return AffineModel(np.zeros((inputs.shape[1], width)), np.zeros(width))
 
 
-def constant(inputs: Float, targets: Float) -> Affine:
+def constant(inputs: Float, targets: Float) -> AffineModel:
     """Always the mean of the training targets."""
     mean = targets.mean(axis=0, dtype=np.float64)
-    return Affine(np.zeros((inputs.shape[1], len(mean))), mean)
+    return AffineModel(np.zeros((inputs.shape[1], len(mean))), mean)
 
 
-def linear(inputs: Float, targets: Float) -> Affine:
+def linear(inputs: Float, targets: Float) -> AffineModel:
     """Least squares with intercept; inputs are centred first, for conditioning."""
     centre = inputs.mean(axis=0, dtype=np.float64)
     mean = targets.mean(axis=0, dtype=np.float64)
     weight = np.linalg.lstsq(inputs - centre, targets - mean, rcond=None)[0]
-    return Affine(weight, mean - centre @ weight)
+    return AffineModel(weight, mean - centre @ weight)
 
 
 def ridge(
     inputs: Float, targets: Float, validation_inputs: Float, validation_targets: Float
-) -> Affine:
+) -> AffineModel:
     """Least squares with intercept and a penalty that is chosen on the validation rows.
 
     Args:
@@ -67,11 +67,11 @@ def ridge(
     spread = np.where(spread > 0, spread, 1.0)
     scaled = (inputs - centre) / spread
     gram, moment = scaled.T @ scaled, scaled.T @ (targets - offset)
-    best: tuple[float, Affine] | None = None
+    best: tuple[float, AffineModel] | None = None
     for strength in RIDGE_STRENGTHS:
         penalty = strength * len(inputs) * np.eye(len(gram))
         weight = np.linalg.solve(gram + penalty, moment) / spread[:, None]
-        line = Affine(weight, offset - centre @ weight)
+        line = AffineModel(weight, offset - centre @ weight)
         residual = line.predict(validation_inputs) - validation_targets
         score = float(np.mean(np.square(residual)))
         if best is None or score < best[0]:

@@ -175,7 +175,7 @@ _THINNEST_REST_M = 5e-5
 
 
 @dataclass(frozen=True, slots=True)
-class Pooling:
+class FilmPooling:
     """Linear map from nodal displacement to the change of the film near every electrode.
 
     Attributes:
@@ -211,7 +211,7 @@ def core_normal(points: npt.NDArray[np.floating]) -> Floats:
     return np.asarray(radial / np.linalg.norm(radial, axis=1, keepdims=True))
 
 
-def pooling(mesh: SkinMesh) -> Pooling:
+def pooling(mesh: SkinMesh) -> FilmPooling:
     """Kernel ``(1 - (d/r)^2)^2`` on the core's surface, weighted by the nodes' share of the area.
 
     A site with no inner node within the radius takes the nearest one.
@@ -244,7 +244,7 @@ def pooling(mesh: SkinMesh) -> Pooling:
             columns.append(near / near.sum())
     weights = np.stack(columns, axis=1)
     used = np.flatnonzero(weights.any(axis=1))
-    return Pooling(
+    return FilmPooling(
         nodes=inner[used],
         normals=normals[used].astype(np.float32),
         weights=weights[used].astype(np.float32),

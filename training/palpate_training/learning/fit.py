@@ -132,7 +132,7 @@ def fit(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FeaturesConfig(FitConfig):
+class FeaturesFitConfig(FitConfig):
     """Settings of a training of one quantity from tared counts.
 
     Attributes:
@@ -161,7 +161,7 @@ def fit_quantity(
     validation: tuple[FloatArray, FloatArray] | None = None,
     *,
     baseline: FloatArray | None = None,
-    config: FeaturesConfig | None = None,
+    config: FeaturesFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FittedMlp:
@@ -178,7 +178,7 @@ def fit_quantity(
         seed: Seed of the first weights, the order of the rows and the drift.
         on_epoch: Called after each epoch, for a progress bar.
     """
-    config = config or FeaturesConfig()
+    config = config or FeaturesFitConfig()
     if config.drift_sd > 0 and baseline is None:
         raise ValueError("drift_sd needs the baseline of the training rows")
     torch.manual_seed(seed)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from palpate.files.tasks import TASKS
 from palpate.messages import TensorInfo
 from palpate_training.datasets.features import ELECTRODES
-from palpate_training.learning.field_code import FieldCode, Pooling
+from palpate_training.learning.field_code import FieldCode, FilmPooling
 
 PAPER_WIDTHS = (256, 128, 128)
 """Hidden layers of the paper's MLP."""
@@ -242,7 +242,7 @@ class SynthesisGraph(nn.Module):
     counts_spread: Tensor
 
     def __init__(
-        self, net: FilmNet, code: FieldCode, pooling: Pooling, counts_sd: FloatArray
+        self, net: FilmNet, code: FieldCode, pooling: FilmPooling, counts_sd: FloatArray
     ) -> None:
         super().__init__()
         self.net = net

@@ -22,7 +22,7 @@ Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Split:
+class RowSplit:
     """Row numbers of each side; ``guard`` rows are on none.
 
     Attributes:
@@ -40,7 +40,7 @@ class Split:
 
 def contiguous_folds(
     block: Labels, recording: Labels, *, folds: int = 5, guard_rows: int = 100
-) -> list[Split]:
+) -> list[RowSplit]:
     """Hold out whole blocks; every block is tested in exactly one fold.
 
     In each recording the blocks are counted in order of time: fold ``k`` tests those with
@@ -84,7 +84,7 @@ def contiguous_folds(
 
 def unseen_sensor(
     sensor: Labels, block: Labels, *, test_sensor: int, guard_rows: int = 100
-) -> Split:
+) -> RowSplit:
     """Train on the other sensors, test on all rows of one that was never seen.
 
     Args:
@@ -106,7 +106,7 @@ def unseen_sensor(
 
 def by_group(
     group: Labels, *, test_share: float = 0.2, validation_share: float = 0.1, seed: int = 0
-) -> Split:
+) -> RowSplit:
     """Deal whole groups (presses, trajectories) to test, validation and train.
 
     Args:
@@ -130,13 +130,13 @@ def by_group(
     return _guarded(validation, test, group, guard_rows=0)
 
 
-def _guarded(validation: Mask, test: Mask, recording: Labels, guard_rows: int) -> Split:
+def _guarded(validation: Mask, test: Mask, recording: Labels, guard_rows: int) -> RowSplit:
     near_test = _near(test, recording, guard_rows)
     near_validation = _near(validation, recording, guard_rows)
     train = ~test & ~validation & ~near_test & ~near_validation
     validation = validation & ~near_test
     guard = ~train & ~validation & ~test
-    return Split(*(np.flatnonzero(side) for side in (train, validation, test, guard)))
+    return RowSplit(*(np.flatnonzero(side) for side in (train, validation, test, guard)))
 
 
 def _near(mask: Mask, recording: Labels, distance: int) -> Mask:
@@ -155,7 +155,7 @@ def _near(mask: Mask, recording: Labels, distance: int) -> Mask:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldOut:
     """Rows of some units, dealt by trajectory.
 
     Attributes:
@@ -164,10 +164,10 @@ class Held:
     """
 
     units: tuple[str, ...]
-    split: Split
+    split: RowSplit
 
 
-def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> Split:
+def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> RowSplit:
     """Deal 70, 20 and 10 % of the unique trajectories to train, test and validation.
 
     The paper keeps a trajectory's rows together (section "Contiguity"); here every execution of
@@ -184,7 +184,7 @@ def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> Split:
     return by_group(data.row_trajectory, test_share=0.2, validation_share=0.1, seed=seed)
 
 
-def of_units(data: ExperimentDataset, split: Split, units: Sequence[str]) -> Held:
+def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> HeldOut:
     """The rows of a split that belong to some units.
 
     Args:
@@ -214,7 +214,9 @@ def of_units(data: ExperimentDataset, split: Split, units: Sequence[str]) -> Hel
                 remedy="use a data set with more trajectories of these units, or another seed",
             )
     guard = keep(split.guard)
-    return Held(tuple(units), Split(sides["train"], sides["validation"], sides["test"], guard))
+    return HeldOut(
+        tuple(units), RowSplit(sides["train"], sides["validation"], sides["test"], guard)
+    )
 
 
 def unit_sets(data: ExperimentDataset) -> list[tuple[str, ...]]:

@@ -23,11 +23,10 @@ import numpy.typing as npt
 from palpate.errors import BundleError, DatasetError
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import ExperimentDataset
-from palpate_training.datasets.features import FeatureDataset
-from palpate_training.datasets.features_file import open_dataset
+from palpate_training.datasets.features import FeatureDataset, open_dataset
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_features
-from palpate_training.learning.fit import FeaturesConfig, FittedMlp, fit_quantity
+from palpate_training.learning.fit import FeaturesFitConfig, FittedMlp, fit_quantity
 from palpate_training.learning.metrics import (
     cluster_bootstrap,
     force_errors,
@@ -39,7 +38,7 @@ from palpate_training.learning.metrics import (
 from palpate_training.learning.networks import FeaturesGraph, Mlp, predict
 from palpate_training.learning.splits import (
     Rows,
-    Split,
+    RowSplit,
     by_group,
     by_trajectory,
     of_units,
@@ -56,16 +55,17 @@ from palpate_training.tasks.results import (
     TaskReport,
     averaged,
     label_of,
+    stack_seeds,
     tick,
 )
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 OnEpoch = Callable[[str, int, int], None]
 """Called with the quantity, the epoch and the number of epochs at most."""
 
-FEATURES_CONFIG = FeaturesConfig(epochs=40, patience=12, batch_rows=512)
+FEATURES_CONFIG = FeaturesFitConfig(epochs=40, patience=12, batch_rows=512)
 """Under two minutes for 100,000 rows on one core."""
 
 FALSE_CONTACT_SHARE = 0.001
@@ -98,14 +98,14 @@ def train_features(
     *,
     name: str = "features",
     version: int = 1,
-    config: FeaturesConfig = FEATURES_CONFIG,
+    config: FeaturesFitConfig = FEATURES_CONFIG,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FeaturesReport:
     """Train, evaluate on presses that were never seen, and write the bundle.
 
     Args:
-        dataset_path: HDF5 data set (``palpate_training.datasets.features_file``).
+        dataset_path: HDF5 data set (``palpate_training.datasets.features``).
         bundle_dir: Folder of the bundle; must not exist yet.
         name: Name of the bundle.
         version: Its version, from 1.
@@ -198,7 +198,7 @@ def _residual_sd(estimate: FloatArray, truth: FloatArray) -> FloatArray:
     return np.asarray(rms(estimate - truth), dtype=np.float32)
 
 
-def _contact_threshold(data: FeatureDataset, estimate: FloatArray, split: Split) -> float:
+def _contact_threshold(data: FeatureDataset, estimate: FloatArray, split: RowSplit) -> float:
     if data.in_contact is None or data.in_contact[split.validation].all():
         return MIN_CONTACT_THRESHOLD_N
     untouched = np.linalg.norm(estimate[~data.in_contact[split.validation]], axis=1)
@@ -207,7 +207,7 @@ def _contact_threshold(data: FeatureDataset, estimate: FloatArray, split: Split)
 
 
 def _force_report(
-    data: FeatureDataset, x: FloatArray, estimate: FloatArray, split: Split, threshold: float
+    data: FeatureDataset, x: FloatArray, estimate: FloatArray, split: RowSplit, threshold: float
 ) -> dict[str, float]:
     """Force metrics of the rows in contact, and how often contact itself is told right."""
     truth = data.force[split.test]
@@ -264,7 +264,7 @@ def _location_report(
 
 Floating = npt.NDArray[np.floating]
 
-PAPER_CONFIG = FeaturesConfig(epochs=60, patience=20)
+PAPER_CONFIG = FeaturesFitConfig(epochs=60, patience=20)
 """The paper's layers; epochs at most."""
 
 Metrics = Callable[[Floating, Floating], dict[str, float]]
@@ -285,7 +285,7 @@ def evaluate_features(
     *,
     seeds: int = 3,
     split_seed: int = 0,
-    config: FeaturesConfig = PAPER_CONFIG,
+    config: FeaturesFitConfig = PAPER_CONFIG,
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> list[TaskReport]:
@@ -332,9 +332,7 @@ def evaluate_features(
             truth, cluster = y[fold.test], data.row_trajectory[fold.test]
             for model, each in estimates.items():
                 errors = [errors_of(one, truth) for one in each]
-                stacked = {
-                    name: np.stack([one[name] for one in errors], axis=1) for name in headlines
-                }
+                stacked = stack_seeds(errors, headlines)
                 found = [metrics_of(one, truth) for one in each]
                 ends = cluster_bootstrap(stacked, cluster, draws=draws)
                 results.append(averaged(label_of(units), model, found, ends))

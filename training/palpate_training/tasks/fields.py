@@ -32,7 +32,7 @@ from palpate_training.learning.field_code import FieldCode, fit_code
 from palpate_training.learning.fit import FitConfig, OnEpoch, fit
 from palpate_training.learning.metrics import field_errors, field_summary, join
 from palpate_training.learning.networks import FieldGraph, Mlp, predict
-from palpate_training.learning.splits import Held, Rows, by_trajectory, of_units, unit_sets
+from palpate_training.learning.splits import HeldOut, Rows, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.results import (
     ALL,
     MEAN,
@@ -42,7 +42,7 @@ from palpate_training.tasks.results import (
     Errors,
     ModelResult,
     OnNetwork,
-    Picture,
+    ResultPicture,
     TaskReport,
     facts_of,
     label_of,
@@ -62,7 +62,7 @@ _CHUNK_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldConfig(FitConfig):
+class FieldFitConfig(FitConfig):
     """Settings of a training of a field or synthesis network.
 
     Attributes:
@@ -106,10 +106,10 @@ def tared_counts(data: MixedDataset) -> FloatArray:
 
 def fit_field(
     data: MixedDataset,
-    held: Held,
+    held: HeldOut,
     *,
     code: FieldCode | None = None,
-    config: FieldConfig | None = None,
+    config: FieldFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FieldModel:
@@ -123,7 +123,7 @@ def fit_field(
         seed: Seed of weights, order of rows and noise of the untouched rows.
         on_epoch: Called after each epoch.
     """
-    config = config or FieldConfig()
+    config = config or FieldFitConfig()
     split = held.split
     code = code or fit_code(data, split.train, split.validation)
     x, y = tared_counts(data), code.encode(data.coefficients)
@@ -155,7 +155,7 @@ def fit_on_norms(
     *,
     scale: float,
     floor: float,
-    config: FieldConfig,
+    config: FieldFitConfig,
     on_epoch: OnEpoch | None,
 ) -> None:
     """Train in place on the norm of each row's error.
@@ -189,7 +189,7 @@ def evaluate_field(
     *,
     seeds: int = 3,
     split_seed: int = 0,
-    config: FieldConfig | None = None,
+    config: FieldFitConfig | None = None,
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> TaskReport:
@@ -250,13 +250,13 @@ def evaluate_field(
             error[units[0]] = errors[OWN][0]["all_m"]
         row = rows[typical(errors[OWN][0]["all_m"], data.experiment.force[rows])]
         truth = data.displacement(row[None])[0]
-        picture = Picture(
+        picture = ResultPicture(
             force_n, error, name_of(data, int(row)), truth, fitted[units][OWN][0](row[None])[0]
         )
     return TaskReport(
         "field",
         results,
-        {"modes": modes, **facts_of(data, seeds, config or FieldConfig())},
+        {"modes": modes, **facts_of(data, seeds, config or FieldFitConfig())},
         picture,
     )
 
@@ -302,7 +302,7 @@ def field_bundle(
     units: Sequence[str] = (),
     name: str = "field",
     version: int = 1,
-    config: FieldConfig | None = None,
+    config: FieldFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
@@ -397,7 +397,7 @@ def _node_sd(data: MixedDataset, rows: Rows, estimate: Callable[[Rows], FloatArr
     return np.asarray(np.sqrt(total / len(rows)), np.float32)
 
 
-def trained_on_line(data: MixedDataset, held: Held) -> str:
+def trained_on_line(data: MixedDataset, held: HeldOut) -> str:
     """What a network was trained and tested on, one line for people."""
 
     def presses(rows: Rows) -> int:

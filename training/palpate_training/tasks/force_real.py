@@ -3,12 +3,9 @@
 Each recording is cut into contiguous blocks (20 of about 9 s), 5 folds test every fifth block each,
 so every row is tested once; 1 s beside every border is left out. The rows of all folds are pooled.
 One network for each finger, as in the paper's "unseen trajectory"; for the unseen BioTac, one
-trained on the other finger. How much longer or shorter blocks matter is reported beside it.
+trained on the other finger. Longer and shorter blocks are reported beside.
 
     palpate train force-real --data lasa.h5 --out docs/results
-
-
-Figures of results, made without a display.
 """
 
 from __future__ import annotations
@@ -21,21 +18,24 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.process import require
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
+from palpate_training.figures.style import new_figure, save
 from palpate_training.learning import baselines
-from palpate_training.learning.fit import FeaturesConfig, fit_quantity
+from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.networks import predict
-from palpate_training.learning.splits import Split, contiguous_folds, unseen_sensor
-from palpate_training.tasks.results import ModelResult, force_result, markdown_table, write_json
+from palpate_training.learning.splits import RowSplit, contiguous_folds, unseen_sensor
+from palpate_training.tasks.results import ModelResult, force_result, force_table, write_json
 
 FloatArray = npt.NDArray[np.float32]
 
-FORCE_CONFIG = FeaturesConfig()
+FORCE_CONFIG = FeaturesFitConfig()
 """Chosen on validation blocks only; training/LOG.md has what was tried."""
 
 OTHER_BLOCKS = (10, 40)
 """Blocks of a recording (about 18 s and 4.6 s each) that are reported beside the data set's own."""
+
+NETWORK = "MLP"
+"""Model whose numbers are the mean over the single networks: the headline everywhere."""
 
 FOLDS = 5
 GUARD_ROWS = 100
@@ -44,10 +44,10 @@ GUARD_ROWS = 100
 
 @dataclass(frozen=True, slots=True)
 class ForceReport:
-    """Results of the experiment, and truth against the averaged networks for the figure."""
+    """Results of the experiment, and truth against estimates for the figure."""
 
     results: list[ModelResult]
-    panels: list[Panel]
+    panels: list[ForcePanel]
     facts: dict[str, object]
 
 
@@ -63,7 +63,7 @@ def run_force_real(
     data: FeatureDataset,
     *,
     seeds: int = 5,
-    config: FeaturesConfig = FORCE_CONFIG,
+    config: FeaturesFitConfig = FORCE_CONFIG,
     unseen: bool = True,
     other_blocks: Sequence[int] = OTHER_BLOCKS,
     draws: int = 2000,
@@ -81,9 +81,9 @@ def run_force_real(
         on_network: Called after each training, for a progress bar.
     """
     results: list[ModelResult] = []
-    panels: list[Panel] = []
+    panels: list[ForcePanel] = []
 
-    def compare(source: FeatureDataset, test: str, folds: list[Split], networks: int) -> None:
+    def compare(source: FeatureDataset, test: str, folds: list[RowSplit], networks: int) -> None:
         rows, panel = _compare(source, test, folds, networks, config, draws, on_network)
         results.extend(rows)
         if source is data:
@@ -126,12 +126,12 @@ def run_force_real(
 def _compare(
     data: FeatureDataset,
     test: str,
-    folds: Sequence[Split],
+    folds: Sequence[RowSplit],
     networks: int,
-    config: FeaturesConfig,
+    config: FeaturesFitConfig,
     draws: int,
     on_network: Callable[[], None] | None,
-) -> tuple[list[ModelResult], Panel]:
+) -> tuple[list[ModelResult], ForcePanel]:
     """Constant, line, single networks and their mean on the pooled test rows of all folds."""
     x, y = data.tared_counts, data.force
     tested = np.sort(np.concatenate([split.test for split in folds]))
@@ -158,27 +158,30 @@ def _compare(
     models: list[tuple[str, list[npt.NDArray[np.floating]]]] = [
         ("constant (training mean)", [constant[tested]]),
         ("linear fit", [linear[tested]]),
-        ("MLP", [estimate[tested] for estimate in estimates]),
+        (NETWORK, [estimate[tested] for estimate in estimates]),
     ]
     if networks > 1:
         models.append((f"mean of {networks} MLPs", [mean]))
-    rows = [force_result(test, name, each, truth, block, draws=draws) for name, each in models]
-    headline = rows[-1].metrics
-    panel = Panel(
-        f"{test} ({rows[-1].model}): median error of magnitude"
+    rows = {
+        name: force_result(test, name, each, truth, block, draws=draws) for name, each in models
+    }
+    # The figure shows what the table's row MLP and README.md state: every single network.
+    headline = rows[NETWORK].metrics
+    panel = ForcePanel(
+        f"{test}, {NETWORK}: median error of magnitude"
         f" {headline['force_magnitude_median_n']:.3f} N, angle"
         f" {headline['force_angle_median_rad']:.3f} rad",
-        truth,
-        mean,
+        np.tile(truth, (networks, 1)),
+        np.concatenate([estimate[tested] for estimate in estimates]),
     )
-    return rows, panel
+    return list(rows.values()), panel
 
 
-def _folds(data: FeatureDataset, sensor: int) -> list[Split]:
+def _folds(data: FeatureDataset, sensor: int) -> list[RowSplit]:
     """Folds of one sensor's blocks, as row numbers of the data set."""
     rows = np.flatnonzero(data.sensor == sensor)
     return [
-        Split(rows[split.train], rows[split.validation], rows[split.test], rows[split.guard])
+        RowSplit(rows[split.train], rows[split.validation], rows[split.test], rows[split.guard])
         for split in contiguous_folds(
             data.block[rows], data.group[rows], folds=FOLDS, guard_rows=GUARD_ROWS
         )
@@ -195,17 +198,21 @@ def _recut(group: npt.NDArray[np.int32], blocks: int) -> npt.NDArray[np.int32]:
 
 
 _PREFACE = """\
-LASA force calibration (two BioTacs, always in contact; no licence stated, so numbers only).
-Electrodes are paired with the force before by as many rows as the data set says ("pairing" in
-force-real.json). Inputs: raw counts minus the untouched baseline, standardised by the training
-rows. Held out are contiguous blocks, never single rows: each recording is cut into blocks of equal
-length, five folds test every fifth block each, 1 s beside every border is left out, the test rows
-of all folds are pooled. "MLP" is the paper's 19-256-128-128-3 network: its metrics are averaged
-over the networks; "mean of n MLPs" averages their estimates, row by row. Settings were chosen on
-validation blocks and then kept; all models learn from all blocks that are not tested. "unseen":
-trained on the other finger alone, nothing calibrated. With longer blocks less of what is pressed
-in the test was ever seen in training, so the number of blocks belongs to the result; it is varied
-in the last rows.
+LASA force calibration: two BioTacs, always in contact. Its authors state no licence, so this page
+holds numbers only. Electrodes are paired with the force of some rows earlier; "pairing" in
+force-real.json says how many. Inputs are raw counts minus the untouched baseline, standardised by
+the training rows.
+
+Held out are contiguous blocks, never single rows. Each recording is cut into blocks of equal
+length; each of five folds tests every fifth block; 1 s beside every border is left out; the test
+rows of all folds are pooled. "unseen" networks are trained on the other finger alone, and nothing
+is calibrated. With longer blocks, less of what is pressed in the test was seen in training, so the
+number of blocks belongs to the result; the last rows vary it.
+
+"MLP" is the paper's 19-256-128-128-3 network. Its metrics are means over the single networks, and
+so are the numbers in the figure's titles and in README.md; the figure shows the estimates of all
+single networks. "mean of n MLPs" averages the networks' estimates row by row instead. Settings were
+chosen on validation blocks and then kept; all models learn from all blocks that are not tested.
 """
 
 
@@ -223,7 +230,7 @@ def write_report(folder: Path, report: ForceReport, *, command: str) -> None:
     (folder / "force-real.md").write_text(
         "# Force on two real BioTacs\n\n"
         f"Made by `{command}`.\n\n{_PREFACE}\n"
-        + markdown_table(report.results)
+        + force_table(report.results)
         + "\nIn brackets: 95 % interval, whole blocks resampled. `/ std`: over the standard"
         " deviation of the true magnitude; `/ norm`: over the row's true magnitude.\n\n"
         "![truth against estimate](force-real.png)\n",
@@ -238,7 +245,7 @@ _BINS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class ForcePanel:
     """Truth and estimate of one test, shape ``(N, 3)`` [N], and its headline."""
 
     title: str
@@ -246,17 +253,14 @@ class Panel:
     estimate: Floats
 
 
-def draw_force(path: Path, panels: Sequence[Panel]) -> None:
+def draw_force(path: Path, panels: Sequence[ForcePanel]) -> None:
     """Truth against estimate, one row of axes for each panel: x, y, z and the magnitude.
 
     Args:
         path: PNG to write.
         panels: What to draw.
     """
-    matplotlib = require("matplotlib", extra="training")
-    matplotlib.use("agg")
-    pyplot = require("matplotlib.pyplot", extra="training")
-    figure = pyplot.figure(figsize=(11, 3.1 * len(panels)), layout="constrained")
+    figure = new_figure(11, 3.1 * len(panels))
     parts = figure.subfigures(len(panels), 1, squeeze=False)[:, 0]
     for part, panel in zip(parts, panels, strict=True):
         part.suptitle(panel.title, x=0.01, ha="left", fontsize=11)
@@ -282,8 +286,7 @@ def draw_force(path: Path, panels: Sequence[Panel]) -> None:
             axis.set_ylabel(f"estimated {name} [N]")
             axis.locator_params(nbins=5, integer=True)
             axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    pyplot.close(figure)
+    save(figure, path)
 
 
 def _with_norm(force: Floats) -> npt.NDArray[np.float64]:

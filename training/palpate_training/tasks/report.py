@@ -1,20 +1,14 @@
-"""Tables of the twin beside the paper's numbers: Markdown for people, JSON with every metric.
+"""The page of the twin's results: tables beside the paper's numbers, a figure and JSON each.
 
-What the paper measured on real BioTacs, to stand beside results on the twin.
-
-Narang et al., unseen trajectories: contact location and force of the best network for each (MLP;
-voxel network for the magnitude, MLP for the angle), field and electrodes of PointNet++. The field
-is counted on 128 ventral nodes, the electrodes over full scale and in counts.
-
-
-One figure for each task: error by force, and a typical held-out row, truth beside estimate.
+The paper's numbers (Narang et al., real BioTacs, unseen trajectories): contact location and force
+of the best network for each (MLP; voxel network for the magnitude, MLP for the angle), field and
+electrodes of PointNet++. The field is counted on 128 ventral nodes, the electrodes over full scale
+and in counts.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,57 +16,52 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.process import require
+from palpate.files.atomic import written_whole
 from palpate_training.datasets.experiment import SkinMesh
 from palpate_training.datasets.features import ELECTRODES
-from palpate_training.tasks.results import ModelResult, Picture, TaskReport, write_json
+from palpate_training.figures.style import markdown_table, new_figure, save
+from palpate_training.tasks.results import (
+    MetricColumn,
+    ResultPicture,
+    TaskReport,
+    write_json,
+)
 
 TWIN_LABEL, PAPER_LABEL = "twin", "paper (real)"
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
-    """Heading with the unit, metric, factor from SI to that unit, digits, and its interval."""
-
-    heading: str
-    metric: str
-    factor: float
-    digits: int
-    interval: str = ""
-
-
 _NORM = "electrode_l2_median_counts"
-_SUBSET = Column("128 nodes [mm]", "nodal_subset_m", 1e3, 3, "nodal_subset_m")
-_RMSE = Column("RMSE [counts]", "electrode_rmse_counts", 1, 0, "electrode_rmse_counts")
-_LOCATION = Column("median [mm]", "location_distance_median_m", 1e3, 2, "distance_m")
-_MAGNITUDE = Column("magnitude median [N]", "force_magnitude_median_n", 1, 2, "magnitude_n")
+_SUBSET = MetricColumn("128 nodes [mm]", "nodal_subset_m", 3, "nodal_subset_m", factor=1e3)
+_RMSE = MetricColumn("RMSE [counts]", "electrode_rmse_counts", 0, "electrode_rmse_counts")
+_LOCATION = MetricColumn("median [mm]", "location_distance_median_m", 2, "distance_m", factor=1e3)
+_MAGNITUDE = MetricColumn("magnitude median [N]", "force_magnitude_median_n", 2, "magnitude_n")
 
-COLUMNS: dict[str, tuple[Column, ...]] = {
+COLUMNS: dict[str, tuple[MetricColumn, ...]] = {
     "field": (
         _SUBSET,
-        Column("all nodes [mm]", "nodal_all_m", 1e3, 3, "nodal_all_m"),
-        Column("moving nodes [mm]", "nodal_moving_m", 1e3, 3),
-        Column("worst node [mm]", "nodal_max_m", 1e3, 2),
-        Column("skill, 128 nodes", "skill_subset", 1, 3),
-        Column("skill, all nodes", "skill_all", 1, 3),
+        MetricColumn("all nodes [mm]", "nodal_all_m", 3, "nodal_all_m", factor=1e3),
+        MetricColumn("moving nodes [mm]", "nodal_moving_m", 3, factor=1e3),
+        MetricColumn("worst node [mm]", "nodal_max_m", 2, factor=1e3),
+        MetricColumn("skill, 128 nodes", "skill_subset", 3),
+        MetricColumn("skill, all nodes", "skill_all", 3),
     ),
     "synthesis": (
-        Column("RMSE [-]", "electrode_rmse", 1, 4),
+        MetricColumn("RMSE [-]", "electrode_rmse", 4),
         _RMSE,
-        Column("l2 median [counts]", _NORM, 1, 0, _NORM),
-        Column("skill", "skill_rmse", 1, 3),
+        MetricColumn("l2 median [counts]", _NORM, 0, _NORM),
+        MetricColumn("skill", "skill_rmse", 3),
     ),
     "force": (
         _MAGNITUDE,
-        Column("mean [N]", "force_magnitude_mean_n", 1, 2),
-        Column("/ std", "force_magnitude_over_std_median", 1, 2),
-        Column("angle median [rad]", "force_angle_median_rad", 1, 3, "angle_rad"),
-        Column("1 - cos median", "force_one_minus_cos_median", 1, 4),
+        MetricColumn("mean [N]", "force_magnitude_mean_n", 2),
+        MetricColumn("/ std", "force_magnitude_over_std_median", 2),
+        MetricColumn("angle median [rad]", "force_angle_median_rad", 3, "angle_rad"),
+        MetricColumn("1 - cos median", "force_one_minus_cos_median", 4),
     ),
     "location": (
         _LOCATION,
-        Column("mean [mm]", "location_distance_mean_m", 1e3, 2),
-        Column("IQR [mm]", "location_distance_iqr_m", 1e3, 2),
+        MetricColumn("mean [mm]", "location_distance_mean_m", 2, factor=1e3),
+        MetricColumn("IQR [mm]", "location_distance_iqr_m", 2, factor=1e3),
     ),
 }
 """What each task's table shows; the JSON holds every metric."""
@@ -96,42 +85,43 @@ more than 0.1 mm. A skill is one minus the error over that of predicting zero.
 
 
 def table(report: TaskReport) -> str:
-    """One task as a Markdown table, the paper's row below the twin's rows of each unit."""
+    """One task as a Markdown table, the paper's row below the twin's rows of each specimen."""
     columns = COLUMNS[report.task]
-    lines = _head(["held out", "data", "model", *(column.heading for column in columns)], 3)
+    rows = []
     for test in dict.fromkeys(result.test for result in report.results):
         for result in report.results:
             if result.test == test:
-                cells = [_cell(result, column) for column in columns]
-                lines.append(_line([test, TWIN_LABEL, result.model, *cells]))
+                cells = [column.cell(result) for column in columns]
+                rows.append([test, TWIN_LABEL, result.model, *cells])
         known = PAPER[report.task].get(test)
         if known is not None:
-            cells = [_known(known.get(column.metric), column) for column in columns]
-            lines.append(_line([test, PAPER_LABEL, "best published", *cells]))
-    return "\n".join(lines) + "\n"
+            cells = [column.show(known.get(column.metric)) for column in columns]
+            rows.append([test, PAPER_LABEL, "best published", *cells])
+    headings = ["held out", "data", "model", *(column.heading for column in columns)]
+    return markdown_table(headings, rows, words=3)
 
 
 def headline_table(reports: Sequence[TaskReport]) -> str:
-    """All tasks in one table: unit by unit the models, then the paper."""
+    """All tasks in one table: specimen by specimen the models, then the paper."""
     shown = {report.task: report for report in reports}
-    tasks = [task for task in _HEADLINES if task in shown]
-    lines = _head(["held out", "data", "model", *(_HEADLINES[task][0] for task in tasks)], 3)
+    columns = {task: column for task, (_, column) in _HEADLINES.items() if task in shown}
+    rows = []
     each = [result for report in reports for result in report.results]
     for test in dict.fromkeys(result.test for result in each):
         for model in dict.fromkeys(result.model for result in each if result.test == test):
             cells = []
-            for task in tasks:
+            for task, column in columns.items():
                 found = [r for r in shown[task].results if (r.test, r.model) == (test, model)]
-                cells.append(_cell(found[0], _HEADLINES[task][1]) if found else "-")
-            lines.append(_line([test, TWIN_LABEL, model, *cells]))
-        known = [PAPER[task].get(test, {}) for task in tasks]
-        if any(known):
+                cells.append(column.cell(found[0]) if found else "-")
+            rows.append([test, TWIN_LABEL, model, *cells])
+        known = {task: PAPER[task].get(test, {}) for task in columns}
+        if any(known.values()):
             cells = [
-                _known(one.get(_HEADLINES[task][1].metric), _HEADLINES[task][1])
-                for task, one in zip(tasks, known, strict=True)
+                columns[task].show(one.get(columns[task].metric)) for task, one in known.items()
             ]
-            lines.append(_line([test, PAPER_LABEL, "best published", *cells]))
-    return "\n".join(lines) + "\n"
+            rows.append([test, PAPER_LABEL, "best published", *cells])
+    headings = ["held out", "data", "model", *(_HEADLINES[task][0] for task in columns)]
+    return markdown_table(headings, rows, words=3)
 
 
 def write_report(
@@ -158,44 +148,19 @@ def write_report(
         text += [f"## {report.task.capitalize()}", table(report).rstrip()]
         if report.picture is not None:
             path = folder / f"twin-{report.task}.png"
-            part = path.with_suffix(".part.png")
             if report.task == "field":
-                draw_field(part, report.picture, mesh)
+                draw_field(path, report.picture, mesh)
             else:
-                draw_synthesis(part, report.picture)
-            os.replace(part, path)
+                draw_synthesis(path, report.picture)
             written.append(path)
             text.append(f"![{report.task}: {report.picture.example}]({path.name})")
         path = folder / f"twin-{report.task}.json"
-        part = path.with_suffix(".part")
-        write_json(part, report.results, {"command": command, **report.facts})
-        os.replace(part, path)
+        write_json(path, report.results, {"command": command, **report.facts})
         written.append(path)
     path = folder / "twin.md"
-    part = path.with_suffix(".part")
-    part.write_text("\n\n".join(text) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    with written_whole(path) as part:
+        part.write_text("\n\n".join(text) + "\n", encoding="utf-8")
     return [*written, path]
-
-
-def _head(headings: Sequence[str], words: int) -> list[str]:
-    return [_line(headings), "|" + "---|" * words + "---:|" * (len(headings) - words)]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _cell(result: ModelResult, column: Column) -> str:
-    text = _known(result.metrics[column.metric], column)
-    if column.interval in result.interval:
-        low, high = (_known(end, column) for end in result.interval[column.interval])
-        text += f" ({low}-{high})"
-    return text
-
-
-def _known(value: float | None, column: Column) -> str:
-    return "-" if value is None else f"{value * column.factor:.{column.digits}f}"
 
 
 ALL_UNITS = "all units"
@@ -246,7 +211,7 @@ FORCE_BINS_N = (0.0, 2.0, 8.0, np.inf)
 _BIN_NAMES = ("< 2 N", "2-8 N", "> 8 N")
 
 
-def draw_field(path: Path, picture: Picture, mesh: SkinMesh) -> None:
+def draw_field(path: Path, picture: ResultPicture, mesh: SkinMesh) -> None:
     """Error by force bin and the example on the skin, seen from below.
 
     Args:
@@ -254,7 +219,7 @@ def draw_field(path: Path, picture: Picture, mesh: SkinMesh) -> None:
         picture: What to draw; fields (V, 3) [m].
         mesh: The skin.
     """
-    figure = _figure(13.0)
+    figure = new_figure(13.0, 4.2)
     left, *right = figure.subplots(1, 4, width_ratios=[1.5, 1, 1, 1])
     _boxes(left, picture, 1e3, "mean nodal error, all nodes [mm]")
     truth, estimate = (
@@ -281,17 +246,17 @@ def draw_field(path: Path, picture: Picture, mesh: SkinMesh) -> None:
     right[0].set_ylabel("x [mm]")
     figure.colorbar(drawn, ax=right, label="displacement [mm]", shrink=0.8)
     figure.suptitle(f"Held-out trajectory of typical error: {picture.example}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
-def draw_synthesis(path: Path, picture: Picture) -> None:
+def draw_synthesis(path: Path, picture: ResultPicture) -> None:
     """Error by force bin and the 19 electrodes of the example.
 
     Args:
         path: PNG to write.
         picture: What to draw; tared counts (19,).
     """
-    figure = _figure(11.0)
+    figure = new_figure(11.0, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.6])
     _boxes(left, picture, 1.0, "norm of the error in R^19 [counts]")
     at = np.arange(ELECTRODES)
@@ -302,7 +267,7 @@ def draw_synthesis(path: Path, picture: Picture) -> None:
     right.legend(frameon=False)
     right.spines[["top", "right"]].set_visible(False)
     figure.suptitle(f"Held-out trajectory of typical error: {picture.example}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def ventral_faces(mesh: SkinMesh) -> npt.NDArray[np.int32]:
@@ -323,7 +288,7 @@ def by_force(
     return [error[(force_n >= low) & (force_n < high)] for low, high in pairwise(FORCE_BINS_N)]
 
 
-def _boxes(axis: Any, picture: Picture, factor: float, label: str) -> None:
+def _boxes(axis: Any, picture: ResultPicture, factor: float, label: str) -> None:
     units = list(picture.error)
     width = 0.8 / len(units)
     for i, unit in enumerate(units):
@@ -342,15 +307,3 @@ def _boxes(axis: Any, picture: Picture, factor: float, label: str) -> None:
     axis.set(xlabel="true force", ylabel=label, ylim=(0, None))
     axis.legend(frameon=False, fontsize=8)
     axis.spines[["top", "right"]].set_visible(False)
-
-
-def _figure(width: float) -> Any:
-    matplotlib = require("matplotlib", extra="training")
-    matplotlib.use("agg")
-    pyplot = require("matplotlib.pyplot", extra="training")
-    return pyplot.figure(figsize=(width, 4.2), layout="constrained")
-
-
-def _save(figure: Any, path: Path) -> None:
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    require("matplotlib.pyplot", extra="training").close(figure)

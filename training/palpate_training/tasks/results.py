@@ -1,7 +1,4 @@
-"""Results beside their baselines: one row for each model, as a rich table, Markdown and JSON.
-
-Results of networks and their rivals on held-out trajectories: what every task shares.
-"""
+"""Results of models on held-out rows, beside their baselines: what every task shares."""
 
 from __future__ import annotations
 
@@ -14,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from rich.table import Table
 
+from palpate.files.atomic import written_whole
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
+from palpate_training.figures.style import markdown_table
 from palpate_training.learning.fit import FitConfig
 from palpate_training.learning.metrics import (
     Rows64,
@@ -68,57 +67,56 @@ def force_result(
         cluster: Block of every row, shape ``(N,)``.
         draws: Draws of the bootstrap.
     """
-    each = [force_metrics(estimate, truth) for estimate in estimates]
     errors = [force_errors(estimate, truth) for estimate in estimates]
-    stacked = {
-        name: np.stack([one[name] for one in errors], axis=1)
-        for name in ("magnitude_n", "angle_rad", "vector_n")
-    }
-    return ModelResult(
-        test=test,
-        model=model,
-        metrics={name: float(np.mean([one[name] for one in each])) for name in each[0]},
-        seed_sd={name: float(np.std([one[name] for one in each], ddof=1)) for name in each[0]}
-        if len(each) > 1
-        else {},
-        interval=cluster_bootstrap(stacked, cluster, draws=draws),
-    )
+    stacked = stack_seeds(errors, ("magnitude_n", "angle_rad", "vector_n"))
+    seeds = [force_metrics(estimate, truth) for estimate in estimates]
+    return averaged(test, model, seeds, cluster_bootstrap(stacked, cluster, draws=draws))
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
-    """A column of the table: heading, metric, digits, and the interval to put behind it."""
+class MetricColumn:
+    """A column of a table.
+
+    Attributes:
+        heading: With the unit that is shown.
+        metric: Name of the metric.
+        digits: Behind the point.
+        interval: Name of the interval to put behind the value.
+        factor: From the metric's unit to the one that is shown.
+    """
 
     heading: str
     metric: str
     digits: int
     interval: str = ""
+    factor: float = 1.0
+
+    def show(self, value: float | None) -> str:
+        """A value of the metric as text."""
+        return "-" if value is None else f"{value * self.factor:.{self.digits}f}"
+
+    def cell(self, result: ModelResult) -> str:
+        """The metric of a result, with its interval where there is one."""
+        text = self.show(result.metrics[self.metric])
+        if self.interval in result.interval:
+            low, high = (self.show(end) for end in result.interval[self.interval])
+            text += f" ({low}-{high})"
+        return text
 
 
 FORCE_COLUMNS = (
-    Column("magnitude median [N]", "force_magnitude_median_n", 3, "magnitude_n"),
-    Column("mean [N]", "force_magnitude_mean_n", 3),
-    Column("IQR [N]", "force_magnitude_iqr_n", 3),
-    Column("/ std", "force_magnitude_over_std_median", 2),
-    Column("/ norm", "force_magnitude_over_norm_median", 3),
-    Column("angle median [rad]", "force_angle_median_rad", 3, "angle_rad"),
-    Column("1 - cos", "force_one_minus_cos_median", 4),
-    Column("vector median [N]", "force_vector_median_n", 3, "vector_n"),
-    Column("RMSE x [N]", "force_rmse_x_n", 3),
-    Column("RMSE y [N]", "force_rmse_y_n", 3),
-    Column("RMSE z [N]", "force_rmse_z_n", 3),
+    MetricColumn("magnitude median [N]", "force_magnitude_median_n", 3, "magnitude_n"),
+    MetricColumn("mean [N]", "force_magnitude_mean_n", 3),
+    MetricColumn("IQR [N]", "force_magnitude_iqr_n", 3),
+    MetricColumn("/ std", "force_magnitude_over_std_median", 2),
+    MetricColumn("/ norm", "force_magnitude_over_norm_median", 3),
+    MetricColumn("angle median [rad]", "force_angle_median_rad", 3, "angle_rad"),
+    MetricColumn("1 - cos", "force_one_minus_cos_median", 4),
+    MetricColumn("vector median [N]", "force_vector_median_n", 3, "vector_n"),
+    MetricColumn("RMSE x [N]", "force_rmse_x_n", 3),
+    MetricColumn("RMSE y [N]", "force_rmse_y_n", 3),
+    MetricColumn("RMSE z [N]", "force_rmse_z_n", 3),
 )
-
-
-def _cells(result: ModelResult, columns: Sequence[Column]) -> list[str]:
-    cells = []
-    for column in columns:
-        text = f"{result.metrics[column.metric]:.{column.digits}f}"
-        if column.interval in result.interval:
-            low, high = result.interval[column.interval]
-            text += f" ({low:.{column.digits}f}-{high:.{column.digits}f})"
-        cells.append(text)
-    return cells
 
 
 def rich_table(results: Sequence[ModelResult], title: str) -> Table:
@@ -132,19 +130,18 @@ def rich_table(results: Sequence[ModelResult], title: str) -> Table:
     for before, result in zip((None, *results), results, strict=False):
         if before is not None and before.test != result.test:
             table.add_section()
-        table.add_row(result.test, result.model, *_cells(result, columns))
+        table.add_row(result.test, result.model, *(column.cell(result) for column in columns))
     return table
 
 
-def markdown_table(results: Sequence[ModelResult]) -> str:
+def force_table(results: Sequence[ModelResult]) -> str:
     """All columns as a Markdown table."""
     headings = ["held out", "model", *(column.heading for column in FORCE_COLUMNS)]
-    lines = ["| " + " | ".join(headings) + " |", "|---|---|" + "---:|" * len(FORCE_COLUMNS)]
-    lines += [
-        "| " + " | ".join([result.test, result.model, *_cells(result, FORCE_COLUMNS)]) + " |"
+    rows = [
+        [result.test, result.model, *(column.cell(result) for column in FORCE_COLUMNS)]
         for result in results
     ]
-    return "\n".join(lines) + "\n"
+    return markdown_table(headings, rows, words=2)
 
 
 def write_json(path: Path, results: Sequence[ModelResult], facts: dict[str, object]) -> None:
@@ -161,7 +158,9 @@ def write_json(path: Path, results: Sequence[ModelResult], facts: dict[str, obje
         }
         for result in results
     ]
-    path.write_text(json.dumps({**facts, "results": rows}, indent=1) + "\n", encoding="utf-8")
+    text = json.dumps({**facts, "results": rows}, indent=1) + "\n"
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def _short(value: float) -> float:
@@ -176,7 +175,7 @@ ZERO, MEAN, RIDGE, OWN, ALL = "zero", "training mean", "ridge", "network", "netw
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ResultPicture:
     """What the figure of a task shows.
 
     Attributes:
@@ -208,7 +207,7 @@ class TaskReport:
     task: str
     results: list[ModelResult]
     facts: dict[str, object] = field(default_factory=dict)
-    picture: Picture | None = None
+    picture: ResultPicture | None = None
 
 
 def networks(data: ExperimentDataset, seeds: int) -> int:
@@ -229,23 +228,25 @@ def typical(error: Rows64, force: FloatArray) -> int:
     return int(hard[np.argsort(error[hard], kind="stable")[len(hard) // 2]])
 
 
+def stack_seeds(errors: Sequence[Errors], names: Sequence[str]) -> dict[str, Rows64]:
+    """Errors of every row and seed by name, each of shape ``(N, S)``."""
+    return {name: np.stack([one[name] for one in errors], axis=1) for name in names}
+
+
 def interval_of(
     errors: Sequence[Errors], cluster: npt.NDArray[np.int32], draws: int
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of the headline numbers, whole trajectories drawn with replacement."""
-
-    def stack(name: str) -> Rows64:
-        return np.stack([one[name] for one in errors], axis=1)
-
     if "subset_m" in errors[0]:
-        wanted = {f"nodal_{name}": stack(name) for name in ("subset_m", "all_m")}
+        stacked = stack_seeds(errors, ("subset_m", "all_m"))
+        wanted = {f"nodal_{name}": values for name, values in stacked.items()}
         return cluster_bootstrap(
             wanted, cluster, statistic=lambda values: float(np.nanmean(values)), draws=draws
         )
-    rmse = cluster_bootstrap(
-        {"electrode_rmse_counts": stack("mean_square")}, cluster, statistic=root_mean, draws=draws
-    )
-    norm = {"electrode_l2_median_counts": stack("l2_counts")}
+    stacked = stack_seeds(errors, ("mean_square", "l2_counts"))
+    squares = {"electrode_rmse_counts": stacked["mean_square"]}
+    rmse = cluster_bootstrap(squares, cluster, statistic=root_mean, draws=draws)
+    norm = {"electrode_l2_median_counts": stacked["l2_counts"]}
     return rmse | cluster_bootstrap(norm, cluster, draws=draws)
 
 

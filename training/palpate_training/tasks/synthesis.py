@@ -19,13 +19,13 @@ from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_fields
-from palpate_training.learning.field_code import FieldCode, Pooling, fit_code, pooling
+from palpate_training.learning.field_code import FieldCode, FilmPooling, fit_code, pooling
 from palpate_training.learning.fit import OnEpoch
 from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
 from palpate_training.learning.networks import FilmNet, Mlp, SynthesisGraph, predict
-from palpate_training.learning.splits import Held, by_trajectory, of_units, unit_sets
+from palpate_training.learning.splits import HeldOut, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.fields import (
-    FieldConfig,
+    FieldFitConfig,
     fit_on_norms,
     refuse_existing,
     spread_rows,
@@ -40,7 +40,7 @@ from palpate_training.tasks.results import (
     ZERO,
     ModelResult,
     OnNetwork,
-    Picture,
+    ResultPicture,
     TaskReport,
     facts_of,
     name_of,
@@ -64,14 +64,14 @@ class SynthesisModel:
 
     net: FilmNet
     code: FieldCode
-    pooling: Pooling
+    pooling: FilmPooling
 
     def counts(self, features: FloatArray) -> FloatArray:
         """Tared counts (N, 19) of features (N, K + P) from ``synthesis_features``."""
         return predict(self.net, features)
 
 
-def synthesis_features(data: MixedDataset, code: FieldCode, film: Pooling) -> FloatArray:
+def synthesis_features(data: MixedDataset, code: FieldCode, film: FilmPooling) -> FloatArray:
     """What the shipped graph computes from the field of every row, without making the fields.
 
     Projection and pooling are linear in the field and the field is linear in the data set's
@@ -90,22 +90,22 @@ def synthesis_features(data: MixedDataset, code: FieldCode, film: Pooling) -> Fl
     return np.asarray(data.coefficients @ (lead[:-1] - lead[-1]) + lead[-1], np.float32)
 
 
-def _features(displacement: FloatArray, code: FieldCode, film: Pooling) -> FloatArray:
+def _features(displacement: FloatArray, code: FieldCode, film: FilmPooling) -> FloatArray:
     flat = displacement.reshape(len(displacement), -1)
     return np.hstack([code.project(flat), film.pool(displacement)])
 
 
 def fit_synthesis(
     data: MixedDataset,
-    held: Held,
+    held: HeldOut,
     *,
     code: FieldCode | None = None,
-    config: FieldConfig | None = None,
+    config: FieldFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> SynthesisModel:
     """Train field -> electrodes; the arguments are those of ``fit_field``."""
-    config = config or FieldConfig()
+    config = config or FieldFitConfig()
     split = held.split
     code = code or fit_code(data, split.train, split.validation)
     film = pooling(data.mesh)
@@ -135,7 +135,7 @@ def evaluate_synthesis(
     *,
     seeds: int = 3,
     split_seed: int = 0,
-    config: FieldConfig | None = None,
+    config: FieldFitConfig | None = None,
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> TaskReport:
@@ -179,14 +179,16 @@ def evaluate_synthesis(
         force_n[units[0]] = np.linalg.norm(data.experiment.force[rows], axis=1)
         error[units[0]] = errors[OWN][0]["l2_counts"]
         at = typical(error[units[0]], data.experiment.force[rows])
-        picture = Picture(
+        picture = ResultPicture(
             force_n,
             error,
             name_of(data, int(rows[at])),
             counts[rows[at]],
             np.asarray(estimates[OWN][0][at], np.float32),
         )
-    return TaskReport("synthesis", results, facts_of(data, seeds, config or FieldConfig()), picture)
+    return TaskReport(
+        "synthesis", results, facts_of(data, seeds, config or FieldFitConfig()), picture
+    )
 
 
 def synthesis_bundle(
@@ -196,7 +198,7 @@ def synthesis_bundle(
     unit: str,
     name: str = "synthesis",
     version: int = 1,
-    config: FieldConfig | None = None,
+    config: FieldFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:

@@ -12,12 +12,12 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed, mix
 from palpate_training.datasets.basis import fit_basis
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,
     SkinMesh,
 )
-from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.trials import MixedRows, SimulatedTrial, TrialRows
 from palpate_training.experiment.generate.simulator import (
     IndentationStore,

@@ -13,13 +13,13 @@ from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.hdf5 import schema_of
 from palpate_training.datasets.assembly import assemble_experiment, common_trajectories
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,
     write_experiment,
     write_mixed,
 )
-from palpate_training.datasets.features import Provenance
 from palpate_training.datasets.processing import process_all
 from palpate_training.datasets.trials import (
     TRIALS_SCHEMA,
@@ -36,7 +36,7 @@ from palpate_training.experiment.generate.simulator import (
     IndentationStore,
     OnProgress,
     SimulatedIndentation,
-    Simulator,
+    TwinSimulator,
 )
 
 Dropped = tuple[tuple[str, str], ...]
@@ -63,7 +63,7 @@ class ProcessedExperiment:
 def process_files(
     paths: Sequence[Path],
     out: Path,
-    simulator: Simulator,
+    simulator: TwinSimulator,
     *,
     mechanics: Path | None = None,
     mixed: Path | None = None,
@@ -167,7 +167,7 @@ def _check_once(paths: Sequence[Path], names: Sequence[Sequence[str]]) -> None:
 
 
 def _mix(
-    simulator: Simulator,
+    simulator: TwinSimulator,
     store: IndentationStore,
     rows: Sequence[TrialRows],
     experiment: ExperimentDataset,

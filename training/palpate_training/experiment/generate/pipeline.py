@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from palpate import __version__
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import write_experiment, write_mixed
-from palpate_training.datasets.features import Provenance
 from palpate_training.experiment.generate.data_sets import AssembledSets, assemble
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
     PressedSpecimens,
-    Simulator,
     Specimen,
+    TwinSimulator,
 )
 from palpate_training.experiment.generate.trials import make_trials
 from palpate_training.experiment.generate.workers import RayCluster, TaskRunner, WorkerProcesses
@@ -47,7 +47,7 @@ OnStage = Callable[[str, int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Generated:
+class GeneratedExperiment:
     """What an experiment came to.
 
     Attributes:
@@ -69,7 +69,7 @@ def generate(
     folder: Path,
     spec: ExperimentSpec,
     specimens: Sequence[Specimen],
-    simulator: Simulator,
+    simulator: TwinSimulator,
     *,
     workers: int,
     threads: int = 1,
@@ -77,7 +77,7 @@ def generate(
     stop: threading.Event | None = None,
     on_stage: OnStage = lambda *_: None,
     command: str = "palpate data generate",
-) -> Generated | None:
+) -> GeneratedExperiment | None:
     """Run an experiment, or go on with it.
 
     Killed at any time, it goes on where it was: trajectories and trials are files of their own that
@@ -170,7 +170,7 @@ def generate(
     write_experiment(folder / EXPERIMENT, data.experiment)
     write_mixed(folder / MIXED, data.mixed)
     seconds["data sets"] = time.monotonic() - began
-    return Generated(folder, data, digest, seconds, _sizes(folder))
+    return GeneratedExperiment(folder, data, digest, seconds, _sizes(folder))
 
 
 def _stage(name: str, on_stage: OnStage) -> Callable[[int, int, str], None]:

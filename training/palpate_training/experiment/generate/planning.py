@@ -14,28 +14,28 @@ from palpate_training.experiment.generate.simulator import (
     IndentationStore,
     OnProgress,
     SimulatedFingertip,
-    Simulator,
+    TwinSimulator,
 )
-from palpate_training.experiment.kinematics import Arm
+from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import (
     ARMS,
-    Eliminated,
-    Plan,
-    Station,
-    Trajectory,
+    ArmBase,
+    EliminatedTrajectory,
+    PlannedTrajectory,
+    RobotPlan,
     assign_arm,
     make_plan,
 )
-from palpate_training.experiment.registration import Registration
+from palpate_training.experiment.registration import ArmRegistration
 from palpate_training.experiment.stand_in_arm import HOME, sensor_robot, stand_in_arm
 
 SAME_PATH = 1e-6
 """Paths of the same plan agree to this, in metres and in numbers of a quaternion."""
 
 
-def stations_of(
-    arms: Mapping[str, Arm], registrations: Mapping[str, Registration] | None
-) -> dict[str, Station]:
+def bases_of(
+    arms: Mapping[str, ArmKinematics], registrations: Mapping[str, ArmRegistration] | None
+) -> dict[str, ArmBase]:
     """The arms as they stand.
 
     Args:
@@ -46,7 +46,7 @@ def stations_of(
         ConfigError: Kinematics are given for an arm that is not registered.
     """
     if registrations is None and not arms:
-        return {side: Station(sensor_robot(side), stand_in_arm(side), HOME) for side in ARMS}
+        return {side: ArmBase(sensor_robot(side), stand_in_arm(side), HOME) for side in ARMS}
     for arm in arms:
         if arm not in (registrations or {}):
             raise ConfigError(
@@ -54,7 +54,7 @@ def stations_of(
                 remedy="measure its holes, palpate data register, and give --registration",
             )
     return {
-        arm: Station(found.sensor_robot, arms.get(arm))
+        arm: ArmBase(found.sensor_robot, arms.get(arm))
         for arm, found in (registrations or {}).items()
     }
 
@@ -62,18 +62,18 @@ def stations_of(
 def plan_experiment(
     spec: ExperimentSpec,
     fingertip: SimulatedFingertip,
-    stations: Mapping[str, Station],
-    simulator: Simulator,
+    bases: Mapping[str, ArmBase],
+    simulator: TwinSimulator,
     *,
     store: IndentationStore | None = None,
     on_progress: OnProgress = lambda *_: None,
-) -> tuple[Plan, list[Eliminated]]:
+) -> tuple[RobotPlan, list[EliminatedTrajectory]]:
     """Plan what the twin presses, to the paper's depths.
 
     Args:
         spec: Indenters, points, angles and seed; its overtravel is left out.
         fingertip: Whose skin is aimed at.
-        stations: By arm; a single one executes everything.
+        bases: By arm; a single one executes everything.
         simulator: Plans the trajectories on its skin.
         store: Simulation that the trials will be mixed with: what it holds must be this plan's.
         on_progress: Called before each trajectory.
@@ -82,28 +82,28 @@ def plan_experiment(
         The plan, and what no arm can follow.
 
     Raises:
-        ConfigError: No station, or the store holds a trajectory of the same name that goes
+        ConfigError: No arm, or the store holds a trajectory of the same name that goes
             elsewhere.
     """
-    if not stations:
+    if not bases:
         raise ConfigError("no arm is registered", remedy="palpate data register")
     plans = simulator.plans(replace(spec, overtravel_m=0.0), fingertip)
     if store is not None:
         _check_same(plans, store)
 
-    def trajectories() -> Iterator[Trajectory]:
+    def trajectories() -> Iterator[PlannedTrajectory]:
         for k, plan in enumerate(plans):
             on_progress(k, len(plans), plan.name)
-            yield _trajectory(plan, stations)
+            yield _trajectory(plan, bases)
 
-    found = make_plan(trajectories(), stations)
+    found = make_plan(trajectories(), bases)
     on_progress(len(plans), len(plans), "")
     return found
 
 
-def _trajectory(plan: IndentationPlan, stations: Mapping[str, Station]) -> Trajectory:
-    arm = assign_arm(plan.target) if len(stations) > 1 else next(iter(stations))
-    return Trajectory(
+def _trajectory(plan: IndentationPlan, bases: Mapping[str, ArmBase]) -> PlannedTrajectory:
+    arm = assign_arm(plan.target) if len(bases) > 1 else next(iter(bases))
+    return PlannedTrajectory(
         trajectory=plan.name,
         indenter=plan.indenter,
         arm=arm,

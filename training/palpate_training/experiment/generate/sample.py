@@ -27,8 +27,8 @@ from palpate_training.experiment.generate.pipeline import EXPERIMENT, MIXED, STO
 from palpate_training.experiment.generate.simulator import (
     IndentationStore,
     SimulatedIndentation,
-    Simulator,
     Specimen,
+    TwinSimulator,
 )
 from palpate_training.experiment.generate.trials import read_trials
 
@@ -61,7 +61,7 @@ class ExperimentSample:
 def make_sample(
     folder: Path,
     specimens: Sequence[Specimen],
-    simulator: Simulator,
+    simulator: TwinSimulator,
     dataset: Path,
     tape: Path,
     rest: Path | None = None,

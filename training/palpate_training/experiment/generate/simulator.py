@@ -257,7 +257,7 @@ MakeSpecimens = Callable[[], PressedSpecimens]
 """Makes them on a worker: hashable and equal by what it makes; can be pickled."""
 
 
-class Simulator(Protocol):
+class TwinSimulator(Protocol):
     """Finite elements and film electrodes, as the experiment uses them."""
 
     clearance_m: float

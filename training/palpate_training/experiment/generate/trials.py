@@ -32,8 +32,8 @@ from palpate_training.experiment.generate.simulator import (
     PressedSpecimens,
     SimulatedIndentation,
     SimulatedStep,
-    Simulator,
     Specimen,
+    TwinSimulator,
 )
 from palpate_training.experiment.generate.workers import TaskRunner
 from palpate_training.experiment.plan import APPROACH_M, ARMS, assign_arm
@@ -55,7 +55,7 @@ def make_trials(
     spec: ExperimentSpec,
     store: IndentationStore,
     specimens: Sequence[Specimen],
-    simulator: Simulator,
+    simulator: TwinSimulator,
     folder: Path,
     runner: TaskRunner,
     *,
