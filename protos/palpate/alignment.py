@@ -43,27 +43,27 @@ class Stamped(Protocol):
         ...
 
 
-class Clock(Enum):
+class AlignmentClock(Enum):
     """Which of a stamp's times is compared."""
 
     MONOTONIC = "monotonic"
     WALL = "wall"
 
 
-def common_clock(*streams: Iterable[Stamped]) -> Clock:
+def common_clock(*streams: Iterable[Stamped]) -> AlignmentClock:
     """The monotonic clock if all messages were stamped by the same one, else wall clocks."""
     ids = {message.stamp.clock_id for stream in streams for message in stream}
-    return Clock.MONOTONIC if len(ids) <= 1 else Clock.WALL
+    return AlignmentClock.MONOTONIC if len(ids) <= 1 else AlignmentClock.WALL
 
 
-def times_of(stream: Iterable[Stamped], clock: Clock) -> Times:
+def times_of(stream: Iterable[Stamped], clock: AlignmentClock) -> Times:
     """Times of messages [ns], int64, shape ``(N,)``."""
     stamps = [message.stamp for message in stream]
-    told = [s.monotonic_ns if clock is Clock.MONOTONIC else s.wall_ns for s in stamps]
+    told = [s.monotonic_ns if clock is AlignmentClock.MONOTONIC else s.wall_ns for s in stamps]
     return np.array(told, np.int64)
 
 
-def electrode_instants(frames: Sequence[ElectrodeFrame], clock: Clock) -> Times:
+def electrode_instants(frames: Sequence[ElectrodeFrame], clock: AlignmentClock) -> Times:
     """When each electrode of each frame was sampled [ns], int64, shape ``(N, E)``.
 
     Raises:
@@ -78,7 +78,7 @@ def electrode_instants(frames: Sequence[ElectrodeFrame], clock: Clock) -> Times:
     return np.asarray(times_of(frames, clock)[:, None] + offsets)
 
 
-def frame_instants(frames: Sequence[ElectrodeFrame], clock: Clock) -> Times:
+def frame_instants(frames: Sequence[ElectrodeFrame], clock: AlignmentClock) -> Times:
     """Mean instant of each frame's electrodes [ns], int64, shape ``(N,)``."""
     middles = np.array([sample_offsets(frame).middle_ns for frame in frames], np.int64)
     return np.asarray(times_of(frames, clock) + middles)

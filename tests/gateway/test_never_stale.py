@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from palpate import clock
-from palpate.bus import Delivery, Received
+from palpate.bus import Delivery, ReceivedMessage
 from palpate.bus.topics import ELECTRODES, WRENCH
 from palpate.errors import StaleError
 from palpate.messages import ElectrodeFrame, WrenchFrame
@@ -143,7 +143,7 @@ def _check(queue: Any, told: Callable[[Any], float], stopped_s: float, went_on_s
     """Read until it is live again; the number of messages that had waited while it stood still."""
     waited, fresh = 0, 0
     while fresh < 20:
-        received: Received[Any] = queue.next(timeout_s=PATIENCE_S)
+        received: ReceivedMessage[Any] = queue.next(timeout_s=PATIENCE_S)
         stamp = received.message.stamp
         taken_s = told(received.message)
         assert 1e-9 * stamp.monotonic_ns - taken_s < TOO_NEW_S

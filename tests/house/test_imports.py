@@ -53,7 +53,8 @@ PLANTS = [
     ("services/palpate_services/planted.py", "import serial", "Ports stay in the gateway"),
     ("services/palpate_services/planted.py", "import torch", "Torch stays in training"),
     ("services/palpate_services/planted.py", "import warp", "Warp stays in fem"),
-    ("fem/palpate_fem/indenter/planted.py", "import palpate_fem.store", "only point down"),
+    ("fem/palpate_fem/indenter/planted.py", "import palpate_fem.store", "Inside fem"),
+    ("protos/palpate/messages/planted.py", "import palpate.bus", "Inside palpate"),
 ]
 
 

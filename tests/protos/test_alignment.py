@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.alignment import (
-    Clock,
+    AlignmentClock,
     common_clock,
     electrode_instants,
     frame_instants,
@@ -119,10 +119,10 @@ def test_orientations_turn_evenly_along_the_shorter_arc() -> None:
 
 def test_streams_of_two_hosts_meet_on_wall_clocks() -> None:
     mine, theirs = [frame(10 * MS)], [wrench(10 * MS, clock_id=8)]
-    assert common_clock(mine) is Clock.MONOTONIC
-    assert common_clock(mine, theirs) is Clock.WALL
-    assert times_of(theirs, Clock.WALL).tolist() == [10**18 + 10 * MS]
-    assert electrode_instants(mine, Clock.WALL)[0, 0] == 10**18 + 10 * MS
+    assert common_clock(mine) is AlignmentClock.MONOTONIC
+    assert common_clock(mine, theirs) is AlignmentClock.WALL
+    assert times_of(theirs, AlignmentClock.WALL).tolist() == [10**18 + 10 * MS]
+    assert electrode_instants(mine, AlignmentClock.WALL)[0, 0] == 10**18 + 10 * MS
 
 
 def test_what_is_no_stream_is_said() -> None:
@@ -131,7 +131,7 @@ def test_what_is_no_stream_is_said() -> None:
     with pytest.raises(DatasetError, match="no stream"):
         slerp(np.array([1]), np.array([1, 2]), np.zeros((1, 4)))
     with pytest.raises(DatasetError, match="different numbers of electrodes"):
-        electrode_instants([frame(0), frame(1, SensorType.BIOTAC_SP)], Clock.MONOTONIC)
+        electrode_instants([frame(0), frame(1, SensorType.BIOTAC_SP)], AlignmentClock.MONOTONIC)
 
 
 def test_an_overloaded_reading_is_left_out_by_who_asks() -> None:
@@ -139,7 +139,7 @@ def test_an_overloaded_reading_is_left_out_by_who_asks() -> None:
     wrenches[2] = replace(wrenches[2], overload=True)
     kept = [one for one in wrenches if not one.overload]
     value, known = linear(
-        np.array([2 * MS]), times_of(kept, Clock.MONOTONIC), [one.force for one in kept]
+        np.array([2 * MS]), times_of(kept, AlignmentClock.MONOTONIC), [one.force for one in kept]
     )
     assert known.all()
     assert value[0, 2] == pytest.approx(2.0)

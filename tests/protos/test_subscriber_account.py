@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from palpate.bus import Delivery
-from palpate.bus.pubsub import Fifo, NewestWins, Subscriber
+from palpate.bus.pubsub import FifoQueue, NewestQueue, Subscriber
 from palpate.bus.topics import ELECTRODES, sensor_key
 from palpate.errors import StaleError, StreamTimeout
 from palpate.messages import ElectrodeFrame, Origin
@@ -59,7 +59,7 @@ class Bus:
 
 def test_newest_wins_counts_what_it_drops_of_each_key() -> None:
     counters: Counter[str] = Counter()
-    waiting: NewestWins[int] = NewestWins(counters, depth=2)
+    waiting: NewestQueue[int] = NewestQueue(counters, depth=2)
     for item in range(5):
         waiting.put("a", item)
     waiting.put("b", 10)
@@ -70,7 +70,7 @@ def test_newest_wins_counts_what_it_drops_of_each_key() -> None:
 
 def test_a_full_queue_counts_what_it_refuses_of_each_key() -> None:
     counters: Counter[str] = Counter()
-    waiting: Fifo[int] = Fifo(counters, 2, sender_waits=False)
+    waiting: FifoQueue[int] = FifoQueue(counters, 2, sender_waits=False)
     for item in range(4):
         waiting.put("a", item)
     waiting.put("b", 10)

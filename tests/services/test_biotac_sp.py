@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import Delivery, Sample, Session, endpoints
+from palpate.bus import Delivery, Session, TapSample, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, TARE, TOPICS, sensor_key
 from palpate.client import Client
 from palpate.config import LinkConfig
@@ -123,7 +123,7 @@ def test_field_service_answers_by_an_error(
         assert caught.value.code is ErrorCode.INVALID_REQUEST
 
 
-def samples(sensor: str, messages: list[Any]) -> list[Sample]:
+def samples(sensor: str, messages: list[Any]) -> list[TapSample]:
     out = []
     for message in messages:
         topic = TOPICS["tare" if isinstance(message, Tare) else "electrodes"]
@@ -131,7 +131,7 @@ def samples(sensor: str, messages: list[Any]) -> list[Sample]:
         key = sensor_key("lab", sensor, topic.name)
         payload = topic.codec.encode(message)
         out.append(
-            Sample(topic.name, "lab", sensor, key, topic.encoding, payload, wall_ns, wall_ns)
+            TapSample(topic.name, "lab", sensor, key, topic.encoding, payload, wall_ns, wall_ns)
         )
     return out
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Sample
+from palpate.bus import TapSample
 from palpate.bus.topics import ELECTRODES, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ErrorCode
@@ -27,9 +27,9 @@ Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
 
 
-def sample_of(payload: bytes) -> Sample:
+def sample_of(payload: bytes) -> TapSample:
     key = sensor_key("lab", "finger", "electrodes")
-    return Sample(
+    return TapSample(
         "electrodes",
         "lab",
         "finger",
@@ -42,7 +42,7 @@ def sample_of(payload: bytes) -> Sample:
 
 
 @pytest.fixture
-def sample(make_frame: Frames) -> Callable[[int], Sample]:
+def sample(make_frame: Frames) -> Callable[[int], TapSample]:
     return lambda sequence: sample_of(ELECTRODE_FRAME.encode(make_frame(sequence)))
 
 
@@ -63,7 +63,7 @@ def open_keeper(tmp_path: Path) -> Callable[..., Any]:
 
 
 def test_record_holds_what_was_written(
-    open_keeper: Any, sample: Callable[[int], Sample], tmp_path: Path
+    open_keeper: Any, sample: Callable[[int], TapSample], tmp_path: Path
 ) -> None:
     samples = [sample(n) for n in range(1, 50)]
     with open_keeper() as (keeper, health):
@@ -90,7 +90,7 @@ def test_broken_payload_is_kept_and_counted(open_keeper: Any, tmp_path: Path) ->
 
 def test_rotation_by_size_loses_nothing(
     open_keeper: Any,
-    sample: Callable[[int], Sample],
+    sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -107,7 +107,7 @@ def test_rotation_by_size_loses_nothing(
 
 def test_too_little_space_is_reported_and_recording_resumes(
     open_keeper: Any,
-    sample: Callable[[int], Sample],
+    sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -140,7 +140,7 @@ def test_too_little_space_is_reported_and_recording_resumes(
 
 def test_write_error_of_the_disk_is_survived(
     open_keeper: Any,
-    sample: Callable[[int], Sample],
+    sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     until: Until,
@@ -177,7 +177,7 @@ def test_write_error_of_the_disk_is_survived(
 
 
 def test_leftovers_are_recovered_but_not_those_of_the_living(
-    open_keeper: Any, sample: Callable[[int], Sample], tmp_path: Path, until: Until
+    open_keeper: Any, sample: Callable[[int], TapSample], tmp_path: Path, until: Until
 ) -> None:
     runs = tmp_path / "runs"
     writer = RecordWriter(runs / "lab-dead.mcap")
@@ -198,7 +198,7 @@ def test_leftovers_are_recovered_but_not_those_of_the_living(
 
 def test_view_that_fails_leaves_the_record_alone(
     open_keeper: Any,
-    sample: Callable[[int], Sample],
+    sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from palpate.alignment import Clock, electrode_instants, linear, times_of
+from palpate.alignment import AlignmentClock, electrode_instants, linear, times_of
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import ELECTRODES, POSE, WRENCH
 from palpate.config import LinkConfig
@@ -115,9 +115,9 @@ def stamp_errors(
     counts: OnTime,
 ) -> dict[str, Spread]:
     """How far each stream's stamps are from when their values were there."""
-    at_ns = electrode_instants(frames, Clock.MONOTONIC)
+    at_ns = electrode_instants(frames, AlignmentClock.MONOTONIC)
     shares = _shares(frames, pac=False)
-    stamps_ns = times_of(frames, Clock.MONOTONIC)
+    stamps_ns = times_of(frames, AlignmentClock.MONOTONIC)
     pac_ns = stamps_ns[:, None] + np.array([sample_offsets(frame).pac for frame in frames])
     pac = _shares(frames, pac=True)
     errors = {
@@ -128,9 +128,9 @@ def stamp_errors(
     }
     for name, stream in wrenches.items():
         share = (_forces(stream)[:, 0] - LOW_N) / SPAN_N
-        errors[name] = _off(share, times_of(stream, Clock.MONOTONIC), counts)
+        errors[name] = _off(share, times_of(stream, AlignmentClock.MONOTONIC), counts)
     shares = _travels(poses)[:, 0] / SPAN_M
-    errors["pose"] = _off(shares, times_of(poses, Clock.MONOTONIC), counts)
+    errors["pose"] = _off(shares, times_of(poses, AlignmentClock.MONOTONIC), counts)
     return {name: spread(found) for name, found in errors.items()}
 
 
@@ -145,16 +145,16 @@ def apart(
     Every stream is brought to the instant of each electrode of each frame; what it shows there was
     there sooner or later than what the electrode shows.
     """
-    at_ns = electrode_instants(frames, Clock.MONOTONIC)
+    at_ns = electrode_instants(frames, AlignmentClock.MONOTONIC)
     about_s = _seconds(at_ns)
     shares = _shares(frames, pac=False)
     electrodes_s = np.where(counts(about_s), time_of(shares, about_s), np.nan)
     out = {}
     for name, stream in wrenches.items():
-        force, _ = linear(at_ns, times_of(stream, Clock.MONOTONIC), _forces(stream))
+        force, _ = linear(at_ns, times_of(stream, AlignmentClock.MONOTONIC), _forces(stream))
         share = (force[..., 0] - LOW_N) / SPAN_N
         out[name] = spread(electrodes_s - time_of(share, about_s))
-    travel, _ = linear(at_ns, times_of(poses, Clock.MONOTONIC), _travels(poses))
+    travel, _ = linear(at_ns, times_of(poses, AlignmentClock.MONOTONIC), _travels(poses))
     out["pose"] = spread(electrodes_s - time_of(travel[..., 0] / SPAN_M, about_s))
     return out
 

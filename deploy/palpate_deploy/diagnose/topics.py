@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate import clock
-from palpate.bus import Delivery, Received, Sample, Session
+from palpate.bus import Delivery, ReceivedMessage, Session, TapSample
 from palpate.bus.topics import TOPICS, Topic
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, StreamTimeout, WireError
@@ -173,7 +173,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _json(received: Received[Any]) -> str:
+def _json(received: ReceivedMessage[Any]) -> str:
     return json.dumps(
         {
             "station": received.station,
@@ -184,7 +184,7 @@ def _json(received: Received[Any]) -> str:
     )
 
 
-def _text(topic: Topic[Any], received: Received[Any]) -> str:
+def _text(topic: Topic[Any], received: ReceivedMessage[Any]) -> str:
     lines = [f"--- {received.sensor}/{topic.name}"]
     for part in dataclasses.fields(received.message):
         value = getattr(received.message, part.name)
@@ -237,7 +237,7 @@ class Rate:
     _arrival_ns: int = 0
     _sequence: int | None = None
 
-    def add(self, topic: Topic[object], sample: Sample) -> None:
+    def add(self, topic: Topic[object], sample: TapSample) -> None:
         """Count one sample."""
         self.messages += 1
         self.bytes += len(sample.payload)

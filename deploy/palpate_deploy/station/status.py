@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from palpate.bus import Alive, Session, endpoints
+from palpate.bus import AliveService, Session, endpoints
 from palpate.config import LinkConfig
 from palpate.errors import PalpateError
 from palpate.messages import (
@@ -173,7 +173,9 @@ def duration_text(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def _table(station: str, present: Iterable[Alive], answers: dict[tuple[str, str], Status]) -> Table:
+def _table(
+    station: str, present: Iterable[AliveService], answers: dict[tuple[str, str], Status]
+) -> Table:
     table = Table(title=f"station {station}", title_justify="left")
     for column in ("process", "ready", "state", "up", "sensors", "says", "counters"):
         table.add_column(column, overflow="fold")
@@ -221,7 +223,7 @@ def _sensor(sensor: SensorStatus) -> str:
 def _as_json(
     station: str,
     router: bool,
-    present: Iterable[Alive],
+    present: Iterable[AliveService],
     answers: dict[tuple[str, str], Status],
 ) -> dict[str, Any]:
     processes = []

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from pydantic import Field, field_validator, model_validator
 
-from palpate.bus import Delivery, Received, Session, Subscriber
+from palpate.bus import Delivery, ReceivedMessage, Session, Subscriber
 from palpate.bus.topics import ROBOT_POSE
 from palpate.config import LinkConfig, Name, TlsConfig, endpoint_host_port
 from palpate.errors import DeviceLost, DeviceTimeout, LinkError, StreamTimeout
@@ -150,7 +150,7 @@ class PoseZenoh(BusDevice):
         self._counts["samples"] += len(readings)
         return readings
 
-    def _reading(self, received: Received[RobotPoseFrame]) -> PoseReading | None:
+    def _reading(self, received: ReceivedMessage[RobotPoseFrame]) -> PoseReading | None:
         """The tip; None, and counted, if the pose is rejected."""
         frame = received.message
         if frame.robot != self._options.robot:

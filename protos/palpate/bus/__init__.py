@@ -5,22 +5,22 @@ sensor streams drop rather than block; a query is always answered; plain TCP, ne
 """
 
 from palpate.bus.link import Session, run_router
-from palpate.bus.presence import Alive, CallerToken, Presence
-from palpate.bus.pubsub import Delivery, Publisher, Received, Sample, Subscriber, Tap
+from palpate.bus.presence import AliveService, CallerToken, Presence
+from palpate.bus.pubsub import Delivery, Publisher, ReceivedMessage, Subscriber, Tap, TapSample
 from palpate.bus.query import MAX_REPLY_BYTES, QueryAnswer
 
 __all__ = [
     "MAX_REPLY_BYTES",
-    "Alive",
+    "AliveService",
     "CallerToken",
     "Delivery",
     "Presence",
     "Publisher",
     "QueryAnswer",
-    "Received",
-    "Sample",
+    "ReceivedMessage",
     "Session",
     "Subscriber",
     "Tap",
+    "TapSample",
     "run_router",
 ]

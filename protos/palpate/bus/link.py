@@ -12,7 +12,7 @@ from typing import Any, Protocol, Self, TypeVar
 import zenoh
 
 from palpate.bus.endpoints import Endpoint
-from palpate.bus.presence import Alive, CallerToken, CallerWatch, Presence, alive
+from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Delivery, Publisher, Subscriber, Tap
 from palpate.bus.query import (
     Queryable,
@@ -363,7 +363,7 @@ class Session(Closing):
         """Declare this process alive; call ``ready`` on the result when it serves."""
         return self._keep(Presence(self._raw, self.station, service, instance))
 
-    def alive(self, *, station: str | None = None) -> list[Alive]:
+    def alive(self, *, station: str | None = None) -> list[AliveService]:
         """Who is alive, and who is ready."""
         return alive(self._raw, self.station if station is None else station)
 

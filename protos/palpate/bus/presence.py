@@ -19,7 +19,7 @@ _SETTLE_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Alive:
+class AliveService:
     """A process that is there, and whether it is ready to serve."""
 
     station: str
@@ -58,7 +58,7 @@ class Presence(Closing):
         self._alive.undeclare()
 
 
-def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> list[Alive]:
+def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> list[AliveService]:
     """Everyone who is alive at a station (``"*"`` = any)."""
     found: dict[tuple[str, str, str], bool] = {}
     key = live_key(station, "*", "*", "*")
@@ -68,7 +68,7 @@ def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> li
         *_, where, service, instance, what = str(reply.ok.key_expr).split("/")
         name = (where, service, instance)
         found[name] = found.get(name, False) or what == "ready"
-    return [Alive(*name, ready) for name, ready in sorted(found.items())]
+    return [AliveService(*name, ready) for name, ready in sorted(found.items())]
 
 
 class CallerToken(Closing):

@@ -18,7 +18,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import zenoh
 
 from palpate import clock
-from palpate.bus.topics import Address, Topic, check_schema, parse_key
+from palpate.bus.topics import StreamAddress, Topic, check_schema, parse_key
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import Origin
 from palpate.process import Closing
@@ -40,7 +40,7 @@ class Delivery(Enum):
     EVERY = "every"
 
 
-class Waiting(Protocol[T]):
+class DeliveryQueue(Protocol[T]):
     """A queue between the bus and one consumer."""
 
     def put(self, key: str, item: T) -> None:
@@ -53,7 +53,7 @@ class Waiting(Protocol[T]):
         """Release a blocked sender."""
 
 
-class NewestWins(Generic[T]):
+class NewestQueue(Generic[T]):
     """Per key only the newest items wait; keys are served in the order in which they waited.
 
     Args:
@@ -71,7 +71,7 @@ class NewestWins(Generic[T]):
         self._depth = depth
 
     def put(self, key: str, item: T) -> None:
-        """See ``Waiting.put``."""
+        """See ``DeliveryQueue.put``."""
         with self._lock:
             items = self._waiting.get(key)
             if items is None:
@@ -86,7 +86,7 @@ class NewestWins(Generic[T]):
             self._order.put(key)
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """See ``Waiting.get``."""
+        """See ``DeliveryQueue.get``."""
         try:
             key = self._order.get(timeout=timeout_s)
         except queue.Empty:
@@ -98,7 +98,7 @@ class NewestWins(Generic[T]):
         """Nothing to release."""
 
 
-class Fifo(Generic[T]):
+class FifoQueue(Generic[T]):
     """First in, first out, bounded; a full queue counts the newcomer or makes the sender wait."""
 
     def __init__(self, counters: Counter[str], capacity: int, *, sender_waits: bool) -> None:
@@ -111,7 +111,7 @@ class Fifo(Generic[T]):
         self._counters = counters
 
     def put(self, key: str, item: T) -> None:
-        """See ``Waiting.put``."""
+        """See ``DeliveryQueue.put``."""
         with self._changed:
             while self._sender_waits and len(self._items) >= self._capacity and not self._closed:
                 self._changed.wait(0.5)
@@ -123,7 +123,7 @@ class Fifo(Generic[T]):
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """See ``Waiting.get``."""
+        """See ``DeliveryQueue.get``."""
         with self._changed:
             if not self._items:
                 self._changed.wait_for(lambda: bool(self._items), timeout_s)
@@ -135,19 +135,19 @@ class Fifo(Generic[T]):
             return item
 
     def close(self) -> None:
-        """See ``Waiting.close``."""
+        """See ``DeliveryQueue.close``."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
 
-def waiting_for(
+def queue_for(
     delivery: Delivery, capacity: int, counters: Counter[str], *, depth: int = 1
-) -> Waiting[T]:
+) -> DeliveryQueue[T]:
     """The queue that keeps ``delivery``'s promise; ``depth`` is for ``NEWEST``."""
     if delivery is Delivery.NEWEST:
-        return NewestWins(counters, depth)
-    return Fifo(counters, capacity, sender_waits=delivery is Delivery.EVERY)
+        return NewestQueue(counters, depth)
+    return FifoQueue(counters, capacity, sender_waits=delivery is Delivery.EVERY)
 
 
 M = TypeVar("M")
@@ -212,7 +212,7 @@ class Publisher(Generic[M]):
 
 
 @dataclass(frozen=True, slots=True)
-class Received(Generic[M]):
+class ReceivedMessage(Generic[M]):
     """A valid message and how it came.
 
     Attributes:
@@ -231,7 +231,7 @@ class Received(Generic[M]):
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class TapSample:
     """An undecoded message: what a recorder writes."""
 
     topic: str
@@ -270,11 +270,11 @@ class Subscriber(Generic[M], Closing):
         self.topic = topic
         self.key = key
         self._counters: Counter[str] = Counter()
-        self._waiting: Waiting[tuple[zenoh.Sample, int]] = waiting_for(
+        self._waiting: DeliveryQueue[tuple[zenoh.Sample, int]] = queue_for(
             delivery, capacity, self._counters, depth=depth
         )
         self._newest: dict[str, tuple[zenoh.Sample, int]] = {}
-        self._addresses: dict[str, Address] = {}
+        self._addresses: dict[str, StreamAddress] = {}
         self._last: dict[str, tuple[int, int, int]] = {}
         self._subscriber = session.declare_subscriber(key, self._on_sample)
 
@@ -292,7 +292,7 @@ class Subscriber(Generic[M], Closing):
         """Events since it was declared."""
         return dict(self._counters)
 
-    def next(self, timeout_s: float) -> Received[M]:
+    def next(self, timeout_s: float) -> ReceivedMessage[M]:
         """The next valid message that was not delivered yet; invalid ones are counted and skipped.
 
         Raises:
@@ -315,7 +315,7 @@ class Subscriber(Generic[M], Closing):
                 self._counters["delivered"] += 1
                 return received
 
-    def latest(self, max_age_s: float, *, sensor: str | None = None) -> Received[M]:
+    def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
         """The newest message, if it is young enough; nothing is consumed.
 
         The age counts from the stamp (when the sensor was read), not from arrival.
@@ -353,20 +353,20 @@ class Subscriber(Generic[M], Closing):
             )
         return received
 
-    def _address(self, key: str) -> Address:
+    def _address(self, key: str) -> StreamAddress:
         address = self._addresses.get(key)
         if address is None:
             address = self._addresses[key] = parse_key(key)
         return address
 
-    def _decode(self, sample: zenoh.Sample, received_ns: int) -> Received[M]:
+    def _decode(self, sample: zenoh.Sample, received_ns: int) -> ReceivedMessage[M]:
         check_schema(str(sample.encoding), self.topic.codec.schema)
         address = self._address(str(sample.key_expr))
         payload = sample.payload.to_bytes()
         message = self.topic.codec.decode(payload)
-        return Received(message, payload, address.station, address.sensor, received_ns)
+        return ReceivedMessage(message, payload, address.station, address.sensor, received_ns)
 
-    def _in_order(self, received: Received[M], lost_here: int) -> bool:
+    def _in_order(self, received: ReceivedMessage[M], lost_here: int) -> bool:
         """Account for holes, restarts and duplicates; False = do not deliver."""
         stamp = self.topic.stamp_of(received.message)
         if stamp is None:
@@ -414,7 +414,7 @@ class Tap(Closing):
         capacity: int,
     ) -> None:
         self._counters: Counter[str] = Counter()
-        self._waiting: Waiting[tuple[zenoh.Sample, int, int]] = waiting_for(
+        self._waiting: DeliveryQueue[tuple[zenoh.Sample, int, int]] = queue_for(
             delivery, capacity, self._counters
         )
         # By default each subscriber calls back from a thread of its own, and a frame may overtake
@@ -432,7 +432,7 @@ class Tap(Closing):
         """``received``, ``dropped``, ``overflow``, ``rejected_key``."""
         return dict(self._counters)
 
-    def next(self, timeout_s: float) -> Sample:
+    def next(self, timeout_s: float) -> TapSample:
         """The next sample.
 
         Raises:
@@ -452,7 +452,7 @@ class Tap(Closing):
             except WireError as error:
                 self._counters[f"rejected_{error.reason}"] += 1
                 continue
-            return Sample(
+            return TapSample(
                 address.topic,
                 address.station,
                 address.sensor,

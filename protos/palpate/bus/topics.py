@@ -220,7 +220,7 @@ def _chunk(name: str, what: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Address:
+class StreamAddress:
     """What a key says: station, sensor (or ``service/instance``) and topic."""
 
     station: str
@@ -228,7 +228,7 @@ class Address:
     topic: str
 
 
-def parse_key(key: str) -> Address:
+def parse_key(key: str) -> StreamAddress:
     """Split a stream's key.
 
     Raises:
@@ -236,9 +236,9 @@ def parse_key(key: str) -> Address:
     """
     chunks = key.split("/")
     if len(chunks) == 5 and key.startswith(ROOT):
-        return Address(chunks[2], chunks[3], chunks[4])
+        return StreamAddress(chunks[2], chunks[3], chunks[4])
     if len(chunks) == 7 and key.startswith(ROOT) and chunks[3] == "@service":
-        return Address(chunks[2], f"{chunks[4]}/{chunks[5]}", chunks[6])
+        return StreamAddress(chunks[2], f"{chunks[4]}/{chunks[5]}", chunks[6])
     raise WireError(
         f"key {key!r} is not {ROOT}/<station>/<sensor>/<stream>",
         remedy="publish under the keys of docs/adr/0004-keys-and-qos.md",

@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from typing import Any, TypeVar
 
-from palpate.bus import Alive, Delivery, Received, Session, Subscriber, endpoints
+from palpate.bus import AliveService, Delivery, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import OnProgress, OnStep, ask_simulation
@@ -141,7 +141,9 @@ class Client(Closing):
             timeout_s=self._timeout_s if timeout_s is None else timeout_s,
         )
 
-    def next_features(self, sensor: str, *, timeout_s: float = 1.0) -> Received[FeatureEstimate]:
+    def next_features(
+        self, sensor: str, *, timeout_s: float = 1.0
+    ) -> ReceivedMessage[FeatureEstimate]:
         """Wait for the next estimate that was not returned yet.
 
         Raises:
@@ -245,7 +247,7 @@ class Client(Closing):
             endpoints.MODEL, ServiceRequest(), service=service, timeout_s=self._timeout_s
         )
 
-    def alive(self) -> list[Alive]:
+    def alive(self) -> list[AliveService]:
         """Who is there, and who is ready."""
         return self.session.alive()
 

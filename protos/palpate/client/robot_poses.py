@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from palpate.bus import Publisher, Session
-from palpate.bus.pubsub import NewestWins
+from palpate.bus.pubsub import NewestQueue
 from palpate.bus.topics import ROBOT_POSE
 from palpate.errors import LinkError, WireError
 from palpate.messages import Pose, RobotPoseFrame
@@ -44,7 +44,7 @@ class RobotPosePublisher(Closing):
         self._run_id = secrets.randbits(64) or 1
         self._sequence = 0
         self._counters: Counter[str] = Counter({"put": 0, "published": 0, "dropped": 0})
-        self._waiting: NewestWins[bytes] = NewestWins(self._counters, waiting)
+        self._waiting: NewestQueue[bytes] = NewestQueue(self._counters, waiting)
         self._encode = ROBOT_POSE.codec.encode
         self._error: LinkError | None = None
         self._closed = threading.Event()

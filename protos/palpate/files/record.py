@@ -27,7 +27,7 @@ from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, Address, parse_key
+from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
 from palpate.errors import RecordingError, WireError
 
 FLUSH_S = 0.1
@@ -241,7 +241,7 @@ class RecordItem:
     """
 
     key: str
-    address: Address
+    address: StreamAddress
     schema: str
     payload: bytes
     log_time_ns: int
@@ -260,7 +260,7 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
         RecordingError: Not a record of palpate, or damaged (after the messages before the damage).
     """
     schemas: dict[int, Schema] = {}
-    channels: dict[int, tuple[str, Address, str]] = {}
+    channels: dict[int, tuple[str, StreamAddress, str]] = {}
     count = 0
     complete = False
     try:
@@ -302,7 +302,9 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
         )
 
 
-def _channel(path: Path, channel: Channel, schemas: dict[int, Schema]) -> tuple[str, Address, str]:
+def _channel(
+    path: Path, channel: Channel, schemas: dict[int, Schema]
+) -> tuple[str, StreamAddress, str]:
     schema = schemas.get(channel.schema_id)
     if schema is None or schema.encoding != "protobuf":
         raise RecordingError(

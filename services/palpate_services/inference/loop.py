@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from palpate import clock
-from palpate.bus import Delivery, Publisher, Received, Session, Subscriber, endpoints
+from palpate.bus import Delivery, Publisher, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.topics import Topic
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, RemoteError, StreamTimeout, WireError
@@ -114,7 +114,7 @@ class Answerer(Generic[M, E]):
         self._busy_ns = 0
         self._counted_ns = self._gauged_ns = time.monotonic_ns()
 
-    def answer(self, received: Received[M]) -> None:
+    def answer(self, received: ReceivedMessage[M]) -> None:
         """Publish the estimate of a message, or count why there is none."""
         sensor = received.sensor
         if self._sensors and sensor not in self._sensors:

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from palpate.bus import Sample
+from palpate.bus import TapSample
 from palpate.bus.topics import TOPICS, Topic
 from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import RecordWriter, is_being_written, recover
@@ -206,7 +206,7 @@ class RecordKeeper:
         self._recovery.start()
         self._open()
 
-    def write(self, sample: Sample) -> None:
+    def write(self, sample: TapSample) -> None:
         """Record one sample; without a disk to write to it is counted as ``lost_disk_full``."""
         if self._writer is None:
             self._counts["lost_disk_full"] += 1
@@ -238,7 +238,7 @@ class RecordKeeper:
         if self._view is not None and message is not None and sample.topic in SensorScene.TOPICS:
             self._view.offer(sample.sensor, message)
 
-    def _look_at(self, topic: Topic[Any], sample: Sample) -> tuple[Any, int, int]:
+    def _look_at(self, topic: Topic[Any], sample: TapSample) -> tuple[Any, int, int]:
         """Message, wall clock [ns] and sequence of its stamp.
 
         What breaks the contract is recorded as it came, for whoever has to find out why.
