@@ -38,7 +38,7 @@ from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.writer import Place, StoreWriter
+from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
 from palpate_fem.trajectory import CLEARANCE_M, Campaign, PlannedIndentation
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
@@ -308,7 +308,7 @@ class FemSimulator:
             store, fingertip, shared=True, outline=outline_of, command=COMMAND
         ) as writer:
             done = writer.done()
-            places: dict[str, Place] = {}
+            places: dict[str, TrajectoryClaim] = {}
 
             def claimed() -> Iterator[_MechanicsTask]:
                 for plan in plans:

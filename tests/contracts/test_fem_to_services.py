@@ -13,10 +13,9 @@ pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
 from palpate_deploy.cli import files as cli_files
 from palpate_deploy.cli.options import PalpateGroup
-from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate_fem.store.writer import StoreWriter
+from palpate_fem.store.writer import StoreWriter, export
 from palpate_services.viewer.simulation_file import DrawnSimulations
 
 NAMES = ["sphere_medium/00/angled", "sphere_medium/00/normal"]

@@ -101,9 +101,10 @@ def test_the_shipped_sample_trains_a_field_that_services_serve(
     played: list[object], tmp_path: Path
 ) -> None:
     pytest.importorskip("torch")
-    from palpate_training.datasets.experiment import read_mixed
     from palpate_training.tasks.bundles import field_bundle
     from palpate_training.tasks.field_fit import FitConfig
+
+    from palpate_training.datasets.experiment import read_mixed
 
     path = Path(str(resources.files("palpate_training").joinpath("samples/twin.h5")))
     assert path.stat().st_size < 1.5e6

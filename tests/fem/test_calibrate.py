@@ -296,5 +296,5 @@ def test_result_is_a_file_that_gives_the_parameters_back(tmp_path: Path) -> None
     assert picture.read_bytes().startswith(b"\x89PNG")
     path.write_text(path.read_text().replace("palpate.calibration", "other"))
     for bad in (path, tmp_path / "nothing.json", picture):
-        with pytest.raises(ConfigError, match="no calibration"):
+        with pytest.raises(ConfigError, match="not a calibration"):
             read_parameters(bad)

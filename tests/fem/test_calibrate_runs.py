@@ -92,7 +92,7 @@ class Dying(Executor):
 
 
 def test_a_dying_process_is_named() -> None:
-    with pytest.raises(SimulationError, match="ended by itself: killed"):
+    with pytest.raises(SimulationError, match="died: killed"):
         SimulationRuns(Spring(), Dying()).run([(TRUTH, press())])
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
-from palpate_fem.plot.step import plot_curves, plot_overview, plot_step, von_mises
-from palpate_fem.plot.trajectories import travel_m
+from palpate_fem.plot.step import plot_step, von_mises
+from palpate_fem.plot.trajectories import plot_curves, plot_overview, travel_m
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.files import StoreDiskError

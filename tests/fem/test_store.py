@@ -18,11 +18,10 @@ from palpate.errors import ConfigError, DatasetError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip
-from palpate_fem.store.export import export
 from palpate_fem.store.files import StoreMismatchError, StoreTakenError
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate_fem.store.writer import StoreWriter
+from palpate_fem.store.writer import StoreWriter, export
 
 ID = "sphere_medium/03/normal"
 FLOAT32 = 6e-8
@@ -227,7 +226,7 @@ def test_export_onto_a_full_disk(path: Path) -> None:
 import resource, signal, sys
 from pathlib import Path
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.export import export
+from palpate_fem.store.writer import export
 from palpate_fem.store.files import StoreDiskError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))

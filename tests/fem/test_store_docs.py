@@ -9,7 +9,7 @@ import h5py
 import pytest
 
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
-from palpate_fem.store.trajectory import CONVERGENCE
+from palpate_fem.store.schema import CONVERGENCE
 from palpate_fem.store.writer import StoreWriter
 
 

@@ -18,10 +18,9 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
 from palpate_fem.result import IndentationOutcome
-from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import sample_fingertip, sample_trajectory
-from palpate_fem.store.writer import StoreWriter
+from palpate_fem.store.writer import StoreWriter, export
 from palpate_fem.validation.sources import measured_from, simulated_from
 from palpate_fem.validation.validate import (
     INDENTER_HEADINGS,

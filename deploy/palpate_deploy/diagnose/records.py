@@ -210,7 +210,8 @@ def _review_store(
 def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
     """The overview of a store, or the last step of the one trajectory that is asked for."""
     from palpate.files.simulation_store import choose_trajectories
-    from palpate_fem.plot.step import plot_overview, plot_step
+    from palpate_fem.plot.step import plot_step
+    from palpate_fem.plot.trajectories import plot_overview
     from palpate_fem.store.read import SimulationStore
 
     store = SimulationStore.open(path)

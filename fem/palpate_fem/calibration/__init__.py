@@ -1,1 +1,1 @@
-"""Parameters of a fingertip from measured forces."""
+"""Mechanical parameters of a fingertip from measured forces."""

@@ -32,12 +32,12 @@ THRESHOLD_N = 0.5
 INCREMENTS = 20
 """Even displacement increments (paper, "Experimental and simulation data processing", step 5)."""
 _LARGEST_SHIFT_M = 0.3e-3
-"""Bound of a fitted shift [m]: three times what noise of 0.05 N does to the crossing where the
-force rises by 0.5 N/mm."""
+"""Largest fitted shift [m]: three times the shift by noise of 0.05 N where the force rises by
+0.5 N/mm."""
 _SHIFT_DONE_M = 1e-8
 _SHIFTS = 12
 _SAME_PLACE_M = 1e-9
-"""Poses closer than this are one place: held, not moved; robots repeat to 2e-5 m."""
+"""Poses closer than this are one place: the indenter was held. Robots repeat to 2e-5 m."""
 
 
 class AlignmentProblem(StrEnum):
@@ -53,8 +53,8 @@ class AlignmentError(DatasetError):
     """Two curves cannot be compared.
 
     Args:
-        side: ``"simulation"`` or ``"measurement"``: which one is to blame.
-        reason: Why.
+        side: Which curve is unsuitable: ``"simulation"`` or ``"measurement"``.
+        reason: Why it is.
         threshold_n: Force at which curves begin [N].
     """
 
@@ -69,7 +69,7 @@ class AlignmentError(DatasetError):
 
 @dataclass(frozen=True, slots=True)
 class ForceCurve:
-    """Net force against the way of the indenter.
+    """Net force against the travel of the indenter.
 
     Attributes:
         travel_m: Path length since the first pose [m], increasing, shape (K,).
@@ -80,7 +80,7 @@ class ForceCurve:
     force_n: Floats
 
     def begins_at(self, threshold_n: float) -> bool:
-        """Whether the first sample has this force: such a curve has been cut there."""
+        """Whether the first sample has exactly this force, because the curve was cut there."""
         return bool(abs(np.linalg.norm(self.force_n[0]) - threshold_n) < 1e-9 * threshold_n)
 
     def scaled(self, factor: float) -> ForceCurve:
@@ -90,10 +90,10 @@ class ForceCurve:
 
 @dataclass(frozen=True, slots=True)
 class AlignedCurves:
-    """Two curves, sampled alike; N = number of increments.
+    """Two curves at common samples; N = number of increments.
 
     Attributes:
-        displacement_m: Since the threshold force, each its own [m], shape (N,).
+        displacement_m: Since each curve's own threshold force [m], shape (N,).
         simulated_n: SimulatedIndentation force [N], shape (N, 3).
         measured_n: Measured force [N], shape (N, 3).
         depth_offset_m: Travel at the threshold, simulation minus measurement [m]: positive if the
@@ -110,17 +110,17 @@ class AlignedCurves:
 
 
 def curve(path: Floats, force_n: Floats) -> ForceCurve:
-    """ForceCurve of a trajectory, shorter than its path if it stopped early.
+    """Curve of a trajectory; shorter than its path if the trajectory stopped early.
 
     Args:
         path: Poses of the indenter, shape (K, 7).
-        force_n: Net force at the first of them [N], shape (k, 3) with k <= K.
+        force_n: Net force at the first k <= K of them [N], shape (k, 3).
     """
     return along(path_lengths(path)[: len(force_n)], force_n)
 
 
 def along(travel_m: Floats, force_n: Floats) -> ForceCurve:
-    """ForceCurve of samples.
+    """Curve of samples.
 
     Of several at one place the last counts, as in the paper ("the final time step of each 0.1 mm
     displacement increment").
@@ -136,13 +136,12 @@ def along(travel_m: Floats, force_n: Floats) -> ForceCurve:
 def from_contact(whole: ForceCurve, *, side: str, threshold_n: float = THRESHOLD_N) -> ForceCurve:
     """The part of a curve from exactly the threshold force on.
 
-    Single samples that noise lifts over the threshold before contact do not count as contact: the
-    curve begins at the last crossing before its greatest force. Later samples below the threshold
-    are left out.
+    Noise may lift single samples over the threshold before contact. So the curve begins at the last
+    crossing before its greatest force; later samples below the threshold are left out.
 
     Args:
-        whole: The curve, from before contact.
-        side: Named in the error.
+        whole: The curve, starting before contact.
+        side: Name for the error.
         threshold_n: Force at which it begins [N].
 
     Raises:
@@ -164,7 +163,7 @@ def from_contact(whole: ForceCurve, *, side: str, threshold_n: float = THRESHOLD
     keep = np.flatnonzero(magnitude[before + 1 :] >= threshold_n) + before + 1
     start_m = whole.travel_m[before] + share * np.diff(whole.travel_m[before : before + 2])[0]
     start_n = whole.force_n[before] + share * np.diff(whole.force_n[before : before + 2], axis=0)[0]
-    # the first sample may hold the threshold exactly: then it is the start, not a second one
+    # A sample exactly at the threshold is the start itself; it must not be counted twice.
     keep = keep[whole.travel_m[keep] > start_m + _SAME_PLACE_M]
     return ForceCurve(
         np.concatenate([[start_m], whole.travel_m[keep]]),
@@ -183,13 +182,13 @@ def align(
     """Bring a simulated and a measured curve of the same path to the same samples.
 
     Args:
-        simulated: From before contact.
-        measured: From before contact, or from the threshold force on.
+        simulated: Starting before contact.
+        measured: Starting before contact, or at the threshold force.
         threshold_n: Force at which both begin [N].
         increments: Even increments of the common displacement.
-        fit_offset: Shift the simulation from there to where the forces agree best. Noise moves the
-            measured curve's crossing of the threshold, and with it every sample; the shift takes
-            that back. The paper does not do it.
+        fit_offset: Shift the simulation to where the forces agree best. Noise moves the point where
+            the measured curve crosses the threshold, and every sample with it; the shift undoes
+            that. The paper does not do it.
 
     Raises:
         AlignmentError: One of them never reaches the threshold, begins above it, or ends there.
@@ -222,7 +221,7 @@ def _resampled(
 def _common(
     simulated: ForceCurve, start_m: float, measured: ForceCurve, increments: int
 ) -> tuple[Floats, float]:
-    """Displacements that both have [m], shape (increments,), and their part of the measured one."""
+    """Common displacements [m], shape (increments,), and their part of the measured one."""
     length = float(measured.travel_m[-1] - measured.travel_m[0])
     common = min(float(simulated.travel_m[-1]) - start_m, length)
     return common * np.arange(1, increments + 1) / increments, common / length
@@ -233,7 +232,7 @@ def _best_shift(
 ) -> float:
     """Shift of the simulation's start with the least squared difference of the forces [m].
 
-    Gauss-Newton in one unknown; the curves are piecewise linear, so it may end up between two
+    Gauss-Newton in one unknown. The curves are piecewise linear, so it may alternate between two
     pieces, a fraction of a micrometre apart.
     """
     shift, most = 0.0, min(_LARGEST_SHIFT_M, 0.5 * float(simulated.travel_m[-1] - start_m))
@@ -256,14 +255,14 @@ def _at(line: ForceCurve, travel_m: Floats) -> tuple[Floats, Floats]:
     start = way[before]
     length = way[before + 1] - start
     slope = (force[before + 1] - force[before]) / length[:, None]
-    # the last travel may lie beyond the end by a rounding error
+    # The last travel may lie beyond the end by a rounding error.
     return force[before] + np.minimum(travel_m - start, length)[:, None] * slope, slope
 
 
 def _share_to(a: Floats, b: Floats, magnitude: float) -> float:
     """Share s in (0, 1] where |a + s (b - a)| is ``magnitude``, for |a| < magnitude <= |b|.
 
-    Interpolating the magnitude instead would miss it where the direction turns.
+    Interpolating the magnitude instead would miss the point if the direction changes.
     """
     step = b - a
     square, half, rest = step @ step, a @ step, a @ a - magnitude**2
@@ -274,12 +273,12 @@ def _share_to(a: Floats, b: Floats, magnitude: float) -> float:
 
 
 TARGET_THICKNESS_M = 15.1e-3
-"""Total thickness of the pressurised finger [m], the manufacturer's (paper, SynTouch manual)."""
+"""Total thickness of the pressurised finger [m], from the manufacturer (paper, SynTouch manual)."""
 
 
 @dataclass(frozen=True, slots=True)
 class CostWeights:
-    """CostWeights of the cost, hand-selected in the paper.
+    """Weights of the cost, selected by hand in the paper.
 
     Attributes:
         force: w1, of the force error in newton.
@@ -297,7 +296,7 @@ def axis_rms_n(pairs: Sequence[AlignedCurves]) -> Floats:
 
 
 def rms_n(pair: AlignedCurves) -> float:
-    """RMS force error of one trajectory [N]: the sum of its axes', as in the cost."""
+    """RMS force error of one trajectory [N]: the sum over its axes, as in the cost."""
     return float(axis_rms_n([pair]).sum())
 
 

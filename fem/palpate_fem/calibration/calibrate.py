@@ -1,11 +1,11 @@
 """Calibration: skin thickness, modulus, friction and fluid volume from measured forces.
 
-The paper minimises its cost by SLSQP over four parameters, with a run for every evaluation. Two of
-them need no run: forces scale exactly with the modulus at an unchanged shape, and the fluid's
-volume follows from the total thickness. So a coarse scan in thickness and friction finds a place to
-start. Each step from there runs the simulator once beside the point for each parameter, minimises
-the cost by SLSQP over all parameters, with curves linear in those and exact in the modulus, and is
-taken only if runs at its end confirm it.
+The paper minimises its cost by SLSQP over four parameters, with simulator runs for every
+evaluation. Two of the parameters need no run: forces scale exactly with the modulus at an unchanged
+shape, and the fluid's volume follows from the total thickness. So a coarse scan in thickness and
+friction finds a starting point. Each step from there runs the simulator near the point, once for
+each parameter, builds a model that is linear in those and exact in the modulus, and minimises the
+cost of that model by SLSQP. The step is accepted only if runs at its end confirm it.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from palpate_fem.calibration.settings import (
 from palpate_fem.result import IndentationOutcome
 
 _REACH = {THICKNESS: 0.15, FRICTION: 0.6, VOLUME: 0.15}
-"""First and largest change of a logarithm in one step: about half a cell of the scan."""
-_STILL = {THICKNESS: 1e-3, FRICTION: 5e-3, VOLUME: 1e-3}
-"""Changes of the logarithms below which the search has arrived; a tenth of what is asked for."""
+"""Initial and largest change of a logarithm in one step: about half a cell of the scan."""
+_CONVERGED = {THICKNESS: 1e-3, FRICTION: 5e-3, VOLUME: 1e-3}
+"""Changes of the logarithms at which the search has converged: a tenth of the required accuracy."""
 _ENOUGH = 1e-5
-"""A promised gain below this part of the cost is no reason for another run: moving all parameters
+"""Smallest predicted gain, as a part of the cost, that is worth another run: moving all parameters
 by one standard deviation changes the cost of N samples by about 1 / 2N of it."""
 
 
@@ -62,21 +62,21 @@ def calibrate(
 
     Args:
         simulator: SimulationRuns indentations; the sensor is not part of a run.
-        measured: Trajectories, of one or several sensors. Friction shows only where the indenter
-            slips, so angled ones belong to them. Thickness and modulus replace one another until
-            the skin is pinched on the core: one press of the long cylinder with noise of 0.02 N
-            gives the thickness within 2.2 % up to 6 N, and within 0.13 % up to 12 N.
+        measured: Trajectories of one or several sensors. Friction is visible only where the
+            indenter slips, so include angled ones. Thickness and modulus act alike until the skin
+            is pinched on the core: one indentation with the long cylinder and noise of 0.02 N gives
+            the thickness within 2.2 % up to 6 N, and within 0.13 % up to 12 N.
         settings: Bounds, weights, search; None = the paper's.
-        executor: SimulationRuns simulations in parallel, e.g. a process pool; None = one after the
+        executor: Runs simulations in parallel, e.g. a process pool; None = one after the
             other.
-        on_evaluation: Told of every evaluation of the cost that took runs.
-        on_run: Told after each run how many of the present batch are done, and how many it has.
+        on_evaluation: Called with every evaluation of the cost that took runs.
+        on_run: Called after each run with the number of finished and of all runs of the batch.
 
     Returns:
-        The parameters, how sure they are, how well they fit, and all that was left out.
+        The parameters, their uncertainty, how well they fit, and everything that was left out.
 
     Raises:
-        DatasetError: No measured trajectory can be compared at all.
+        DatasetError: No measured trajectory can be compared.
         SimulationError: No simulation can be compared with its measurement.
     """
     search = _Search(simulator, measured, settings or CalibrationSettings(), executor, on_run)
@@ -85,7 +85,7 @@ def calibrate(
 
 
 class _Search:
-    """SimulatedPoint of one calibration."""
+    """State of one calibration."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class _Search:
                     self.notes.append(note)
 
     def evaluate(self, state: SimulatedPoint, stage: str) -> ModulusFit:
-        """ModulusFit the modulus and report."""
+        """Fit the modulus at a point, and report the evaluation."""
         fit = fit_modulus(state, self.cases, self.settings)
         names = [case.item.name for case in self.cases]
         entry = Evaluation(
@@ -167,7 +167,7 @@ class _Search:
         return fit
 
     def drop(self, which: int, why: str, states: Sequence[SimulatedPoint]) -> list[SimulatedPoint]:
-        """Leave a case out from now on, in the open."""
+        """Exclude a case from now on, and record why."""
         self.excluded[self.cases[which].item.name] = why
         kept = [i for i in range(len(self.cases)) if i != which]
         self.cases = [self.cases[i] for i in kept]
@@ -176,7 +176,8 @@ class _Search:
     def scan(self) -> tuple[SimulatedPoint, ModulusFit]:
         """Best point of the coarse scan; a case that fails at most points is left out.
 
-        Where most cases fail it is the point's fault, e.g. as paths begin inside a thick skin.
+        A point at which most cases fail says nothing about them: there, e.g., paths begin inside a
+        thick skin.
         """
         states = self.simulate(self.settings.scan_points())
         while True:
@@ -194,17 +195,17 @@ class _Search:
             states = self.drop(worst, f"simulation: {fit.failures[worst]}", states)
 
     def refine(self, state: SimulatedPoint, fit: ModulusFit) -> Calibration:
-        """Step to the optimum, each step confirmed by runs."""
+        """Step to the optimum; each step is confirmed by runs."""
         names = self.settings.simulated
         largest = np.array([_REACH[name] for name in names])
-        still = np.array([_STILL[name] for name in names])
+        smallest = np.array([_CONVERGED[name] for name in names])
         reach, model, converged = largest.copy(), None, False
         for _ in range(self.settings.iterations):
             if model is None:
                 state, fit, model = self.local_model(state, fit)
             shift, promised = minimise(model, math.log(fit.modulus_pa), reach)
             gain = fit.cost - promised
-            if (np.abs(shift) <= still).all() or gain <= _ENOUGH * fit.cost:
+            if (np.abs(shift) <= smallest).all() or gain <= _ENOUGH * fit.cost:
                 converged = True
                 break
             trial = self.simulate([state.point * np.exp(shift)])[0]
@@ -215,9 +216,9 @@ class _Search:
                 reach = np.minimum(reach * (1.5 if won > 0.75 * gain else 1.0), largest)
             else:
                 reach = 0.3 * np.minimum(np.abs(shift), reach)
-                reach = np.maximum(reach, still)
+                reach = np.maximum(reach, smallest)
         else:
-            self.notes.append(f"stopped after {self.settings.iterations} steps, still moving")
+            self.notes.append(f"stopped after {self.settings.iterations} steps, not converged")
         if model is None:
             state, fit, model = self.local_model(state, fit)
         return self._result(model, fit, converged)
@@ -233,10 +234,10 @@ class _Search:
             which, why = next(iter(failures.items()))
             if len(self.cases) == 1:
                 raise SimulationError(
-                    f"no simulation beside the optimum can be compared: {why}",
-                    remedy="choose a shallower trajectory, or look into why the solver stops",
+                    f"no simulation near the optimum can be compared: {why}",
+                    remedy="choose a shallower trajectory, or find out why the solver stops",
                 )
-            (state,) = self.drop(which, f"simulation beside the optimum: {why}", [state])
+            (state,) = self.drop(which, f"simulation near the optimum: {why}", [state])
             fit = fit_modulus(state, self.cases, self.settings)
 
     def _moved(

@@ -30,19 +30,19 @@ from palpate_fem.calibration.point import (
 from palpate_fem.calibration.settings import MODULUS, CalibrationSettings
 
 _LOG_STEP = 1e-3
-"""Difference step of a logarithm; the model is linear, only the alignment is not."""
+"""Difference step of a logarithm. The model is linear; only the alignment is not."""
 _LEAST_RMS_N = 1e-4
-"""An axis that fits better than this is not weighted up further [N]; no instrument sees it."""
+"""Smallest RMS for the weight of an axis [N]: no instrument resolves a better fit."""
 
 
 class LocalModel:
-    """Curves around a base point, linear in the logarithm of the simulated parameters.
+    """Force curves around a base point, linear in the logarithms of the simulated parameters.
 
     Args:
-        base: SimulationRuns at the base point.
-        moved: SimulationRuns with one parameter moved each, in the order of ``settings.simulated``.
-        cases: What they are compared with.
-        settings: How.
+        base: Runs at the base point.
+        moved: Runs with one parameter moved each, in the order of ``settings.simulated``.
+        cases: Measurements that they are compared with.
+        settings: Settings of the comparison.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class LocalModel:
         steps = [float(np.log(state.point[i] / base.point[i])) for i, state in enumerate(moved)]
         self._travel, self._force, self._slopes = [], [], []
         for j, line in enumerate(base.curves):
-            # runs that stopped early: what all of them have
+            # Runs may have stopped early: use what all of them have.
             length = min(len(state.curves[j].travel_m) for state in (base, *moved))
             self._travel.append(line.travel_m[:length])
             self._force.append(line.force_n[:length])
@@ -147,21 +147,21 @@ def curvature(slopes: Floats, residuals: Floats) -> tuple[Floats, Floats]:
 
 _ROUNDS = 6
 _ENOUGH = 1e-6
-"""A round that gains less than this part of the cost was the last."""
+"""A round that gains less than this part of the cost is the last one."""
 _FLATTEST = 1e-8
-"""Directions flatter than this part of the steepest are not stretched further."""
+"""Directions with less than this part of the greatest curvature are not stretched further."""
 
 
 def minimise(model: LocalModel, log_modulus: float, reach: Floats) -> tuple[Floats, float]:
     """Minimise the cost over the logarithms of all parameters together.
 
-    Thickness and modulus nearly replace one another, so the cost is a long valley, and SLSQP, which
-    begins with a curvature of one in every direction, stalls in it. It works in coordinates in
-    which the Gauss-Newton curvature is one; where it ends, it begins anew with the curvature there.
+    Thickness and modulus have nearly the same effect, so the cost is a long valley. SLSQP starts
+    with a curvature of one in every direction and stalls in it. So it works in coordinates in which
+    the Gauss-Newton curvature is one; where it ends, it starts again with the curvature there.
 
     Args:
-        model: Built at the point to start from.
-        log_modulus: Logarithm of the modulus to start from.
+        model: Model built at the starting point.
+        log_modulus: Logarithm of the modulus at the start.
         reach: Largest change of the logarithm of each simulated parameter.
 
     Returns:
@@ -172,7 +172,7 @@ def minimise(model: LocalModel, log_modulus: float, reach: Floats) -> tuple[Floa
     for _ in range(_ROUNDS):
         try:
             new = _round(model, at, reach)
-        except AlignmentError:  # at the edge of what can be compared there are no slopes
+        except AlignmentError:  # no slopes exist at the edge of what can be compared
             break
         new_cost = model.cost(new[:-1], new[-1])
         if new_cost >= cost * (1.0 - _ENOUGH):
@@ -197,7 +197,7 @@ def _round(model: LocalModel, start: Floats, reach: Floats) -> Floats:
 
     def force_cost(w: Floats) -> float:
         v = logs(w)
-        # SLSQP's line search turns back from a cost that is worse, but not from infinity
+        # SLSQP's line search recovers from a high cost, but not from infinity.
         return min(model.force_cost(v[:-1], v[-1]), worst)
 
     constraints: list[dict[str, Any]] = [
@@ -211,7 +211,7 @@ def _round(model: LocalModel, start: Floats, reach: Floats) -> Floats:
     begin = np.zeros(count)
     objective = force_cost
     if settings.volume_is_free:
-        # |thickness error| has its kink where the optimum lies: one more unknown bounds it instead
+        # |thickness error| has its kink at the optimum, so one more unknown bounds it from above.
         weight = settings.weights.thickness
 
         def error(w: Floats) -> float:
@@ -237,7 +237,7 @@ def _round(model: LocalModel, start: Floats, reach: Floats) -> Floats:
 
 
 def _limits(model: LocalModel, reach: Floats) -> tuple[Floats, Floats]:
-    """Bounds of the logarithms: the parameters' own, and the reach of the model."""
+    """Bounds of the logarithms: those of the parameters, and the reach of the model."""
     settings = model.settings
     low, high = np.transpose(
         [settings.log_bounds(name) for name in (*settings.simulated, MODULUS)]
@@ -250,9 +250,9 @@ def _limits(model: LocalModel, reach: Floats) -> tuple[Floats, Floats]:
 
 _FORCE_STEP_N = 1e-4
 _AT_BOUND = 1e-3
-"""A parameter within this part of its logarithmic range of a bound is at the bound."""
+"""A parameter closer to a bound than this part of its logarithmic range is at the bound."""
 _BLIND = 1e-8
-"""Curvature below this part of the greatest: the data say nothing about that direction."""
+"""In directions with less than this part of the greatest curvature, the data determine nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,12 +262,12 @@ class ParameterEstimate:
     Attributes:
         name: Of the parameter.
         value: Found value [SI].
-        sd: One standard deviation from the noise alone; infinite if the data do not determine it,
-            NaN if it stopped at a bound.
-        sensitivity_n: Change of the force when it changes by 1 %: sum of the axes' RMS [N].
-        lower: Its bound.
-        upper: Its bound.
-        at_bound: Whether it stopped there.
+        sd: One standard deviation from noise alone; infinite if the data do not determine it, NaN
+            if it stopped at a bound.
+        sensitivity_n: Change of the force for a change of 1 %: sum over the axes of the RMS [N].
+        lower: Its lower bound.
+        upper: Its upper bound.
+        at_bound: Whether it stopped at a bound.
     """
 
     name: str
@@ -285,8 +285,8 @@ def estimates(
     """Values and uncertainties of all parameters at a point of a local model.
 
     Args:
-        model: Built close to the optimum.
-        shift: Logarithms of the simulated parameters from its base.
+        model: Model built close to the optimum.
+        shift: Change of the logarithms of the simulated parameters from its base.
         log_modulus: Logarithm of the modulus.
     """
     settings = model.settings
@@ -319,11 +319,11 @@ def _variance(
     log_modulus: float,
     shift: Floats,
 ) -> Floats:
-    """Variance of the logarithms of the free parameters; infinite where data are blind."""
+    """Variance of the logarithms of the free parameters; infinite if not determined."""
     slopes = slopes[:, :, free]
     hessian, weight = curvature(slopes, residuals)
 
-    # A free volume follows the thickness target: only directions along it remain.
+    # A free volume is tied to the target thickness, so only directions along it remain.
     basis = np.eye(len(free))
     along = np.append(model.thickness_slopes, 0.0)[free]
     if model.settings.volume_is_free and np.abs(along).max() > 0.0:
@@ -352,7 +352,7 @@ def _noise(
 ) -> Floats:
     """Gradient of the cost by each raw sample, times that sample's noise; shape (samples, P).
 
-    The noise, one for all axes, is what explains the residuals after the alignment.
+    The noise is one number for all axes: the one that explains the residuals after alignment.
     """
     settings, start = model.settings, 0
     gradients, explained = [], 0.0
@@ -369,11 +369,11 @@ def _noise(
 def _sample_effects(
     ours: ForceCurve, case: CalibrationCase, settings: CalibrationSettings
 ) -> list[Floats]:
-    """By how much each raw force value moves the residuals, each (increments, 3) per newton."""
+    """Derivative of the residuals by each raw force value, each of shape (increments, 3)."""
     effects = []
     pair = compare(ours, case, 1.0, settings)
     before = pair.simulated_n - pair.measured_n
-    # the last sample below the threshold is the first that matters
+    # The last sample below the threshold is the first one that matters.
     first = max(int(np.searchsorted(case.whole.travel_m, case.contact.travel_m[0])) - 1, 0)
     for row in range(first, len(case.whole.travel_m)):
         for axis in range(3):

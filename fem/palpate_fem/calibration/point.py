@@ -1,4 +1,4 @@
-"""The cost at a simulated point, with the best modulus: it takes no further run."""
+"""The cost at one simulated point, with the best modulus there, which takes no further run."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from palpate_fem.calibration.runs import SimulatedIndentation
 from palpate_fem.calibration.settings import MODULUS, CalibrationSettings
 
 _GRID = 13
-"""Moduli tried before the search between two of them: steps of 20 % over the paper's bounds."""
+"""Moduli that are tried before the search between two of them: steps of 20 % over the bounds."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationCase:
-    """A measured trajectory, its whole curve, and the part from the threshold force on."""
+    """A measured trajectory, its whole curve, and the part after the threshold force."""
 
     item: MeasuredIndentation
     whole: ForceCurve
@@ -49,7 +49,7 @@ class CalibrationCase:
     def of_curve(
         cls, item: MeasuredIndentation, whole: ForceCurve, settings: CalibrationSettings
     ) -> CalibrationCase:
-        """Prepare a trajectory with another curve than its own."""
+        """Prepare a trajectory with a different curve."""
         threshold = settings.threshold_n
         return cls(item, whole, from_contact(whole, side="measurement", threshold_n=threshold))
 
@@ -72,7 +72,7 @@ class SimulatedPoint:
 
     @classmethod
     def of(cls, point: Floats, runs: Sequence[SimulatedIndentation]) -> SimulatedPoint:
-        """From the runs of all cases; refused ones know no thickness."""
+        """From the runs of all cases; refused runs have no thickness."""
         known = [run for run in runs if math.isfinite(run.thickness_m)]
         first = known[0] if known else runs[0]
         return cls(
@@ -130,11 +130,11 @@ def fit_modulus(
     if not math.isfinite(costs[best]):
         return ModulusFit(math.inf, math.nan, (), _failures(state, cases, settings, grid))
     if best > 0 and not math.isfinite(costs[best - 1]):
-        # the best would be softer still, but a case that ends early holds it back
+        # The optimum is softer still, but there a case cannot be compared as it ends early.
         softer = math.exp(grid[best - 1])
         return ModulusFit(math.inf, math.nan, (), failures_at(state, cases, softer, settings))
     bracket = (grid[max(best - 1, 0)], grid[min(best + 1, _GRID - 1)])
-    worst = 10.0 * float(costs[best]) + 1.0  # instead of infinity, which spoils a parabola
+    worst = 10.0 * float(costs[best]) + 1.0  # parabolic interpolation fails with infinity
     found = minimize_scalar(
         lambda log: min(_cost_at(log, state, cases, settings), worst),
         bounds=bracket,
@@ -206,10 +206,10 @@ def _failures(
     settings: CalibrationSettings,
     grid: Floats,
 ) -> dict[int, str]:
-    """Cases that can be compared at no modulus, and why not at the stiffest, which reaches most."""
+    """Cases that cannot be compared at any modulus, and why not at the stiffest one."""
     at_each = [failures_at(state, cases, math.exp(log), settings) for log in grid]
     always = set(at_each[0]).intersection(*at_each)
-    # each may be comparable by itself, but not where the others are
+    # Each may be comparable alone, but not at a modulus where the others are.
     return {i: at_each[-1][i] for i in sorted(always)} or dict.fromkeys(
         range(len(cases)), "no modulus suits it and the others"
     )

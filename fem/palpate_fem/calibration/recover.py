@@ -35,7 +35,7 @@ from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.trajectory import angled_direction, pad_point, press_path
 
 TOLERANCES = {THICKNESS: 0.02, MODULUS: 0.02, FRICTION: 0.05, VOLUME: 0.01}
-"""Relative errors that the calibration must stay below."""
+"""Largest allowed relative errors of the calibration."""
 
 
 class Planned(NamedTuple):
@@ -48,14 +48,14 @@ class Planned(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ParameterRecovery:
-    """Planted and found parameters.
+    """Known and found parameters.
 
     Attributes:
-        truth: Planted values by name, the fluid volume included.
+        truth: Known values by name, the fluid volume included.
         found: Calibrated values.
-        sd: Their standard deviations as the calibration states them.
-        calibration: All of it.
-        measured: The noisy trajectories it was made from.
+        sd: Their standard deviations, as stated by the calibration.
+        calibration: The whole calibration.
+        measured: The noisy trajectories that it used.
     """
 
     truth: dict[str, float]
@@ -75,7 +75,7 @@ class ParameterRecovery:
         return all(abs(error) <= TOLERANCES[name] for name, error in self.errors.items())
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Parameter, planted, found, error, stated deviation, tolerance, verdict; for a table."""
+        """Rows of a table: parameter, known, found, error, stated deviation, tolerance, verdict."""
         return [
             (
                 name,
@@ -97,12 +97,12 @@ def noisy(
     noise_n: float,
     random: np.random.Generator,
 ) -> MeasuredIndentation:
-    """A simulated trajectory as an instrument would record it, up to where it ended.
+    """A simulated trajectory with the noise of an instrument, up to where it ended.
 
     Args:
         planned: What was simulated.
         run: The result, at the poses of the path.
-        sensor: Name of the pretended sensor.
+        sensor: Name of the virtual sensor.
         noise_n: Standard deviation of the noise of each axis [N].
         random: Source of the noise.
 
@@ -144,19 +144,19 @@ def recover(
     The calibration gets forces and poses only, and begins with its scan.
 
     Args:
-        simulator: SimulationRuns both.
-        truth: Planted parameters.
-        trajectories: What to simulate; angled ones among them, for friction.
+        simulator: Runs the known and the calibrated simulations.
+        truth: Known parameters.
+        trajectories: What to simulate; include angled ones, for friction.
         noise_n: Standard deviation of the noise of each axis [N].
-        seed: Of the noise.
-        sensors: Records of each trajectory with noise of their own; the paper had three BioTacs.
-        settings: Of the calibration.
-        executor: Where simulations run.
+        seed: For the noise.
+        sensors: Copies of each trajectory with independent noise; the paper had three BioTacs.
+        settings: Settings of the calibration.
+        executor: Runs simulations, see ``calibrate``.
         on_evaluation: See ``calibrate``.
         on_run: See ``calibrate``.
 
     Raises:
-        SimulationError: The planted trajectories cannot be simulated or compared.
+        SimulationError: The trajectories cannot be simulated or compared.
     """
     random = np.random.default_rng(seed)
     plans = [MeasuredIndentation(p.name, p.indenter, "-", p.path, np.zeros((len(p.path), 3)))
@@ -199,8 +199,8 @@ class _Press(NamedTuple):
     azimuth_deg: float
 
 
-# Below some 6 N thickness and modulus act alike; a pinch on the core to 10 N and more tells them
-# apart. Friction shows where an indenter moves sideways.
+# Below about 6 N thickness and modulus have the same effect; a pinch on the core to 10 N and more
+# separates them. Friction is visible where an indenter moves sideways.
 PRESSES = {
     "pinch": _Press("cylinder_long", -4e-3, 4.2e-3, 0.0, 0.0),
     "normal": _Press("sphere_medium", -4e-3, 3.0e-3, 0.0, 0.0),
@@ -210,11 +210,11 @@ PRESSES = {
 }
 
 CLEARANCE_M = 1e-3
-"""Paths begin so far from the skin [m]: the calibration tries thicker ones, too."""
+"""Distance of the first pose from the skin [m]; the calibration tries thicker skins, too."""
 
 
 def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
-    """Poses for the presses, from first contact with this finger's pad on."""
+    """Paths of the indentations, from first contact with this finger's pad on."""
     surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
     planned = []
     for name, press in PRESSES.items():

@@ -1,10 +1,9 @@
-"""What a calibration found, and its file."""
+"""Result of a calibration, and its file."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import ConfigError, DatasetError
+from palpate.errors import ConfigError
+from palpate.files.atomic import written_whole
 from palpate_fem.calibration.alignment import AlignedCurves, axis_rms_n, rms_n
 from palpate_fem.calibration.local import ParameterEstimate
 from palpate_fem.calibration.measured import MeasuredIndentation
@@ -28,13 +28,13 @@ class Evaluation:
 
     Attributes:
         stage: ``scan``, ``start`` or ``step``.
-        parameters: Where; the modulus is the best one there.
+        parameters: Parameters there, with the best modulus.
         cost: Total cost [N]; infinite if a trajectory could not be compared.
         axis_rms_n: RMS force error of each axis [N].
         thickness_m: Total thickness [m].
         fluid_volume_m3: Fluid [m^3].
-        simulations: SimulationRuns made until now.
-        failures: Trajectory and reason, of those that could not be compared.
+        simulations: Number of runs so far.
+        failures: Reason by trajectory, for those that could not be compared.
     """
 
     stage: str
@@ -49,9 +49,9 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFit:
-    """How one trajectory fits at the optimum; ``pair`` has the curves.
+    """Fit of one trajectory at the optimum; ``pair`` has the curves.
 
-    ``rms_n`` is what was minimised; ``paper_rms_n`` is with the paper's alignment at 0.5 N.
+    ``rms_n`` was minimised; ``paper_rms_n`` uses the paper's alignment at 0.5 N.
     """
 
     name: str
@@ -66,7 +66,7 @@ class TrajectoryFit:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Calibrated parameters and what speaks for and against them.
+    """Calibrated parameters, their uncertainty, and the quality of the fit.
 
     Attributes:
         parameters: For the solver; its fluid volume is None unless the volume was free.
@@ -79,10 +79,10 @@ class Calibration:
         paper_axis_rms_n: The same with the paper's alignment at 0.5 N.
         trajectories: Each compared trajectory.
         history: Every evaluation that took runs, in order.
-        simulations: SimulationRuns made.
-        converged: Whether the last step was below what matters.
+        simulations: Number of runs.
+        converged: Whether the last step was small enough.
         excluded: Trajectories that were not compared, with the reason.
-        notes: What else the reader must know, such as runs that ended early.
+        notes: Remarks, such as runs that ended early.
         self_test: Whether the "measurements" are simulations themselves.
     """
 
@@ -161,21 +161,13 @@ def trajectory_fits(
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write JSON without NaN or infinity (null instead); the file appears whole or not at all.
+    """Write JSON with null for NaN and infinity; the file appears complete or not at all.
 
     Raises:
         DatasetError: The disk refused.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
         partial.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n", "utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
 
 
 def _plain(value: Any) -> Any:
@@ -189,7 +181,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_calibration(path: Path, result: Calibration) -> None:
-    """Write a calibration as JSON; ``read_parameters`` takes it up again.
+    """Write a calibration as JSON, for ``read_parameters``.
 
     Raises:
         DatasetError: The disk refused.
@@ -201,7 +193,7 @@ def read_parameters(path: Path) -> FingertipParameters:
     """Parameters of a calibration file.
 
     Raises:
-        ConfigError: There is no such file, it is no calibration, or its values are out of range.
+        ConfigError: The file does not exist, is not a calibration, or has values out of range.
     """
     try:
         content = json.loads(path.read_text("utf-8"))
@@ -212,6 +204,6 @@ def read_parameters(path: Path) -> FingertipParameters:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(
-            f"{path}: no calibration of schema {SCHEMA} {SCHEMA_VERSION} ({error!r})",
+            f"{path}: not a calibration of schema {SCHEMA} {SCHEMA_VERSION} ({error!r})",
             remedy="make it with `palpate fem calibrate`",
         ) from error

@@ -21,16 +21,16 @@ from palpate_fem.result import IndentationOutcome, IndentationResult
 Key = tuple[object, ...]
 
 _PLACES = 9
-"""Decimals of a path's metres that tell runs apart: a nanometre is far below what a solver sees."""
+"""Decimals of a path in metres that distinguish runs; a nanometre has no effect on a solver."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedIndentation:
-    """What a comparison needs of one simulated indentation.
+    """One simulated indentation, reduced to what a comparison needs.
 
     Attributes:
-        forces: Net force on the BioTac at the first k poses of the path, the untouched first one
-            included [N], sensor frame, shape (k, 3).
+        forces: Net force on the BioTac at the first k poses of the path [N], sensor frame,
+            shape (k, 3); the first pose is untouched.
         travel: Path length at each of them [m], shape (k,).
         thickness_m: Total thickness of the pressurised finger [m].
         fluid_volume_m3: Fluid between skin and core [m^3].
@@ -49,7 +49,7 @@ class SimulatedIndentation:
     def of(
         cls, trajectory: IndentationResult, *, thickness_m: float, fluid_volume_m3: float
     ) -> SimulatedIndentation:
-        """From a solver's trajectory, whose steps begin at the second pose, and its finger."""
+        """From a solver's result, whose steps begin at the second pose, and its finger."""
         forces = from_rest(trajectory.forces)
         return cls(
             forces,
@@ -67,15 +67,15 @@ class SimulatedIndentation:
 
 
 def from_rest(force_n: Floats) -> Floats:
-    """Forces at a solver's steps, and none before them at the untouched first pose [N]."""
+    """Forces at a solver's steps [N], with zero force in front for the untouched first pose."""
     return np.concatenate([np.zeros((1, 3)), force_n])
 
 
 class Simulator(Protocol):
-    """SimulationRuns one indentation; it must be picklable for a process pool.
+    """Runs one indentation; it must be picklable for a process pool.
 
-    Successive calls of a process mostly share their parameters: an implementation should keep the
-    last pressurised finger. A run that ends early is an answer, not an error.
+    Successive calls in a process mostly share their parameters, so an implementation should keep
+    the last pressurised finger. A run that ends early is a result, not an error.
     """
 
     def simulate(
@@ -86,15 +86,15 @@ class Simulator(Protocol):
 
 
 class SimulationRuns:
-    """Memo of runs, filled through an executor.
+    """Results of runs, each made only once, through an executor.
 
     Args:
-        simulator: What runs.
-        executor: Where it runs, e.g. a process pool; None = here, one after the other.
-        on_run: Told after each run how many of those now asked for are done, and how many they are.
+        simulator: Runs one indentation.
+        executor: Runs several at a time, e.g. a process pool; None = one after the other.
+        on_run: Called after each run with the number of finished and of all runs of this call.
 
     Attributes:
-        count: SimulationRuns made so far.
+        count: Number of runs so far.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class SimulationRuns:
     ) -> list[SimulatedIndentation]:
         """Results in the order of the jobs; what ran before is not run again.
 
-        A run that the simulator refuses comes back without steps, with the reason.
+        A run that the simulator refuses gives a result without steps, with the reason.
 
         Raises:
             SimulationError: A process of the simulation died.
@@ -146,10 +146,10 @@ class SimulationRuns:
                 yield futures[future], future.result()
         except (BrokenProcessPool, CancelledError) as error:
             raise SimulationError(
-                f"a process of the simulation ended by itself: {error}",
+                f"a process of the simulation died: {error}",
                 remedy="check the memory of the machine, or use fewer processes",
             ) from error
-        finally:  # after an error or Ctrl-C nobody waits for the rest
+        finally:  # after an error or Ctrl-C the rest is not needed
             for future in futures:
                 future.cancel()
 
@@ -157,7 +157,7 @@ class SimulationRuns:
 def _simulate(
     simulator: Simulator, parameters: FingertipParameters, indenter: str, path: Floats
 ) -> SimulatedIndentation:
-    """One run; a refused one is one trajectory's trouble, not that of all."""
+    """One run; if it is refused, only this trajectory has no result."""
     try:
         return simulator.simulate(parameters, indenter, path)
     except (SimulationError, ConfigError) as error:
@@ -173,8 +173,8 @@ def _simulate(
 
 
 def _key(parameters: FingertipParameters, item: MeasuredIndentation) -> Key:
-    """One key for what gives one answer: the sensor and the measured force do not matter."""
-    path = np.round(item.pose, _PLACES) + 0.0  # -0.0 and 0.0 are one place
+    """Key of a run: sensor and measured force have no effect on it."""
+    path = np.round(item.pose, _PLACES) + 0.0  # -0.0 and 0.0 are the same place
     return (parameters, item.indenter, path.tobytes())
 
 
@@ -186,7 +186,7 @@ def simulate_all(
     executor: Executor | None = None,
     on_run: Callable[[int, int], None] | None = None,
 ) -> dict[str, SimulatedIndentation]:
-    """Run every measured trajectory in simulation; sensors that share a path share its run.
+    """Simulate every measured trajectory; sensors that share a path share its run.
 
     Returns:
         Simulations by the name of the trajectory.

@@ -1,4 +1,4 @@
-"""What a calibration may change, between which bounds, and how it searches."""
+"""Settings of a calibration: parameters, bounds, weights and search."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ PAPER_BOUNDS = {THICKNESS: (1e-3, 2e-3), MODULUS: (1e5, 1e6), FRICTION: (0.1, 1.
 """Bounds of the paper (table "Optimization parameters")."""
 
 STEPS = {THICKNESS: 0.02, FRICTION: 0.1, VOLUME: 0.02}
-"""Relative steps of the finite differences. Far above the ripple that a mesh leaves in a force; the
-force is smooth in thickness and volume, and nearly linear in friction where the indenter slips."""
+"""Relative steps of the finite differences. They are far above the ripple that a mesh causes in a
+force, which is smooth in thickness and volume, and nearly linear in friction while the indenter
+slips."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,21 +38,21 @@ class CalibrationSettings:
     """How to calibrate.
 
     Attributes:
-        bounds: Lower and upper bound by the name of the parameter. With bounds for
-            ``fluid_volume_m3`` the volume is free and the cost's thickness term holds it; without,
-            the simulator fills in what the target thickness needs, which is the same optimum.
-        weights: Of the cost.
-        target_thickness_m: Total thickness to reach [m].
+        bounds: Lower and upper bound by name of the parameter. With bounds for ``fluid_volume_m3``
+            the volume is free, and the thickness term of the cost determines it. Without, the
+            simulator fills in what the target thickness needs; the optimum is the same.
+        weights: Weights of the cost.
+        target_thickness_m: Required total thickness [m].
         threshold_n: Force at which curves are aligned [N].
         increments: Samples of a curve.
-        fit_offsets: Whether each measured curve may slide along the path to where it fits best.
-            Noise of 0.05 N moves the crossing of 0.5 N by up to 0.1 mm, and all samples with it,
-            which no number of samples averages out; sliding takes it back. False = the paper's
+        fit_offsets: Whether each measured curve may be shifted along the path to where it fits
+            best. Noise of 0.05 N moves the crossing of 0.5 N by up to 0.1 mm, and all samples with
+            it; more samples do not average that out, a shift undoes it. False = the paper's
             alignment.
-        least_coverage: A simulated curve that covers less of the measured displacement than this
-            is not compared; a shorter and shorter curve would fit better and better.
+        least_coverage: Smallest part of the measured displacement that a simulated curve must cover
+            to be compared; without it, shorter and shorter curves would fit better and better.
         scan: Points of the coarse scan in thickness and friction.
-        iterations: Most steps after the scan.
+        iterations: Largest number of steps after the scan.
         reference_shear_modulus_pa: Modulus of all runs [Pa]; forces scale with it exactly.
     """
 
@@ -95,7 +96,7 @@ class CalibrationSettings:
 
     @property
     def volume_is_free(self) -> bool:
-        """Whether the fluid's volume is searched for, not solved for."""
+        """Whether the fluid's volume is a parameter of the search."""
         return VOLUME in self.bounds
 
     @property
@@ -113,7 +114,7 @@ class CalibrationSettings:
 
         Args:
             point: Values of ``simulated``; a shorter one leaves the volume to the thickness.
-            modulus_pa: Its modulus; None = that of the runs.
+            modulus_pa: Its modulus; None = the one of the runs.
         """
         volume = float(point[2]) if len(point) > 2 else None
         return FingertipParameters(

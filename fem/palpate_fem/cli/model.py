@@ -1,4 +1,4 @@
-"""Which fingertip a command means: mesh, parameters, and how many workers solve it."""
+"""The fingertip of a command line: mesh, parameters, and number of workers."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ PARAMETRIC = "biotac"
 
 @dataclass(frozen=True, slots=True)
 class FingertipModel:
-    """What the options of a command say.
+    """The fingertip that the options of a command describe.
 
     Attributes:
         factory: ``module:function`` that makes fingertips.
         options: Its keyword arguments.
-        parameters: Of the fingertip.
+        parameters: Parameters of the fingertip.
     """
 
     factory: str
@@ -30,7 +30,7 @@ class FingertipModel:
     parameters: FingertipParameters
 
     def setup(self, *, keep: int = 1) -> WorkerSetup:
-        """For workers."""
+        """Setup of worker processes."""
         return WorkerSetup(self.factory, self.options, self.parameters, keep)
 
 
@@ -47,7 +47,7 @@ def model_of(
     """Check the options and convert their units.
 
     Raises:
-        ConfigError: A value is out of range, or a file is not there.
+        ConfigError: A value is out of range, or a file does not exist.
     """
     options: dict[str, object] = {"layers": layers}
     if mesh != PARAMETRIC:
@@ -78,11 +78,11 @@ def model_of(
 
 
 def workers_for(wanted: int, jobs: int | None = None) -> tuple[int, int]:
-    """Workers, and threads for each, on this host.
+    """Number of workers, and of threads for each, on this host.
 
     Args:
-        wanted: As asked for; 0 = one for each core.
-        jobs: How much there is to do, if that is known.
+        wanted: Requested number; 0 = one for each core.
+        jobs: Number of jobs, if it is known.
     """
     cores = os.cpu_count() or 1
     workers = wanted or cores

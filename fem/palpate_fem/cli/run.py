@@ -43,8 +43,8 @@ from palpate_fem.service.batch import (
 )
 from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
-from palpate_fem.store.export import export
 from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.writer import export
 from palpate_fem.trajectory import Campaign, angled_direction, pad_point, press_path
 
 DEFAULT_INDENTER = "sphere_medium"

@@ -1,4 +1,4 @@
-"""Plane cuts through solids and surfaces, and the outline of a patch of faces: lines to draw."""
+"""Plane cuts through solids and surfaces, and the outline of a patch of faces."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ _HEXAHEDRON_SIDES = (
 _CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 _OFF_PLANE_M = 1e-10
-"""Nodes on the plane are taken to lie this far behind it: a symmetric mesh has many of them."""
+"""Nodes on the plane are moved this far behind it, which avoids special cases: a symmetric mesh has
+many of them."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cut:
-    """Where a plane meets a solid.
+class PlaneCut:
+    """Intersection of a plane with a solid.
 
     Attributes:
         ends: The two nodes between which each point lies, shape (P, 2).
-        share: How far from the first to the second, shape (P,).
+        share: Position from the first (0) to the second (1), shape (P,).
         triangles: Ids of points, shape (T, 3).
         elements: Element that each triangle is cut from, shape (T,).
     """
@@ -50,14 +51,14 @@ class Cut:
         return found
 
 
-def cut_solid(nodes: Floats, elements: Ints, *, axis: int, at_m: float) -> Cut:
+def cut_solid(nodes: Floats, elements: Ints, *, axis: int, at_m: float) -> PlaneCut:
     """Cut hexahedra or wedges with a plane across an axis.
 
     Args:
         nodes: Positions [m], shape (V, 3).
         elements: Node ids, shape (E, 8) or (E, 6).
         axis: 0..2 for a plane across x, y, z.
-        at_m: Where on that axis [m].
+        at_m: Position of the plane on that axis [m].
     """
     kinds = _HEXAHEDRON if elements.shape[1] == 8 else _WEDGE
     tetrahedra = elements[:, kinds].reshape(-1, 4)
@@ -71,7 +72,7 @@ def cut_solid(nodes: Floats, elements: Ints, *, axis: int, at_m: float) -> Cut:
         chosen = np.flatnonzero(count == 2 if corners == 4 else (count == 1) | (count == 3))
         edges = tetrahedra[chosen][:, _CORNERS]  # (n, 6, 2)
         crossed = (distance[edges] < 0).sum(axis=2) == 1
-        # Of the four crossed edges in table order, 0-1-2 and 1-2-3 are the halves of the quad.
+        # With the four crossed edges in table order, 0-1-2 and 1-2-3 are the halves of the quad.
         ends.append(edges[crossed])
         base = points + corners * np.arange(len(chosen))
         for three in order:
@@ -80,19 +81,19 @@ def cut_solid(nodes: Floats, elements: Ints, *, axis: int, at_m: float) -> Cut:
         points += corners * len(chosen)
     between = np.concatenate(ends)
     first, second = distance[between[:, 0]], distance[between[:, 1]]
-    return Cut(
+    return PlaneCut(
         between, first / (first - second), np.concatenate(triangles), np.concatenate(elements_cut)
     )
 
 
 def cut_sides(nodes: Floats, elements: Ints, *, axis: int, at_m: float) -> Floats:
-    """Where a plane meets the faces of elements: segments [m], shape (S, 2, 3).
+    """Intersection of a plane with the faces of elements: segments [m], shape (S, 2, 3).
 
     Args:
         nodes: Positions [m], shape (V, 3).
         elements: Node ids, shape (E, 8) or (E, 6).
         axis: 0..2 for a plane across x, y, z.
-        at_m: Where on that axis [m].
+        at_m: Position of the plane on that axis [m].
     """
     sides = _HEXAHEDRON_SIDES if elements.shape[1] == 8 else _WEDGE_SIDES
     faces = elements[:, np.array(sides)].reshape(-1, 4)
@@ -104,13 +105,13 @@ def cut_sides(nodes: Floats, elements: Ints, *, axis: int, at_m: float) -> Float
 
 
 def cut_surface(vertices: Floats, triangles: Ints, *, axis: int, at_m: float) -> list[Floats]:
-    """Where a plane meets a triangle mesh: polylines [m], each (N, 3), closed where the mesh is.
+    """Intersection of a plane with a triangle mesh: polylines [m], each (N, 3), closed if it is.
 
     Args:
         vertices: Positions [m], shape (C, 3).
         triangles: Vertex ids, shape (T, 3).
         axis: 0..2 for a plane across x, y, z.
-        at_m: Where on that axis [m].
+        at_m: Position of the plane on that axis [m].
     """
     crossed, edges = _crossed(_distance(vertices, axis, at_m), triangles)
     pairs = [tuple(map(tuple, pair)) for pair in np.sort(edges[crossed], 1).reshape(-1, 2, 2)]
@@ -119,7 +120,7 @@ def cut_surface(vertices: Floats, triangles: Ints, *, axis: int, at_m: float) ->
 
 
 def outline(faces: Ints) -> Ints:
-    """Edges that belong to one of the faces only: node ids, shape (B, 2)."""
+    """Edges that belong to only one of the faces: node ids, shape (B, 2)."""
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     edges = edges[edges[:, 0] != edges[:, 1]]
     _, first, count = np.unique(
@@ -135,7 +136,7 @@ def _distance(points: Floats, axis: int, at_m: float) -> Floats:
 
 
 def _crossed(distance: Floats, triangles: Ints) -> tuple[NDArray[np.bool_], Ints]:
-    """Which edges (T, 3) of triangles cross, two of each or none, and all their ends (T, 3, 2)."""
+    """Whether edges of triangles cross the plane, shape (T, 3), and their ends, shape (T, 3, 2)."""
     edges = triangles[:, np.array([[0, 1], [1, 2], [2, 0]])]
     return (distance[edges] < 0).sum(axis=2) == 1, edges
 
@@ -149,13 +150,13 @@ def _points(points: Floats, edges: Ints, axis: int, at_m: float) -> Floats:
 
 
 def _chains(pairs: list[tuple[Any, Any]]) -> list[list[Any]]:
-    """Links to chains of their ends; a closed chain ends where it began."""
+    """Join segments, given as pairs of ends, to chains; a closed chain ends where it began."""
     at: dict[Any, list[int]] = defaultdict(list)
     for number, pair in enumerate(pairs):
         for end in pair:
             at[end].append(number)
     used = [False] * len(pairs)
-    # Loose ends first, so that an open chain is not begun in its middle.
+    # Start at loose ends, so that an open chain is not started in its middle.
     order = sorted(range(len(pairs)), key=lambda number: min(len(at[end]) for end in pairs[number]))
     chains = []
     for number in order:

@@ -1,7 +1,4 @@
-"""Pictures of simulations: one step of a fingertip, cut open and from below.
-
-`plot_curves` and `plot_overview`, re-exported here, draw a trajectory and a whole store.
-"""
+"""Picture of one simulated step: sections of the fingertip, the pad from below, and the force."""
 
 from __future__ import annotations
 
@@ -26,11 +23,9 @@ from palpate_fem.plot.style import (
     new_figure,
     save,
 )
-from palpate_fem.plot.trajectories import draw_force, plot_curves, plot_overview, travel_mm
+from palpate_fem.plot.trajectories import draw_force, travel_mm
 from palpate_fem.result import IndentationResult, IndentationStep
 from palpate_fem.store.content import Outline, StoredFingertip
-
-__all__ = ["plot_curves", "plot_overview", "plot_step", "von_mises"]
 
 Floats = NDArray[np.float64]
 Quantity = Literal["displacement", "von_mises"]
@@ -59,21 +54,21 @@ def plot_step(
     y_m: float = 0.0,
     title: str = "",
 ) -> None:
-    """Draw one step: sections undeformed, pressurised, indented; across; from below; force.
+    """Draw one step: sections undeformed, pressurised and indented, from below, and the force.
 
     Args:
         tip: The fingertip.
         trajectory: The indentation.
         path: The PNG to write.
-        step: Which step; negative from the end.
-        quantity: What the colour says. Displacement counts from the state in the panel before,
-            stress is as it is, and of the pressurised state only known if the first step is one.
+        step: Number of the step; negative counts from the end.
+        quantity: Shown by colour. Displacement counts from the state in the panel before. Stress of
+            the pressurised state is only known if the first step does not touch.
         indenter: Its surface in its own frame; None = only its tip is drawn.
-        y_m: Where the lengthwise section is [m].
+        y_m: Position of the lengthwise section [m].
         title: Above it all; empty = the indenter.
 
     Raises:
-        ConfigError: There is no such step, or no stress was kept.
+        ConfigError: There is no such step, or stress was not stored.
         StoreDiskError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
@@ -131,7 +126,7 @@ def _chosen(trajectory: IndentationResult, step: int, quantity: Quantity) -> Ind
     shown = trajectory.steps[step]
     if quantity == "von_mises" and not len(shown.stress):
         raise ConfigError(
-            "the stress of this trajectory was not kept", remedy="run it again and keep stress"
+            "the stress of this trajectory was not kept", remedy="run it again with --stress"
         )
     return shown
 
@@ -146,7 +141,7 @@ def _draw_section(
     axis: int,
     at_m: float,
 ) -> None:
-    """Skin with its layers and the core; ``colours`` for each node or element, None = plain."""
+    """Draw skin, layers and core; ``colours`` are by node or element, None = plain."""
     right = 0 if axis == 1 else 1
     cut = cut_solid(nodes, tip.mesh.elements, axis=axis, at_m=at_m)
     points = MM * cut.at(nodes)
@@ -183,13 +178,13 @@ def _draw_below(
     colours: Floats,
     paint: dict[str, Any],
 ) -> Any:
-    """The pad as seen from below, with the outline of what the indenter touches."""
+    """Draw the pad from below, with the outline of the contact."""
     collections = require("matplotlib.collections", extra="fem")
     faces = tip.mesh.outer_faces
     corners = deformed[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     seen = np.flatnonzero(normal[:, 2] < 0)
-    seen = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]  # far ones first
+    seen = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]  # the farthest first
     values = (
         colours[faces[seen]].mean(axis=1)
         if len(colours) == len(deformed)
@@ -211,7 +206,7 @@ def _draw_below(
         axes.plot(*(MM * shown.centre_of_pressure[:2]), "+", color=PATCH, ms=10, mew=2)
     axes.set_aspect("equal")
     axes.autoscale_view()
-    # Looking up at the pad with the tip to the right, +y points down.
+    # Seen from below with the tip to the right, +y points down.
     axes.invert_yaxis()
     area = MM**2 * shown.contact_area_m2
     label(axes, "x [mm]", "y [mm]", f"from below; contact {area:.1f} mm², + centre of pressure")
@@ -232,7 +227,7 @@ def _placed(body: Outline, pose: Floats) -> Outline:
 
 
 def _frame(panels: Any, points: Floats) -> None:
-    """The same window for all panels: the finger and a little more, however long the indenter."""
+    """Use the same window in all panels: the finger with a margin, but not the whole indenter."""
     low, high = MM * (points.min(axis=0) - _MARGIN_M), MM * (points.max(axis=0) + _MARGIN_M)
     for axes in panels:
         axes.set_aspect("equal")

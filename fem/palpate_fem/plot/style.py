@@ -1,4 +1,4 @@
-"""How our pictures of simulations look. matplotlib is loaded when the first one is drawn."""
+"""Style of all pictures of simulations. matplotlib is loaded when the first one is drawn."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ OUTCOME_COLOURS = {
 }
 
 MM = 1e3
-"""People read a fingertip in millimetres; only the picture does [mm/m]."""
+"""[mm/m]; only pictures and tables are in millimetres."""
 
 KPA = 1e-3
 """[kPa/Pa]."""
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty figure without a window [inch]."""
+    """An empty figure without a window; size in inch."""
     figures = require("matplotlib.figure", extra="fem")
     return figures.Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
@@ -52,7 +52,7 @@ def save(figure: Any, path: Path) -> None:
 
 
 def label(axes: Any, across: str, up: str, title: str = "") -> None:
-    """Name the axes and make them quiet."""
+    """Label axes, and apply our style to them."""
     axes.set_xlabel(across, color=INK, fontsize=9)
     axes.set_ylabel(up, color=INK, fontsize=9)
     axes.set_title(title, color=INK, fontsize=10)
@@ -62,5 +62,5 @@ def label(axes: Any, across: str, up: str, title: str = "") -> None:
 
 
 def grid(axes: Any) -> None:
-    """Lines to read values by."""
+    """Draw grid lines."""
     axes.grid(visible=True, color=GRID, lw=0.7)

@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 def travel_m(path: Floats, pose: Floats) -> Floats:
-    """Way of the indenter from where it started to each step [m], shape (K,).
+    """Travel of the indenter from its first pose to each step [m], shape (K,).
 
     Args:
         path: Requested poses; only the first is used, shape (1 or more, 7).
@@ -43,12 +43,12 @@ def travel_m(path: Floats, pose: Floats) -> Floats:
 
 
 def plot_curves(trajectory: IndentationResult, path: Path, *, title: str = "") -> None:
-    """Draw how one indentation went, step by step.
+    """Draw one indentation step by step: force, pressure, contact area, Newton iterations.
 
     Args:
-        trajectory: The indentation; without a step the curves are empty.
+        trajectory: The indentation; without steps the curves are empty.
         path: The PNG to write.
-        title: Above it all; empty = the indenter.
+        title: Title; empty = the indenter.
 
     Raises:
         StoreDiskError: The disk is full or refuses.
@@ -80,13 +80,13 @@ def plot_curves(trajectory: IndentationResult, path: Path, *, title: str = "") -
 
 
 def travel_mm(trajectory: IndentationResult) -> Floats:
-    """Travel of the indenter at each step, for people [mm], shape (K,)."""
+    """Travel of the indenter at each step [mm], shape (K,)."""
     pose = np.array([step.pose for step in trajectory.steps]).reshape(-1, 7)
     return MM * travel_m(trajectory.path, pose)
 
 
 def draw_force(axes: Any, travel_mm: Floats, force: Floats, *, mark: int | None = None) -> None:
-    """Components of the net force on the BioTac against travel; ``mark`` is a step to point out."""
+    """Draw the net force on the BioTac against travel; ``mark`` is a step to mark."""
     for at, (name, colour) in enumerate(zip(AXES, AXIS_COLOURS, strict=True)):
         axes.plot(travel_mm, force[:, at], "o-", color=colour, lw=1.4, ms=3, label=f"F{name}")
     touching = np.flatnonzero(np.linalg.norm(force, axis=1) > 0)
@@ -102,7 +102,7 @@ def draw_force(axes: Any, travel_mm: Floats, force: Floats, *, mark: int | None 
 
 
 def _draw_newton(axes: Any, trajectory: IndentationResult) -> None:
-    """Iterations and factorisations as bars, seconds as a line on its own scale."""
+    """Draw iterations and factorisations as bars, and seconds as a line on its own scale."""
     table = [step.convergence for step in trajectory.steps]
     number = 1 + np.arange(len(table))
     axes.bar(
@@ -129,7 +129,7 @@ def _draw_newton(axes: Any, trajectory: IndentationResult) -> None:
 
 
 COLUMNS = 5
-"""Small plots side by side: nine indenters are two rows."""
+"""Small plots in a row; nine indenters need two rows."""
 
 
 def plot_overview(
@@ -140,10 +140,10 @@ def plot_overview(
     Args:
         summaries: One for each trajectory.
         path: The PNG to write.
-        title: Above it all.
+        title: Title.
 
     Returns:
-        How many trajectories ended in which way.
+        Number of trajectories by outcome.
 
     Raises:
         DatasetError: There is no trajectory.
@@ -198,7 +198,7 @@ def _draw_range(axes: Any, names: list[str], groups: dict[str, list[TrajectorySu
         peaks = np.array([_peak(summary) for summary in groups[name]])
         axes.plot([peaks.min(), peaks.max()], [row, row], color="#b9bec7", lw=5, zorder=1)
         axes.plot(np.median(peaks), row, "|", color=INK, ms=14, mew=2, zorder=3)
-        # Spread a little, so that equal forces do not hide one another.
+        # Spread a little, so that equal forces do not cover each other.
         spread = 0.24 * np.sin(2.4 * np.arange(len(peaks)))
         colours = [OUTCOME_COLOURS[summary.outcome] for summary in groups[name]]
         axes.scatter(peaks, row + spread, s=14, c=colours, zorder=2)

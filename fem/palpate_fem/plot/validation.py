@@ -24,13 +24,13 @@ from palpate_fem.validation.validate import (
 _PANELS = 4
 _ROWS = 6
 _LEAST_SPAN_N = 1.0
-"""An axis that shows less than this would make much of its noise [N]."""
+"""Smallest range of a force axis [N]; a smaller one would exaggerate noise."""
 _MARKERS = ("o", "s", "^", "D", "v")
 _SENSOR_COLOURS = ("#2f6fb5", "#e09f3e", "#2e8b57", "#8d5fb0", "#d1495b")
 
 
 class _Drawn(Protocol):
-    """What a panel needs of a compared trajectory."""
+    """A compared trajectory, as far as a panel needs it."""
 
     @property
     def sensor(self) -> str: ...
@@ -39,12 +39,12 @@ class _Drawn(Protocol):
 
 
 def plot_calibration(result: Calibration, path: Path, *, title: str = "") -> None:
-    """Calibrated simulation against each sensor's measurement; a row for a trajectory.
+    """Draw the calibrated simulation against each sensor's measurement, one trajectory in a row.
 
     Args:
         result: Of the calibration.
         path: The PNG to write; the first six trajectories are drawn.
-        title: Above it all; empty = the parameters.
+        title: Title; empty = the parameters.
 
     Raises:
         StoreDiskError: The disk is full or refuses.
@@ -68,7 +68,7 @@ def plot_calibration(result: Calibration, path: Path, *, title: str = "") -> Non
 
 
 def _axis_panel(panel: Any, fits: Sequence[_Drawn], axis: int) -> None:
-    """One axis of one trajectory: a line of the simulation, dots of each sensor."""
+    """Draw one axis of one trajectory: a line for the simulation, dots for each sensor."""
     grid(panel)
     longest = max(fits, key=lambda fit: fit.pair.displacement_m[-1])
     way = MM * longest.pair.displacement_m
@@ -90,14 +90,14 @@ def _axis_panel(panel: Any, fits: Sequence[_Drawn], axis: int) -> None:
 def plot_examples(
     validation: Validation, path: Path, *, names: Iterable[str] = (), seed: int = 0
 ) -> None:
-    """Four trajectories, all axes: simulation as lines, sensors as dots.
+    """Draw four trajectories with all axes: simulation as lines, sensors as dots.
 
     Args:
-        validation: With one compared trajectory at least.
+        validation: With at least one compared trajectory.
         path: The PNG to write.
-        names: Trajectories to draw, without sensor; none = as in the paper, the one of highest
-            force of each of four random indenters.
-        seed: Of that choice.
+        names: Trajectories to draw, without sensor; empty = as in the paper, the one with the
+            highest force for each of four random indenters.
+        seed: For that choice.
 
     Raises:
         StoreDiskError: The disk is full or refuses.
@@ -116,7 +116,7 @@ def plot_examples(
 
 
 def examples(validation: Validation, seed: int = 0) -> list[str]:
-    """The trajectory of highest force of each of four random indenters."""
+    """The trajectory with the highest force for each of four random indenters."""
     best: dict[str, ComparedTrajectory] = {}
     for item in validation.compared:
         known = best.get(item.indenter)
@@ -156,10 +156,10 @@ def _example_panel(panel: Any, name: str, items: Sequence[ComparedTrajectory]) -
 
 
 def plot_indenters(validation: Validation, path: Path) -> None:
-    """Mean RMS error of each indenter as bars, beside the paper's range and median.
+    """Draw the mean RMS error of each indenter as bars, with the paper's range and median.
 
     Args:
-        validation: With one compared trajectory at least.
+        validation: With at least one compared trajectory.
         path: The PNG to write.
 
     Raises:
@@ -217,10 +217,10 @@ LIMIT = "#9aa0a8"
 
 
 def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
-    """Change of force and displacement by each refinement, and seconds, one line an indenter.
+    """Draw the change of force and displacement by each refinement, and its computing time.
 
     Args:
-        rows: Of `mesh_study` (drawn over unknowns) or `step_study` (drawn over steps).
+        rows: From `mesh_study` (drawn over unknowns) or `step_study` (drawn over steps).
         path: PNG to write.
 
     Raises:
@@ -254,7 +254,7 @@ def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
 
 
 def _study_tick(row: StudyRow, *, meshes: bool) -> str:
-    """What stands under a row's points."""
+    """Tick label of a row."""
     if not meshes:
         return f"{row.steps} steps"
     gflop = f"{row.factor_gflop:.1f} GFlop"

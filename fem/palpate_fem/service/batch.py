@@ -35,11 +35,11 @@ from palpate_fem.service.jobs import (
 from palpate_fem.service.pool import WorkerPool
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
-from palpate_fem.store.writer import Place, StoreWriter
+from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
 
 _POLL_S = 0.1
 FAILED = "failed"
-"""IndentationOutcome, in a report, of a trajectory that could not be run or whose worker died."""
+"""Outcome, in a report, of a trajectory that could not be run or whose worker died."""
 
 
 class TrajectoryPlan(Protocol):
@@ -304,25 +304,25 @@ def sweep_into_store(
     ) as store:
         done = store.done()
         left = [plan for plan in plans if plan.name not in done]
-        places: dict[str, Place] = {}
+        claims: dict[str, TrajectoryClaim] = {}
 
         def claimed() -> Iterator[TrajectoryPlan]:
             for plan in left:
                 with contextlib.suppress(StoreTakenError):  # another process runs it, or has run it
-                    places[plan.name] = store.claim(plan.name)
+                    claims[plan.name] = store.claim(plan.name)
                     yield plan
 
         def keep(plan: TrajectoryPlan, trajectory: IndentationResult) -> None:
-            with places.pop(plan.name) as place:
-                place.write(trajectory)
+            with claims.pop(plan.name) as claim:
+                claim.write(trajectory)
 
         try:
             report = batch.run(
                 claimed(), len(left), stop=stop, on_trajectory=keep, on_report=on_report
             )
         finally:
-            for place in places.values():
-                place.close()  # releases what was not written
+            for claim in claims.values():
+                claim.close()  # releases what was not written
     return report, len(plans) - len(left)
 
 

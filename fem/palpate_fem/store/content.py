@@ -1,4 +1,4 @@
-"""What a store holds: one fingertip, and trajectories that were run or measured on it."""
+"""Content of a store: one fingertip, and trajectories that were simulated or measured on it."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Outline = tuple[NDArray[np.floating[Any]], Ints]
 """A closed triangle mesh of an indenter, outward, in its own frame: vertices [m], triangles."""
 
 SAME_SHAPE_M = 1e-7
-"""Pressurised shapes of the same inputs agree to this [m]: far above the solver's tolerance, far
-below what matters; more means that the solver itself has changed."""
+"""Pressurised shapes from the same inputs agree to this [m]: far above the solver's tolerance, far
+below what matters. A larger difference means that the solver itself has changed."""
 
 
 @dataclass(frozen=True)
 class StoredFingertip:
-    """What all trajectories of a store share; sensor frame, SI.
+    """The fingertip that all trajectories of a store share; sensor frame, SI.
 
     Attributes:
         mesh: The solid, unpressurised.
@@ -55,7 +55,7 @@ class StoredFingertip:
 
     @cached_property
     def key(self) -> str:
-        """Digest, hex, of mesh, parameters and settings: what decides every trajectory."""
+        """Digest, hex, of everything that determines a trajectory: mesh, parameters, settings."""
         digest = hashlib.sha256(self.mesh.sha256)
         for name, value in sorted({**named_values(self.parameters), **self.settings}.items()):
             # A flag or count written back as a NumPy scalar must not change the digest.
@@ -63,7 +63,7 @@ class StoredFingertip:
         return digest.hexdigest()
 
     def differences(self, other: StoredFingertip) -> list[str]:
-        """What would make trajectories of the two differ, a phrase each; empty = nothing."""
+        """What makes trajectories of the two differ, a phrase for each; empty = nothing."""
         found = []
         if self.mesh.sha256 != other.mesh.sha256:
             found.append(f"mesh {_mesh_name(self.mesh)} is not {_mesh_name(other.mesh)}")
@@ -87,14 +87,14 @@ class TrajectorySummary:
     Attributes:
         id: E.g. ``sphere_medium/03/normal``.
         indenter: Its name.
-        sensor: Which BioTac was measured; empty = simulated.
+        sensor: Name of the BioTac that was measured; empty = simulated.
         outcome: How it ended.
         reason: Why it did not complete.
         complete: Whether every pose of the path has its step.
         travel_m: Path length at the last converged increment [m].
-        seconds: Time it took to compute [s].
-        path: Requested poses, shape (K + 1 or more, 7), sensor frame: the first does not touch, the
-            steps are at those that follow. Of a measured one its poses.
+        seconds: Computing time [s].
+        path: Requested poses, shape (K + 1 or more, 7), sensor frame; the first does not touch, the
+            steps are at those that follow. For a measured trajectory, its poses.
         pose: Poses of the steps, shape (K, 7), sensor frame.
         force: Net force on the BioTac [N], shape (K, 3).
         fluid_pressure_pa: Above ambient [Pa], shape (K,); NaN where not measured.

@@ -1,7 +1,7 @@
-"""Files that are there whole or not at all, and that one writer has at a time.
+"""Files that appear complete or not at all, with one writer at a time.
 
-A file is claimed by a lock on ``NAME.part``, written into it, brought to the disk and renamed. The
-kernel drops a lock with its process, so nothing of a killed writer is in anybody's way.
+A writer claims a file by a lock on ``NAME.part``, writes into that, brings it to the disk and
+renames it. The kernel drops a lock with its process, so a killed writer blocks nobody.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ PART = ".part"
 
 
 class StoreTakenError(DatasetError):
-    """Another writer has the store, or has or has finished this trajectory."""
+    """Another writer uses the store, or runs or has finished this trajectory."""
 
     code = ErrorCode.UNAVAILABLE
 
@@ -30,11 +30,11 @@ class StoreDiskError(DatasetError):
 
 
 class StoreMismatchError(DatasetError):
-    """What is to be written belongs to another fingertip than the store."""
+    """The result belongs to another fingertip than the store."""
 
 
 def disk_error(path: Path, error: OSError) -> StoreDiskError:
-    """The error for a disk that does not take a file."""
+    """The error for a file that cannot be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free some space" if full else "check the folder's rights and that its disk is there"
     return StoreDiskError(
@@ -43,19 +43,19 @@ def disk_error(path: Path, error: OSError) -> StoreDiskError:
     )
 
 
-class Claim(Closing):
-    """The right to write one file, until the block ends or the process does.
+class FileClaim(Closing):
+    """The exclusive right to write one file, until the block or the process ends.
 
     Args:
-        target: The file; its folder is made.
-        wait: Wait for another claimant instead of raising.
+        target: The file; its folder is created.
+        wait: Wait for another claim to end instead of raising.
 
     Attributes:
-        part: What to write into, where :meth:`commit` does not suit.
+        part: File to write into, if :meth:`commit` does not suit.
 
     Raises:
-        StoreTakenError: Another process or thread has it.
-        StoreDiskError: The folder takes no file.
+        StoreTakenError: Another process or thread has claimed it.
+        StoreDiskError: No file can be created in the folder.
     """
 
     def __init__(self, target: Path, *, wait: bool = False) -> None:
@@ -73,7 +73,7 @@ class Claim(Closing):
             file = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-                if _is_at(file, self.part):  # else the one before us renamed or removed it
+                if _is_at(file, self.part):  # else its last owner renamed or removed it meanwhile
                     return file
             except BlockingIOError as error:
                 os.close(file)
@@ -87,7 +87,7 @@ class Claim(Closing):
             os.close(file)
 
     def commit(self, image: bytes) -> None:
-        """Make ``image`` the content of the file, on the disk, and let go of it.
+        """Make ``image`` the content of the file, on the disk, and end the claim.
 
         Raises:
             StoreDiskError: The disk refused; the file is as before.
@@ -103,7 +103,7 @@ class Claim(Closing):
         self.finish()
 
     def finish(self) -> None:
-        """Make what was written to ``part`` the file, on the disk, and let go of it.
+        """Make ``part`` the file, on the disk, and end the claim.
 
         Raises:
             StoreDiskError: The disk refused; the file is as before.
@@ -123,7 +123,7 @@ class Claim(Closing):
             raise ValueError(f"the claim on {self.target} has ended")
 
     def close(self) -> None:
-        """Let go of it, unwritten. Nothing if it was written."""
+        """End the claim without writing. Does nothing after ``commit`` or ``finish``."""
         if not self._open:
             return
         self._open = False
@@ -132,15 +132,15 @@ class Claim(Closing):
 
 
 class FolderLock:
-    """Keeps a second writer out of a folder; several that all say ``shared`` may be in.
+    """Lock of a folder: for one writer, or for several that all use ``shared``.
 
     Args:
         folder: The folder; it exists.
-        shared: Whether others that say so too may write at the same time.
+        shared: Whether others with ``shared`` may write at the same time.
 
     Raises:
-        StoreTakenError: Someone else is in.
-        StoreDiskError: The folder takes no file.
+        StoreTakenError: Another writer has locked it.
+        StoreDiskError: No file can be created in the folder.
     """
 
     def __init__(self, folder: Path, *, shared: bool) -> None:
@@ -165,13 +165,13 @@ class FolderLock:
             self._sign(f"{os.getpid()}\n")
 
     def release(self) -> None:
-        """Let others in."""
+        """Unlock the folder."""
         if not self._shared:
             self._sign("")
         os.close(self._file)
 
     def _sign(self, text: str) -> None:
-        # For the message to a second writer only; on a full disk it stays unsigned.
+        # Only for the message to a second writer; on a full disk it is left out.
         try:
             os.ftruncate(self._file, 0)
             os.pwrite(self._file, text.encode("ascii"), 0)
@@ -180,7 +180,7 @@ class FolderLock:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring names in a folder to the disk: without it a renamed file may be lost with the power."""
+    """Bring the names in a folder to the disk; else a power cut may undo a renaming."""
     file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(file)

@@ -6,18 +6,17 @@ from palpate.files.hdf5 import text
 from palpate.files.simulation_store import SimulationFiles
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
-from palpate_fem.store.hdf5 import read_fingertip
-from palpate_fem.store.trajectory import read_summary, read_trajectory
+from palpate_fem.store.schema import read_fingertip, read_summary, read_trajectory
 
 UNFINISHED = (IndentationOutcome.CANCELLED, IndentationOutcome.DEADLINE)
-"""Outcomes that say nothing of the finger: such a trajectory is not done, and run again."""
+"""Outcomes that depend on the run and not on the finger; such a trajectory is run again."""
 
 
 class SimulationStore(SimulationFiles):
     """Reads a store; see ``SimulationFiles`` for what it does with files."""
 
     def done(self) -> set[str]:
-        """Ids that a resumed sweep need not run again: all but those cancelled or out of time.
+        """Ids that a resumed sweep does not run again: all except those cancelled or out of time.
 
         Raises:
             DatasetError: A file is damaged; names it.
@@ -54,7 +53,7 @@ class SimulationStore(SimulationFiles):
             return read_summary(trajectory, group)
 
     def trajectory(self, trajectory: str) -> IndentationResult:
-        """All of a trajectory. Fields come back as float64 but were kept as float32.
+        """A whole trajectory. Fields are float64, but were stored as float32.
 
         Raises:
             DatasetError: Not there, damaged, or measured, so without fields.

@@ -1,7 +1,7 @@
-"""A made-up fingertip and a made-up press, to try stores and pictures with. No mechanics at all.
+"""An invented fingertip and indentation, to try stores and pictures without any mechanics.
 
-The finger is a thick spherical shell of hexahedra, fixed on its back, around a ball; the press is
-a dent where a sphere would be. Numbers have the right order of magnitude and nothing else.
+The finger is a thick spherical shell of hexahedra, fixed on its back, around a ball; the
+indentation is a dent where a sphere would be. Only the order of magnitude of the numbers is right.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CORE_M = 4.6e-3
 BULGE_M = 0.8e-3
 INDENTER_M = 3.5e-3
 START_M = 0.3e-3
-"""Air between skin and indenter at the first pose."""
+"""Gap between skin and indenter at the first pose."""
 
 
 def sample_fingertip(divisions: int = 8, layers: int = 2) -> StoredFingertip:
@@ -126,7 +126,7 @@ def _step(
     dent = np.where(touched, np.maximum(dent, top - along), dent) if depth_m > 0 else 0.0 * dent
     displacement = dent[:, None] * inward
     radius = np.linalg.norm(skin + displacement, axis=1)
-    # Nothing gets into the core, and the layers outside of it keep some thickness.
+    # Keep everything out of the core, and let the layers around it keep some thickness.
     least = CORE_M + 0.6 * (np.linalg.norm(tip.mesh.nodes, axis=1) - INNER_M)
     back = np.maximum(least - radius, 0.0)[:, None] * (skin + displacement) / radius[:, None]
     displacement += back

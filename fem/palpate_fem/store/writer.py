@@ -1,10 +1,12 @@
-"""Writing simulations: crash-safe, resumable, by one process or by many."""
+"""Writing simulations: crash-safe, resumable, by one process or by many; and exporting them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+import h5py
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.simulation_store import FINGERTIP, SUFFIX, TRAJECTORIES, check_id
@@ -13,44 +15,50 @@ from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.files import (
     PART,
-    Claim,
+    FileClaim,
     FolderLock,
     StoreMismatchError,
     StoreTakenError,
     disk_error,
 )
-from palpate_fem.store.hdf5 import file_image, write_fingertip
 from palpate_fem.store.read import UNFINISHED, SimulationStore
-from palpate_fem.store.trajectory import write_trajectory
+from palpate_fem.store.schema import (
+    LIBVER,
+    file_image,
+    write_fingertip,
+    write_header,
+    write_trajectory,
+)
 
 
 class StoreWriter(SimulationStore, Closing):
-    """A store that takes trajectories; made if it is not there, else continued.
+    """A store that takes trajectories; it is created if it does not exist, else continued.
 
-    Alone by default. Where several processes share the work, each opens the store with ``shared``
-    and claims what it is about to run; the first one to come gets it::
+    One writer at a time by default. If several processes share the work, each opens the store with
+    ``shared`` and claims a trajectory before it runs it; the first one gets it::
 
         with StoreWriter(path, tip, shared=True) as store:
             for id in sorted(wanted - store.done()):
                 try:
-                    with store.claim(id) as place:
-                        place.write(run(id))
+                    with store.claim(id) as claim:
+                        claim.write(run(id))
                 except StoreTakenError:
-                    continue  # another process is at it, or was
+                    continue  # another process runs it, or has run it
 
     Args:
         path: Folder ``NAME.sim``.
-        fingertip: What is simulated; a store takes one only.
-        shared: Whether other writers that say so too may write at the same time.
-        outline: Gives the surface of an indenter by its name, for pictures; None = keep none.
+        fingertip: The fingertip that is simulated; a store holds one only.
+        shared: Whether other writers with ``shared`` may write at the same time.
+        outline: Function from the name of an indenter to its surface, for pictures; None = none
+            is stored.
         stress: Whether to keep stress, the largest of the fields.
-        command: What runs the simulations, for people.
+        command: Command line that runs the simulations, for provenance.
 
     Raises:
         StoreTakenError: Another process is writing.
-        StoreMismatchError: The store is another fingertip's; says what differs.
+        StoreMismatchError: The store belongs to another fingertip; says what differs.
         StoreDiskError: The folder cannot be written.
-        DatasetError: The folder is no store, or damaged.
+        DatasetError: The folder is not a store, or is damaged.
         ConfigError: ``path`` does not end in ``.sim``.
     """
 
@@ -78,22 +86,22 @@ class StoreWriter(SimulationStore, Closing):
             self.close()
             raise
 
-    def claim(self, trajectory: str) -> Place:
+    def claim(self, trajectory: str) -> TrajectoryClaim:
         """Reserve a trajectory before it is run.
 
         Args:
             trajectory: Its id, e.g. ``sphere_medium/03/normal``.
 
         Raises:
-            StoreTakenError: It is done, or another process or thread is running it.
-            DatasetError: It would be inside another trajectory, or hold one.
-            ConfigError: It is no id.
+            StoreTakenError: It is done, or another process or thread runs it.
+            DatasetError: Its id is inside another trajectory's, or contains one.
+            ConfigError: It is not a valid id.
         """
         check_id(trajectory)
         if self._lock is None:
             raise ValueError(f"{self.path} is closed")
         self._check_place(trajectory)
-        claim = Claim(self.file_of(trajectory))
+        claim = FileClaim(self.file_of(trajectory))
         try:
             if claim.target.exists() and self.outcome(trajectory) not in UNFINISHED:
                 raise StoreTakenError(
@@ -103,14 +111,14 @@ class StoreWriter(SimulationStore, Closing):
         except BaseException:
             claim.close()
             raise
-        return Place(self, trajectory, claim)
+        return TrajectoryClaim(self, trajectory, claim)
 
     def write(self, trajectory: str, result: IndentationResult, *, sensor: str = "") -> None:
-        """Claim and write in one; when this returns it is on the disk.
+        """Claim and write a trajectory; when this returns, it is on the disk.
 
         Args:
             trajectory: Its id.
-            result: How it went, whatever the outcome.
+            result: The result, with any outcome.
             sensor: Name of the BioTac it was measured on; empty = simulated.
 
         Raises:
@@ -121,13 +129,13 @@ class StoreWriter(SimulationStore, Closing):
             place.write(result, sensor=sensor)
 
     def close(self) -> None:
-        """Let others in. Again does nothing."""
+        """Release the store for other writers. May be called again."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
 
     def image(self, trajectory: str, result: IndentationResult, sensor: str) -> bytes:
-        """Bytes of the file of a trajectory."""
+        """Content of the file of a trajectory."""
 
         def fill(file: Any) -> None:
             write_trajectory(
@@ -165,19 +173,19 @@ class StoreWriter(SimulationStore, Closing):
             raise disk_error(self.path, error) from error
         if strange and not (self.path / FINGERTIP).exists():
             raise DatasetError(
-                f"{self.path} is no store: it holds {strange[0]}", remedy="choose another folder"
+                f"{self.path} is not a store: it holds {strange[0]}", remedy="choose another folder"
             )
 
     def _sweep_parts(self) -> None:
-        """Remove what killed writers left; nobody else is writing now."""
+        """Remove what killed writers left behind; safe because there is no other writer now."""
         for part in self.path.rglob(f"*.h5{PART}"):
             part.unlink(missing_ok=True)
 
     def _begin(self) -> None:
         head = self.path / FINGERTIP
         if not head.exists():
-            with Claim(head, wait=True) as claim:
-                if not head.exists():  # else another one has begun while we waited
+            with FileClaim(head, wait=True) as claim:
+                if not head.exists():  # else another process has created it while we waited
                     tip = self._fingertip
                     claim.commit(
                         file_image(lambda file: write_fingertip(file, tip), command=self._command)
@@ -186,11 +194,11 @@ class StoreWriter(SimulationStore, Closing):
         if differences:
             raise StoreMismatchError(
                 f"{self.path} is another fingertip's: {'; '.join(differences)} as in the store",
-                remedy="write to a new store, or run with what this one was begun with",
+                remedy="write to a new store, or use the parameters and settings of this one",
             )
 
     def _check_place(self, trajectory: str) -> None:
-        """A trajectory cannot be inside another one: in HDF5 both would be one group."""
+        """Refuse an id inside another one: in an export, one group would contain the other."""
         folder = self.path / TRAJECTORIES
         parents = [parent.as_posix() for parent in Path(trajectory).parents][:-1]
         inside = [name for name in parents if (folder / f"{name}.h5").exists()]
@@ -201,14 +209,14 @@ class StoreWriter(SimulationStore, Closing):
             )
 
 
-class Place(Closing):
-    """The right to write one trajectory, from :meth:`StoreWriter.claim`."""
+class TrajectoryClaim(Closing):
+    """The exclusive right to write one trajectory, from :meth:`StoreWriter.claim`."""
 
-    def __init__(self, store: StoreWriter, trajectory: str, claim: Claim) -> None:
+    def __init__(self, store: StoreWriter, trajectory: str, claim: FileClaim) -> None:
         self._store, self._trajectory, self._claim = store, trajectory, claim
 
     def write(self, result: IndentationResult, *, sensor: str = "") -> None:
-        """Write it, once.
+        """Write the trajectory; possible once.
 
         Raises:
             StoreDiskError: The disk is full or refuses; the store is as before.
@@ -216,5 +224,55 @@ class Place(Closing):
         self._claim.commit(self._store.image(self._trajectory, result, sensor))
 
     def close(self) -> None:
-        """Let go of it, unwritten. Nothing if it was written."""
+        """Release the claim if nothing was written."""
         self._claim.close()
+
+
+def export(
+    store: SimulationStore,
+    path: Path,
+    *,
+    ids: Sequence[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    command: str = "",
+) -> int:
+    """Copy a folder of trajectories into one file; it appears complete or not at all.
+
+    Args:
+        store: A store that is a folder.
+        path: The file to write (``.h5``); replaced if it is there.
+        ids: Trajectories to copy; None = all.
+        progress: Called with the number of copied trajectories, and of all.
+        command: Command line that makes the file, for provenance.
+
+    Returns:
+        Number of trajectories in it.
+
+    Raises:
+        DatasetError: The store is damaged, lacks one of ``ids``, or is one file already.
+        StoreDiskError: The disk is full or refuses.
+    """
+    if store.path.is_file():
+        raise DatasetError(f"{store.path} is one file already", remedy="copy it")
+    names = store.ids() if ids is None else list(ids)
+    with FileClaim(path) as claim:
+        try:
+            with h5py.File(claim.part, "w", libver=LIBVER, locking=False) as target:
+                write_header(target, command=command)
+                _copy(store.path / FINGERTIP, "fingertip", target)
+                for at, name in enumerate(names):
+                    if progress is not None:
+                        progress(at, len(names))
+                    store.summary(name)  # raises a readable error if it is damaged
+                    group = f"{TRAJECTORIES}/{name}"
+                    _copy(store.path / f"{group}.h5", group, target)
+        except (OSError, RuntimeError) as error:  # HDF5 reports a full disk when it closes
+            raise disk_error(path, OSError(str(error))) from error
+        claim.finish()
+    return len(names)
+
+
+def _copy(source: Path, group: str, target: h5py.File) -> None:
+    above, _, name = f"/{group}".rpartition("/")
+    with h5py.File(source, "r", locking=False) as file:
+        target.copy(file[group], target.require_group(above or "/"), name)

@@ -1,1 +1,1 @@
-"""SimulatedIndentation beside measured forces, as the paper compares them."""
+"""Simulated against measured forces, compared as in the paper."""

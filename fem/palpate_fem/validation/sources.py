@@ -1,4 +1,4 @@
-"""Simulations of a store, in the place of a simulation or of a measurement."""
+"""Sources of a validation: measured trajectories from files, simulations from a store."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from palpate_fem.store.content import TrajectorySummary
 from palpate_fem.store.read import SimulationStore
 
 _SIDEWAYS_M = 20e-6
-"""Paths of one trajectory lie this close: the robot's repeatability (paper, "testbed design")."""
+"""Largest distance between paths of one trajectory: the robot's repeatability (paper, "testbed
+design")."""
 _TURNED = np.cos(np.radians(1.0))
 
 
@@ -35,10 +36,10 @@ def measured_from(path: Path) -> tuple[tuple[MeasuredIndentation, ...], dict[str
             store's trajectories count as measured only if they name a sensor.
 
     Returns:
-        The trajectories, and name and reason of those that are none.
+        The trajectories, and the reason by name for those that cannot be used.
 
     Raises:
-        DatasetError: It is neither, or damaged.
+        DatasetError: It is neither of them, or damaged.
     """
     if path.is_file() and not is_file_of(path, SIMULATIONS.name):
         return read_indentations(path), {}
@@ -47,7 +48,7 @@ def measured_from(path: Path) -> tuple[tuple[MeasuredIndentation, ...], dict[str
         item = store.summary(name)
         pose, force = item.pose, item.force
         if not item.sensor and len(pose):
-            # a solver's steps begin at the second pose; at the first it does not touch
+            # a solver's steps begin at the second pose, as the first does not touch
             pose, force = np.concatenate([item.path[:1], pose]), from_rest(force)
         try:
             found.append(
@@ -71,15 +72,15 @@ def simulated_from(
 ) -> tuple[dict[str, SimulatedIndentation], dict[str, str]]:
     """The stored simulation of each measured trajectory.
 
-    A simulation serves every sensor: ``sphere_medium/03/normal`` is that of
+    One simulation serves every sensor: ``sphere_medium/03/normal`` belongs to
     ``sphere_medium/03/normal/biotac1``. Its path may begin elsewhere on the same line.
 
     Args:
-        store: Where simulations are.
-        measured: What they are compared with.
+        store: Store with simulations.
+        measured: Trajectories that they are compared with.
 
     Returns:
-        Simulations by the name of the measured trajectory, and name and reason of those that
+        Simulations by name of the measured trajectory, and the reason by name for those that
         cannot be used.
 
     Raises:
@@ -112,7 +113,7 @@ def simulated_from(
 
 
 def _mismatch(simulated: TrajectorySummary, item: MeasuredIndentation) -> str:
-    """Why a simulation is not of this trajectory; empty if it is."""
+    """Why a simulation does not belong to this trajectory; empty if it does."""
     if simulated.indenter != item.indenter:
         return f"simulated with {simulated.indenter}, measured with {item.indenter}"
     along = _direction(item.pose)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ from statistics import mean, median
 
 import numpy as np
 
-from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
 from palpate_fem.calibration.alignment import (
     INCREMENTS,
     THRESHOLD_N,
@@ -47,12 +46,12 @@ PAPER_MEDIAN_N = 0.260
 PAPER_INDENTER_N = {"texture": 0.226, "ring": 0.486}
 """The indenters whose mean the paper names."""
 PAPER_RELATIVE = {"cylinder_small": "least", "sphere_small": "greatest"}
-"""Relative errors of which the paper gives the order, not the value."""
+"""Relative errors of which the paper gives the rank, not the value."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedTrajectory:
-    """One trajectory.
+    """One trajectory, compared with its simulation.
 
     Attributes:
         name: Of the trajectory, with its sensor if the file has several.
@@ -62,7 +61,7 @@ class ComparedTrajectory:
         axis_rms_n: The same for each axis [N].
         peak_n: Greatest measured force in the compared part [N].
         relative: RMS error over the greatest force.
-        depth_offset_m: By how much the simulation reaches 0.5 N later [m].
+        depth_offset_m: Depth at which the simulation reaches 0.5 N, minus the measured one [m].
         displacement_m: ComparedTrajectory displacement from there [m].
         coverage: Its part of the measured one.
         outcome: How the simulation ended.
@@ -84,7 +83,7 @@ class ComparedTrajectory:
 
     @property
     def path_name(self) -> str:
-        """Name without the sensor: what sensors that were pressed alike have in common."""
+        """Name without the sensor, common to all sensors that were pressed along this path."""
         return self.name.removesuffix(f"/{self.sensor}")
 
 
@@ -103,7 +102,7 @@ class IndenterErrors:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """What a comparison of all trajectories gave.
+    """Result of the comparison of all trajectories.
 
     Attributes:
         compared: One entry for each compared trajectory, in the order of the measurements.
@@ -147,7 +146,7 @@ class Validation:
 
     @property
     def title(self) -> str:
-        """What this is, for every table and figure."""
+        """Title of every table and figure."""
         if self.self_test:
             return "SELF-TEST: simulation against simulations, no measurement is involved"
         return "simulation against measurement"
@@ -163,7 +162,7 @@ def validate(
     """Compare each measured trajectory with its simulation.
 
     Args:
-        measured: What was measured; simulations in their place make it a self-test.
+        measured: Measured trajectories; if they are simulations, this is a self-test.
         simulated: By the name of the measured trajectory, along the same path.
         threshold_n: Force at which curves are aligned [N].
         increments: Samples of a curve.
@@ -270,7 +269,7 @@ def indenter_rows(validation: Validation) -> list[tuple[str, ...]]:
 
 
 def summary_lines(validation: Validation) -> list[str]:
-    """What must be said beside the table: kind, outcomes, what was left out and why."""
+    """Lines below the table: kind of comparison, outcomes, what was left out and why."""
     lines = [validation.title]
     ends = ", ".join(f"{count} {name}" for name, count in validation.outcomes.items())
     lines.append(f"simulations: {ends or 'none'}")
@@ -308,7 +307,7 @@ def write_report(folder: Path, validation: Validation) -> tuple[Path, Path, Path
     """Write ``trajectories.csv``, ``indenters.csv`` and ``validation.json``.
 
     Args:
-        folder: Made if it is not there.
+        folder: Created if it does not exist.
         validation: What to write.
 
     Returns:
@@ -326,7 +325,7 @@ def write_report(folder: Path, validation: Validation) -> tuple[Path, Path, Path
 
 
 def as_json(validation: Validation) -> dict[str, object]:
-    """All numbers [SI], the paper's beside ours, without the curves."""
+    """All numbers [SI], the paper's next to ours, without the curves."""
     compared = []
     for item in validation.compared:
         record = asdict(item)
@@ -354,12 +353,5 @@ def _write_csv(path: Path, headings: Sequence[str], rows: Sequence[Sequence[str]
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(headings)
     writer.writerows(rows)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
         partial.write_text(text.getvalue(), "utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error

@@ -1,16 +1,112 @@
-"""One trajectory of the store: HDF5 group to `IndentationResult` and back."""
+"""Schema ``palpate.simulations`` version 1: HDF5 groups to Python values and back.
+
+docs/simulation-store.md describes the same in words. This module knows groups only; files and
+folders are the business of ``store.writer`` and ``palpate.files.simulation_store``.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import h5py
 import numpy as np
 
 from palpate import __version__
 from palpate.files.hdf5 import set_attributes, text
+from palpate.files.simulation_store import SIMULATIONS
+from palpate_fem.config import FingertipParameters
+from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
-from palpate_fem.store.content import Outline, TrajectorySummary
-from palpate_fem.store.hdf5 import PACKED, create
+from palpate_fem.store.content import Outline, StoredFingertip, TrajectorySummary, named_values
+
+LIBVER = ("v110", "v110")
+"""Readable since HDF5 1.10 (2016); the format before it has no checksums of its own structure."""
+
+PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletcher32": True}
+"""Small arrays are packed too, for the checksum: a flipped bit is an error, not a wrong force."""
+
+MESH_UNITS = {
+    "nodes": "m",
+    "elements": "1",
+    "outer_faces": "1",
+    "outer_elements": "1",
+    "inner_faces": "1",
+    "inner_elements": "1",
+    "fixed": "1",
+    "mirror": "1",
+}
+FINGERTIP_UNITS = {**MESH_UNITS, "pressurised_nodes": "m", "core_vertices": "m", "core_faces": "1"}
+
+
+def file_image(fill: Callable[[Any], None], *, command: str) -> bytes:
+    """Bytes of an HDF5 file with our header.
+
+    Made in memory: HDF5 writes out of order, so a file on the disk would be invalid until closed.
+
+    Args:
+        fill: Writes into the open file.
+        command: Command line that makes it, for provenance.
+    """
+    with h5py.File("image", "w", driver="core", backing_store=False, libver=LIBVER) as file:
+        write_header(file, command=command)
+        fill(file)
+        file.flush()
+        image: bytes = file.id.get_file_image()
+    return image
+
+
+def write_header(file: Any, *, command: str) -> None:
+    """Write the attributes that every file has: schema, frame, version, command."""
+    set_attributes(file, {**SIMULATIONS.facts, "palpate": __version__, "command": command})
+
+
+def write_fingertip(file: Any, tip: StoredFingertip) -> None:
+    """Write group ``fingertip``."""
+    group = file.create_group("fingertip")
+    scalars = ("fluid_pressure_pa", "fluid_volume_m3", "total_thickness_m")
+    names = {"mesh_name": tip.mesh.name, "mesh_sha256": tip.mesh.sha256.hex()}
+    numbers = {name: float(getattr(tip, name)) for name in scalars}
+    set_attributes(group, {"key": tip.key, **names, **numbers})
+    set_attributes(group.create_group("parameters"), named_values(tip.parameters))
+    set_attributes(group.create_group("settings"), tip.settings)
+    for name, unit in FINGERTIP_UNITS.items():
+        array = getattr(tip.mesh if name in MESH_UNITS else tip, name)
+        create(group, name, array, unit)
+
+
+def read_fingertip(file: Any) -> StoredFingertip:
+    """Read group ``fingertip``."""
+    group = file["fingertip"]
+    arrays = {name: group[name][()] for name in FINGERTIP_UNITS}
+    mesh = SolidMesh(
+        **{name: arrays[name] for name in MESH_UNITS}, name=text(group.attrs["mesh_name"])
+    )
+    return StoredFingertip(
+        mesh=mesh,
+        parameters=FingertipParameters(
+            **{name: float(value) for name, value in group["parameters"].attrs.items()}
+        ),
+        settings={name: _setting(value) for name, value in group["settings"].attrs.items()},
+        **{name: arrays[name] for name in FINGERTIP_UNITS if name not in MESH_UNITS},
+        fluid_pressure_pa=float(group.attrs["fluid_pressure_pa"]),
+        fluid_volume_m3=float(group.attrs["fluid_volume_m3"]),
+        total_thickness_m=float(group.attrs["total_thickness_m"]),
+    )
+
+
+def _setting(value: Any) -> bool | int | float | str:
+    if isinstance(value, bytes):
+        return text(value)
+    plain: bool | int | float | str = value.item() if isinstance(value, np.generic) else value
+    return plain
+
+
+def create(group: Any, name: str, array: Any, unit: str) -> None:
+    """Write an array with its unit."""
+    dataset = group.create_dataset(name, data=array, **(PACKED if array.size else {}))
+    set_attributes(dataset, {"unit": unit})
+
 
 SCALAR_FIELDS = {
     "pose": "m, 1",
@@ -20,10 +116,10 @@ SCALAR_FIELDS = {
     "contact_area_m2": "m^2",
     "centre_of_pressure": "m",
 }
-"""A few numbers for each step, float64."""
+"""Datasets with a few numbers for each step, float64, and their units."""
 
 NODAL_FIELDS = {"displacement": "m", "indenter_force": "N", "core_force": "N"}
-"""Three numbers for each step and node, float32, a chunk for each step."""
+"""Datasets with three numbers for each step and node, float32, and their units."""
 
 CONVERGENCE = np.dtype(
     [
@@ -53,18 +149,18 @@ def write_trajectory(
     Args:
         group: An empty group.
         trajectory: What to write.
-        nodes: Nodes of the mesh; what the fields of no step at all would have.
-        fingertip: Key of the fingertip that it was run on.
+        nodes: Number of nodes of the mesh; gives fields a shape if there is no step.
+        fingertip: Key of the fingertip.
         sensor: Name of the BioTac it was measured on; empty = simulated.
         outline: The indenter's surface, for pictures.
-        stress: Whether to keep the stress, which doubles the size.
+        stress: Whether to keep stress, which doubles the size.
     """
     steps = trajectory.steps
-    told = ("indenter", "reason", "travel_m", "seconds")
+    plain = ("indenter", "reason", "travel_m", "seconds")
     set_attributes(
         group,
         {
-            **{name: getattr(trajectory, name) for name in told},
+            **{name: getattr(trajectory, name) for name in plain},
             "outcome": trajectory.outcome.value,
             "complete": trajectory.outcome is IndentationOutcome.COMPLETE,
             "sensor": sensor,
@@ -92,7 +188,7 @@ def write_trajectory(
 
 
 def read_summary(trajectory: str, group: Any) -> TrajectorySummary:
-    """Read what is quick to read; a measured trajectory needs only pose, force and indenter."""
+    """Read poses and forces; a measured trajectory needs only pose, force and indenter."""
     pose, force = (group[name][()].astype(np.float64) for name in ("pose", "force"))
     pressure = group.get("fluid_pressure_pa")
     attributes = group.attrs
@@ -114,7 +210,7 @@ def read_summary(trajectory: str, group: Any) -> TrajectorySummary:
 
 
 def read_trajectory(group: Any) -> IndentationResult:
-    """Read all of one trajectory; stress has no rows where it was not kept."""
+    """Read a whole trajectory; stress has no rows if it was not stored."""
     table = group["convergence"][()]
     columns: dict[str, Any] = {
         name: group[name][()].astype(np.float64) for name in (*SCALAR_FIELDS, *NODAL_FIELDS)
@@ -145,7 +241,7 @@ def read_trajectory(group: Any) -> IndentationResult:
 def _create_stepwise(
     group: Any, name: str, values: list[Any], shape: tuple[int, ...], unit: str
 ) -> None:
-    """One chunk a step, so that a step is read alone; written one by one to save memory."""
+    """Write a field with one chunk for each step, so that a step can be read alone."""
     count = len(values)
     chunks = {"chunks": (1, *shape), **PACKED} if count else {}
     dataset = group.create_dataset(name, shape=(count, *shape), dtype=np.float32, **chunks)
