@@ -1,8 +1,7 @@
-"""Write docs/results/fem.md from what the commands in it printed.
+"""Write docs/results/fem.md from the output of the commands that it names.
 
-``python docs/make_fem_results.py`` reads docs/results/fem/*.json and a store, if one is given,
-whose
-trajectories it first sums up into docs/results/fem/campaign.json.
+``python docs/make_fem_results.py [STORE]`` reads docs/results/fem/*.json. The indentations of a
+store are first summarised in docs/results/fem/campaign.json.
 """
 
 from __future__ import annotations
@@ -19,28 +18,27 @@ import numpy as np
 RESULTS = Path(__file__).parent / "results"
 DATA = RESULTS / "fem"
 
-HEAD = """# The fingertip in finite elements: what was measured
+HEAD = """# The fingertip in finite elements: measured results
 
 Two cores of a shared virtual machine (its dense product reaches {peak:.0f} GFlop/s in double and
-{single:.0f} in single precision on both). Made by `python docs/make_fem_results.py` from the
-output of the
-commands named below, kept beside this page in `fem/`.
+{single:.0f} in single precision on both). `python docs/make_fem_results.py` writes this page from
+the output of the commands named below, which is kept in `fem/`.
 """
 
 
 def load(name: str) -> Any:
-    """What a command printed."""
+    """Output of a command."""
     return json.loads((DATA / f"{name}.json").read_text())
 
 
 def table(headings: list[str], rows: list[list[str]]) -> str:
-    """Markdown; the first column is words."""
+    """Markdown table whose first column is text."""
     rule = ["---", *["---:"] * (len(headings) - 1)]
     return "\n".join(f"| {' | '.join(row)} |" for row in [headings, rule, *rows]) + "\n"
 
 
 def sum_up(path: Path) -> None:
-    """A store's trajectories in a line each."""
+    """Summarise a store, one line for each indentation."""
     from palpate_fem.store.read import SimulationStore
 
     store, rows = SimulationStore.open(path), []
@@ -85,14 +83,15 @@ paper's model took 420 s on
 six processors.
 
 """
-        + table(["press", "seconds", *PARTS, "iterations", "factorisations"], rows)
+        + table(["indentation", "seconds", *PARTS, "iterations", "factorisations"], rows)
         + f"""
-Filling the finger takes {bench["pressurise.seconds"]:.1f} s, once. A whole factorisation is
+Filling the fingertip takes {bench["pressurise.seconds"]:.1f} s, once. A whole factorisation is
 {bench["solver.factor_gflop"]:.1f} GFlop in {bench["solver.whole_factorisation_s"] * 1e3:.0f} ms:
 {bench["solver.factor_gflops"]:.0f} GFlop/s, {bench["solver.factor_share_of_single_peak"]:.0%}
 of the peak in single
 precision; a solve takes {bench["solver.solve_s"] * 1e3:.0f} ms and is bound by memory. Peak memory
-{bench["memory.peak_mib"]:.0f} MiB. Cost against mesh size is the right picture below.
+{bench["memory.peak_mib"]:.0f} MiB. The right picture below shows the cost
+against the size of the mesh.
 """
     )
 
@@ -101,12 +100,11 @@ PARTS = ["factorise", "solve", "assemble", "residual", "rest"]
 
 
 CLAMP = """
-The angled press goes towards the tip (`angled-0`), but for the long cylinder sideways
-(`angled-1`, with `--indenter cylinder_long --angled 2`): it is as long as the finger, and tilted
-towards the tip its other end meets the rim that the clamp holds (seen in the first runs, and the
-direction changed after that). Those runs are listed below all the same: their force is that of
-the rim (34.3 of 35.0 N in one of them stand on held nodes), not of a pinch, and they count
-neither way.
+The angled indentation goes towards the tip (`angled-0`), but sideways for the long cylinder
+(`angled-1`, with `--indenter cylinder_long --angled 2`). That cylinder is as long as the finger:
+tilted towards the tip, its other end meets the rim that the clamp holds, as the first runs showed.
+The runs in that direction are listed below, but not counted: their force is that of the rim (in one
+of them held nodes carry 34.3 of 35.0 N), not of a pinch.
 """
 
 
@@ -148,9 +146,8 @@ each, 3 mm along the
 normal and 1.5 mm at 30 degrees. **{len(good)} of {len(runs)} ({len(good) / len(runs):.1%})
 reach full depth or
 32 N** (the goal is 98 %); deepest penetration of any converged step
-{max(run["penetration_um"] for run in runs):.2f} um. Two at a time on the two cores, so each
-takes about twice
-as long as alone.
+{max(run["penetration_um"] for run in runs):.2f} um. Two ran at a time on the two cores, so
+each took about twice as long as alone.
 
 ![All trajectories by indenter](../pictures/fem-campaign.png)
 
@@ -172,9 +169,9 @@ def studies() -> str:
 ## Mesh and steps
 
 `palpate fem study mesh --png mesh.png --json` and `palpate fem study steps --json`: three
-presses of 3 mm. Displacement
-is that of the whole outer skin; accepted are 2 % of the force and 0.02 mm in the mean by the
-last refinement.
+indentations of 3 mm. Displacement
+is that of the whole outer skin. Accepted is a change of 2 % of the force and of 0.02 mm in the mean
+by the last refinement.
 
 ![What refinement changes](../pictures/fem-mesh-study.png)
 
@@ -200,13 +197,13 @@ last refinement.
             ]
             for row in load(name)
         ]
-        headings = ["indenter", first, "unknowns", "force [N]", "change [%]", "moved, mean [um]"]
-        text += table([*headings, "at most [um]", "iterations", "seconds"], rows) + "\n"
+        headings = ["indenter", first, "unknowns", "force [N]", "change [%]", "mean change [um]"]
+        text += table([*headings, "largest change [um]", "iterations", "seconds"], rows) + "\n"
     return text
 
 
 def recovery() -> str:
-    """Planted parameters."""
+    """Recovery of known parameters."""
     rows = []
     for path in sorted(DATA.glob("recover-*.json")):
         found = json.loads(path.read_text())
@@ -217,13 +214,12 @@ def recovery() -> str:
         )
     goals = ["goal", "", "", "2", "2", "5", "1", "", ""]
     return """
-## Calibration finds what was planted
+## Calibration recovers known parameters
 
-`palpate fem recover --json` (and `--edge-mm 0.9 --seed N`): five presses are simulated with
-thickness 1.45 mm,
-modulus 330 kPa and friction 0.25, noise is added to each axis of the force, and the
-calibration starts from its scan.
-The simulator explains its own forces here: this tests search and data processing, not the model.
+`palpate fem recover --json` (and `--edge-mm 0.9 --seed N`): five indentations are
+simulated with thickness 1.45 mm, modulus 330 kPa and friction 0.25, noise is added to each axis of
+the force, and the calibration starts from its scan. The simulator explains its own forces here:
+this tests search and data processing, not the model.
 
 """ + table(
         ["mesh", "noise [N]", "seed", "thickness [%]", "modulus [%]", "friction [%]", "volume [%]",
@@ -245,7 +241,7 @@ def main() -> None:
 
 
 def flowing(block: str) -> str:
-    """A paragraph on lines of even length; tables, lists and headings as they are."""
+    """Wrap a paragraph; leave tables, lists and headings as they are."""
     if block.lstrip()[:1] in ("|", "#", "*", "!"):
         return block.strip("\n")
     return textwrap.fill(" ".join(block.split()), 110, break_on_hyphens=False)

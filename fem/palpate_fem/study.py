@@ -7,7 +7,7 @@ tilted by 30 degrees so that its edge presses, and the ring.
 from __future__ import annotations
 
 import resource
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -98,15 +98,8 @@ def mesh_study(
     on_row: Callable[[StudyRow], None] | None = None,
 ) -> list[StudyRow]:
     """The indentations on finer and finer meshes."""
-    rows: list[StudyRow] = []
-    last: dict[str, _SkinDisplacement] = {}
-    for edge in edges_m:
-        tip = Fingertip.pressurised(biotac(edge_m=edge))
-        for name in PRESSES:
-            rows.append(_press(tip, name, edge, steps, last))
-            if on_row is not None:
-                on_row(rows[-1])
-    return rows
+    tips = ((Fingertip.pressurised(biotac(edge_m=edge)), edge, steps) for edge in edges_m)
+    return _study(tips, on_row)
 
 
 def step_study(
@@ -117,11 +110,18 @@ def step_study(
 ) -> list[StudyRow]:
     """The indentations in smaller and smaller steps."""
     tip = Fingertip.pressurised(biotac(edge_m=edge_m))
+    return _study(((tip, edge_m, count) for count in steps), on_row)
+
+
+def _study(
+    refinements: Iterable[tuple[Fingertip, float, int]], on_row: Callable[[StudyRow], None] | None
+) -> list[StudyRow]:
+    """Run all indentations for each fingertip, edge [m] and number of steps."""
     rows: list[StudyRow] = []
     last: dict[str, _SkinDisplacement] = {}
-    for count in steps:
+    for tip, edge, steps in refinements:
         for name in PRESSES:
-            rows.append(_press(tip, name, edge_m, count, last))
+            rows.append(_press(tip, name, edge, steps, last))
             if on_row is not None:
                 on_row(rows[-1])
     return rows
