@@ -181,7 +181,7 @@ class _Ports:
         share = PORTS[worker::workers]
         # Two runs on one machine begin at different places.
         start = os.getpid() * 37 % len(share)
-        self._left = iter([*share[start:], *share[:start]])
+        self._left: Iterator[int] = iter([*share[start:], *share[:start]])
 
     def __call__(self) -> int:
         for port in self._left:

@@ -337,7 +337,7 @@ def test_frictions_unsymmetric_share_is_answered(strength: float, left: float | 
     unsymmetric = strength * rng.normal(size=(size, size)) / np.sqrt(size)
     solver = NewtonSolver(
         SimpleNamespace(unsymmetric_product=lambda v: unsymmetric @ v),  # type: ignore[arg-type]
-        SimpleNamespace(solve=lambda v: np.linalg.solve(symmetric, v)),  # type: ignore[arg-type]
+        SimpleNamespace(solve=lambda v: np.linalg.solve(symmetric, v)),
         NewtonSettings(),
     )
     # Moves of micrometres, as in an increment.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -277,7 +278,8 @@ def test_whole_frames_go_the_quick_way(layout: FrameLayout, told: bool) -> None:
 def test_halves_of_two_frames_are_no_whole_one(counter: str, told: bool) -> None:
     """Though their channels come in the usual order."""
     layout = BIOTAC_LAYOUT
-    later = [slot._replace(**{counter: 9}) for slot in frame_of(3, layout, told=told)]
+    change: dict[str, Any] = {counter: 9}
+    later = [slot._replace(**change) for slot in frame_of(3, layout, told=told)]
     halves = [*frame_of(3, layout, told=told)[:22], *later[22:]]
     readings, _ = assemble([*frame_of(1, layout), *frame_of(2, layout), *halves], layout)
     assert [len(bad_channels(one, layout)) for one in readings] == [0, 0, 22, 22]
