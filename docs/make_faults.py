@@ -1,7 +1,7 @@
 """Write docs/results/faults.md: every fault of every emulated device, through worker and pipeline.
 
-``python -m docs.make_faults`` takes about ten minutes, in which the machine should be quiet. A
-trial in which this process stood still is repeated: it would time the machine, not the gateway.
+``python -m docs.make_faults`` takes about ten minutes on an idle machine. A trial in which this
+process was suspended is repeated: it would measure the machine, not the gateway.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PAGE = Path(__file__).parent / "results" / "faults.md"
 
 LASTS_S = 0.5
 LONG_S = (3.3, 4.1)
-"""Lengths of an outage; two, because attempts to open again come at intervals."""
+"""Durations of an outage [s]; two, because attempts to reopen come at intervals."""
 
 OUTAGES = ("unplug", "restart", "silence", "busoff", "absent")
 """Faults that can last."""
@@ -30,20 +30,20 @@ _TRIES = 20
 HEAD = """# Faults: how they show, and how soon they are over
 
 Made by `python -m docs.make_faults`: the gateway's own worker and pipeline read each device in
-software, which has each of its faults for {lasts} s, and outages for {long} s too. Every message is
-compared with what the device measured at that time.
+software, which has each of its faults for {lasts} s, and outages for {long} s, too. Every message
+is compared with the load or the counts of the device at that time.
 
-*Shows as*: counters and errors that tell of it (those named in `tests/gateway/fault_names.py`).
-*Wrong*: messages that said what was not measured, or went back in time, of all that were published
-from its beginning until all was well. *Over after*: from the end of the fault to the first of the
-good messages that followed one another, after {lasts} s and at worst after an outage. The goal is
-1 s.
+*Shows as*: counters and errors that show it (those in `tests/gateway/fault_names.py`). *Wrong*:
+messages with values that were not measured, or with a time before that of the last one, of all
+messages from the begin of the fault until the device works again. *Over after*: time from the end
+of the fault to the first of several good messages in a row, after {lasts} s and, at worst, after an
+outage. The goal is 1 s.
 
 """
 
 
-class _Watch:
-    """Tells how long this process has stood still."""
+class _SuspensionWatch:
+    """Measures how long this process was suspended."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
@@ -58,17 +58,17 @@ class _Watch:
             last_s = now_s
 
 
-def _trial(bench: FaultBench, fault: str, lasts_s: float, watch: _Watch) -> Outcome:
+def _trial(bench: FaultBench, fault: str, lasts_s: float, watch: _SuspensionWatch) -> Outcome:
     for _ in range(_TRIES):
         watch.longest_s = 0.0
         outcome = bench.trial(fault, lasts_s)
         if watch.longest_s < STOOD_STILL_S:
             return outcome
-        _tell(f"repeated: stood still for {watch.longest_s:.1f} s")
+        _tell(f"repeated: suspended for {watch.longest_s:.1f} s")
     raise SystemExit(f"this machine is too busy: {fault} was tried {_TRIES} times")
 
 
-def _row(bench: FaultBench, fault: str, watch: _Watch) -> str:
+def _row(bench: FaultBench, fault: str, watch: _SuspensionWatch) -> str:
     name = bench.case.name
     untold = why_untold(name, fault)
     outcome = _trial(bench, fault, LASTS_S if untold else SLOW_S.get(fault, LASTS_S), watch)
@@ -93,7 +93,7 @@ def _milliseconds(time_s: float) -> str:
     return text if time_s <= 1.0 else f"**{text}**"
 
 
-def _section(case: Case, watch: _Watch) -> str:
+def _section(case: Case, watch: _SuspensionWatch) -> str:
     lines = [f"## {case.name}", "", "| Fault | Shows as | Wrong | Over after | after an outage |"]
     lines.append("|---|---|---|---|---|")
     with FaultBench(case) as bench:
@@ -108,13 +108,13 @@ def _section(case: Case, watch: _Watch) -> str:
 
 def main() -> None:
     """Try everything and write the page."""
-    watch = _Watch()
+    watch = _SuspensionWatch()
     chosen = [case for case in CASES if case.emulate is not None]
     if sys.argv[1:]:
         chosen = [case for case in chosen if case.name in sys.argv[1:]]
     sections = [_section(case, watch) for case in chosen]
     if sys.argv[1:]:
-        return  # to look at some of them; the page is of all
+        return  # some devices only: the page must hold all
     head = HEAD.format(lasts=LASTS_S, long=" and ".join(map(str, LONG_S)))
     PAGE.write_text(head + "\n".join(sections), encoding="utf-8")
 

@@ -277,7 +277,7 @@ def _add(name: str, command: EmulateCommand) -> None:
         from palpate_gateway.cli.emulate_run import run_emulator
 
         faults, seconds = values.pop("fault") or [], values.pop("seconds")
-        run_emulator(make_emulated(name, values), faults, seconds)
+        run_emulator(name, make_emulated(name, values), faults, seconds)
 
     # Typer reads a command's options from the signature of its function.
     vars(run).update(__signature__=Signature(command.options), __doc__=None)

@@ -33,23 +33,12 @@ class EmulatedDevice(NamedTuple):
     """A device in software, not yet started.
 
     Attributes:
-        name: Name of its command.
         emulator: The emulator.
         driver: The driver that reads it.
         sensors: Gives name and driver's options of each sensor; only valid once the emulator runs,
             because its ports are not known before.
         failures: Errors of its start if its address is in use or there is no such bus.
     """
-
-    name: str
-    emulator: Emulator
-    driver: str
-    sensors: Sensors
-    failures: Failures
-
-
-class _Made(NamedTuple):
-    """What a maker returns; see ``EmulatedDevice``."""
 
     emulator: Emulator
     driver: str
@@ -151,33 +140,33 @@ def make_emulated(name: str, values: Mapping[str, Any]) -> EmulatedDevice:
     fields = EmulatedScene.__dataclass_fields__
     scene = EmulatedScene(**{key: value for key, value in values.items() if key in fields})
     own = {key: value for key, value in values.items() if key not in fields}
-    return EmulatedDevice(name, *_MAKERS[name](scene, **own))
+    return _MAKERS[name](scene, **own)
 
 
-def _kms40(scene: EmulatedScene, **options: Any) -> _Made:
+def _kms40(scene: EmulatedScene, **options: Any) -> EmulatedDevice:
     from palpate_gateway.emulators.kms40 import Kms40Emulator
 
     emulator = Kms40Emulator(scene.wrench(), **options)
-    return _Made(
+    return EmulatedDevice(
         emulator,
         "wrench_kms40",
         lambda: [("wrench", {**_host_port(emulator), "rate_hz": emulator.rate_hz})],
     )
 
 
-def _rdt(scene: EmulatedScene, *, product: str, **options: Any) -> _Made:
+def _rdt(scene: EmulatedScene, *, product: str, **options: Any) -> EmulatedDevice:
     from palpate_gateway.emulators.rdt import RdtEmulator
 
     kinds = {"ati_net_ft": "netft", "ati_axia": "axia", "schunk_ftn": "axia", "onrobot_hex": "hex"}
     emulator = RdtEmulator(kinds[product], scene.wrench(), **options)
 
     def sensors() -> list[tuple[str, Options]]:
-        told: Options = {"product": str(product), **_host_port(emulator)}
+        sensor: Options = {"product": str(product), **_host_port(emulator)}
         if product != "onrobot_hex":
-            told["http_port"] = emulator.page.port
-        return [("wrench", {**told, "rate_hz": emulator.rate_hz})]
+            sensor["http_port"] = emulator.page.port
+        return [("wrench", {**sensor, "rate_hz": emulator.rate_hz})]
 
-    return _Made(emulator, "wrench_rdt", sensors)
+    return EmulatedDevice(emulator, "wrench_rdt", sensors)
 
 
 def _robotous(
@@ -188,7 +177,7 @@ def _robotous(
     interface: str,
     channel: str,
     **options: Any,
-) -> _Made:
+) -> EmulatedDevice:
     from palpate_gateway.emulators import robotous
 
     if options["model"] not in robotous.TORQUE_DIVISORS:
@@ -200,24 +189,24 @@ def _robotous(
         where: Options = {"interface": interface, "channel": channel}
         emulator = robotous.RobotousCanEmulator(scene.wrench(), **where, **options)
         sensor = ("wrench", {**where, "rate_hz": 200})
-        return _Made(emulator, "wrench_robotous", lambda: [sensor], _can_failures())
+        return EmulatedDevice(emulator, "wrench_robotous", lambda: [sensor], _can_failures())
     _check_baud(baud, sorted(robotous.MOST_HZ))
     line = robotous.RobotousSerialEmulator(scene.wrench(), baud, _checked_link(link), **options)
-    return _Made(
+    return EmulatedDevice(
         line,
         "wrench_robotous",
         lambda: [("wrench", {"port": line.address, "baud": baud, "rate_hz": 200})],
     )
 
 
-def _bota(scene: EmulatedScene, *, link: Path | None, baud: int, **options: Any) -> _Made:
+def _bota(scene: EmulatedScene, *, link: Path | None, baud: int, **options: Any) -> EmulatedDevice:
     from palpate_gateway.emulators.bota import BAUDS, BotaEmulator
 
     # The lowest speed is too slow even for the lowest rate.
     _check_baud(baud, [speed for speed in BAUDS if speed > 9600])
     emulator = BotaEmulator(scene.wrench(), baud=baud, path=_checked_link(link), **options)
     rate_hz = 400.0 if baud >= 230400 else 100.0
-    return _Made(
+    return EmulatedDevice(
         emulator,
         "wrench_bota",
         lambda: [("wrench", {"port": emulator.address, "baud": baud, "rate_hz": rate_hz})],
@@ -231,7 +220,7 @@ def _biotac_can(
     fingers: int,
     electrodes: str,
     **options: Any,
-) -> _Made:
+) -> EmulatedDevice:
     from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
 
     more = parse_key_values(bus or [])
@@ -248,7 +237,7 @@ def _biotac_can(
     shared |= {"can_id": options["can_id"], "fingers": fingers}
     shared |= {"slot_rate_hz": options["slot_rate_hz"]}
     shared |= _sequence(electrodes, pac_first=options["pac_first"])
-    return _Made(emulator, "biotac_can", lambda: _ports(shared, fingers), _can_failures())
+    return EmulatedDevice(emulator, "biotac_can", lambda: _ports(shared, fingers), _can_failures())
 
 
 def _biotac_bridge(
@@ -259,7 +248,7 @@ def _biotac_bridge(
     source_id: int,
     electrodes: str,
     **options: Any,
-) -> _Made:
+) -> EmulatedDevice:
     from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
     from palpate_gateway.emulators.lines import speeds
 
@@ -277,10 +266,10 @@ def _biotac_bridge(
         shared = {"line": emulator.address, "baud": options["baud"], "source": source_id}
         return _ports(shared | _sequence(electrodes, pac_first=options["pac_first"]), fingers)
 
-    return _Made(emulator, "biotac_bridge", sensors)
+    return EmulatedDevice(emulator, "biotac_bridge", sensors)
 
 
-def _biotac_pic32(scene: EmulatedScene, *, link: Path | None, **options: Any) -> _Made:
+def _biotac_pic32(scene: EmulatedScene, *, link: Path | None, **options: Any) -> EmulatedDevice:
     from palpate_gateway.emulators.biotac_pic32 import BiotacPic32Emulator
     from palpate_gateway.emulators.lines import speeds
 
@@ -292,10 +281,10 @@ def _biotac_pic32(scene: EmulatedScene, *, link: Path | None, **options: Any) ->
         line = {"port": emulator.address, "baud": options["baud"]}
         return [("finger", {**line, "layout": layout})]
 
-    return _Made(emulator, "biotac_pic32", sensors)
+    return EmulatedDevice(emulator, "biotac_pic32", sensors)
 
 
-def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> _Made:
+def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice:
     from palpate_gateway.emulators.robot import BASE_SENSOR, FLANGE_INDENTER, RobotEmulator
 
     check_name(name, "robot")
@@ -311,7 +300,7 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> _Made:
     emulator = RobotEmulator(tip, robot=name, **options)
 
     def sensors() -> list[tuple[str, Options]]:
-        told: Options = {
+        sensor: Options = {
             "robot": emulator.robot,
             "connect": emulator.address,
             "station": emulator.station,
@@ -319,13 +308,13 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> _Made:
             "indenter": indenter,
         }
         for key, pose in (("base_sensor", BASE_SENSOR), ("flange_indenter", FLANGE_INDENTER)):
-            told[key] = {"position_m": pose.position, "orientation_wxyz": pose.orientation}
-        return [("robot", told)]
+            sensor[key] = {"position_m": pose.position, "orientation_wxyz": pose.orientation}
+        return [("robot", sensor)]
 
-    return _Made(emulator, "pose_zenoh", sensors)
+    return EmulatedDevice(emulator, "pose_zenoh", sensors)
 
 
-_MAKERS: dict[str, Callable[..., _Made]] = {
+_MAKERS: dict[str, Callable[..., EmulatedDevice]] = {
     "kms40": _kms40,
     "rdt": _rdt,
     "robotous": _robotous,

@@ -63,7 +63,7 @@ def parse_faults(texts: Iterable[str], known: Collection[str]) -> list[Scheduled
     return sorted(faults)
 
 
-def run_emulator(device: EmulatedDevice, faults: Sequence[str], seconds: float) -> None:
+def run_emulator(name: str, device: EmulatedDevice, faults: Sequence[str], seconds: float) -> None:
     """Serve until ``seconds`` have passed (0 = Ctrl-C).
 
     Raises:
@@ -78,17 +78,17 @@ def run_emulator(device: EmulatedDevice, faults: Sequence[str], seconds: float) 
             device.emulator.start()
         except device.failures as error:
             raise LinkError(
-                f"{device.name}: the emulator cannot start there: {error}",
+                f"{name}: the emulator cannot start there: {error}",
                 remedy="choose another address, port, link or channel; ports below 1024 need root",
             ) from error
         try:
-            _introduce(device)
+            _introduce(name, device)
             line = Live(console=console, auto_refresh=False) if console.is_terminal else None
             with line or nullcontext():
                 _serve(device, plan, seconds, line, crashes)
         finally:
             device.emulator.stop()
-            typer.echo(f"{device.name}: {device.emulator.sent} samples sent", err=True)
+            typer.echo(f"{name}: {device.emulator.sent} samples sent", err=True)
 
 
 @contextmanager
@@ -107,12 +107,12 @@ def _crashes() -> Iterator[list[BaseException]]:
         threading.excepthook = before
 
 
-def _introduce(device: EmulatedDevice) -> None:
+def _introduce(name: str, device: EmulatedDevice) -> None:
     """Show its address, the tables for a profile, and a command that tries it."""
-    typer.echo(f"# {device.name} at {device.emulator.address}; Ctrl-C ends it. For a profile:")
+    typer.echo(f"# {name} at {device.emulator.address}; Ctrl-C ends it. For a profile:")
     sensors = device.sensors()
-    for name, options in sensors:
-        typer.echo("\n" + sensor_toml(name, device.driver, options), nl=False)
+    for sensor, options in sensors:
+        typer.echo("\n" + sensor_toml(sensor, device.driver, options), nl=False)
     typer.echo(f"\n# palpate gateway probe {device.driver} {command_words(sensors[0][1])}")
 
 
@@ -130,7 +130,7 @@ def _serve(
     while (elapsed_s := time.monotonic() - began_s) < until_s:
         if crashes:
             raise DeviceError(
-                f"{device.name}: the emulator failed: {crashes[0]!r}",
+                f"the emulator failed: {crashes[0]!r}",
                 remedy="check its bus or address; if they are right, report this",
             ) from crashes[0]
         while waiting and waiting[0].start_s <= elapsed_s:

@@ -71,12 +71,12 @@ def _about(name: str) -> dict[str, str]:
     line = (module.__doc__ or "").strip().partition("\n")[0]
     needs = sorted({_PACKAGE_OF[part] for part in _parts(module) if part in _PACKAGE_OF})
     missing = [one for one in needs if importlib.util.find_spec(one) is None]
-    told = ", ".join(_DISTRIBUTION[one] for one in missing)
+    names = ", ".join(_DISTRIBUTION[one] for one in missing)
     return {
         "name": name,
         # The reference of the protocol is of no use in a list of drivers.
         "about": re.sub(r" \([^()]*hardware reference[^()]*\)", "", line).rstrip("."),
-        "missing": f'{told}; pip install "palpate[gateway]"' if missing else "",
+        "missing": f'{names}; pip install "palpate[gateway]"' if missing else "",
     }
 
 
@@ -139,7 +139,7 @@ def _configs(can: ModuleType, kind: str) -> list[dict[str, str]]:
     out = []
     for config in configs:
         more = {key: value for key, value in config.items() if key not in ("interface", "channel")}
-        told = " ".join(f"{key}={value}" for key, value in more.items())
+        listed = " ".join(f"{key}={value}" for key, value in more.items())
         channel = str(config.get("channel", ""))
-        out.append({"interface": kind, "channel": channel, "more": told})
+        out.append({"interface": kind, "channel": channel, "more": listed})
     return out

@@ -102,8 +102,8 @@ def _show(device: Device, found: dict[str, Any], streams: DeviceStreams) -> None
     typer.echo(f"nominal    {nominal_hz:.2f} Hz")
     for name, stream in streams.by_name.items():
         rate_hz = stream.rate_hz
-        told = "rate unknown: too few readings" if rate_hz is None else f"{rate_hz:.2f} Hz"
-        typer.echo(f"{name:11}{told} ({stream.readings} readings)")
+        rate = "rate unknown: too few readings" if rate_hz is None else f"{rate_hz:.2f} Hz"
+        typer.echo(f"{name:11}{rate} ({stream.readings} readings)")
         nominal = device.info.live and name in _OF_NOMINAL_RATE
         if nominal and rate_hz and abs(rate_hz / nominal_hz - 1.0) > _RATE_TOLERANCE:
             typer.echo(f"{'':11}note: this is not the nominal rate; see the counters")
@@ -115,9 +115,9 @@ def _show(device: Device, found: dict[str, Any], streams: DeviceStreams) -> None
 
 def counter_lines(counters: Mapping[str, int]) -> list[str]:
     """Counters above 0, and the names of those at 0."""
-    told = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()) if count)
+    above = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()) if count)
     zero = ", ".join(name for name, count in sorted(counters.items()) if not count)
-    lines = [f"counters   {told or 'none'}"]
+    lines = [f"counters   {above or 'none'}"]
     return [*lines, f"    all 0: {zero}"] if zero else lines
 
 

@@ -102,8 +102,8 @@ def _electrode_lines(reading: ElectrodeReading) -> list[str]:
         for number, count in enumerate(reading.pac.tolist())
         if layout.first_pac_bit + number not in bad
     ]
-    told = f"{min(pac)}..{max(pac)}" if pac else "none"
-    lines.append(f"PDC {reading.pdc}  TAC {reading.tac}  TDC {reading.tdc}  PAC {told} [counts]")
+    span = f"{min(pac)}..{max(pac)}" if pac else "none"
+    lines.append(f"PDC {reading.pdc}  TAC {reading.tac}  TDC {reading.tdc}  PAC {span} [counts]")
     if bad:
         more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
         names = ", ".join(layout.bit_name(bit) for bit in bad[:_NAMED])

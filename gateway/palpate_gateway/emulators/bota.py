@@ -222,8 +222,8 @@ class BotaEmulator(SerialEmulator):
 
     def _frame(self) -> bytes:
         """The present sample as a frame, or as a line of text."""
-        felt = self._source(self.held(self._time_s))
-        values = [a + b for a, b in zip(felt, self.settings.offsets, strict=True)]
+        load = self._source(self.held(self._time_s))
+        values = [a + b for a, b in zip(load, self.settings.offsets, strict=True)]
         status = sum(bit for name, bit in _STATUS.items() if self.faulty(name))
         if not self.settings.calibrated:
             status |= _STATUS["raw"]

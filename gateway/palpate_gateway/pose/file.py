@@ -19,7 +19,7 @@ from palpate.files.record import RecordItem, read_record
 from palpate.messages import Origin, RobotPoseFrame
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.pose.placement import Placement, PlacementOptions
-from palpate_gateway.pose.table import PoseRow, PoseSource, PoseTable
+from palpate_gateway.pose.table import PoseRow, PoseTable
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import Reading
 
@@ -161,7 +161,7 @@ class PoseFile(Device):
         )
         self._options = options
         self._placement = Placement(options)
-        self._source: PoseSource | None = None
+        self._source: PoseTable | RecordedPoses | None = None
         self._rows: Iterator[PoseRow] = iter(())
         self._damage: RecordingError | None = None
         self._counts: Mapping[str, int] = {}

@@ -26,7 +26,7 @@ class PoseZenohOptions(PlacementOptions):
 
     Attributes:
         robot: Name under which the robot's program publishes.
-        rate_hz: Rate of its poses [Hz]; a gap of three periods and 50 ms is a silence.
+        rate_hz: Rate of its poses [Hz]; a gap longer than 40 ms and three periods is a silence.
         station: Station on which it publishes; empty = the gateway's own.
         connect: Endpoint of the router; empty = the gateway's own.
         tls: Certificates for that router.
@@ -77,7 +77,7 @@ class PoseZenoh(BusDevice):
         self._session: Session | None = None
         self._subscriber: Subscriber[RobotPoseFrame] | None = None
         self._counts = {"samples": 0, "wrong_robot": 0}
-        self._heard: Mapping[str, int] = {}
+        self._last_counts: Mapping[str, int] = {}
         self._began_ns: int | None = None
         self._restarted = False
         self.join(LinkConfig(), "lab")
@@ -86,9 +86,9 @@ class PoseZenoh(BusDevice):
     def counters(self) -> Mapping[str, int]:
         """Poses that became readings, rejected poses by reason, and lost poses."""
         subscriber = self._subscriber  # another thread may close it meanwhile
-        heard = self._heard if subscriber is None else subscriber.counters
-        refused = {name: n for name, n in heard.items() if name.startswith("rejected_")}
-        overflow = {"queue_overflow": heard.get("overflow", 0)}
+        counted = self._last_counts if subscriber is None else subscriber.counters
+        refused = {name: n for name, n in counted.items() if name.startswith("rejected_")}
+        overflow = {"queue_overflow": counted.get("overflow", 0)}
         return {**self._counts, **self._track.counters, **overflow, **refused}
 
     def join(self, link: LinkConfig, station: str) -> None:
@@ -104,7 +104,7 @@ class PoseZenoh(BusDevice):
     def _open(self) -> DeviceIdentity:
         self._track.begin()
         self._counts = dict.fromkeys(self._counts, 0)
-        self._heard = {}
+        self._last_counts = {}
         self._began_ns = None
         self._restarted = False
         try:
@@ -118,7 +118,7 @@ class PoseZenoh(BusDevice):
 
     def _close(self) -> None:
         if self._subscriber is not None:
-            self._heard = self._subscriber.counters
+            self._last_counts = self._subscriber.counters
         session, self._session, self._subscriber = self._session, None, None
         if session is not None:
             session.close()

@@ -8,14 +8,30 @@ and comes after all rows before it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from palpate.errors import RecordingError
 from palpate.messages import Pose
 from palpate.rigid import is_rotation, quaternion_length
+
+_LINE_LIMIT = 1 << 16
+"""A longer line is not a line of such a file [bytes]."""
+
+_FAR = 1e6
+"""Largest valid coordinate, in m or in mm; a larger number is damage."""
+
+_WALL_DIGITS = 19
+_TIME, _WALL = "time_s", "wall_ns"
+_POSITIONS = {("x_m", "y_m", "z_m"): 1.0, ("x_mm", "y_mm", "z_mm"): 1e-3}
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_COLUMNS = (
+    "name the columns time_s, x_m y_m z_m (or x_mm y_mm z_mm), qw qx qy qz, and optionally "
+    "wall_ns, separated by commas"
+)
+_REPAIR = "repair or delete the line; all rows before it were delivered"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,45 +51,6 @@ class PoseRow:
     missed_before: int = 0
 
 
-class PoseSource(Protocol):
-    """An open file of robot poses."""
-
-    @property
-    def counters(self) -> Mapping[str, int]:
-        """Dropped poses by reason."""
-        ...
-
-    @property
-    def start_wall_ns(self) -> int | None:
-        """Wall clock at the first row [ns], if the file has it; known once that has been read."""
-        ...
-
-    def rows(self) -> Iterator[PoseRow]:
-        """Poses in order of time; raises ``RecordingError`` where the file is broken."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
-
-
-_LINE_LIMIT = 1 << 16
-"""A longer line is not a line of such a file [bytes]."""
-
-_FAR = 1e6
-"""Largest valid coordinate, in m or in mm; a larger number is damage."""
-
-_WALL_DIGITS = 19
-_TIME, _WALL = "time_s", "wall_ns"
-_POSITIONS = {("x_m", "y_m", "z_m"): 1.0, ("x_mm", "y_mm", "z_mm"): 1e-3}
-_QUATERNION = ("qw", "qx", "qy", "qz")
-_COLUMNS = (
-    "name the columns time_s, x_m y_m z_m (or x_mm y_mm z_mm), qw qx qy qz, and optionally "
-    "wall_ns, separated by commas"
-)
-_REPAIR = "repair or delete the line; all rows before it were delivered"
-
-
 class PoseTable:
     """Rows of one file; can be read once.
 
@@ -89,7 +66,7 @@ class PoseTable:
     def __init__(self, path: Path) -> None:
         self.counters = {"repeated_poses": 0}
         self.start_wall_ns: int | None = None
-        """See ``PoseSource``."""
+        """Wall clock at the first row [ns], if the file has it; known once that has been read."""
         self._path = path
         self._line = 0
         try:
@@ -150,10 +127,10 @@ class PoseTable:
         for name in (_TIME, _WALL, *_QUATERNION, *(n for names in _POSITIONS for n in names)):
             if names.count(name) > 1:
                 raise self._wrong(f"column {name!r} is there twice", _COLUMNS)
-        told = [group for group in _POSITIONS if any(name in names for name in group)]
-        if len(told) > 1:
+        given = [group for group in _POSITIONS if any(name in names for name in group)]
+        if len(given) > 1:
             raise self._wrong("positions are there in m and in mm", "keep one of the two")
-        positions = told[0] if told else next(iter(_POSITIONS))
+        positions = given[0] if given else next(iter(_POSITIONS))
         for name in (_TIME, *positions, *_QUATERNION):
             if name not in names:
                 raise self._wrong(f"column {name!r} is missing", _COLUMNS)

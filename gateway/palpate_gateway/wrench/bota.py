@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
 from palpate_gateway.ports.serial_port import SerialPort, settle
-from palpate_gateway.protocols import bota as ask
+from palpate_gateway.protocols import bota as wire
 from palpate_gateway.protocols.bota import BotaCommand, BotaDecoder, BotaFrame
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
@@ -32,7 +32,7 @@ _SILENCE_S = 0.3
 
 _BITS_PER_BYTE = 10
 _WRAP_US = 1 << 32
-_RAW = 1 << ask.STATUS_NAMES.index("raw")
+_RAW = 1 << wire.STATUS_NAMES.index("raw")
 _ZERO_S = 0.2
 _NO_OFFSETS = (0.0,) * 6
 
@@ -62,12 +62,12 @@ class BotaOptions(WrenchOptions):
 
     @model_validator(mode="after")
     def _fits(self) -> BotaOptions:
-        true_hz = 1.0 / ask.period_s(sinc_of(self.rate_hz))
+        true_hz = 1.0 / wire.period_s(sinc_of(self.rate_hz))
         if abs(true_hz / self.rate_hz - 1.0) > 0.02:
-            known = ", ".join(f"{1.0 / ask.period_s(sinc):.0f}" for sinc in ask.SINC_LENGTHS)
+            known = ", ".join(f"{1.0 / wire.period_s(sinc):.0f}" for sinc in wire.SINC_LENGTHS)
             raise ValueError(f"rate_hz {self.rate_hz:g} is none of {known}")
         if self.baud:
-            ask.communication_request(baud=self.baud)
+            wire.communication_request(baud=self.baud)
             if (highest_hz := _highest_hz(self.baud)) < true_hz:
                 raise ValueError(
                     f"rate_hz {self.rate_hz:g} is above {highest_hz:.0f} for {self.baud} bit/s"
@@ -77,11 +77,11 @@ class BotaOptions(WrenchOptions):
 
 def sinc_of(rate_hz: float) -> int:
     """Filter length with the nearest rate."""
-    return min(ask.SINC_LENGTHS, key=lambda sinc: abs(math.log(rate_hz * ask.period_s(sinc))))
+    return min(wire.SINC_LENGTHS, key=lambda sinc: abs(math.log(rate_hz * wire.period_s(sinc))))
 
 
 def _highest_hz(baud: int) -> float:
-    return baud / (_BITS_PER_BYTE * ask.FRAME_BYTES)
+    return baud / (_BITS_PER_BYTE * wire.FRAME_BYTES)
 
 
 class WrenchBota(WrenchDevice):
@@ -91,18 +91,18 @@ class WrenchBota(WrenchDevice):
 
     def __init__(self, options: BotaOptions) -> None:
         self._sinc = sinc_of(options.rate_hz)
-        period_s = ask.period_s(self._sinc)
+        period_s = wire.period_s(self._sinc)
         super().__init__("wrench_bota", f"Bota on {options.port}", 1.0 / period_s, options)
         self._options = options
         self._period_us = 1e6 * period_s
         self._baud = options.baud  # 0 while it is not known
-        self._port = SerialPort(options.port, options.baud or ask.BAUDS_TO_PROBE[0])
+        self._port = SerialPort(options.port, options.baud or wire.BAUDS_TO_PROBE[0])
         self._begin()
 
     def _begin(self) -> None:
         """Reset the state of an earlier connection."""
         self._decoder = BotaDecoder()
-        self._boot = ask.BotaTextWait(ask.BOOT_TEXT)
+        self._boot = wire.BotaTextWait(wire.BOOT_TEXT)
         self._early = b""
         self._clock = SampleClock(self._period_us, _WRAP_US)
 
@@ -135,19 +135,19 @@ class WrenchBota(WrenchDevice):
             )
         options = self._options
         self._ask(
-            ask.communication_request(
+            wire.communication_request(
                 baud=baud, temperature_compensation=options.temperature_compensation
             )
         )
         self._ask(
-            ask.filter_request(self._sinc, chop=options.chop, fast=options.fast, fir=options.fir)
+            wire.filter_request(self._sinc, chop=options.chop, fast=options.fast, fir=options.fir)
         )
         self._run()
         return options.port
 
     def _find(self) -> int:
         """Open the port at the sensor's speed and enter its configuration mode; the speed."""
-        bauds = (self._options.baud,) if self._options.baud else ask.BAUDS_TO_PROBE
+        bauds = (self._options.baud,) if self._options.baud else wire.BAUDS_TO_PROBE
         began_s = time.monotonic()
         until = began_s + self._options.boot_s
         while True:
@@ -170,14 +170,14 @@ class WrenchBota(WrenchDevice):
                 )
 
     def _configure(self, within_s: float = _ANSWER_S) -> None:
-        self._ask(ask.bare_request(BotaCommand.CONFIG), within_s)
+        self._ask(wire.bare_request(BotaCommand.CONFIG), within_s)
         # Discard answers to earlier requests and the rest of the stream.
         settle(self._port, _QUIET_S, _ANSWER_S)
 
     def _run(self) -> None:
-        self._early = self._ask(ask.bare_request(BotaCommand.RUN))
+        self._early = self._ask(wire.bare_request(BotaCommand.RUN))
         self._decoder.reset()
-        self._boot = ask.BotaTextWait(ask.BOOT_TEXT)
+        self._boot = wire.BotaTextWait(wire.BOOT_TEXT)
         self._clock.pause()
         self._silent_since = None
 
@@ -200,20 +200,20 @@ class WrenchBota(WrenchDevice):
         """The reading of a frame; None if the frame is not new or not valid."""
         verdict = self._clock.take(frame.device_time_us, time.monotonic())
         if verdict is SampleVerdict.RESTARTED:
-            raise self._restarted("its clock began anew")
+            raise self._restarted("its clock started again")
         if verdict is not SampleVerdict.NEW:
             return None
-        if status := frame.status & ~ask.OVERRANGE:
-            for name in ask.status_names(status):
+        if status := frame.status & ~wire.OVERRANGE:
+            for name in wire.status_names(status):
                 self._counts["status_" + name.replace(" ", "_")] += 1
-        if frame.status & (ask.INVALID | _RAW):
+        if frame.status & (wire.INVALID | _RAW):
             self._counts["invalid_samples"] += 1
             return None
         return self._reading(
             frame.wrench,
             time_s=self._clock.time_s,
             tick=self._clock.tick,
-            overload=bool(frame.status & ask.OVERRANGE),
+            overload=bool(frame.status & wire.OVERRANGE),
         )
 
     def _restarted(self, how: str) -> DeviceLost:
@@ -240,7 +240,7 @@ class WrenchBota(WrenchDevice):
 
     def _set_offsets(self, offsets: Sequence[float]) -> None:
         self._configure()
-        self._ask(ask.offsets_request(offsets))
+        self._ask(wire.offsets_request(offsets))
         self._run()
 
     def _ask(self, request: bytes, within_s: float = _ANSWER_S) -> bytes:
@@ -252,14 +252,14 @@ class WrenchBota(WrenchDevice):
         """
         self._port.write(request)
         what = f"{self.info.model}: command {request.decode('ascii')!r}"
-        wait = ask.BotaTextWait(ask.expected_reply(request) or b"\n")
+        wait = wire.BotaTextWait(wire.expected_reply(request) or b"\n")
         until = time.monotonic() + within_s
         while (left_s := until - time.monotonic()) > 0.0:
             with contextlib.suppress(DeviceTimeout):
                 after = wait.feed(self._port.read(left_s))
                 if after is not None:
                     return after
-                ack = ask.find_ack(wait.before)
+                ack = wire.find_ack(wait.before)
                 if ack is not None and ack.command == chr(request[0]) and ack.code:
                     raise DeviceError(
                         f"{what} was refused (code {ack.code})",

@@ -21,6 +21,7 @@ from pydantic import Field, model_validator
 from palpate.config import StrictConfig
 from palpate.errors import DeviceLost, DeviceTimeout
 from palpate.messages import FloatArray, Origin
+from palpate.rigid import is_rotation, quaternion_length, rotation_matrices
 from palpate_gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import ClockObservation, Reading, WrenchReading
 
@@ -46,11 +47,11 @@ class MountOptions(StrictConfig):
 
     @model_validator(mode="after")
     def _is_rotation(self) -> MountOptions:
-        size = math.sqrt(sum(part * part for part in self.orientation_wxyz))
-        if not abs(size - 1.0) < 1e-3:
+        if not is_rotation(self.orientation_wxyz):
             raise ValueError(
-                f"orientation_wxyz {self.orientation_wxyz} has length {size:.4g}, not 1: give a "
-                "unit quaternion w x y z"
+                f"orientation_wxyz {self.orientation_wxyz} has length "
+                f"{quaternion_length(self.orientation_wxyz):.4g}, not 1: "
+                "give a unit quaternion w x y z"
             )
         if not all(math.isfinite(part) for part in self.origin_m):
             raise ValueError(f"origin_m {self.origin_m} is not finite")
@@ -61,14 +62,8 @@ class Mount:
     """The transformation that `MountOptions` describe."""
 
     def __init__(self, options: MountOptions) -> None:
-        w, x, y, z = np.array(options.orientation_wxyz) / np.linalg.norm(options.orientation_wxyz)
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        quaternion = np.array(options.orientation_wxyz)
+        rotation = rotation_matrices(quaternion / np.linalg.norm(options.orientation_wxyz))
         x, y, z = options.origin_m
         arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         sign = 1.0 if options.carries == "biotac" else -1.0

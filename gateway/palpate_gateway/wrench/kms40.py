@@ -17,7 +17,7 @@ from palpate.errors import DeviceError, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.port import silent
 from palpate_gateway.ports.sockets import ReceivedBytes, TcpPort
-from palpate_gateway.protocols import kms40 as ask
+from palpate_gateway.protocols import kms40 as wire
 from palpate_gateway.protocols.kms40 import (
     FAULTS,
     KmsDecoder,
@@ -62,17 +62,17 @@ class Kms40Options(WrenchOptions):
     """
 
     host: str = Field(min_length=1)
-    port: int = Field(default=ask.PORT, ge=1, le=65535)
-    rate_hz: float = Field(default=ask.BASE_RATE_HZ, ge=1.0, le=ask.BASE_RATE_HZ)
-    filter_number: int | None = Field(default=None, ge=0, le=ask.FILTER_MAX)
+    port: int = Field(default=wire.PORT, ge=1, le=65535)
+    rate_hz: float = Field(default=wire.BASE_RATE_HZ, ge=1.0, le=wire.BASE_RATE_HZ)
+    filter_number: int | None = Field(default=None, ge=0, le=wire.FILTER_MAX)
     flags_every_s: float = Field(default=1.0, ge=0.0, le=60.0)
 
     @model_validator(mode="after")
     def _has_divider(self) -> Kms40Options:
-        divider = ask.divider_of_rate(self.rate_hz)
-        near = ask.rate_of_divider(divider)
+        divider = wire.divider_of_rate(self.rate_hz)
+        near = wire.rate_of_divider(divider)
         if abs(near / self.rate_hz - 1.0) > 1e-3:
-            below = ask.rate_of_divider(divider + 1)
+            below = wire.rate_of_divider(divider + 1)
             raise ValueError(
                 f"rate_hz {self.rate_hz:g} is not 500 divided by a whole number; the nearest are "
                 f"{below:g} and {near:g}"
@@ -86,8 +86,8 @@ class WrenchKms40(WrenchDevice):
     options_class = Kms40Options
 
     def __init__(self, options: Kms40Options) -> None:
-        self._divider = ask.divider_of_rate(options.rate_hz)
-        rate_hz = ask.rate_of_divider(self._divider)
+        self._divider = wire.divider_of_rate(options.rate_hz)
+        rate_hz = wire.rate_of_divider(self._divider)
         model = f"Weiss KMS 40 at {options.host}"
         super().__init__("wrench_kms40", model, rate_hz, options)
         self._filter, self._flags_every_s = options.filter_number, options.flags_every_s
@@ -110,11 +110,11 @@ class WrenchKms40(WrenchDevice):
 
     def zero(self) -> None:
         """See ``WrenchDevice``; the stream pauses, and the samples before it are discarded."""
-        self._ask(ask.stop_request(), "L0")
+        self._ask(wire.stop_request(), "L0")
         try:
-            self._ask(ask.tare_request(), "TARE", "1")
+            self._ask(wire.tare_request(), "TARE", "1")
         finally:
-            self._ask(ask.start_request(), "L1")
+            self._ask(wire.start_request(), "L1")
             self._arrivals.begin()
 
     def _keeps_zero(self) -> bool:
@@ -124,21 +124,21 @@ class WrenchKms40(WrenchDevice):
         self._begin()
         self._port.open()
         self._greet()
-        self._ask(ask.query_request(ask.KmsQuery.IDENTITY), "ID")
-        serial = self._ask(ask.query_request(ask.KmsQuery.SERIAL_NUMBER), "SN")
+        self._ask(wire.query_request(wire.KmsQuery.IDENTITY), "ID")
+        serial = self._ask(wire.query_request(wire.KmsQuery.SERIAL_NUMBER), "SN")
         if not serial:
             raise DeviceError(
                 f"{self.info.model}: it gives no serial number",
                 remedy="check that this is a KMS 40",
             )
-        self._ask(ask.mask_request(), "LMASK", "{1,1,1,1,1,1}")
+        self._ask(wire.mask_request(), "LMASK", "{1,1,1,1,1,1}")
         if self._filter is not None:
-            self._ask(ask.filter_request(self._filter), "FLT", str(self._filter))
-        self._ask(ask.divider_request(self._divider), "LDIV", str(self._divider))
-        self._ask(ask.quiet_request(), "VL", "0")
+            self._ask(wire.filter_request(self._filter), "FLT", str(self._filter))
+        self._ask(wire.divider_request(self._divider), "LDIV", str(self._divider))
+        self._ask(wire.quiet_request(), "VL", "0")
         if self._flags_every_s:
             self._check_flags()
-        self._ask(ask.start_request(), "L1")
+        self._ask(wire.start_request(), "L1")
         return serial
 
     def _greet(self) -> None:
@@ -147,14 +147,14 @@ class WrenchKms40(WrenchDevice):
         while True:
             left_s = until - time.monotonic()
             try:
-                self._ask(ask.stop_request(), "L0", within_s=min(_GREET_S, left_s))
+                self._ask(wire.stop_request(), "L0", within_s=min(_GREET_S, left_s))
                 return
             except DeviceTimeout:
                 if left_s <= _GREET_S:
                     raise
 
     def _check_flags(self) -> None:
-        self._ask(ask.query_request(ask.KmsQuery.FLAGS), "FLAGS")
+        self._ask(wire.query_request(wire.KmsQuery.FLAGS), "FLAGS")
         faults = self._flags & FAULTS
         if faults:
             raise DeviceError(
@@ -166,7 +166,7 @@ class WrenchKms40(WrenchDevice):
     def _close(self) -> None:
         # Wait for the echo: a socket that is closed with unread input cancels the request.
         with contextlib.suppress(DeviceError):
-            self._ask(ask.stop_request(), "L0", within_s=_GOODBYE_S)
+            self._ask(wire.stop_request(), "L0", within_s=_GOODBYE_S)
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -214,15 +214,15 @@ class WrenchKms40(WrenchDevice):
         if now_s - self._heard_s >= self._patience_s:
             self._heard_s = now_s
             self._counts["streams_restarted"] += 1
-            self._port.write(ask.start_request())
+            self._port.write(wire.start_request())
         if self._flags_every_s and now_s >= self._flags_due_s:
             self._flags_due_s = now_s + self._flags_every_s
             self._counts["flags_unanswered"] += self._flags_asked
             self._flags_asked = True
-            self._port.write(ask.query_request(ask.KmsQuery.FLAGS))
+            self._port.write(wire.query_request(wire.KmsQuery.FLAGS))
 
     def _note(self, reply: KmsReply) -> None:
-        if reply.name != ask.KmsQuery.FLAGS:
+        if reply.name != wire.KmsQuery.FLAGS:
             return
         self._flags_asked = False
         flags = parse_flags(reply.value)

@@ -353,15 +353,15 @@ class WrenchRdt(WrenchDevice):
         records, self._early = self._early, []
         until = time.monotonic() + timeout_s
         while not records:
-            heard = False
+            received = False
             left_s = max(until - time.monotonic(), 0.0)
             with contextlib.suppress(DeviceTimeout):
                 records += self._fresh(self._port.receive(min(left_s, self._patience_s)))
-                heard = True
+                received = True
                 for _ in range(_AT_ONCE - 1):
                     records += self._fresh(self._port.receive(0.0))
             self._keep_going()
-            if heard:
+            if received:
                 break
             if time.monotonic() >= until:
                 raise silent(self.info.model, round(timeout_s, 3))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 from pydantic import Field, model_validator
@@ -17,7 +16,7 @@ from palpate.errors import DeviceError, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.ports.serial_port import SerialPort
-from palpate_gateway.protocols import robotous as ask
+from palpate_gateway.protocols import robotous as wire
 from palpate_gateway.protocols.robotous import (
     FIRST_ID,
     REQUEST_ID,
@@ -36,44 +35,8 @@ _APART = 0.75
 """Halves that are further apart belong to two samples [periods]."""
 
 
-class RobotousLine(ABC):
-    """A line to one sensor: requests go out, the data bytes of answers come in.
-
-    Attributes:
-        name: Name for messages to the user.
-    """
-
-    name: str
-
-    @property
-    @abstractmethod
-    def counters(self) -> Mapping[str, int]:
-        """Events since the last opening."""
-
-    @abstractmethod
-    def open(self) -> None:
-        """Connect; raises the errors of the port."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Disconnect; never raises."""
-
-    @abstractmethod
-    def send(self, request: bytes) -> None:
-        """Send the data bytes of a request."""
-
-    @abstractmethod
-    def read(self, timeout_s: float) -> list[bytes]:
-        """Data bytes of the answers that are now complete; may be none, e.g. from half a frame.
-
-        Raises:
-            DeviceTimeout: Nothing came.
-            DeviceLost: The line is gone.
-        """
-
-
-class RobotousSerialLine(RobotousLine):
-    """A serial line.
+class RobotousSerialLine:
+    """A serial line to one sensor: requests go out, the data bytes of answers come in.
 
     Args:
         port: Its name.
@@ -87,29 +50,34 @@ class RobotousSerialLine(RobotousLine):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """See ``RobotousLine``."""
+        """Events since the last opening."""
         return self._decoder.counters
 
     def open(self) -> None:
-        """See ``RobotousLine``."""
+        """Connect; raises the errors of the port."""
         self._decoder = RobotousSerialDecoder()
         self._port.open()
 
     def close(self) -> None:
-        """See ``RobotousLine``."""
+        """Disconnect; never raises."""
         self._port.close()
 
     def send(self, request: bytes) -> None:
-        """See ``RobotousLine``."""
+        """Send the data bytes of a request."""
         self._port.write(serial_frame(request))
 
     def read(self, timeout_s: float) -> list[bytes]:
-        """See ``RobotousLine``."""
+        """Data bytes of the answers that are now complete; may be none, e.g. from half a frame.
+
+        Raises:
+            DeviceTimeout: Nothing came.
+            DeviceLost: The line is gone.
+        """
         return self._decoder.feed(self._port.read(timeout_s))
 
 
-class RobotousCanLine(RobotousLine):
-    """A CAN bus, which other devices may use, too.
+class RobotousCanLine:
+    """A CAN bus to one sensor, as ``RobotousSerialLine``; other devices may use the bus, too.
 
     Args:
         bus: The bus, closed.
@@ -131,25 +99,25 @@ class RobotousCanLine(RobotousLine):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """See ``RobotousLine``."""
+        """Events since the last opening."""
         return {**self._decoder.counters, **self._bus.counters}
 
     def open(self) -> None:
-        """See ``RobotousLine``."""
+        """Connect; raises the errors of the port."""
         self._decoder = RobotousCanDecoder(*self._ids)
         self._bus.counters.update(dict.fromkeys(self._bus.counters, 0))
         self._bus.open()
 
     def close(self) -> None:
-        """See ``RobotousLine``."""
+        """Disconnect; never raises."""
         self._bus.close()
 
     def send(self, request: bytes) -> None:
-        """See ``RobotousLine``."""
+        """Send the data bytes of a request."""
         self._bus.write(self._request_id, request)
 
     def read(self, timeout_s: float) -> list[bytes]:
-        """See ``RobotousLine``."""
+        """See ``RobotousSerialLine``."""
         out = []
         for can_id, data, arrival_ns in self._bus.read(timeout_s).messages():
             # Samples have no numbers: only the times show that two halves do not belong together.
@@ -202,7 +170,7 @@ class RobotousOptions(WrenchOptions):
     second_id: int = Field(default=SECOND_ID, ge=1, le=255)
     rate_hz: int = 200
     cutoff_hz: int = 0
-    filter_order: ask.RobotousFilterOrder = ask.RobotousFilterOrder.MANUALS
+    filter_order: wire.RobotousFilterOrder = wire.RobotousFilterOrder.MANUALS
     model: str = ""
     torque_divisor: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
 
@@ -210,13 +178,13 @@ class RobotousOptions(WrenchOptions):
     def _fits(self) -> RobotousOptions:
         if bool(self.port) == bool(self.interface and self.channel):
             raise ValueError("give either port (serial line), or interface and channel (CAN)")
-        ask.rate_request(self.rate_hz)
-        ask.filter_request(self.cutoff_hz or None, order=self.filter_order)
+        wire.rate_request(self.rate_hz)
+        wire.filter_request(self.cutoff_hz or None, order=self.filter_order)
         if self.model:
-            ask.scale_of(self.model, torque_divisor=self.torque_divisor)
+            wire.scale_of(self.model, torque_divisor=self.torque_divisor)
         if self.port:
-            ask.baud_request(self.baud)
-            highest = ask.HIGHEST_RATE_HZ[self.baud]
+            wire.baud_request(self.baud)
+            highest = wire.HIGHEST_RATE_HZ[self.baud]
             if self.rate_hz > highest:
                 raise ValueError(f"rate_hz {self.rate_hz} is above {highest} for {self.baud} bit/s")
         else:
@@ -224,7 +192,7 @@ class RobotousOptions(WrenchOptions):
         return self
 
 
-def _line_of(options: RobotousOptions) -> RobotousLine:
+def _line_of(options: RobotousOptions) -> RobotousSerialLine | RobotousCanLine:
     if options.port:
         return RobotousSerialLine(options.port, options.baud)
     return RobotousCanLine(
@@ -248,7 +216,7 @@ class WrenchRobotous(WrenchDevice):
         self._options = options
         self._tells_time = False
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
-        self._scale = ask.RobotousScale(1.0, 1.0)
+        self._scale = wire.RobotousScale(1.0, 1.0)
         self._arrivals = ArrivalTimes(1.0 / options.rate_hz)
 
     def zero(self) -> None:
@@ -258,7 +226,7 @@ class WrenchRobotous(WrenchDevice):
         """
         before = self._mean()
         for _ in range(_ATTEMPTS):
-            self._line.send(ask.bias_request())
+            self._line.send(wire.bias_request())
             self._mean()  # some of these may have been on their way
             after = self._mean()
             pairs = zip(before, after, strict=True)
@@ -271,7 +239,7 @@ class WrenchRobotous(WrenchDevice):
 
     def _connect(self) -> str:
         self._line.open()
-        self._line.send(ask.stop_request())
+        self._line.send(wire.stop_request())
         until = time.monotonic() + _DRAIN_S
         with contextlib.suppress(DeviceTimeout):
             while time.monotonic() < until:
@@ -280,22 +248,22 @@ class WrenchRobotous(WrenchDevice):
         serial = self._text(RobotousCommand.SERIAL)
         self._scale = self._scale_of(reported)
         cutoff_hz = self._options.cutoff_hz or None
-        self._set(ask.filter_request(cutoff_hz, order=self._options.filter_order))
-        self._set(ask.rate_request(self._options.rate_hz))
-        self._answer(ask.start_request(), RobotousCommand.START)
+        self._set(wire.filter_request(cutoff_hz, order=self._options.filter_order))
+        self._set(wire.rate_request(self._options.rate_hz))
+        self._answer(wire.start_request(), RobotousCommand.START)
         self._arrivals.begin()
         return serial or self._line.name
 
-    def _scale_of(self, reported: str) -> ask.RobotousScale:
+    def _scale_of(self, reported: str) -> wire.RobotousScale:
         model, divisor = self._options.model or reported, self._options.torque_divisor
         try:
-            scale = ask.scale_of(model, torque_divisor=divisor)
+            scale = wire.scale_of(model, torque_divisor=divisor)
         except ValueError as error:
             raise DeviceError(
                 f"{self.info.model}: {error}", remedy="set model or torque_divisor (its manual)"
             ) from error
         with contextlib.suppress(ValueError):
-            if divisor is None and ask.scale_of(reported) != scale:
+            if divisor is None and wire.scale_of(reported) != scale:
                 raise DeviceError(
                     f"{self.info.model}: it says that it is a {reported}, not a {model}",
                     remedy="correct model, or set torque_divisor",
@@ -304,7 +272,7 @@ class WrenchRobotous(WrenchDevice):
 
     def _close(self) -> None:
         with contextlib.suppress(DeviceError):
-            self._line.send(ask.stop_request())
+            self._line.send(wire.stop_request())
         self._line.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -315,7 +283,7 @@ class WrenchRobotous(WrenchDevice):
         times_ns = self._arrivals.times_ns(len(samples), time.monotonic_ns())
         readings = []
         for arrival_ns, sample in zip(times_ns, samples, strict=True):
-            for axis in ask.overloaded_axes(sample.overload):
+            for axis in wire.overloaded_axes(sample.overload):
                 self._counts[f"status_overload_{axis.lower()}"] += 1
             wrench = self._scale.wrench(sample.counts)
             reading = self._reading(wrench, arrival_ns=arrival_ns, overload=sample.overload != 0)
@@ -324,7 +292,7 @@ class WrenchRobotous(WrenchDevice):
         return readings
 
     def _samples(self, timeout_s: float) -> list[RobotousData]:
-        records = [ask.decode(payload) for payload in self._line.read(timeout_s)]
+        records = [wire.decode(payload) for payload in self._line.read(timeout_s)]
         samples = [
             r for r in records if isinstance(r, RobotousData) and r.command == RobotousCommand.START
         ]
@@ -343,13 +311,13 @@ class WrenchRobotous(WrenchDevice):
         return [sum(axis) / len(samples) for axis in zip(*(s.counts for s in samples), strict=True)]
 
     def _text(self, command: RobotousCommand) -> str:
-        record = self._answer(ask.get_request(command), command)
-        return record.text if isinstance(record, ask.RobotousText) else ""
+        record = self._answer(wire.get_request(command), command)
+        return record.text if isinstance(record, wire.RobotousText) else ""
 
     def _set(self, request: bytes) -> None:
         record = self._answer(request, RobotousCommand(request[0]))
-        if not (isinstance(record, ask.RobotousResult) and record.ok):
-            why = ask.ERRORS.get(getattr(record, "error", 0), "no reason given")
+        if not (isinstance(record, wire.RobotousResult) and record.ok):
+            why = wire.ERRORS.get(getattr(record, "error", 0), "no reason given")
             raise DeviceError(
                 f"{self.info.model}: {_name(request)} was refused: {why}",
                 remedy="choose another rate or filter, or raise the sensor's baud",
@@ -364,14 +332,14 @@ class WrenchRobotous(WrenchDevice):
         patience_s = _ANSWER_S + 2.0 / self.info.rate_hz
         for attempt in range(_ATTEMPTS):
             if attempt:  # while it streams it ignores most requests
-                self._line.send(ask.stop_request())
+                self._line.send(wire.stop_request())
             self._line.send(request)
             until = time.monotonic() + patience_s
             with contextlib.suppress(DeviceTimeout):
                 while (left_s := until - time.monotonic()) > 0.0:
                     for payload in self._line.read(left_s):
                         if payload[0] == command:
-                            return ask.decode(payload)
+                            return wire.decode(payload)
         came = ", ".join(f"{count} {name}" for name, count in self._line.counters.items() if count)
         raise DeviceTimeout(
             f"{self.info.model}: {_name(request)} was not answered; it sent: {came or 'nothing'}",

@@ -100,47 +100,6 @@ def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: FingerQueue) -
     assert np.median(times) == pytest.approx(0.02, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("fault", "counter"),
-    [
-        ("parity", "parity_errors"),
-        ("parity", "bridge_parity_errors"),
-        ("error_word", "device_error_too_little_sampling_delay"),
-        ("error_word", "bridge_error_words"),
-        ("crc", "crc_errors"),
-        ("cut", "lost_packets"),
-        ("junk", "junk_bytes"),
-        ("lost", "lost_packets"),
-        ("lost", "missing_frames"),
-        ("repeated", "repeated_packets"),
-        ("saturated", "saturated_samples"),
-    ],
-)
-def test_a_fault_is_counted_and_nothing_wrong_comes_out(
-    emulate: Emulate, finger: FingerQueue, fault: str, counter: str
-) -> None:
-    emulator = emulate()
-    device = finger(emulator.address)
-    device.open()
-    # A STATUS has come by then: what the bridge counts is told from the first one on.
-    readings = read_frames(device, lambda got: len(got) > 15)
-    for _ in range(3):
-        wanted = device.counters[counter] + 1
-        emulator.inject(fault)
-        readings += read_frames(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
-    readings += read_frames(device, lambda got: got and got[-1].validity == ALL_VALID)
-    if fault != "saturated":
-        assert_right(readings, 0)
-
-
-def test_stuck_fingers_come_out_stuck(emulate: Emulate, finger: FingerQueue) -> None:
-    emulator = emulate()
-    device = finger(emulator.address)
-    device.open()
-    emulator.inject("stuck", 30.0)
-    read_frames(device, lambda got: got and len(set(got[-1].pac)) == 1)
-
-
 def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     emulator.inject("clock_drift", 30.0)

@@ -74,32 +74,6 @@ def test_an_empty_port_is_no_sensor_and_a_pulled_one_is_lost(emulate: Emulate, f
     assert_right(read_frames(there, lambda got: len(got) > 5), 0)
 
 
-@pytest.mark.parametrize(
-    ("fault", "counter"),
-    [
-        ("parity", "parity_errors"),
-        ("error_word", "device_error_too_little_sampling_delay"),
-        ("foreign", "bad_commands"),
-        ("short", "short_slots"),
-        ("lost", "lost_slots"),
-    ],
-)
-def test_a_fault_is_counted_and_nothing_wrong_comes_out(
-    emulate: Emulate, finger: Any, fault: str, counter: str
-) -> None:
-    emulator, device = emulate(), finger()
-    device.open()
-    readings = read_frames(device, lambda got: len(got) > 5)
-    before = device.counters[counter]
-    for times in (1, 2, 3):
-        emulator.inject(fault)
-        wanted = before + times
-        readings += read_frames(device, lambda _: device.counters[counter] >= wanted)  # noqa: B023
-    readings += read_frames(device, lambda got: got and got[-1].validity == ALL_VALID)
-    assert device.counters[counter] >= before + 3
-    assert_right(readings, 0)
-
-
 def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: Any) -> None:
     emulator, device = emulate(), finger()
     device.open()

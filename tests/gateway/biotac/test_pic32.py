@@ -74,29 +74,6 @@ def test_the_older_firmware() -> None:
         follower.device.close()
 
 
-@pytest.mark.parametrize(
-    ("fault", "counter"),
-    [
-        ("cut", "realigned"),
-        ("junk", "realigned"),
-        ("high_bits", "misaligned"),
-        ("lost", "lost_samples"),
-        ("repeated", "repeated_samples"),
-        ("end", "end_records"),
-    ],
-)
-def test_a_fault_is_counted_and_nothing_wrong_comes_out(
-    board: BiotacPic32Emulator, follower: Board, fault: str, counter: str
-) -> None:
-    follower.more()
-    for _ in range(3):
-        before = follower.counts()[counter]
-        board.inject(fault)
-        follower.until(lambda: follower.counts()[counter] > before)  # noqa: B023
-        follower.more(5)
-    follower.assert_right()
-
-
 @pytest.mark.parametrize("fault", ["restart", "unplug", "silence"])
 def test_a_board_that_is_gone_is_found_again(
     board: BiotacPic32Emulator, follower: Board, fault: str
@@ -150,12 +127,3 @@ def test_a_finger_that_was_pulled_is_told_and_not_delivered_as_zeros(
     follower.more()
     follower.assert_right()
     assert follower.counts()["absent"] > 10
-
-
-def test_saturated_channels_are_counted_and_delivered(
-    board: BiotacPic32Emulator, follower: Board
-) -> None:
-    follower.more()
-    board.inject("saturated", 60.0)
-    follower.until(lambda: follower.readings[-1].pac[0] == 4095)
-    assert follower.counts()["saturated_samples"] > 0

@@ -252,8 +252,3 @@ def test_a_clock_that_drifts(emulate: Emulate, ppm: float) -> None:
     told_s = (got[-1].time_us - got[0].time_us) * 1e-6
     assert told_s == pytest.approx(0.4, abs=1e-5)
     assert told_s / true_s == pytest.approx(1.0 + ppm * 1e-6, abs=2e-3)
-
-
-def test_only_its_own_faults() -> None:
-    with pytest.raises(ValueError, match="fault 'busoff' is none of absent, clock_drift, crc"):
-        BiotacBridgeEmulator().inject("busoff")

@@ -231,8 +231,3 @@ def test_a_clock_that_drifts(emulate: Emulate, ppm: float) -> None:
     line.write(b"r\n")
     ticks = [tick(record(line)) for _ in range(6)]
     assert ticks[5] - ticks[0] == pytest.approx(5 * 400_000 * (1.0 + ppm * 1e-6), abs=5)
-
-
-def test_only_its_own_faults() -> None:
-    with pytest.raises(ValueError, match="fault 'parity' is none of absent, clock_drift, cut"):
-        BiotacPic32Emulator().inject("parity")

@@ -158,23 +158,6 @@ def test_unplugging_takes_the_line_away_and_gives_it_back(
         assert ask(again, request(16)) == answer(16, 0)
 
 
-@pytest.mark.parametrize("fault", ["crc", "cut", "junk", "lost", "repeated", "silence"])
-def test_faults_spoil_the_stream_and_pass(
-    line: Any, sensor: RobotousSerialEmulator, fault: str
-) -> None:
-    line.write(START)
-    assert line.read(19) == DATA
-    sensor.inject(fault)
-    got = line.read(19 * 20)
-    got = got[got.rindex(DATA[:17]) - 5 * 19 :]
-    assert got[: 5 * 19] == DATA * 5
-
-
-def test_unknown_faults_are_refused(sensor: RobotousSerialEmulator) -> None:
-    with pytest.raises(ValueError, match="nan"):
-        sensor.inject("nan")
-
-
 @pytest.fixture
 def bus(request: pytest.FixtureRequest) -> Iterator[Any]:
     with can.Bus(interface="virtual", channel=request.node.name) as opened:

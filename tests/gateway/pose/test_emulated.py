@@ -86,29 +86,6 @@ def test_it_tells_where_the_tip_is() -> None:
     assert emulator.sent >= 100
 
 
-@pytest.mark.parametrize(
-    ("fault", "counter"),
-    [
-        ("lost", "lost_poses"),
-        ("repeated", "repeated_poses"),
-        ("late", "late_poses"),
-        ("nan", "rejected_non_finite"),
-        ("long", "rejected_quaternion"),
-        ("wrong_time", "wrong_times"),
-    ],
-)
-def test_a_fault_is_named_counted_and_over(fault: str, counter: str) -> None:
-    with bench() as (emulator, device):
-        emulator.inject(fault, 0.0 if fault in ("lost", "wrong_time") else 60.0)
-        seen = follow(device, lambda: device.counters.get(counter, 0) > 0)
-        emulator.end(fault)
-        before = device.counters["samples"]
-        seen += follow(device, lambda: device.counters["samples"] > before + 20)
-    assert all(on_the_path(reading) for reading in seen)
-    ticks = [reading.tick for reading in seen]
-    assert ticks == sorted(set(ticks))
-
-
 def test_a_restart_is_another_run() -> None:
     with bench() as (emulator, device):
         emulator.inject("restart", 0.1)

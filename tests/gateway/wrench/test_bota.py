@@ -154,17 +154,7 @@ def test_offsets_that_work_otherwise_are_found(monkeypatch: pytest.MonkeyPatch) 
         assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(LOAD[:3])
 
 
-FAULTS = [
-    ("crc", 0.1, "failed_checks lost_samples"),
-    ("cut", 0.1, "junk_bytes lost_samples"),
-    ("junk", 0.1, "junk_bytes"),
-    ("lost", 0.1, "lost_samples"),
-    ("repeated", 0.1, "repeated_samples"),
-    ("overload", 0.1, "overloads"),
-    ("late", 0.1, "status_app_took_too_long"),
-    ("error", 0.1, "status_invalid invalid_samples"),
-    ("raw", 0.1, "status_raw invalid_samples"),
-    ("nan", 0.1, "not_finite"),
+AWAY = [
     ("silence", 0.1, "lost_samples"),
     ("silence", 0.45, "error: no sample came for 0.3 s"),
     ("restart", 0.0, "error: it has restarted: it wrote its boot text"),
@@ -173,8 +163,8 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("fault", "duration_s", "shown"), FAULTS)
-def test_faults_are_found_named_and_survived(
+@pytest.mark.parametrize(("fault", "duration_s", "shown"), AWAY)
+def test_a_sensor_that_is_away_is_found_again(
     sensor: BotaEmulator,
     follower: Follower[WrenchReading],
     fault: str,
@@ -190,9 +180,6 @@ def test_faults_are_found_named_and_survived(
     follower.until(lambda: not sensor.faulty(fault))
     follower.more(40)
     assert all(map(is_of_sweep, follower.readings))
-    flagged = sum(reading.overload for reading in follower.readings)
-    assert (flagged > 0) == (fault == "overload")
-    assert flagged == follower.counts()["overloads"]
     assert sensor.settings.sinc == 64
 
 
@@ -225,7 +212,7 @@ def test_a_clock_that_begins_anew_without_a_word_is_a_restart(
 ) -> None:
     follower.more()
     sensor._clock_us = 10_000.0
-    follower.until(lambda: any("its clock began anew" in str(e) for e in follower.errors))
+    follower.until(lambda: any("its clock started again" in str(e) for e in follower.errors))
     follower.more()
     assert all(map(is_of_sweep, follower.readings))
     assert follower.counts()["restarts"] == 1

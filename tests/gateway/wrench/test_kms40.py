@@ -121,30 +121,6 @@ def test_it_stops_the_stream_when_it_leaves_and_finds_an_old_one(emulator: Kms40
         assert not device.counters["junk_bytes"]
 
 
-@pytest.mark.parametrize(
-    ("fault", "counters"),
-    [
-        ("cut", {"malformed_lines", "wrong_counts", "bad_numbers"}),
-        ("nan", {"bad_numbers"}),
-        ("junk", {"non_ascii_lines", "malformed_lines", "unknown_lines"}),
-    ],
-)
-def test_bad_lines_are_counted_and_passed_over(
-    emulator: Kms40Emulator, device: WrenchKms40, fault: str, counters: set[str]
-) -> None:
-    fakes.take(device, 5)
-
-    def seen() -> int:
-        return sum(device.counters[name] for name in counters)
-
-    for _ in range(5):
-        before = seen()
-        emulator.inject(fault)
-        while seen() == before:
-            fakes.read_until(device, lambda readings: len(readings) > 0)
-    fakes.read_until(device, lambda readings: len(readings) >= 50)
-
-
 def test_silence_is_a_timeout_and_ends(emulator: Kms40Emulator, device: WrenchKms40) -> None:
     fakes.take(device, 5)
     emulator.inject("silence", 100.0)
@@ -153,14 +129,6 @@ def test_silence_is_a_timeout_and_ends(emulator: Kms40Emulator, device: WrenchKm
         fakes.wait_for_timeout(device)
     fakes.end(emulator, "silence")
     fakes.read_until(device, lambda readings: len(readings) >= 50)
-
-
-def test_a_stream_that_ends_is_started_again(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    fakes.take(device, 5)
-    emulator.inject("stopped")
-    fakes.read_until(device, lambda _: device.counters.get("streams_restarted", 0) >= 1)
-    fakes.read_until(device, lambda readings: len(readings) >= 50)
-    assert emulator.streaming
 
 
 @pytest.mark.parametrize("fault", ["restart", "unplug"])
@@ -174,26 +142,6 @@ def test_a_lost_connection_is_found_and_opened_again(emulator: Kms40Emulator, fa
         open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
         assert emulator.divider == 2
-
-
-def test_overload_is_flagged_while_it_lasts(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    fakes.take(device, 5)
-    emulator.inject("overload", 100.0)
-    fakes.read_until(device, lambda readings: bool(readings) and readings[-1].overload)
-    fakes.end(emulator, "overload")
-    fakes.read_until(device, lambda readings: bool(readings) and not readings[-1].overload)
-    assert device.counters["overloads"] > 0
-    assert device.counters["status_over_range_fz"] >= 1
-
-
-def test_with_a_fault_nothing_is_published(emulator: Kms40Emulator, device: WrenchKms40) -> None:
-    fakes.take(device, 5)
-    emulator.inject("error", 100.0)
-    fakes.read_until(device, lambda _: device.counters.get("invalid_samples", 0) > 0)
-    fakes.end(emulator, "error")
-    fakes.read_until(device, lambda readings: len(readings) >= 50)
-    assert device.counters["status_calibration_fault"] >= 1
-    assert device.counters["status_calibration_not_valid"] >= 1
 
 
 def test_with_a_fault_it_is_not_opened(emulator: Kms40Emulator) -> None:

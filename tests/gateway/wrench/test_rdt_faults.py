@@ -40,24 +40,6 @@ def running(
         yield emulator, device
 
 
-@pytest.mark.parametrize(
-    ("fault", "counter"),
-    [
-        ("cut", "bad_lengths"),
-        ("junk", "bad_lengths"),
-        ("lost", "lost_samples"),
-        ("repeated", "repeated_records"),
-        ("late", "late_records"),
-    ],
-)
-def test_bad_datagrams_are_counted_and_passed_over(fault: str, counter: str) -> None:
-    with running() as (emulator, device):
-        for count in range(1, 6):
-            emulator.inject(fault)
-            fakes.read_until(device, lambda _, least=count: device.counters[counter] >= least)
-        fakes.read_until(device, lambda readings: len(readings) >= 50)
-
-
 def test_a_start_that_is_not_heard_is_repeated() -> None:
     with RdtEmulator("hex", fakes.wave) as emulator:
         emulator.inject("deaf", 0.25)
@@ -99,50 +81,6 @@ def test_unplugged_it_is_found_and_opened_again() -> None:
         fakes.end(emulator, "unplug")
         open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
-
-
-@pytest.mark.parametrize(
-    ("product", "counter"),
-    [
-        ("ati_net_ft", "status_transducer_saturated_or_converter_fault"),
-        ("ati_axia", "status_force_or_torque_out_of_range"),
-        ("onrobot_hex", "status_overload_on_some_axis"),
-    ],
-)
-def test_overload_is_flagged_while_it_lasts(product: str, counter: str) -> None:
-    with running(product) as (emulator, device):
-        emulator.inject("overload", 100.0)
-        fakes.read_until(device, lambda readings: bool(readings) and readings[-1].overload)
-        fakes.end(emulator, "overload")
-        fakes.read_until(device, lambda readings: bool(readings) and not readings[-1].overload)
-        assert device.counters["overloads"] == device.counters[counter] > 0
-        assert not device.counters.get("invalid_samples")
-
-
-@pytest.mark.parametrize(
-    ("product", "counter"),
-    [
-        ("ati_net_ft", "status_analogue_board_fault"),
-        ("ati_axia", "status_broken_gage"),
-        ("onrobot_hex", "status_sensor_not_detected"),
-    ],
-)
-def test_with_an_error_nothing_is_published(product: str, counter: str) -> None:
-    with running(product) as (emulator, device):
-        emulator.inject("error", 100.0)
-        fakes.read_until(device, lambda _: device.counters.get("invalid_samples", 0) > 0)
-        fakes.end(emulator, "error")
-        fakes.read_until(device, lambda readings: len(readings) >= 50)
-        assert device.counters["invalid_samples"] == device.counters[counter]
-
-
-def test_a_latched_threshold_leaves_the_data_good() -> None:
-    with running() as (emulator, device):
-        emulator.inject("latched")
-        fakes.read_until(
-            device, lambda _: device.counters.get("status_monitor_condition_latched", 0) > 9
-        )
-        assert not device.counters.get("invalid_samples")
 
 
 def test_a_drifting_clock_is_followed() -> None:

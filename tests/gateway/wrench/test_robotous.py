@@ -150,46 +150,28 @@ def test_a_zero_that_is_not_taken_is_told(
         device.zero()
 
 
-FAULTS = [
-    ("crc", 0.1, "failed_checks"),
-    ("cut", 0.1, "junk_bytes lonely_first"),
-    ("junk", 0.1, "junk_bytes wrong_lengths"),
-    ("overload", 0.1, "status_overload_fx"),
-    ("lost", 0.1, ""),
-    ("repeated", 0.1, ""),
-    ("silence", 0.6, "no sample came for 0.3 s"),
-    ("restart", 0.1, "no sample came for 0.3 s"),
-    ("unplug", 0.2, "is gone"),
-]
+SILENT = "no sample came for 0.3 s"
 
 
-@pytest.mark.parametrize(("fault", "duration_s", "shown"), FAULTS)
-def test_faults_are_found_named_and_survived(
+@pytest.mark.parametrize(
+    ("fault", "duration_s", "error"),
+    [("silence", 0.6, SILENT), ("restart", 0.1, SILENT), ("unplug", 0.2, "is gone")],
+)
+def test_a_sensor_that_is_away_is_found_again(
     sensor: RobotousEmulator,
     follower: Follower[WrenchReading],
     fault: str,
     duration_s: float,
-    shown: str,
+    error: str,
 ) -> None:
-    if fault not in sensor.faults:
-        pytest.skip("this line has no such fault")
     if fault == "unplug" and isinstance(sensor, RobotousCanEmulator):
-        shown = "no sample came for 0.3 s"  # the bus stays; the plug has taken its supply
+        error = SILENT  # the bus stays; the plug has taken the sensor's supply
     follower.more()
     sensor.inject(fault, duration_s)
-    names = shown.split()
-    if not shown:
-        follower.more(40)
-    elif " " in shown and "_" not in shown:
-        follower.until(lambda: any(shown in str(error) for error in follower.errors))
-    else:
-        follower.until(lambda: any(follower.counts()[name] for name in names))
+    follower.until(lambda: any(error in str(one) for one in follower.errors))
     follower.until(lambda: not sensor.faulty(fault))
     follower.more(40)
     assert all(map(is_of_sweep, follower.readings))
-    flagged = sum(reading.overload for reading in follower.readings)
-    assert (flagged > 0) == (fault == "overload")
-    assert flagged == follower.counts()["overloads"]
 
 
 def test_a_restart_is_followed_by_the_same_settings(sensor: RobotousEmulator) -> None:
