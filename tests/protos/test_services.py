@@ -243,3 +243,17 @@ def test_a_robot_needs_five_lines(
     finally:
         stop.set()
         server.join()
+
+
+def test_only_the_first_call_of_a_sensor_waits(link: LinkConfig) -> None:
+    """A control loop that asks for a sensor that is not there must not stop at each call."""
+    with Client(link.connect[0], timeout_s=0.6) as robot:
+        waited_s = []
+        for sensor in ("thumb", "thumb", "thumb", "index"):
+            begin = time.monotonic()
+            with pytest.raises(StaleError, match="has ever arrived"):
+                robot.features(sensor)
+            waited_s.append(time.monotonic() - begin)
+    assert waited_s[0] >= 0.6
+    assert waited_s[1] + waited_s[2] < 0.6, "later calls wait no more"
+    assert waited_s[3] >= 0.6, "the first call of another sensor"
