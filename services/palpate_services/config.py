@@ -1,4 +1,4 @@
-"""Configuration of estimating services and of the recorder: one table of a profile each."""
+"""Configuration of the estimating services and of the recorder: one table of the profile each."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from palpate.config import Name, StrictConfig
 DEFAULT_BUNDLE = "features-virtual"
 
 
-class AnswererConfig(StrictConfig):
-    """What every service that answers messages with estimates is told.
+class EstimatingConfig(StrictConfig):
+    """What all estimating services have in common.
 
     Attributes:
         bundle: Name of a packaged bundle (newest version), ``name:version``, or the path of a
             bundle's folder.
         sensors: Sensors to serve; empty = every sensor of the station.
-        delivery: ``newest`` answers the newest message and counts what it skipped (live);
-            ``every`` answers each and slows the source down (lossless replay).
-        keep_newest: Messages per sensor that may wait with ``newest``: a service that was held up
-            for less than this many catches up without loss; ``max_age_s`` still holds.
+        delivery: ``newest`` takes the newest message and counts those it skipped (live);
+            ``every`` takes each and slows the source down (lossless replay).
+        keep_newest: Messages per sensor that may wait with ``newest``: a service that was delayed
+            by no more than these catches up without loss; ``max_age_s`` still applies.
         max_age_s: A live or simulated message older than this gets no estimate [s]; None = no
             limit.
-        accept_replayed: Whether replayed messages are answered; a live station says no.
-        drain_s: How long a stopping service still answers what has already come [s].
+        accept_replayed: Whether replayed messages get estimates; false on a live station.
+        drain_s: How long a stopping service still processes messages that have arrived [s].
     """
 
     bundle: str
@@ -38,28 +38,28 @@ class AnswererConfig(StrictConfig):
     drain_s: float = Field(default=2.0, ge=0, le=30)
 
 
-class ElectrodesConfig(AnswererConfig):
-    """What a service is told that starts from electrodes.
+class ElectrodesConfig(EstimatingConfig):
+    """What services that start from electrodes have in common.
 
     Attributes:
-        tare_timeout_s: How long one frame may wait for a tare that nobody has announced [s].
+        tare_timeout_s: How long one frame may wait for a tare that was not announced [s].
     """
 
     tare_timeout_s: float = Field(default=0.2, gt=0, le=10)
 
 
-class FeaturesConfig(ElectrodesConfig):
-    """How electrodes become features."""
+class FeaturesServiceConfig(ElectrodesConfig):
+    """The features service: electrodes to force and contact location."""
 
     bundle: str = DEFAULT_BUNDLE
 
 
-class FieldConfig(ElectrodesConfig):
-    """How electrodes become displacement fields.
+class FieldServiceConfig(ElectrodesConfig):
+    """The field service: electrodes to displacement fields.
 
     Attributes:
         rate_hz: Fields a second and sensor at most [Hz], by the clock of the frames: the first
-            frame of each period is answered; None = every frame.
+            frame of each period gets one; None = every frame.
     """
 
     bundle: str = "field-twin"
@@ -68,12 +68,12 @@ class FieldConfig(ElectrodesConfig):
     rate_hz: float | None = Field(default=20.0, gt=0, le=1000)
 
 
-class SynthesisConfig(AnswererConfig):
-    """How displacement fields become electrodes.
+class SynthesisServiceConfig(EstimatingConfig):
+    """The synthesis service: displacement fields to tared counts of the electrodes.
 
     Attributes:
-        source: ``truth`` takes fields that are known (``field_truth``), ``estimate`` those that
-            the field service estimates (``field``).
+        source: ``truth`` takes the known fields of a simulation (topic ``field_truth``),
+            ``estimate`` those of the field service (topic ``field``).
     """
 
     bundle: str = "synthesis-twin"
@@ -87,19 +87,19 @@ class RecorderConfig(StrictConfig):
 
     Attributes:
         out: Folder of the records; made if absent.
-        topics: Names of the topics to record; empty = every recorded topic of the contract.
+        topics: Names of the topics to record; empty = all that are recorded by default.
         sensor: One sensor to record, or ``*`` for all.
         delivery: ``queue`` drops (and counts) when the disk cannot follow (live); ``every`` slows
             the source down instead (lossless replay).
         capacity: Messages that may wait for the disk.
         rrd: Whether a Rerun view is written beside each record.
-        rrd_max_bytes: A view larger than this is closed, the record goes on [bytes].
+        rrd_max_bytes: A view that reaches this size is closed; the record goes on [bytes].
         bundles: Bundles, by name or folder, that hold the meshes of the fields to draw, beside the
             packaged ones.
         min_free_bytes: Recording pauses while the disk has less free than this [bytes].
         rotate_bytes: Start a new record at this size [bytes]; None = never.
         rotate_s: Start a new record after this time [s]; None = never.
-        drain_s: How long a stopping recorder still writes what has already come [s].
+        drain_s: How long a stopping recorder still writes messages that have arrived [s].
     """
 
     out: Path = Path("runs")

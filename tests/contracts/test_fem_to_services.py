@@ -16,7 +16,7 @@ from palpate_deploy.cli.options import PalpateGroup
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter, export
-from palpate_services.viewer.simulation_file import DrawnSimulations
+from palpate_services.viewer.simulation import DrawnSimulations
 
 NAMES = ["sphere_medium/00/angled", "sphere_medium/00/normal"]
 

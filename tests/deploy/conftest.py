@@ -165,7 +165,7 @@ def _process_ids(folder: Path) -> dict[str, int]:
             continue
         if "run" in command:
             found[command[command.index("run") + 1]] = int(entry.name)
-        elif any("supervisor_main" in word for word in command):
+        elif any("station.supervisord" in word for word in command):
             found["supervisord"] = int(entry.name)
     return found
 

@@ -12,7 +12,7 @@ import pytest
 
 from palpate.errors import ConfigError
 from palpate.messages import COUNTS_MAX
-from palpate_deploy.bench.harness import Gate, bench_counts, read_rows, write_rows
+from palpate_deploy.bench.harness import SourceGate, bench_counts, read_rows, write_rows
 from palpate_deploy.bench.results import append_history, latency, rounds
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -62,7 +62,7 @@ def test_frames_of_the_benchmark_are_valid_counts() -> None:
 
 
 def test_gate_is_seen_by_another_mapping(tmp_path: Path) -> None:
-    first, second = (Gate(tmp_path / "gate", 1) for _ in range(2))
+    first, second = (SourceGate(tmp_path / "gate", 1) for _ in range(2))
     assert not second.is_open
     first.set(True)
     assert second.is_open

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.messages import ServiceState, Status
-from palpate_deploy.bench.hand import HandResult, Used, account
+from palpate_deploy.bench.hand import GatewayUse, HandResult, account
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -42,7 +42,7 @@ def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandR
         for count in (5, 3)
     ]
     return account(
-        client, floor, 0, 10**9, Used(0.4, 0.5, 0, 0.0), {"finger0.lost_slots": 1}, looks
+        client, floor, 0, 10**9, GatewayUse(0.4, 0.5, 0, 0.0), {"finger0.lost_slots": 1}, looks
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -243,7 +244,10 @@ def test_json_logs(tmp_path: Path) -> None:
     )
     assert process.stderr is not None
     first = json.loads(process.stderr.readline())
+    assert list(first) == ["time", "level", "logger", "message"]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", first["time"])
     assert first["level"] == "info"
+    assert first["logger"] == "palpate_deploy.station.processes"
     assert "router starts" in first["message"]
     process.send_signal(signal.SIGTERM)
     _, rest = process.communicate(timeout=20)

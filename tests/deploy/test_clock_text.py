@@ -46,10 +46,10 @@ def test_every_sensor_and_the_wall_clock_have_a_line() -> None:
     )
     assert lines == [
         "clock of a: followed, 42 ppm slow, frames arrive 10.4 ms after their stamps",
-        "clock of b: it tells none; stamps are the time of arrival",
-        "clock of c: followed, 5000 ppm fast, no quartz is that wrong: check the configured rate",
+        "clock of b: the device sends none; stamps are times of arrival",
+        "clock of c: followed, 5000 ppm fast, too much for a quartz: check the configured rate",
         "clock of d: quality 17",
-        "wall clock: kept right, to 3.2 ms by the kernel's account",
+        "wall clock: synchronised to 3.2 ms, by the kernel's estimate",
         "wall clock: it was set 2 times since the start of gateway",
     ]
 
@@ -62,7 +62,7 @@ def test_one_sensor_has_no_prefix_and_a_service_no_clock() -> None:
 
 def test_nobody_is_told_more_than_is_known() -> None:
     assert "not known" in wall_words(None)
-    assert "nothing keeps it right" in wall_words(WallDiscipline(False, 16.0))
+    assert "not synchronised" in wall_words(WallDiscipline(False, 16.0))
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def test_it_runs_and_ends(link: LinkConfig, tmp_path: Path) -> None:
     )
     process = subprocess.Popen(
         [sys.executable, "-m", "palpate_deploy", "run", "fem", "--profile", str(path)],
-        env={**os.environ, "PYTHONPATH": str(FAKES)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(FAKES), *sys.path])},
         stderr=subprocess.PIPE,
         text=True,
     )

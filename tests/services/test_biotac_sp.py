@@ -22,11 +22,11 @@ from palpate.files.bundle import read_bundle
 from palpate.files.record import read_record
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, SensorType, ServiceState, Tare
-from palpate_services.config import FeaturesConfig, FieldConfig, RecorderConfig
-from palpate_services.inference.estimates import Refusal, estimate, estimate_field
+from palpate_services.config import FeaturesServiceConfig, FieldServiceConfig, RecorderConfig
+from palpate_services.inference.estimates import EstimateRefusal, estimate, estimate_field
 from palpate_services.inference.model import load
 from palpate_services.inference.services import run_features, run_field
-from palpate_services.recorder.writer import RecordKeeper
+from palpate_services.recorder.writer import RecordFiles
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -66,9 +66,9 @@ def test_no_estimate_from_an_sp(
     runtime = load(read_bundle(folder), task)
     ask: Any = estimate if task == "features" else estimate_field
     frame, tare = make_frame(sensor_type=SP), make_tare(sensor_type=SP)
-    assert ask(frame, tare, runtime) is Refusal.WRONG_SENSOR
+    assert ask(frame, tare, runtime) is EstimateRefusal.WRONG_SENSOR
     # After a finger was exchanged: the frame is right, its tare is the other finger's.
-    assert ask(make_frame(), tare, runtime) is Refusal.UNTARED
+    assert ask(make_frame(), tare, runtime) is EstimateRefusal.UNTARED
 
 
 def test_a_bundle_that_claims_an_sp_is_refused(make_bundle: Callable[..., Path]) -> None:
@@ -83,7 +83,7 @@ def test_features_service_names_the_sensor_and_serves_the_others(
     make_tare: Tares,
     until: Until,
 ) -> None:
-    config = FeaturesConfig(bundle=str(make_bundle()), max_age_s=10.0)
+    config = FeaturesServiceConfig(bundle=str(make_bundle()), max_age_s=10.0)
     with running(run_features, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         session = robot.session
@@ -114,7 +114,7 @@ def test_features_service_names_the_sensor_and_serves_the_others(
 def test_field_service_answers_by_an_error(
     link: LinkConfig, make_frame: Frames, make_tare: Tares, until: Until, tmp_path: Path
 ) -> None:
-    config = FieldConfig(bundle=str(bundles.write(tmp_path / "f", "field")))
+    config = FieldServiceConfig(bundle=str(bundles.write(tmp_path / "f", "field")))
     with running(run_field, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         announce(robot.session, "thumb", make_tare(sensor_type=SP))
@@ -151,7 +151,7 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
         ]
 
     health = Health("recorder", "recorder")
-    keeper = RecordKeeper(RecorderConfig(out=tmp_path, min_free_bytes=0), "lab", health)
+    keeper = RecordFiles(RecorderConfig(out=tmp_path, min_free_bytes=0), "lab", health)
     keeper.start()
     came = samples("thumb", frames(SP, 1))
     came += samples("finger", frames(SensorType.BIOTAC, 1) + frames(SP, 41))
@@ -174,13 +174,13 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
 
 
 def test_a_lost_pac_sample_is_a_gap_in_the_picture(make_frame: Frames) -> None:
-    from palpate_services.viewer.timeline import SensorScene
+    from palpate_services.viewer.timeline import SensorTimeline
 
     layout = SP.layout
     frame = make_frame(sensor_type=SP)
     lost = layout.first_pac_bit + 5
     frame = replace(frame, validity=frame.validity & ~(1 << lost))
-    scene = SensorScene()
+    scene = SensorTimeline()
     scene.add(frame)
     (row,) = scene.take().pressure
     assert np.flatnonzero(np.isnan(row.values)).tolist() == [1 + 5]

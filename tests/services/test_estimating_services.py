@@ -18,7 +18,11 @@ from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
 from palpate.files.bundle import read_bundle
 from palpate.messages import ElectrodeFrame, Origin, ServiceRequest, Status, Tare
-from palpate_services.config import FeaturesConfig, FieldConfig, SynthesisConfig
+from palpate_services.config import (
+    FeaturesServiceConfig,
+    FieldServiceConfig,
+    SynthesisServiceConfig,
+)
 from palpate_services.inference.estimates import estimate, estimate_field, synthesise
 from palpate_services.inference.model import Runtime, load
 from palpate_services.inference.services import run_features, run_field, run_synthesis
@@ -66,19 +70,19 @@ def _synthesise(message: Any, _: Tare, runtime: Runtime) -> Any:
 
 CASES = {
     "features": Case(
-        "features", run_features, FeaturesConfig, ELECTRODES, FEATURES, _electrodes, estimate,
-        "frames_received",
+        "features", run_features, FeaturesServiceConfig, ELECTRODES, FEATURES, _electrodes,
+        estimate, "frames_received",
     ),
     "field": Case(
-        "field", run_field, FieldConfig, ELECTRODES, FIELD, _electrodes, estimate_field,
+        "field", run_field, FieldServiceConfig, ELECTRODES, FIELD, _electrodes, estimate_field,
         "frames_received",
     ),
     "synthesis of truth": Case(
-        "synthesis", run_synthesis, SynthesisConfig, FIELD_TRUTH, SYNTHESIS, _known, _synthesise,
-        "fields_received", "truth",
+        "synthesis", run_synthesis, SynthesisServiceConfig, FIELD_TRUTH, SYNTHESIS, _known,
+        _synthesise, "fields_received", "truth",
     ),
     "synthesis of estimates": Case(
-        "synthesis", run_synthesis, SynthesisConfig, FIELD, SYNTHESIS, _guessed, _synthesise,
+        "synthesis", run_synthesis, SynthesisServiceConfig, FIELD, SYNTHESIS, _guessed, _synthesise,
         "fields_received", "estimate",
     ),
 }  # fmt: skip

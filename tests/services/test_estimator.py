@@ -11,7 +11,7 @@ import pytest
 from palpate.codec import FEATURE_ESTIMATE
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.messages import ElectrodeFrame, FeatureEstimate, SensorType, Tare
-from palpate_services.inference.estimates import Refusal, estimate, tared_counts
+from palpate_services.inference.estimates import EstimateRefusal, estimate, tared_counts
 from palpate_services.inference.model import Runtime, load
 
 Frames = Callable[..., ElectrodeFrame]
@@ -80,8 +80,8 @@ def test_no_contact_no_location(
 def test_frame_without_its_tare(
     runtime: Runtime, make_frame: Frames, make_tare: Callable[..., Tare], tare_id: int
 ) -> None:
-    assert estimate(make_frame(tare_id=tare_id), make_tare(5), runtime) is Refusal.UNTARED
-    assert estimate(make_frame(), None, runtime) is Refusal.UNTARED
+    assert estimate(make_frame(tare_id=tare_id), make_tare(5), runtime) is EstimateRefusal.UNTARED
+    assert estimate(make_frame(), None, runtime) is EstimateRefusal.UNTARED
 
 
 def test_one_bad_electrode_is_enough(
@@ -90,7 +90,7 @@ def test_one_bad_electrode_is_enough(
     good = make_frame().validity
     bad_electrode = make_frame(validity=good & ~(1 << 7))
     bad_pac = make_frame(validity=good & ~(1 << 30))
-    assert estimate(bad_electrode, make_tare(), runtime) is Refusal.INVALID_CHANNELS
+    assert estimate(bad_electrode, make_tare(), runtime) is EstimateRefusal.INVALID_CHANNELS
     assert isinstance(estimate(bad_pac, make_tare(), runtime), FeatureEstimate)
 
 
@@ -98,7 +98,7 @@ def test_another_type_of_sensor(
     runtime: Runtime, make_frame: Frames, make_tare: Callable[..., Tare]
 ) -> None:
     frame = make_frame(sensor_type=SensorType.BIOTAC_SP)
-    assert estimate(frame, make_tare(), runtime) is Refusal.WRONG_SENSOR
+    assert estimate(frame, make_tare(), runtime) is EstimateRefusal.WRONG_SENSOR
 
 
 def test_answer_that_is_not_finite(
@@ -106,4 +106,4 @@ def test_answer_that_is_not_finite(
 ) -> None:
     tare = make_tare()
     tare.electrodes[3] = np.inf  # the codec refuses such a tare; the estimator does not rely on it
-    assert estimate(make_frame(), tare, runtime) is Refusal.NON_FINITE
+    assert estimate(make_frame(), tare, runtime) is EstimateRefusal.NON_FINITE

@@ -30,7 +30,7 @@ from palpate.messages import (
     Tare,
     TareRequest,
 )
-from palpate_services.config import FeaturesConfig
+from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference.estimates import estimate
 from palpate_services.inference.model import Runtime
 from palpate_services.inference.services import run_features
@@ -48,7 +48,7 @@ def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> S
     @contextmanager
     def running(**config: Any) -> Iterator[Session]:
         stop = threading.Event()
-        settings = FeaturesConfig(bundle=str(make_bundle()), **config)
+        settings = FeaturesServiceConfig(bundle=str(make_bundle()), **config)
         node = threading.Thread(target=run_features, args=(settings, link, "lab", stop))
         node.start()
         try:
@@ -96,6 +96,22 @@ def test_answers_frames_and_says_what_it_is(
         until(lambda: ask_status(session).gauges.get("latency_p50_s", 0.0) > 0)
         metadata = session.query(endpoints.MODEL, ServiceRequest(), service="features")
         assert metadata.bundle_sha256 == got.message.bundle_sha256
+
+
+def test_latency_counts_from_the_reading_and_of_a_replay_from_the_arrival(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    with serve(max_age_s=10.0, accept_replayed=True) as session:
+        announce(session, "finger", make_tare())
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        for origin, least_s, most_s in ((Origin.SIMULATED, 3.0, 9.0), (Origin.REPLAYED, 0.0, 2.9)):
+            frames.put(make_frame(1 + int(origin), age_s=3.0, origin=origin))
+            # The gauges are those of the last period in which there were estimates.
+            until(
+                lambda least_s=least_s, most_s=most_s: (  # type: ignore[misc]
+                    least_s < ask_status(session).gauges.get("latency_p50_s", -1.0) < most_s
+                )
+            )
 
 
 def test_refuses_what_it_must_and_counts_it(
@@ -245,4 +261,6 @@ def test_ready_token_goes_when_it_stops(serve: Serve, link: LinkConfig, until: U
 
 def test_unknown_bundle_lists_what_there_is() -> None:
     with pytest.raises(ConfigError, match="bundle 'no-such'"):
-        run_features(FeaturesConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event())
+        run_features(
+            FeaturesServiceConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event()
+        )

@@ -21,7 +21,12 @@ from palpate.messages import (
     SynthesisEstimate,
     Tare,
 )
-from palpate_services.inference.estimates import Refusal, estimate_field, synthesise, tared_counts
+from palpate_services.inference.estimates import (
+    EstimateRefusal,
+    estimate_field,
+    synthesise,
+    tared_counts,
+)
 from palpate_services.inference.model import Runtime, load
 
 bundles: Any = importlib.import_module("field_bundles")
@@ -114,13 +119,13 @@ def test_frames_that_get_no_field(
     def refusal(frame: ElectrodeFrame, of: Tare | None = tare) -> object:
         return estimate_field(frame, of, field_runtime)
 
-    assert refusal(make_frame(), None) is Refusal.UNTARED
-    assert refusal(make_frame(tare_id=0)) is Refusal.UNTARED
-    assert refusal(make_frame(tare_id=6)) is Refusal.UNTARED
-    assert refusal(make_frame(validity=good ^ 4)) is Refusal.INVALID_CHANNELS
-    assert refusal(make_frame(sensor_type=SensorType.BIOTAC_SP)) is Refusal.WRONG_SENSOR
+    assert refusal(make_frame(), None) is EstimateRefusal.UNTARED
+    assert refusal(make_frame(tare_id=0)) is EstimateRefusal.UNTARED
+    assert refusal(make_frame(tare_id=6)) is EstimateRefusal.UNTARED
+    assert refusal(make_frame(validity=good ^ 4)) is EstimateRefusal.INVALID_CHANNELS
+    assert refusal(make_frame(sensor_type=SensorType.BIOTAC_SP)) is EstimateRefusal.WRONG_SENSOR
     tare.electrodes[3] = np.inf
-    assert refusal(make_frame()) is Refusal.NON_FINITE
+    assert refusal(make_frame()) is EstimateRefusal.NON_FINITE
 
 
 def test_negative_deviation_among_many_values_is_no_answer(
@@ -128,7 +133,7 @@ def test_negative_deviation_among_many_values_is_no_answer(
 ) -> None:
     folder = bundles.write(tmp_path / "field", "field", signed=True)
     runtime = load(read_bundle(folder), "field")
-    assert estimate_field(make_frame(60), make_tare(), runtime) is Refusal.NON_FINITE
+    assert estimate_field(make_frame(60), make_tare(), runtime) is EstimateRefusal.NON_FINITE
 
 
 def test_fields_that_get_no_counts(synthesis_runtime: Runtime, make_frame: Frames) -> None:
@@ -137,9 +142,9 @@ def test_fields_that_get_no_counts(synthesis_runtime: Runtime, make_frame: Frame
     short = dataclasses.replace(field, displacement=field.displacement[:-1])
     broken = dataclasses.replace(field, displacement=field.displacement.copy())
     broken.displacement[7, 1] = np.nan
-    assert synthesise(other, synthesis_runtime) is Refusal.WRONG_MESH
-    assert synthesise(short, synthesis_runtime) is Refusal.WRONG_MESH
-    assert synthesise(broken, synthesis_runtime) is Refusal.NON_FINITE
+    assert synthesise(other, synthesis_runtime) is EstimateRefusal.WRONG_MESH
+    assert synthesise(short, synthesis_runtime) is EstimateRefusal.WRONG_MESH
+    assert synthesise(broken, synthesis_runtime) is EstimateRefusal.NON_FINITE
 
 
 def test_a_model_wider_than_its_mesh_is_not_served(tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, LinkError, RemoteError
 from palpate.files.bundle import read_bundle
 from palpate.messages import ElectrodeFrame, Origin, Tare
-from palpate_services.config import FieldConfig, SynthesisConfig
+from palpate_services.config import FieldServiceConfig, SynthesisServiceConfig
 from palpate_services.inference.estimates import estimate_field
-from palpate_services.inference.loop import Pace
+from palpate_services.inference.loop import RateLimit
 from palpate_services.inference.model import load
 from palpate_services.inference.services import run_field, run_synthesis
 
@@ -36,8 +36,8 @@ def station(link: LinkConfig, tmp_path: Path, until: Until) -> Iterator[Client]:
     """Field and synthesis services; the synthesis takes what the field service estimates."""
     stop = threading.Event()
     replay: dict[str, Any] = {"delivery": "every", "accept_replayed": True}
-    fields = FieldConfig(bundle=str(bundles.write(tmp_path / "f", "field")), **replay)
-    counts = SynthesisConfig(
+    fields = FieldServiceConfig(bundle=str(bundles.write(tmp_path / "f", "field")), **replay)
+    counts = SynthesisServiceConfig(
         bundle=str(bundles.write(tmp_path / "s", "synthesis")), source="estimate", **replay
     )
     nodes = [
@@ -89,15 +89,15 @@ def test_fields_come_at_their_rate_by_the_clock_of_the_frames_and_become_electro
 def test_pace_is_each_sensors_own_and_takes_no_turn_for_a_refused_frame(
     make_frame: Frames,
 ) -> None:
-    pace = Pace(20.0)
+    pace = RateLimit(20.0)
     first, second = (make_frame(monotonic_ns=ns).stamp for ns in (0, 49_999_999))
-    assert not pace.early("finger", first)
-    assert not pace.early("finger", second)
-    pace.passed("finger", first)
-    assert pace.early("finger", second)
-    assert not pace.early("thumb", second)
-    assert not pace.early("finger", make_frame(monotonic_ns=50_000_000).stamp)
-    assert not Pace(None).early("finger", first)
+    assert not pace.reached("finger", first)
+    assert not pace.reached("finger", second)
+    pace.note("finger", first)
+    assert pace.reached("finger", second)
+    assert not pace.reached("thumb", second)
+    assert not pace.reached("finger", make_frame(monotonic_ns=50_000_000).stamp)
+    assert not RateLimit(None).reached("finger", first)
 
 
 def test_untared_and_unknown_tares_are_counted(
@@ -163,7 +163,7 @@ def test_questions_without_an_answer_say_why(
         with pytest.raises(RemoteError, match=word) as caught:
             station.estimate_field("finger", frame)
         assert caught.value.code is code
-    with pytest.raises(RemoteError, match="nobody knows the tare") as caught:
+    with pytest.raises(RemoteError, match="no gateway knows the tare") as caught:
         station.estimate_field("thumb", make_frame())
     assert caught.value.code is ErrorCode.NOT_FOUND
     stamp = make_frame().stamp

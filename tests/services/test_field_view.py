@@ -21,7 +21,7 @@ from palpate.messages import ElectrodeFrame, Stamp, SynthesisEstimate, Tare
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.recorder.service import run_recorder
-from palpate_services.viewer.timeline import FieldThinner, SensorScene
+from palpate_services.viewer.timeline import FieldThinner, SensorTimeline
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -65,7 +65,7 @@ def test_a_field_that_looks_the_same_is_not_drawn_again(make_frame: Frames) -> N
 
 
 def test_scene_keeps_truth_estimate_and_synthesis_apart(make_frame: Frames) -> None:
-    scene, stamp = SensorScene(), stamp_at(make_frame().stamp, 0.0)
+    scene, stamp = SensorTimeline(), stamp_at(make_frame().stamp, 0.0)
     assert not scene.has_fields
     scene.add(bundles.truth(stamp, 1e-3))
     scene.add(bundles.guess(stamp, 2e-3))
@@ -76,7 +76,7 @@ def test_scene_keeps_truth_estimate_and_synthesis_apart(make_frame: Frames) -> N
         (row,) = rows.fields[name]
         np.testing.assert_array_equal(row.displacement, bundles.pressed(depth_m))
     assert [row.values[18] for row in rows.synthesised] == [18.0]
-    assert {"field", "field_truth", "synthesis"} <= SensorScene.TOPICS
+    assert {"field", "field_truth", "synthesis"} <= SensorTimeline.TOPICS
 
 
 def test_library_knows_packaged_meshes_and_those_it_is_told_of(tmp_path: Path) -> None:
@@ -193,11 +193,11 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
     make_frame: Frames, tmp_path: Path
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.viewer.rerun import View
+    from palpate_services.viewer.rerun import RerunView
 
     meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
     field = bundles.truth(stamp_at(make_frame().stamp, 0.0))
-    with View(tmp_path / "view.rrd", title="view", meshes=meshes) as view:
+    with RerunView(tmp_path / "view.rrd", title="view", meshes=meshes) as view:
         view.add("finger", dataclasses.replace(field, displacement=field.displacement[:-1]))
         view.flush()
         assert dict(view.counters) == {"view_wrong_mesh": 1}

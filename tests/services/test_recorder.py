@@ -29,7 +29,7 @@ from palpate.messages import (
     Status,
     Tare,
 )
-from palpate_services.config import FeaturesConfig, RecorderConfig
+from palpate_services.config import FeaturesServiceConfig, RecorderConfig
 from palpate_services.inference.services import run_features
 from palpate_services.recorder.service import run_recorder
 from palpate_services.recorder.writer import leftovers, recover_all
@@ -47,7 +47,7 @@ def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) ->
     @contextmanager
     def running(*, lossless: bool = False, **config: Any) -> Iterator[Session]:
         stops = {"features": threading.Event(), "recorder": threading.Event()}
-        serve = FeaturesConfig(
+        serve = FeaturesServiceConfig(
             bundle=bundle,
             delivery="every" if lossless else "newest",
             accept_replayed=lossless,

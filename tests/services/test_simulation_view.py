@@ -12,9 +12,8 @@ import pytest
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import SENSOR_FRAME
 from palpate.files.simulation_store import choose_trajectories, is_simulation_store
-from palpate_services.viewer.layout import border_of, normals_of, shades
-from palpate_services.viewer.simulation import LONGEST_ARROW_M, review_simulations
-from palpate_services.viewer.simulation_file import DrawnSimulations
+from palpate_services.viewer.simulation import LONGEST_ARROW_M, DrawnSimulations, review_simulations
+from palpate_services.viewer.surfaces import border_of, normals_of, shades
 
 h5py = pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 

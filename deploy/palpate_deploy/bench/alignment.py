@@ -1,14 +1,13 @@
-"""``palpate bench alignment``: how far off stamps are, and electrodes, wrenches and poses apart.
+"""``palpate bench alignment``: errors of stamps, and of streams aligned by them.
 
-Emulators in processes of their own and a robot's program show one signal whose time is known by the
-host's monotonic clock: a BioTac on a CAN bus, a KMS 40 (TCP), an ATI Net F/T (UDP), a Bota (serial
-line) and poses over the bus. They go the whole way: driver, pipeline, bus, client. What a client
-then holds is compared with the truth.
+Emulators in processes of their own and a robot's program send one signal, whose time is known by
+the host's monotonic clock: a BioTac on a CAN bus, a KMS 40 (TCP), an ATI Net F/T (UDP), a Bota
+(serial line), and poses over the bus. Readings pass driver, pipeline and bus; the client compares
+them with the truth.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import time
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from palpate.alignment import AlignmentClock, electrode_instants, linear, times_of
@@ -39,10 +38,10 @@ from palpate_deploy.bench.alignment_parts import (
     OnTime,
     time_of,
 )
-from palpate_deploy.bench.results import append_history, machine
+from palpate_deploy.bench.results import finish, machine, progress_bar
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
 from palpate_deploy.station.host import write_profile
-from palpate_deploy.station.processes import Children, command_line
+from palpate_deploy.station.processes import FiniteRun, command_line
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
 
@@ -52,15 +51,15 @@ Wrenches = dict[str, list[WrenchFrame]]
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """Of many errors [s]: their median, and of their sizes 95 and 99 % and the largest.
+class ErrorSpread:
+    """Distribution of errors.
 
     Attributes:
-        count: How many readings.
-        median_s: Signed: late is positive.
-        p95_s: Of the sizes.
-        p99_s: Of the sizes.
-        max_s: Of the sizes.
+        count: Number of readings.
+        median_s: Median, late is positive [s].
+        p95_s: 95th percentile of the magnitudes [s].
+        p99_s: 99th percentile of the magnitudes [s].
+        max_s: Largest magnitude [s].
     """
 
     count: int
@@ -70,18 +69,20 @@ class Spread:
     max_s: float
 
 
-def spread(errors_s: Floats) -> Spread:
-    """Numbers of errors [s]; NaN is left out."""
+def spread(errors_s: Floats) -> ErrorSpread:
+    """Distribution of errors [s]; NaN is left out."""
     kept = errors_s[np.isfinite(errors_s)]
     if not len(kept):
-        return Spread(0, np.nan, np.nan, np.nan, np.nan)
+        return ErrorSpread(0, np.nan, np.nan, np.nan, np.nan)
     sizes = np.abs(kept)
     p95, p99 = np.percentile(sizes, (95, 99))
-    return Spread(len(kept), float(np.median(kept)), float(p95), float(p99), float(sizes.max()))
+    return ErrorSpread(
+        len(kept), float(np.median(kept)), float(p95), float(p99), float(sizes.max())
+    )
 
 
 def _off(share: Floats, stamp_ns: npt.NDArray[np.int64], counts: OnTime) -> Floats:
-    """Stamp less the time at which the value was there [s]; NaN at times that do not count."""
+    """Stamp minus the time of the value [s]; NaN at times that do not count."""
     stamp_s = _seconds(stamp_ns)
     return np.where(counts(stamp_s), stamp_s - time_of(share, stamp_s), np.nan)
 
@@ -91,7 +92,7 @@ def _seconds(time_ns: npt.NDArray[np.int64]) -> Floats:
 
 
 def _shares(frames: Sequence[ElectrodeFrame], *, pac: bool) -> Floats:
-    """What the electrodes, or the PAC samples, of frames show; NaN where a sample is invalid."""
+    """The signal in the electrodes, or PAC samples, of frames; NaN where a sample is invalid."""
     layout = frames[0].sensor_type.layout
     first, number = (layout.first_pac_bit, layout.pac_samples) if pac else (0, layout.electrodes)
     counts = np.array([frame.pac if pac else frame.electrodes for frame in frames], np.float64)
@@ -113,8 +114,8 @@ def stamp_errors(
     wrenches: Wrenches,
     poses: Sequence[IndenterPoseFrame],
     counts: OnTime,
-) -> dict[str, Spread]:
-    """How far each stream's stamps are from when their values were there."""
+) -> dict[str, ErrorSpread]:
+    """Errors of the stamps of each stream."""
     at_ns = electrode_instants(frames, AlignmentClock.MONOTONIC)
     shares = _shares(frames, pac=False)
     stamps_ns = times_of(frames, AlignmentClock.MONOTONIC)
@@ -139,11 +140,11 @@ def apart(
     wrenches: Wrenches,
     poses: Sequence[IndenterPoseFrame],
     counts: OnTime,
-) -> dict[str, Spread]:
-    """How far apart in time electrodes and other streams are that were aligned by their stamps.
+) -> dict[str, ErrorSpread]:
+    """Errors in time between the electrodes and other streams aligned by their stamps.
 
-    Every stream is brought to the instant of each electrode of each frame; what it shows there was
-    there sooner or later than what the electrode shows.
+    Every stream is interpolated at the instant of each electrode of each frame; the error is the
+    difference of the times that both values give.
     """
     at_ns = electrode_instants(frames, AlignmentClock.MONOTONIC)
     about_s = _seconds(at_ns)
@@ -202,8 +203,8 @@ time what the two show was there. The goal is 1 ms.
 def page_of(
     seconds: float,
     kept: float,
-    stamps: dict[str, Spread],
-    apart: dict[str, Spread],
+    stamps: dict[str, ErrorSpread],
+    apart: dict[str, ErrorSpread],
     gauges: dict[str, float],
     machine: dict[str, Any],
 ) -> str:
@@ -220,7 +221,7 @@ def page_of(
     )
 
 
-def _table(rows: dict[str, Spread]) -> str:
+def _table(rows: dict[str, ErrorSpread]) -> str:
     out = [
         "| | readings | median | 95 % | 99 % | largest |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
@@ -242,26 +243,26 @@ _IDENTITY = {"position_m": (0.0, 0.0, 0.0), "orientation_wxyz": (1.0, 0.0, 0.0, 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentResult:
-    """What was found.
+    """Errors of stamps and of the alignment.
 
     Attributes:
-        seconds: Length of the measurement [s].
-        kept: Share of it that counts: when the host left the emulators in time (``lateness``).
-        stamps: By stream, stamp less truth.
-        apart: By stream, how far it is from the electrodes once aligned by stamps.
-        gauges: What the gateway told of the clocks.
+        seconds: Duration of the measurement [s].
+        kept: Share of it that counts, in which no emulator was late.
+        stamps: By stream, stamp minus truth.
+        apart: By stream, its error relative to the electrodes once aligned by stamps.
+        gauges: The gateway's gauges of the clocks.
     """
 
     seconds: float
     kept: float
-    stamps: dict[str, Spread]
-    apart: dict[str, Spread]
+    stamps: dict[str, ErrorSpread]
+    apart: dict[str, ErrorSpread]
     gauges: dict[str, float]
 
 
 @dataclass(slots=True)
-class _Caught:
-    """Frames that came to the client."""
+class _Received:
+    """Frames that the client received."""
 
     frames: list[ElectrodeFrame] = field(default_factory=list)
     wrenches: dict[str, list[WrenchFrame]] = field(default_factory=dict)
@@ -280,34 +281,27 @@ class _Caught:
 def run_alignment(
     *, seconds: float, settle_seconds: float, page: Path | None, as_json: bool, save: bool
 ) -> None:
-    """Measure, print, and on request keep.
+    """Measure and print; append to the history on request.
 
     Args:
-        seconds: Length of the measurement [s].
-        settle_seconds: How long before it the clocks are followed [s].
+        seconds: Duration of the measurement [s].
+        settle_seconds: Time for the clocks to settle before it [s].
         page: Write a page of it.
         as_json: Print JSON.
         save: Append to the history.
     """
-    columns = (TextColumn("{task.description:32}"), BarColumn(), TimeElapsedColumn())
-    quiet = Console(stderr=True)
-    with Progress(*columns, console=quiet, disable=not sys.stderr.isatty()) as bar:
+    with progress_bar() as bar:
         result = measure_alignment(seconds, settle_seconds, bar)
     values = {
         "alignment": asdict(result),
         "alignment.goal_met": all(one.p95_s <= GOAL_S for one in result.apart.values()),
     }
-    if as_json:
-        print(json.dumps({**values, "machine": machine()}, indent=2))
-    else:
-        _print(result)
     if page is not None:
         text = page_of(
             result.seconds, result.kept, result.stamps, result.apart, result.gauges, machine()
         )
         page.write_text(text, encoding="utf-8")
-    if save:
-        append_history("alignment", values)
+    finish("alignment", values, lambda: _print(result), as_json=as_json, save=save)
 
 
 def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> AlignmentResult:
@@ -317,7 +311,7 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
         ProcessEnded: A process of the benchmark ended early.
         LinkError: They did not find one another in time, or a stream did not come.
     """
-    with Children("bench-alignment") as children:
+    with FiniteRun("bench-alignment") as children:
         sensors = _start_devices(children)
         profile = gateway_station(sensors)
         endpoint = profile.link.connect[0]
@@ -331,13 +325,13 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
         time.sleep(settle_seconds)
         bar.advance(task)
         names = [*_DEVICES, "robot", "gateway"]
-        caught, gauges = _catch(profile, seconds, children, names, bar)
+        received, gauges = _catch(profile, seconds, children, names, bar)
         for name in ("robot", *_DEVICES):
             children.stop_one(name)
         late = [Path(_late_file(children, name)) for name in ("robot", *_DEVICES)]
     on_time = OnTime.of(late)
-    begin_s, end_s = (1e-9 * caught.frames[at].stamp.monotonic_ns for at in (0, -1))
-    streams = caught.frames, caught.wrenches, caught.poses
+    begin_s, end_s = (1e-9 * received.frames[at].stamp.monotonic_ns for at in (0, -1))
+    streams = received.frames, received.wrenches, received.poses
     return AlignmentResult(
         seconds,
         float(on_time(np.linspace(begin_s, end_s, 10_000)).mean()),
@@ -347,12 +341,12 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
     )
 
 
-def _late_file(children: Children, name: str) -> str:
+def _late_file(children: FiniteRun, name: str) -> str:
     return str(children.folder / f"late-{name}.npy")
 
 
-def _start_devices(children: Children) -> list[dict[str, Any]]:
-    """Start the emulators; the gateway's sensors."""
+def _start_devices(children: FiniteRun) -> list[dict[str, Any]]:
+    """Start the emulators; returns the gateway's sensors."""
     can, tcp, udp, web = (free_port() for _ in range(4))
     line = children.folder / "bota"
     told = {
@@ -379,9 +373,9 @@ def _start_devices(children: Children) -> list[dict[str, Any]]:
 
 
 def _catch(
-    profile: Profile, seconds: float, children: Children, names: list[str], bar: Progress
-) -> tuple[_Caught, dict[str, float]]:
-    caught, stop = _Caught(), threading.Event()
+    profile: Profile, seconds: float, children: FiniteRun, names: list[str], bar: Progress
+) -> tuple[_Received, dict[str, float]]:
+    received, stop = _Received(), threading.Event()
     link = LinkConfig(connect=profile.link.connect, wait_for_router_s=_READY_S)
     with Session.open(link, station=profile.station) as session:
         streams = [
@@ -395,7 +389,7 @@ def _catch(
                     got = stream.next(timeout_s=0.1)
                 except StreamTimeout:
                     continue
-                caught.take(got.sensor, got.message)
+                received.take(got.sensor, got.message)
 
         threads = [threading.Thread(target=take, args=(stream,)) for stream in streams]
         for thread in threads:
@@ -411,21 +405,21 @@ def _catch(
             for thread in threads:
                 thread.join()
         told = [one for one in ask_status(session, timeout_s=5.0) if one.service == "gateway"]
-    missing = [name for name in _WRENCHES if not caught.wrenches.get(name)]
-    missing += [] if caught.frames else ["finger"]
-    missing += [] if caught.poses else ["pose"]
+    missing = [name for name in _WRENCHES if not received.wrenches.get(name)]
+    missing += [] if received.frames else ["finger"]
+    missing += [] if received.poses else ["pose"]
     if missing or not told:
         raise LinkError(
             f"nothing came of {', '.join(missing) or 'the gateway'}",
             remedy=f"see the logs in {children.folder / 'logs'}",
         )
-    return caught, dict(told[0].gauges)
+    return received, dict(told[0].gauges)
 
 
 def _print(result: AlignmentResult) -> None:
     console = Console()
     for title, rows in (
-        ("stamp less truth", result.stamps),
+        ("stamp minus truth", result.stamps),
         ("apart from the electrodes when aligned by stamps", result.apart),
     ):
         table = Table(title=title, title_justify="left")
@@ -436,7 +430,7 @@ def _print(result: AlignmentResult) -> None:
             table.add_row(name, f"{one.count:,}", *(f"{1e3 * value:.3f} ms" for value in numbers))
         console.print(table)
     console.print(
-        f"{result.kept:.0%} of {result.seconds:g} s count: else this host starved the emulators",
+        f"{result.kept:.0%} of {result.seconds:g} s count; at other times an emulator was late",
         highlight=False,
         soft_wrap=True,
     )

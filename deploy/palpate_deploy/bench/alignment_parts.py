@@ -1,9 +1,12 @@
-"""The devices of ``palpate bench alignment``: emulators that all feel one signal, and a robot.
+"""The devices of ``palpate bench alignment``: emulators that measure one signal, and a robot.
 
 ``python -m palpate_deploy.bench.alignment_parts finger CHANNEL PORT LATE`` is a BioTac on CAN,
 ``kms40 PORT LATE``, ``rdt PORT HTTP_PORT LATE`` and ``bota LINK LATE`` are force/torque sensors,
-``robot ENDPOINT STATION LATE`` tells poses; ``LATE`` is a file for ``lateness``. Every device whose
-clock can drift has one that does, by 200 ppm; the robot's is another than the host's altogether.
+``robot ENDPOINT STATION LATE`` publishes poses; ``LATE`` is a file for the times at which it was
+late. Every device with a clock of its own drifts by 200 ppm; the robot has a clock of its own, too.
+
+The signal rises and falls evenly, twice a second, by the host's monotonic clock: a value, and the
+time to a tenth of a ramp, give the exact time at which it was taken.
 """
 
 from __future__ import annotations
@@ -35,24 +38,24 @@ SPAN_M = 0.02
 """Travel of the indenter [m]."""
 
 RAMP_S = 0.25
-"""How long it rises, and falls [s]."""
+"""Duration of one rise or fall [s]."""
 
 MARGIN_S = 0.025
-"""Readings nearer to a turning point are left out: there a value has two times [s]."""
+"""Readings this close to a turning point are left out, because a value has two times there [s]."""
 
 
 def share_at(time_s: Floats) -> Floats:
-    """How far it is pressed, 0..1, at monotonic times [s]."""
+    """The signal, 0..1, at monotonic times [s]."""
     place = np.mod(time_s / RAMP_S, 2.0)
     return np.asarray(1.0 - np.abs(place - 1.0))
 
 
 def time_of(share: Floats, about_s: Floats) -> Floats:
-    """When it was pressed so far [s]; NaN near turning points.
+    """When the signal had a value [s]; NaN near turning points.
 
     Args:
         share: 0..1.
-        about_s: When that was, to a tenth of a ramp [s]; of the same shape.
+        about_s: That time to a tenth of a ramp [s]; same shape.
     """
     ramp = np.floor(about_s / RAMP_S)
     rising = np.mod(ramp, 2.0) == 0.0
@@ -63,20 +66,21 @@ def time_of(share: Floats, about_s: Floats) -> Floats:
 
 
 LATE_S = 5e-3
-"""A sample that is sent later than this was due is of a starved emulator [s]."""
+"""A sample that is later than this came from an emulator that got no CPU time: a busy host delays
+emulators as it never delays a sensor, so such times are not measured [s]."""
 
 _BEFORE_S, _AFTER_S = 0.05, 0.3
-"""What lies around such a sample is left out: slots that come in a burst, times that follow [s]."""
+"""Margins around such times: slots then come in a burst, and the clock model needs time [s]."""
 
 
 class Lateness:
-    """Notes late samples of one process."""
+    """Notes the times at which one process was late."""
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
 
     def note(self, due_s: float) -> None:
-        """A sample is sent now that was due then [s, monotonic]."""
+        """A sample that was due at ``due_s`` [s, monotonic] is sent now."""
         now_s = time.monotonic()
         if now_s - due_s <= LATE_S:
             return
@@ -86,7 +90,7 @@ class Lateness:
             self._spans.append((due_s, now_s))
 
     def write(self, path: Path) -> None:
-        """Keep what was noted, whole or not at all."""
+        """Write the noted times."""
         made = path.with_suffix(".part")
         with made.open("wb") as file:
             np.save(file, np.array(self._spans, np.float64).reshape(-1, 2))
@@ -94,10 +98,10 @@ class Lateness:
 
 
 class OnTime:
-    """Which instants count.
+    """Selects the instants at which no emulator was late.
 
     Args:
-        spans_s: Beginnings and ends of what does not [s, monotonic], shape ``(N, 2)``.
+        spans_s: Beginnings and ends of the late times [s, monotonic], shape ``(N, 2)``.
     """
 
     def __init__(self, spans_s: Floats) -> None:
@@ -108,7 +112,7 @@ class OnTime:
 
     @classmethod
     def of(cls, paths: list[Path]) -> OnTime:
-        """Of all devices together."""
+        """From the files of all devices."""
         return cls(np.concatenate([np.zeros((0, 2)), *(np.load(path) for path in paths)]))
 
     def __call__(self, time_s: Floats) -> npt.NDArray[np.bool_]:
@@ -129,7 +133,7 @@ _FOR_EVER_S = 1e6
 
 
 class RampCounts(CountTrack):
-    """Every channel of a finger shows the signal."""
+    """Counts of a finger, every channel of which is the signal."""
 
     def slots(self, times_s: Times, places: Indices, finger: int) -> Counts:
         """See ``CountTrack``."""
@@ -137,7 +141,7 @@ class RampCounts(CountTrack):
 
 
 class RampForce(HostTimed):
-    """The force along z shows it."""
+    """A wrench whose force along z is the signal."""
 
     def __init__(self, lateness: Lateness) -> None:
         self._lateness = lateness
@@ -150,7 +154,7 @@ class RampForce(HostTimed):
 
 
 class RampFinger(BiotacCanEmulator):
-    """A finger that notes when it was late."""
+    """A finger on CAN that notes when it was late."""
 
     def __init__(self, channel: str, port: int, lateness: Lateness) -> None:
         super().__init__(
@@ -169,15 +173,15 @@ class RampFinger(BiotacCanEmulator):
 
 
 def serve(emulator: Emulator, stop: threading.Event) -> None:
-    """Emulate until told to stop."""
+    """Emulate until ``stop`` is set."""
     if not isinstance(emulator, RampFinger) and "clock_drift" in emulator.faults:
         emulator.inject("clock_drift", _FOR_EVER_S)
     with emulator:
         stop.wait()
 
 
-def be_robot(endpoint: str, station: str, lateness: Lateness, stop: threading.Event) -> None:
-    """Tell poses by a clock that is not the host's, at absolute deadlines."""
+def publish_poses(endpoint: str, station: str, lateness: Lateness, stop: threading.Event) -> None:
+    """Publish poses at absolute deadlines, stamped by a clock of its own."""
     from palpate.client import Client
 
     with Client(endpoint, station=station, timeout_s=20.0) as client:
@@ -193,7 +197,7 @@ def be_robot(endpoint: str, station: str, lateness: Lateness, stop: threading.Ev
 
 
 def main() -> None:
-    """Be the device that the first argument names; the last is where to write when it was late."""
+    """Run the device that the first argument names; the last one is the file of late times."""
     stop, lateness = stop_on_sigterm(), Lateness()
     kind, *told, late_file = sys.argv[1:]
     if kind == "finger":
@@ -206,7 +210,7 @@ def main() -> None:
     elif kind == "bota":
         serve(BotaEmulator(RampForce(lateness), path=told[0]), stop)
     else:
-        be_robot(told[0], told[1], lateness, stop)
+        publish_poses(told[0], told[1], lateness, stop)
     lateness.write(Path(late_file))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -11,14 +10,14 @@ from typing import Any
 from palpate.codec import ELECTRODE_FRAME
 from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp
 from palpate_deploy.bench.harness import KINDS, SERIAL, bench_counts
-from palpate_deploy.bench.results import append_history, machine
+from palpate_deploy.bench.results import finish
 
 GOAL_S = 25e-6
 """Encode and decode with checks, median (issue of the contract)."""
 
 
 def run_codec(rounds: int, *, as_json: bool, save: bool) -> None:
-    """Measure, print, and on request keep.
+    """Measure and print; append to the history on request.
 
     Args:
         rounds: How often all frames are encoded and decoded.
@@ -38,15 +37,11 @@ def run_codec(rounds: int, *, as_json: bool, save: bool) -> None:
         "codec.frame.goal_s": GOAL_S,
         "codec.frame.goal_met": both <= GOAL_S,
     }
-    if as_json:
-        print(json.dumps({**values, "machine": machine()}, indent=2))
-    else:
-        print(
-            f"electrode frame, {len(payloads[0])} bytes: encode {encode * 1e6:.1f} us, "
-            f"decode {decode * 1e6:.1f} us, both {both * 1e6:.1f} us (goal {GOAL_S * 1e6:.0f} us)"
-        )
-    if save:
-        append_history("codec", values)
+    text = (
+        f"electrode frame, {len(payloads[0])} bytes: encode {encode * 1e6:.1f} us, "
+        f"decode {decode * 1e6:.1f} us, both {both * 1e6:.1f} us (goal {GOAL_S * 1e6:.0f} us)"
+    )
+    finish("codec", values, lambda: print(text), as_json=as_json, save=save)
 
 
 def _median_s(call: Callable[[int], Any], rounds: int) -> float:

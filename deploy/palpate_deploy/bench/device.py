@@ -1,4 +1,4 @@
-"""A device for benchmarks: the same kind of frame at absolute deadlines, and nothing to compute."""
+"""A device for benchmarks: prepared frames at absolute deadlines, so that it needs no CPU time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field
 from palpate.config import StrictConfig
 from palpate.errors import DeviceTimeout
 from palpate.messages import PAC_SAMPLES, Origin, SensorType
-from palpate_deploy.bench.harness import KINDS, SERIAL, SLOTS, Gate, bench_counts
+from palpate_deploy.bench.harness import KINDS, SERIAL, SLOTS, SourceGate, bench_counts
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import ElectrodeReading, Reading
 
@@ -21,10 +21,11 @@ class BenchOptions(StrictConfig):
 
     Attributes:
         rate_hz: Frames per second [Hz].
-        phase: Where in the period its frames fall, so that many sensors do not fall together.
+        phase: Share of the period by which its frames are shifted, so that those of many sensors
+            do not coincide.
         frames: Frames, then the source ends; 0 = endless.
-        gate: File of the gate that pauses it; None = never.
-        gate_index: Which byte of it.
+        gate: File of the gate that pauses it; None = none.
+        gate_index: Its byte in that file.
     """
 
     rate_hz: float = Field(default=100.0, ge=1)
@@ -34,8 +35,8 @@ class BenchOptions(StrictConfig):
     gate_index: int = 0
 
 
-class Bench(Device):
-    """Prepared frames at absolute deadlines, with a gate."""
+class BenchDevice(Device):
+    """Sends prepared frames at absolute deadlines while its gate is open."""
 
     options_class = BenchOptions
 
@@ -53,7 +54,7 @@ class Bench(Device):
         )
         self._options = options
         self._period_s = 1 / options.rate_hz
-        self._gate = None if options.gate is None else Gate(options.gate, options.gate_index)
+        self._gate = None if options.gate is None else SourceGate(options.gate, options.gate_index)
         self._counts = bench_counts()
         self._sent = 0
         self._due_s: float | None = None

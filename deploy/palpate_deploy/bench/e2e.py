@@ -1,13 +1,13 @@
-"""``palpate bench e2e``: frame stamp to estimate in a client, beside the bare floor.
+"""``palpate bench e2e``: latency from a frame's stamp to a client's estimate, and a load test.
 
-Two sets of processes live at once, each router, source, service and client over loopback TCP; a
-gate lets one source send at a time, in turns of a few seconds. So both meet the same noise of the
-host, and the one number that a slower host does not change is their ratio.
+For the latency two sets of processes run at once, palpate and a bare floor, each with router,
+source, service and client over loopback TCP. A gate lets one source send at a time, in turns of a
+few seconds, so that both meet the same disturbances by the host: their ratio does not depend on its
+speed. The load test sends frames of many fingers and accounts for each that is lost.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections import Counter
@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from palpate.bus import Session
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import ServiceState
-from palpate_deploy.bench.harness import Gate, read_rows
-from palpate_deploy.bench.results import Latency, append_history, latency, machine, plain
+from palpate_deploy.bench.harness import SourceGate, read_rows
+from palpate_deploy.bench.results import Latency, finish, latency, progress_bar
 from palpate_deploy.bench.station import SETTLE_S, wait_ready
 from palpate_deploy.diagnose.replay import total
 from palpate_deploy.station.host import free_endpoint, write_profile
-from palpate_deploy.station.processes import Children
+from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile, changed, load_profile
 from palpate_deploy.station.status import ask_status
 from palpate_services.inference.repository import resolve
@@ -44,14 +44,14 @@ _GRACE_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class LoadResult:
-    """What became of the frames of many fingers.
+    """The account of a load test.
 
     Attributes:
-        sensors: How many fingers.
-        rate_hz: Of each [Hz].
-        published: Frames that were due an estimate (tared), by the gateways' account.
-        reached_hz: Frames per second and finger that the gateway really sent [Hz].
-        received: Estimates in the client's hands.
+        sensors: Number of fingers.
+        rate_hz: Rate of each [Hz].
+        published: Tared frames, which need an estimate, by the gateway's counters.
+        reached_hz: Frames per second and finger that the gateway sent [Hz].
+        received: Estimates that the client received.
         lost_at: Lost frames by place and reason.
         p50_s: Median age in the client [s].
         p99_s: 99th percentile [s].
@@ -131,15 +131,15 @@ def run_load(
         }
         for index in range(sensors)
     ]
-    with Children("bench-load") as children:
+    with FiniteRun("bench-load") as children:
         out = children.folder / "client.npz"
         began = time.monotonic()
-        # The client keeps all that comes: a frame is lost when palpate did not bring its estimate.
+        # The client queues all messages: a frame counts as lost if its estimate did not arrive.
         profile = start_palpate(children, bundle, out, fingers, delivery="queue")
         link = LinkConfig(connect=profile.link.connect, wait_for_router_s=10)
         deadline = time.monotonic() + seconds * 3 + _GRACE_S
         with Session.open(link, station=profile.station) as session:
-            # Asked seldom: the questions are load too.
+            # Rarely: every request for the status is load as well.
             time.sleep(seconds)
             while True:
                 statuses = {status.service: status for status in ask_status(session)}
@@ -150,7 +150,7 @@ def run_load(
                 if time.monotonic() > deadline:
                     break
                 time.sleep(0.5)
-            time.sleep(1.2)  # what is on its way arrives, and the services hand in their counts
+            time.sleep(1.2)  # the last messages arrive, and the services update their counters
             statuses = {status.service: status for status in ask_status(session)}
         for name in ("client", "gateway", "features"):
             children.stop_one(name)
@@ -208,7 +208,7 @@ def run_e2e(
     as_json: bool,
     save: bool,
 ) -> None:
-    """Measure, print, and on request keep.
+    """Measure and print; append to the history on request.
 
     Args:
         seconds: Length of one round [s].
@@ -221,9 +221,7 @@ def run_e2e(
         save: Append to the history.
     """
     folder = resolve(bundle)
-    quiet = Console(stderr=True)
-    columns = (TextColumn("{task.description:32}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=quiet, disable=not sys.stderr.isatty()) as bar:
+    with progress_bar() as bar:
         palpate, floor = measure_latency(
             seconds=seconds, rounds=rounds, bundle=bundle, model=folder / "model.onnx", bar=bar
         )
@@ -232,12 +230,13 @@ def run_e2e(
         )
         first_loss = ramp_rate(load, bundle=bundle, bar=bar) if ramp else None
     values = _values(palpate, floor, load, first_loss)
-    if as_json:
-        print(json.dumps({**values, "machine": machine()}, indent=2))
-    else:
-        _print(palpate, floor, load, first_loss, ramped=ramp)
-    if save:
-        append_history("e2e", values)
+    finish(
+        "e2e",
+        values,
+        lambda: _print(palpate, floor, load, first_loss, ramped=ramp),
+        as_json=as_json,
+        save=save,
+    )
 
 
 def measure_latency(
@@ -249,14 +248,14 @@ def measure_latency(
         ProcessEnded: A process of the benchmark ended early.
         LinkError: They did not find one another in time.
     """
-    with Children("bench") as children:
+    with FiniteRun("bench") as children:
         gates = children.folder / "gates"
-        opened = [Gate(gates, _PALPATE), Gate(gates, _FLOOR)]
+        opened = [SourceGate(gates, _PALPATE), SourceGate(gates, _FLOOR)]
         outs = [children.folder / "palpate.npz", children.folder / "floor.npz"]
         start_palpate(children, bundle, outs[_PALPATE], _one_finger(gates), delivery="newest")
         _start_floor(children, model, outs[_FLOOR], gates)
         names = ["gateway", "features", "client", "floor-source", "floor-service", "floor-client"]
-        # Both run their first frames through, unmeasured: tare, first inference, page faults.
+        # The first frames are not measured: tare, first inference, page faults.
         for gate in opened:
             gate.set(True)
             time.sleep(1.5)
@@ -264,7 +263,7 @@ def measure_latency(
             time.sleep(SETTLE_S)
         task = bar.add_task("latency, interleaved", total=2 * rounds)
         for turn in range(rounds):
-            # Who goes first changes, so that no side is always the one after the other.
+            # The order alternates, so that no side always follows the other.
             for side in (turn % 2, 1 - turn % 2):
                 opened[side].set(True)
                 time.sleep(seconds)
@@ -273,13 +272,13 @@ def measure_latency(
                 children.check(names)
                 bar.advance(task)
         for gate in opened:
-            gate.set(True)  # a source that waits at its gate would not hear the signal to stop
+            gate.set(True)  # a source that waits at its gate does not see the stop event
         for name in reversed(names):
             children.stop_one(name)
         results = []
         for out in outs:
             _, rows, _ = read_rows(out)
-            # Sequences run on from the first frame; those before the first estimate had no tare.
+            # Frames before the first estimate had no tare and do not count as lost.
             lost = int(rows[-1, 0] - rows[0, 0] + 1 - len(rows)) if len(rows) else -1
             if not len(rows):
                 raise LinkError(
@@ -291,7 +290,7 @@ def measure_latency(
 
 
 def start_palpate(
-    children: Children, bundle: str, out: Path, sensors: list[dict[str, Any]], *, delivery: str
+    children: FiniteRun, bundle: str, out: Path, sensors: list[dict[str, Any]], *, delivery: str
 ) -> Profile:
     """Start router, features, client and the gateway; return when all but the gateway are ready.
 
@@ -315,7 +314,7 @@ def start_palpate(
     return profile
 
 
-def start_gateway(children: Children, profile: Profile, name: str = "gateway") -> None:
+def start_gateway(children: FiniteRun, profile: Profile, name: str = "gateway") -> None:
     """Start the gateway of a benchmark with the benchmark's driver."""
     path = write_profile(profile, children.folder)
     part = [sys.executable, "-m", "palpate_deploy.bench.parts"]
@@ -327,7 +326,7 @@ def _one_finger(gates: Path) -> list[dict[str, Any]]:
     return [{"name": "finger", "driver": "bench", "options": options}]
 
 
-def _start_floor(children: Children, model: Path, out: Path, gates: Path) -> None:
+def _start_floor(children: FiniteRun, model: Path, out: Path, gates: Path) -> None:
     endpoint = free_endpoint()
     settings = {
         "router": _settings(children, "router", LinkConfig(connect=(), listen=(endpoint,))),
@@ -343,8 +342,8 @@ def _start_floor(children: Children, model: Path, out: Path, gates: Path) -> Non
     time.sleep(1.0)
 
 
-def _settings(children: Children, mode: str, link: LinkConfig) -> str:
-    """Palpate's own Zenoh settings as a file: the same for both sides by construction."""
+def _settings(children: FiniteRun, mode: str, link: LinkConfig) -> str:
+    """Palpate's Zenoh settings as a file, so that both sides have the same."""
     from palpate.bus.link import zenoh_config
 
     path = children.folder / f"floor-{mode}.json5"
@@ -357,8 +356,8 @@ def _values(
 ) -> dict[str, Any]:
     p50, p99 = palpate.p50_s / floor.p50_s, palpate.p99_s / floor.p99_s
     return {
-        "e2e.palpate": plain(palpate),
-        "e2e.floor": plain(floor),
+        "e2e.palpate": asdict(palpate),
+        "e2e.floor": asdict(floor),
         "e2e.p50_ratio": round(p50, 3),
         "e2e.p99_ratio": round(p99, 3),
         "e2e.p50_goal_met": p50 <= P50_GOAL,

@@ -1,9 +1,9 @@
-"""The bare floor: what ``palpate bench e2e`` is measured against.
+"""The bare floor, with which ``palpate bench e2e`` compares palpate.
 
-The same job written straight down: Zenoh, the generated protobuf classes, ONNX Runtime; no checks
-beyond the lengths, no health, no presence, no tares to look up, one finger. It gets the same Zenoh
-settings as palpate, as a file, and sends the same frames and estimates field by field. It is the
-one place of this room that may import these packages, because it must not use palpate's own code.
+The shortest program for the same task: Zenoh, the generated protobuf classes, ONNX Runtime; no
+checks beyond the lengths, no health, no presence, no search for tares, one finger. It reads the
+same Zenoh settings as palpate from a file, and sends the same frames and estimates field by field.
+Only this module of the room imports these packages, because it must not use palpate's own code.
 
 ``python -m palpate_deploy.bench.floor router|source|service|client ...`` (see ``main``).
 """
@@ -26,12 +26,12 @@ from palpate_deploy.bench.harness import (
     KINDS,
     REST_COUNTS,
     SERIAL,
-    Gate,
+    SourceGate,
     bench_counts,
     stop_on_sigterm,
     write_rows,
 )
-from palpate_deploy.station.parent import end_with_parent
+from palpate_deploy.station.lifetime import end_with_parent
 
 FRAMES = "floor/finger/electrodes"
 ESTIMATES = "floor/finger/features"
@@ -45,7 +45,7 @@ def session(settings: str) -> Any:
 
 
 def publisher(opened: Any, key: str, message: str) -> Any:
-    """Declare a publisher with the manners of a sensor stream."""
+    """Declare a publisher with the quality of service of a sensor stream."""
     return opened.declare_publisher(
         key,
         encoding=zenoh.Encoding(f"application/protobuf;palpate.v1.{message}"),
@@ -57,7 +57,7 @@ def publisher(opened: Any, key: str, message: str) -> Any:
 
 
 def router(settings: str) -> None:
-    """Introduce the others to one another."""
+    """Be the router of the others."""
     stop = stop_on_sigterm()
     with session(settings):
         stop.wait()
@@ -66,7 +66,7 @@ def router(settings: str) -> None:
 def source(settings: str, gate_file: str, rate_hz: str) -> None:
     """Send prepared frames at absolute deadlines while the gate is open."""
     stop = stop_on_sigterm()
-    gate = Gate(Path(gate_file), 1)
+    gate = SourceGate(Path(gate_file), 1)
     period_ns = round(1e9 / float(rate_hz))
     counts = bench_counts()
     sequence, due_ns, offset_ns = 0, 0, 1 << 62
@@ -109,7 +109,7 @@ def source(settings: str, gate_file: str, rate_hz: str) -> None:
 
 
 def service(settings: str, model: str) -> None:
-    """Answer the newest frame."""
+    """Estimate from the newest frame."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -149,7 +149,7 @@ def service(settings: str, model: str) -> None:
 
 
 def client(settings: str, out: str) -> None:
-    """Take estimates as they come and write down how old they were."""
+    """Note the age of every estimate."""
     rows: list[tuple[int, int, int]] = []
     with session(settings) as opened:
         estimates = opened.declare_subscriber(ESTIMATES, zenoh.handlers.RingChannel(1))
@@ -160,7 +160,7 @@ def client(settings: str, out: str) -> None:
                 estimate = estimates_pb2.FeatureEstimate.FromString(sample.payload.to_bytes())
                 now_ns = time.monotonic_ns()
                 rows.append((estimate.source.sequence, estimate.source.monotonic_ns, now_ns))
-        except SystemExit:  # that is how it ends
+        except SystemExit:  # of exit_on_sigterm
             pass
     write_rows(Path(out), ["finger"] * len(rows), rows, dropped=0)
 

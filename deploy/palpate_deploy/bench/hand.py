@@ -1,9 +1,9 @@
 """``palpate bench hand``: five BioTacs and two force/torque sensors through one gateway.
 
-Emulators play the twin at full rate: three fingers on one CAN bus and two on another (4400 slots a
-second each), a KMS 40 over TCP (500 Hz) and a Bota over a serial line (1000 Hz). Nothing may be
-lost. The floor is a program that reads the same devices with python-can, sockets and pyserial and
-does nothing with what it reads.
+Emulators send at full rate: three fingers on one CAN bus and two on another (4400 slots a second
+each), a KMS 40 over TCP (500 Hz) and a Bota over a serial line (1000 Hz). Nothing may be lost. The
+floor is a program that reads the same devices with python-can, sockets and pyserial, and discards
+what it reads.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from palpate.bus import Session
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import Status
-from palpate_deploy.bench.results import append_history, machine
+from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
 from palpate_deploy.station.host import write_profile
-from palpate_deploy.station.processes import Children, command_line
+from palpate_deploy.station.processes import FiniteRun, command_line
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
 
@@ -40,15 +40,8 @@ CORE_GOAL = 0.5
 _LOSSES = ("lost", "missing", "dropped", "parity", "overflow", "incomplete", "silences", "device_l")
 
 
-class Used(NamedTuple):
-    """What the system says of the gateway's process.
-
-    Attributes:
-        core: Share of one core.
-        worst_core: The same in its worst tenth.
-        kernel_drops: Datagrams that it did not fetch in time.
-        stolen: Share of the cores' time that this virtual machine did not get, though it wanted it.
-    """
+class GatewayUse(NamedTuple):
+    """What the system reports of the gateway's process; see the same names of ``HandResult``."""
 
     core: float
     worst_core: float
@@ -58,26 +51,27 @@ class Used(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HandResult:
-    """What became of the hand's frames.
+    """Load, losses and latency of the hand.
 
     Attributes:
         seconds: Length of the measurement [s].
         core: Share of one core that the gateway used.
         worst_core: The same in its worst tenth.
-        kernel_drops: Datagrams that the kernel threw away because it was not read in time.
-        stolen: Share of the cores' time that this virtual machine did not get, though it wanted it:
-            everything is then late, and takes longer by the clock of its processes, too.
-        frames: Electrode and wrench frames in the client.
-        lost: Frames that sequence numbers, the devices' own account or invalid channels miss.
+        kernel_drops: Datagrams that the kernel discarded because they were not read in time.
+        stolen: Share of the cores' time that the hypervisor gave to other machines: everything is
+            then late, and CPU times are longer too.
+        frames: Electrode and wrench frames that the client received.
+        lost: Frames missing by sequence numbers or by the devices' own counts, or with invalid
+            channels.
         counters: The gateway's counters of losses that are not zero.
-        publish_p50_s: Median of: reading in the gateway's hands to its message on the bus, of the
-            sensor and at the time where it was longest (a look every tenth of the run) [s].
+        publish_p50_s: Median time from a reading in the gateway to its message on the bus: the
+            largest over sensors and the tenths of the run [s].
         publish_p99_s: 99th percentile, likewise [s].
-        p50_s: Median of: last sample of an electrode frame to the client's hands [s].
+        p50_s: Median time from the last sample of an electrode frame to the client [s].
         p99_s: 99th percentile [s].
         wrench_p99_s: The same of the wrenches [s].
         floor_core: Share of one core that the bare reader used.
-        floor_p50_s: Median of: kernel's stamp of a slot to the bare reader's hands [s].
+        floor_p50_s: Median time from the kernel's stamp of a slot to the bare reader [s].
         floor_p99_s: 99th percentile [s].
     """
 
@@ -104,20 +98,20 @@ def account(
     floor_file: Path,
     begin_ns: int,
     end_ns: int,
-    used: Used,
+    used: GatewayUse,
     before: Mapping[str, int],
     looks: Sequence[Status],
 ) -> HandResult:
     """Count what arrived between two instants.
 
     Args:
-        rows_file: What the client wrote.
-        floor_file: What the bare reader wrote.
-        begin_ns: Begin by the monotonic clock [ns].
+        rows_file: Rows of the client.
+        floor_file: Results of the bare reader.
+        begin_ns: Beginning by the monotonic clock [ns].
         end_ns: End [ns].
-        used: What the gateway's process used and missed.
-        before: The gateway's counters at the begin.
-        looks: What it told during the run; the last at the end.
+        used: CPU time and drops of the gateway's process.
+        before: The gateway's counters at the beginning.
+        looks: Its status during the run; the last one at the end.
     """
     with np.load(rows_file, allow_pickle=False) as archive:
         names, rows, lost = archive["sensors"], archive["rows"], int(archive["dropped"])
@@ -141,10 +135,7 @@ def account(
     }
     return HandResult(
         seconds=(end_ns - begin_ns) * 1e-9,
-        core=used.core,
-        worst_core=used.worst_core,
-        kernel_drops=used.kernel_drops,
-        stolen=used.stolen,
+        **used._asdict(),
         frames=len(rows),
         lost=lost + silent,
         counters=told,
@@ -203,7 +194,7 @@ _SETTLE_S = 4.0
 
 
 def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool) -> None:
-    """Measure, print, and on request keep.
+    """Measure and print; append to the history on request.
 
     Args:
         seconds: Length of the measurement [s].
@@ -211,9 +202,7 @@ def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool)
         as_json: Print JSON.
         save: Append to the history.
     """
-    columns = (TextColumn("{task.description:32}"), BarColumn(), TimeElapsedColumn())
-    quiet = Console(stderr=True)
-    with Progress(*columns, console=quiet, disable=not sys.stderr.isatty()) as bar:
+    with progress_bar() as bar:
         result = measure_hand(seconds, floor_seconds, bar)
     values = {
         "hand": asdict(result),
@@ -221,12 +210,7 @@ def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool)
         "hand.loss_goal_met": result.lost == 0,
         "hand.p99_ratio": round(result.p99_s / result.floor_p99_s, 2),
     }
-    if as_json:
-        print(json.dumps({**values, "machine": machine()}, indent=2))
-    else:
-        show(result)
-    if save:
-        append_history("hand", values)
+    finish("hand", values, lambda: show(result), as_json=as_json, save=save)
 
 
 def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandResult:
@@ -236,7 +220,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
         ProcessEnded: A process of the benchmark ended early.
         LinkError: They did not find one another in time.
     """
-    with Children("bench-hand") as children:
+    with FiniteRun("bench-hand") as children:
         buses, wrenches = _start_emulators(children)
         rows_file, floor_file = children.folder / "client.npz", children.folder / "floor.npz"
         profile = _start_gateway(children, buses, wrenches, rows_file)
@@ -277,16 +261,16 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
             floor_file,
             begin_ns,
             end_ns,
-            Used(core, max(shares), drops, stolen / max(total, 1)),
+            GatewayUse(core, max(shares), drops, stolen / max(total, 1)),
             before,
             looks,
         )
 
 
 def _start_emulators(
-    children: Children,
+    children: FiniteRun,
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Start them; python-can's options of the buses, and the addresses of the wrench sensors."""
+    """Start the emulators; returns python-can's options and the addresses of the wrench sensors."""
     emulate = [sys.executable, "-m", "palpate_deploy", "emulate"]
     buses: list[dict[str, Any]] = []
     for number, bus in enumerate(_BUSES):
@@ -312,7 +296,7 @@ def _start_emulators(
 
 
 def _start_gateway(
-    children: Children,
+    children: FiniteRun,
     buses: list[dict[str, Any]],
     wrenches: dict[str, dict[str, Any]],
     rows_file: Path,
@@ -354,16 +338,16 @@ def _cpu_s(pid: int) -> float:
 
 
 def _host_ticks() -> tuple[int, int]:
-    """Of all cores since boot: all ticks, and those that another virtual machine was given."""
+    """Ticks of all cores since boot: all, and those that the hypervisor gave to other machines."""
     ticks = [int(word) for word in Path("/proc/stat").read_text("utf-8").split()[1:9]]
     return sum(ticks), ticks[7]
 
 
 def _kernel_drops(pid: int) -> int:
-    """Datagrams that the kernel threw away because the process did not fetch them in time."""
+    """Datagrams that the kernel discarded because the process did not read them in time."""
     sockets = set()
     for link in Path(f"/proc/{pid}/fd").iterdir():
-        with contextlib.suppress(OSError):  # closed meanwhile
+        with contextlib.suppress(OSError):  # closed in the meantime
             sockets.add(os.readlink(link))
     lines = Path(f"/proc/{pid}/net/udp").read_text("utf-8").splitlines()[1:]
     rows = [line.split() for line in lines]

@@ -1,8 +1,8 @@
-"""The two readers of ``palpate bench hand``: a client of the gateway, and the bare floor.
+"""The two readers of ``palpate bench hand``, processes of their own: client and bare floor.
 
 ``python -m palpate_deploy.bench.hand_parts client ENDPOINT STATION OUT`` takes every frame of every
-sensor and writes down when. ``... floor OUT JSON`` reads the same devices with nothing but
-python-can, pyserial and sockets, and writes down how late it had what.
+sensor and notes its arrival. ``... floor OUT JSON`` reads the same devices with python-can,
+pyserial and sockets only, and notes the delay of every last slot.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from palpate.errors import StreamTimeout
 from palpate_deploy.bench.harness import stop_on_sigterm
 
 _LAST_SLOT = 0x86
-"""Command byte of TDC, which only one more slot of a round follows."""
+"""Command byte of TDC, the last slot but one of a round."""
 
 
 def client(endpoint: str, station: str, out: Path) -> None:
@@ -80,13 +80,18 @@ def client(endpoint: str, station: str, out: Path) -> None:
     )
 
 
-def floor(out: Path, told: str) -> None:
-    """Read what ``told`` names for so many seconds, a thread for each device, and write how."""
+def floor(out: Path, plan_json: str) -> None:
+    """Read the devices of a plan for a while, a thread for each, and write delays and CPU time.
+
+    Args:
+        out: File to write.
+        plan_json: ``seconds``, and the addresses of ``buses``, ``sockets`` and ``lines``.
+    """
     import can
     import serial
 
     stop_on_sigterm()
-    plan = json.loads(told)
+    plan = json.loads(plan_json)
     until_s = time.monotonic() + plan["seconds"]
     offset_s = time.time() - time.monotonic()
     lates, counts = [array("d") for _ in plan["buses"]], [0] * 3

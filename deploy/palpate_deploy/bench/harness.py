@@ -1,4 +1,4 @@
-"""What both sides of the benchmark share and neither is measured for: frames, gate, results."""
+"""What palpate and the floor share in a benchmark: frames, gate and rows of results."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import signal
 import threading
 import time
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate_deploy.station.parent import end_with_parent
+from palpate_deploy.station.lifetime import end_with_parent, stop_on_signals
 
 SERIAL = "BENCH-0001"
 REST_COUNTS = 3000
@@ -31,14 +30,14 @@ def bench_counts() -> npt.NDArray[np.uint16]:
     return (REST_COUNTS + noise).astype(np.uint16)
 
 
-class Gate:
-    """One byte of shared memory for each source: open = send, shut = wait. Free to look at.
+class SourceGate:
+    """Pauses a source by one byte of shared memory, which costs nothing to read.
 
-    A source that is stopped by a signal instead would lose its links after the lease.
+    A source stopped by a signal would lose its links once their lease has expired.
 
     Args:
-        path: A file of some bytes; made if absent.
-        index: Which byte.
+        path: File of the bytes; made if absent.
+        index: The source's byte.
     """
 
     SIZE = 16
@@ -52,11 +51,11 @@ class Gate:
 
     @property
     def is_open(self) -> bool:
-        """Whether a source may send."""
+        """Whether the source may send."""
         return self._memory[self._index] != 0
 
     def set(self, is_open: bool) -> None:
-        """Open or shut it."""
+        """Open or close it."""
         self._memory[self._index] = int(is_open)
 
     def wait(self) -> None:
@@ -67,12 +66,7 @@ class Gate:
 
 def stop_on_sigterm() -> threading.Event:
     """An event that ``SIGTERM`` sets; the process also ends with its parent."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGTERM, on_signal)
+    stop = stop_on_signals(signal.SIGTERM)
     end_with_parent()
     return stop
 
@@ -80,7 +74,7 @@ def stop_on_sigterm() -> threading.Event:
 def write_rows(
     out: Path, sensors: list[str], rows: list[tuple[int, int, int]], *, dropped: int
 ) -> None:
-    """Write what a client saw: sequence, stamp and arrival [ns] of each estimate."""
+    """Write sequence, stamp and arrival [ns] of each estimate that a client received."""
     np.savez(
         out,
         sensors=np.array(sensors, dtype=str),
@@ -90,6 +84,6 @@ def write_rows(
 
 
 def read_rows(path: Path) -> tuple[npt.NDArray[np.str_], npt.NDArray[np.int64], int]:
-    """Sensors, rows and drops as ``write_rows`` wrote them."""
+    """Sensors, rows and number of drops, as ``write_rows`` wrote them."""
     with np.load(path, allow_pickle=False) as archive:
         return archive["sensors"], archive["rows"], int(archive["dropped"])

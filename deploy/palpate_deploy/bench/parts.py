@@ -1,8 +1,8 @@
-"""The two processes of palpate that a benchmark adds to ``palpate run``: gateway and client.
+"""The gateway and the client of ``palpate bench e2e``, processes of their own.
 
 ``python -m palpate_deploy.bench.parts gateway PROFILE`` is the gateway as a station runs it, with
 the benchmark's device in its driver table. ``... client ENDPOINT STATION OUT DELIVERY`` is a
-robot: it takes every estimate as it comes and writes down how old it was.
+robot's client, which notes the age of every estimate.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from palpate.errors import StreamTimeout
 from palpate_deploy.bench.harness import stop_on_sigterm, write_rows
 
-DRIVER = "palpate_deploy.bench.device:Bench"
+DRIVER = "palpate_deploy.bench.device:BenchDevice"
 
 
 def gateway(profile: str) -> None:
@@ -52,7 +52,7 @@ def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
                     got = stream.next(timeout_s=0.1)
                 except StreamTimeout:
                     continue
-                now_ns = time.monotonic_ns()  # the estimate is in the robot's hands, decoded
+                now_ns = time.monotonic_ns()  # the client has the decoded estimate
                 source = got.message.source
                 rows.append((source.sequence, source.monotonic_ns, now_ns))
                 sensors.append(got.sensor)

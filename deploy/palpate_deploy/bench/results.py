@@ -1,4 +1,4 @@
-"""Latencies to the few numbers that are reported, and where they are kept."""
+"""Results of a benchmark: from latencies to percentiles, printed and kept in the history."""
 
 from __future__ import annotations
 
@@ -6,20 +6,24 @@ import json
 import os
 import platform
 import subprocess
+import sys
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from palpate.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Of one side: percentiles [s], how many estimates, how many frames got none."""
+    """Latency of one side: percentiles [s], number of estimates, number of frames without one."""
 
     p50_s: float
     p99_s: float
@@ -29,11 +33,11 @@ class Latency:
 
 
 def latency(rows: npt.NDArray[np.int64], *, warm_up: int, lost: int) -> Latency:
-    """Numbers of rows of one side.
+    """Latency from the rows of one side.
 
     Args:
         rows: Sequence, stamp [ns] and arrival [ns], shape ``(N, 3)``.
-        warm_up: Estimates left out after each pause: links and caches wake up.
+        warm_up: Estimates left out after each pause: caches are cold, links slow.
         lost: Frames that got no estimate.
     """
     kept = np.concatenate([part[warm_up:] for part in rounds(rows)])
@@ -48,13 +52,37 @@ def rounds(rows: npt.NDArray[np.int64], *, pause_s: float = 0.3) -> list[npt.NDA
     return [part for part in np.split(rows, gaps) if len(part)]
 
 
-def plain(side: Latency) -> dict[str, Any]:
-    """Numbers as JSON."""
-    return asdict(side)
+def progress_bar() -> Progress:
+    """A progress bar on stderr, shown only in a terminal."""
+    columns = (TextColumn("{task.description:32}"), BarColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())
+
+
+def finish(
+    name: str, values: dict[str, Any], show: Callable[[], None], *, as_json: bool, save: bool
+) -> None:
+    """Print a result, and append it to the history on request.
+
+    Args:
+        name: Name of the benchmark.
+        values: The result as plain values.
+        show: Prints it for people.
+        as_json: Print JSON instead.
+        save: Append to the history.
+
+    Raises:
+        ConfigError: The history is not there, see ``append_history``.
+    """
+    if as_json:
+        print(json.dumps({**values, "machine": machine()}, indent=2))
+    else:
+        show()
+    if save:
+        append_history(name, values)
 
 
 def machine() -> dict[str, Any]:
-    """What it was measured on."""
+    """The machine that it was measured on."""
     return {
         "cpus": os.cpu_count(),
         "cpu": _cpu_model(),
@@ -77,7 +105,7 @@ def append_history(name: str, values: dict[str, Any]) -> Path:
     """Append one line to ``tests/benchmarks/history.jsonl`` of the working tree.
 
     Raises:
-        ConfigError: The command was not given in palpate's working tree.
+        ConfigError: The command does not run in palpate's working tree.
     """
     folder = Path("tests/benchmarks")
     if not folder.is_dir():

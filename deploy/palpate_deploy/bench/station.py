@@ -1,4 +1,4 @@
-"""The small station of a benchmark: a router and a gateway, at addresses that are free."""
+"""The station of a benchmark: its profile at free addresses, and the wait until it is ready."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def gateway_station(sensors: Sequence[dict[str, Any]]) -> Profile:
 
 
 def free_port() -> int:
-    """A port of this host that nothing uses."""
+    """A free port of this host."""
     return int(free_endpoint().rpartition(":")[2])
 
 

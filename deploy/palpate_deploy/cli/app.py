@@ -1,6 +1,6 @@
-"""The ``palpate`` command. Signatures and help only; each command's work is in its own module.
+"""The ``palpate`` command: its options and help texts; the work is done in other modules.
 
-Nothing heavy is imported before a command runs: ``palpate --help`` must not wait for NumPy.
+They are imported when a command runs: ``palpate --help`` must not wait for NumPy.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def options(
-    log_level: Annotated[LogLevel, typer.Option(help="Least level logged to stderr.")] = "warning",
-    log_format: Annotated[LogFormat, typer.Option(help="Log lines for people or machines.")] = (
-        "text"
-    ),
+    log_level: Annotated[
+        LogLevel, typer.Option(help="Lowest log level written to stderr.")
+    ] = "warning",
+    log_format: Annotated[LogFormat, typer.Option(help="Log lines as text or as JSON.")] = ("text"),
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
-    """Options before the command."""
+    """Options of every command; they precede its name."""
     configure(log_level, log_format)
 
 
@@ -71,16 +71,17 @@ def options(
 def up(
     profile: ProfileOption = DEFAULT_PROFILE,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the resolved profile and end.")
+        bool, typer.Option("--print-config", help="Print the resolved profile and exit.")
     ] = False,
 ) -> None:
     """Start a station's processes and keep them running until Ctrl-C."""
+    import tomli_w
+
     from palpate_deploy.station.profile import load_profile, plain_values
-    from palpate_deploy.toml_text import toml_text
 
     loaded = load_profile(profile)
     if print_config:
-        print(toml_text(plain_values(loaded)), end="")
+        print(tomli_w.dumps(plain_values(loaded)), end="")
         return
     from palpate_deploy.station.up import run_up
 
@@ -92,7 +93,7 @@ def run(
     service: Annotated[str, typer.Argument(help="E.g. gateway, features, field.")],
     profile: ProfileOption = DEFAULT_PROFILE,
 ) -> None:
-    """Be one process of a station, unsupervised (what `palpate up` starts)."""
+    """Run one process of a station in the foreground (`palpate up` starts all of them)."""
     from palpate_deploy.station.processes import run_service, service_named
     from palpate_deploy.station.profile import load_profile
 
@@ -105,7 +106,7 @@ def status(
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
-    """Who is alive and ready, what each process counts, and its last error."""
+    """Processes of a station: state, sensors, counters and last error."""
     from palpate_deploy.station.status import show_status
 
     raise typer.Exit(show_status(client_link(connect), station, as_json=json_))
@@ -113,7 +114,7 @@ def status(
 
 @app.command(epilog=example("palpate doctor --profile virtual"))
 def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -> None:
-    """Check what a station needs on this host; each line ok, warn or fail, with its fix."""
+    """Check what a station needs on this host; each check is ok, warn or fail, with a fix."""
     from palpate_deploy.diagnose.doctor import run_doctor
 
     raise typer.Exit(run_doctor(profile, as_json=json_))
@@ -123,13 +124,14 @@ def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) 
 def tare(
     sensor: Annotated[str, typer.Argument(help="Name of the sensor.")] = "finger",
     frames: Annotated[
-        int, typer.Option(help="Frames, or readings, to average; 0 = the gateway's number.")
+        int,
+        typer.Option(help="Frames (force/torque: readings) to average; 0 = the gateway's setting."),
     ] = 0,
-    timeout_s: Annotated[float, typer.Option(help="How long it may take [s].")] = 5.0,
+    timeout_s: Annotated[float, typer.Option(help="Longest time to wait [s].")] = 5.0,
     connect: ConnectOption = DEFAULT_CONNECT,
     station: StationOption = DEFAULT_STATION,
 ) -> None:
-    """Take the untouched finger, or the present load of a force/torque sensor, as zero now."""
+    """Tare an untouched finger, or zero a force/torque sensor at its present load."""
     from palpate_deploy.station.tare import take_tare
 
     take_tare(client_link(connect), station, sensor, frames=frames, timeout_s=timeout_s)
@@ -137,18 +139,20 @@ def tare(
 
 @app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))
 def demo(
-    seconds: Annotated[float, typer.Option(min=1, help="How long the finger is watched [s].")] = 20,
-    out: Annotated[Path, typer.Option(help="Folder of record, view and picture.")] = Path(
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Duration after the first estimate [s].")
+    ] = 20,
+    out: Annotated[Path, typer.Option(help="Folder for record, view and picture.")] = Path(
         "runs/demo"
     ),
 ) -> None:
-    """Virtual finger -> features -> recorder: truth against estimate, live, then pictures."""
+    """Touch a virtual finger: estimates against the truth, live, then a record and pictures."""
     from palpate_deploy.demo.demo import run_demo
 
     raise typer.Exit(run_demo(seconds, out))
 
 
-topic_app = group("What is on the bus: streams, rates, messages.")
+topic_app = group("Streams on the bus: list, rates, messages.")
 
 TopicArgument = Annotated[str, typer.Argument(metavar="TOPIC", help="E.g. electrodes, features.")]
 
@@ -160,7 +164,7 @@ def list_(
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
-    """Every stream of the contract, and which of them are heard now."""
+    """All streams, and which of them have messages now."""
     from palpate_deploy.diagnose.topics import list_topics
 
     list_topics(client_link(connect), station, seconds, as_json=json_)
@@ -172,14 +176,12 @@ def list_(
 def hz(
     topic: TopicArgument = "electrodes",
     sensor: SensorOption = "*",
-    seconds: Annotated[
-        float, typer.Option(min=0, help="End after this time [s]; 0 = at Ctrl-C.")
-    ] = 0,
+    seconds: Annotated[float, typer.Option(min=0, help="Duration [s]; 0 = until Ctrl-C.")] = 0,
     connect: ConnectOption = DEFAULT_CONNECT,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
-    """Rate, jitter, bandwidth and loss of a stream, once a second."""
+    """Rate, jitter, bandwidth and losses of a stream, once a second."""
     from palpate_deploy.diagnose.topics import measure
 
     raise typer.Exit(measure(client_link(connect), station, topic, sensor, seconds, as_json=json_))
@@ -189,13 +191,15 @@ def hz(
 def echo(
     topic: TopicArgument = "features",
     sensor: SensorOption = "*",
-    count: Annotated[int, typer.Option(min=0, help="End after so many; 0 = at Ctrl-C.")] = 0,
-    timeout_s: Annotated[float, typer.Option(help="End when none comes for so long [s].")] = 10.0,
+    count: Annotated[int, typer.Option(min=0, help="Number of messages; 0 = until Ctrl-C.")] = 0,
+    timeout_s: Annotated[
+        float, typer.Option(help="Stop if no message comes for this long [s].")
+    ] = 10.0,
     connect: ConnectOption = DEFAULT_CONNECT,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
-    """Messages of a stream, decoded."""
+    """Print the messages of a stream."""
     from palpate_deploy.diagnose.topics import echo_topic
 
     echo_topic(

@@ -1,4 +1,4 @@
-"""``palpate bench``: how fast it is, beside the bare floor."""
+"""``palpate bench``: latency and load, compared with a bare implementation (the floor)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from palpate_deploy.cli.options import JsonOption, example, group
 
-bench_app = group("How fast it is, beside the bare floor.")
+bench_app = group("Latency and load, compared with a bare implementation (the floor).")
 
 SaveOption = Annotated[
     bool, typer.Option("--save", help="Append the result to tests/benchmarks/history.jsonl.")
@@ -20,16 +20,18 @@ SaveOption = Annotated[
     epilog=example("palpate bench e2e", "palpate bench e2e --seconds 2 --rounds 3 --json")
 )
 def e2e(
-    seconds: Annotated[float, typer.Option(min=0.5, help="Length of one round [s].")] = 4.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of each of the two.")] = 6,
-    sensors: Annotated[int, typer.Option(min=1, help="Fingers of the load test.")] = 20,
-    load_seconds: Annotated[float, typer.Option(min=1, help="Length of the load test [s].")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Duration of one round [s].")] = 4.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of palpate and of the floor.")] = 6,
+    sensors: Annotated[int, typer.Option(min=1, help="Fingers in the load test.")] = 20,
+    load_seconds: Annotated[
+        float, typer.Option(min=1, help="Duration of the load test [s].")
+    ] = 10.0,
     ramp: Annotated[bool, typer.Option(help="Raise the rate until a frame is lost.")] = True,
     bundle: Annotated[str, typer.Option(help="Bundle that is served.")] = "features-virtual",
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
-    """Frame stamp to estimate in a client, over TCP, interleaved with the bare floor."""
+    """Latency from a frame's stamp to the estimate in a client, in turns with the floor."""
     from palpate_deploy.bench.e2e import run_e2e
 
     run_e2e(
@@ -46,12 +48,14 @@ def e2e(
 
 @bench_app.command(epilog=example("palpate bench hand --seconds 600"))
 def hand(
-    seconds: Annotated[float, typer.Option(min=2, help="Length of the measurement [s].")] = 60.0,
-    floor_seconds: Annotated[float, typer.Option(min=2, help="Length of the floor's [s].")] = 20.0,
+    seconds: Annotated[float, typer.Option(min=2, help="Duration of the measurement [s].")] = 60.0,
+    floor_seconds: Annotated[
+        float, typer.Option(min=2, help="Duration of the floor's measurement [s].")
+    ] = 20.0,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
-    """Five BioTacs and two force/torque sensors through one gateway, beside bare readers."""
+    """Five BioTacs and two force/torque sensors through one gateway, against bare readers."""
     from palpate_deploy.bench.hand import run_hand
 
     run_hand(seconds=seconds, floor_seconds=floor_seconds, as_json=json_, save=save)
@@ -59,15 +63,17 @@ def hand(
 
 @bench_app.command(epilog=example("palpate bench alignment --page docs/results/alignment.md"))
 def alignment(
-    seconds: Annotated[float, typer.Option(min=0.5, help="Length of the measurement [s].")] = 30.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.5, help="Duration of the measurement [s].")
+    ] = 30.0,
     settle_seconds: Annotated[
-        float, typer.Option(min=0, help="How long clocks are followed before it [s].")
+        float, typer.Option(min=0, help="Time for the clocks to settle before it [s].")
     ] = 10.0,
-    page: Annotated[Path | None, typer.Option(help="Write a page of the result.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Write the result as a page, Markdown.")] = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
-    """How far off stamps are, and electrodes, wrenches and poses apart, against a known signal."""
+    """Errors of stamps, and of aligned electrodes, wrenches and poses, for a known signal."""
     from palpate_deploy.bench.alignment import run_alignment
 
     run_alignment(
@@ -77,11 +83,11 @@ def alignment(
 
 @bench_app.command(epilog=example("palpate bench codec --json"))
 def codec(
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds; the median of their medians.")] = 20,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of all frames.")] = 20,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
-    """Encode and decode of an electrode frame, with all checks."""
+    """Time to encode and decode an electrode frame, with all checks."""
     from palpate_deploy.bench.codec import run_codec
 
     run_codec(rounds, as_json=json_, save=save)

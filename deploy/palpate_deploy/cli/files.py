@@ -12,7 +12,7 @@ from palpate_deploy.cli.options import (
     DEFAULT_STATION,
     ConnectOption,
     JsonOption,
-    Pace,
+    ReplayPace,
     SensorOption,
     StationOption,
     client_link,
@@ -26,16 +26,16 @@ RecordArgument = Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A pal
 
 def record(
     out: Annotated[Path, typer.Option(help="Folder of the record.")] = Path("runs"),
-    duration_s: Annotated[float, typer.Option(min=0, help="0 = until Ctrl-C.")] = 0,
+    duration_s: Annotated[float, typer.Option(min=0, help="Duration [s]; 0 = until Ctrl-C.")] = 0,
     topic: Annotated[
-        list[str] | None, typer.Option("--topic", help="Only this topic; may be repeated.")
+        list[str] | None, typer.Option("--topic", help="Record only this topic; may be repeated.")
     ] = None,
     sensor: SensorOption = "*",
     rrd: Annotated[bool, typer.Option(help="Also write a Rerun view.")] = True,
     connect: ConnectOption = DEFAULT_CONNECT,
     station: StationOption = DEFAULT_STATION,
 ) -> None:
-    """Record a running station, beside its own recorder."""
+    """Record a running station, independently of its own recorder."""
     from palpate_deploy.diagnose.records import record_station
 
     record_station(
@@ -51,8 +51,9 @@ def replay(
         Path, typer.Argument(help="A vendor's text log (plain or .gz) or a palpate .mcap.")
     ],
     pace: Annotated[
-        Pace, typer.Option(help="As fast as possible without loss, or as recorded.")
-    ] = Pace.FAST,
+        ReplayPace,
+        typer.Option(help="fast = without loss as fast as possible; recorded = in real time."),
+    ] = ReplayPace.FAST,
     out: Annotated[Path, typer.Option(help="Folder of the new record.")] = Path("runs/replay"),
     bundle: Annotated[
         str, typer.Option(help="Bundle by name, name:version or folder.")
@@ -72,28 +73,32 @@ def review(
     path: Annotated[
         Path, typer.Argument(metavar="FILE.mcap|STORE.sim", help="A record, or simulations.")
     ],
-    out: Annotated[Path | None, typer.Option(help="The .rrd to write; default: beside.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="The .rrd to write; default: next to the input.")
+    ] = None,
     png: Annotated[
         Path | None,
         typer.Option(
-            help="Also draw a PNG: truth against estimate of a record; the overview of a store, or "
-            "the last step of the one trajectory that is named."
+            help="Also draw a PNG: of a record truth against estimate; of a store an overview, or "
+            "with one --trajectory its last step."
         ),
     ] = None,
     trajectory: Annotated[
         list[str] | None,
         typer.Option(
-            "--trajectory", metavar="ID", help="Of a store: only this, e.g. 'cube/*'; repeatable."
+            "--trajectory",
+            metavar="ID",
+            help="Of a store: only this one, e.g. 'cube/*'; may be repeated.",
         ),
     ] = None,
     most: Annotated[
-        int, typer.Option(min=1, help="Of a store: at most so many trajectories, evenly picked.")
+        int, typer.Option(min=1, help="Of a store: largest number of trajectories, evenly chosen.")
     ] = 8,
     bundle: Annotated[
         list[str] | None,
         typer.Option(
-            help="Of a record: a bundle with the mesh of its fields, beside the packaged ones; "
-            "repeatable."
+            help="Of a record: a bundle with the mesh of its fields, in addition to the packaged "
+            "ones; may be repeated."
         ),
     ] = None,
 ) -> None:
@@ -105,7 +110,7 @@ def review(
 
 
 def info(file: RecordArgument, json_: JsonOption = False) -> None:
-    """What a record holds: streams, counts, rates, time."""
+    """Contents of a record: streams, counts, rates, duration."""
     from palpate_deploy.diagnose.records import show_info
 
     show_info(existing_file(file), as_json=json_)
@@ -114,7 +119,7 @@ def info(file: RecordArgument, json_: JsonOption = False) -> None:
 def recover(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap.part", help="A cut-off record.")],
 ) -> None:
-    """Rescue the whole messages of a record whose writer was killed."""
+    """Recover the complete messages of a record whose writer was killed."""
     from palpate_deploy.diagnose.records import recover_record
 
     recover_record(existing_file(file))
@@ -138,7 +143,7 @@ bundle_app = group("Make bundles.")
 
 @model_app.command("list", epilog=example("palpate model list"))
 def list_(json_: JsonOption = False) -> None:
-    """The bundles that come with this palpate."""
+    """Bundles that ship with palpate."""
     from palpate_deploy.demo.bundles import list_models
 
     list_models(as_json=json_)
@@ -157,10 +162,11 @@ def verify(
 @bundle_app.command(epilog=example("palpate bundle virtual --out runs/bundle/1 --frames 20000"))
 def virtual(
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write; default: the one that ships.")
+        Path | None,
+        typer.Option(help="Folder to write; default: the next version of the packaged bundle."),
     ] = None,
     frames: Annotated[int, typer.Option(min=1000, help="Frames of the virtual finger.")] = 160_000,
-    seed: Annotated[int, typer.Option(min=0, help="Of the finger, and of training.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the finger and of the training.")] = 1,
 ) -> None:
     """Train the features bundle of the demo on the virtual finger (needs palpate[training])."""
     from palpate_deploy.demo.bundles import make_virtual_bundle
@@ -170,4 +176,4 @@ def virtual(
 
 @bundle_app.callback()
 def _group() -> None:
-    """Keep ``virtual`` a sub-command although it is the only one."""
+    """Keep ``virtual`` a subcommand although it is the only one."""

@@ -22,17 +22,17 @@ ConnectOption = Annotated[
     str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
 ]
 StationOption = Annotated[str, typer.Option("--station", help="Name of the station.")]
-SensorOption = Annotated[str, typer.Option("--sensor", help="One sensor; * = all.")]
+SensorOption = Annotated[str, typer.Option("--sensor", help="Name of a sensor; * = all.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
-DEFAULT_CONNECT = "tcp/127.0.0.1:7447"  # protos.config.DEFAULT_ROUTER; that import takes too long
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"  # as palpate.config.DEFAULT_ROUTER, whose import is slow
 DEFAULT_STATION = "lab"
 DEFAULT_PROFILE = "virtual"
 ROUTER_WAIT_S = 2.0
-"""How long a command waits for the station's router before it says that there is none [s]."""
+"""How long a command waits for the station's router [s]."""
 
 
-class Pace(enum.StrEnum):
+class ReplayPace(enum.StrEnum):
     """How fast a file is replayed."""
 
     RECORDED = "recorded"
@@ -64,7 +64,7 @@ def example(*lines: str) -> str:
 
 
 def client_link(connect: str) -> LinkConfig:
-    """How a command joins a running station: it gives up soon and says so.
+    """Link of a command to a running station, with a short wait for its router.
 
     Raises:
         ConfigError: ``connect`` is not an endpoint.
@@ -79,10 +79,10 @@ def client_link(connect: str) -> LinkConfig:
 
 
 def existing_file(path: Path) -> Path:
-    """Check that a file is there.
+    """Check that a file exists.
 
     Raises:
-        ConfigError: It is not.
+        ConfigError: It does not.
     """
     from palpate.errors import ConfigError
 

@@ -1,4 +1,4 @@
-"""``palpate bundle virtual``: the bundle of the demo, trained on the virtual finger."""
+"""Bundles: those that ship, a check of one, and the training of the one for the virtual finger."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from palpate_gateway.service.pipeline import Pipeline
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import PACKAGED, available, resolve
 
-TELLING_METRICS = (
+_SHOWN_METRICS = (
     "force_magnitude_n_median",
     "force_angle_rad_median",
     "location_distance_m_median",
 )
-"""What a person wants to see of a bundle; the rest is in --json and in its manifest."""
+"""Metrics that the table shows; --json and the manifest have all."""
 
 
 def list_models(*, as_json: bool) -> None:
-    """Print every bundle that comes with this palpate, a broken one with its error."""
+    """Print every bundle that ships with palpate; of a broken one the error."""
     rows: list[dict[str, Any]] = []
     for name in available():
         try:
@@ -70,14 +70,14 @@ def list_models(*, as_json: bool) -> None:
             "\n".join(
                 f"{key} {value:.4g}"
                 for key, value in row["metrics"].items()
-                if key in TELLING_METRICS
+                if key in _SHOWN_METRICS
             ),
         )
     Console().print(table)
 
 
 def verify_model(name: str) -> None:
-    """Check a bundle as the service does before it serves it, and say what it is.
+    """Check a bundle as a service does before it serves it, and describe it.
 
     Raises:
         ConfigError: There is no such bundle.
@@ -106,24 +106,25 @@ def write_virtual_record(
     rate_hz: float = 100.0,
     on_frames: Callable[[int], None] | None = None,
 ) -> int:
-    """Record the virtual finger as a gateway would publish it, tare and ground truth included.
+    """Record the virtual finger as a gateway publishes it, with tare and ground truth.
 
     Args:
         path: ``NAME.mcap``.
         frames: How many electrode frames.
-        seed: Of trajectories and noise.
-        unit: Number of the finger.
-        rate_hz: Frames per second of the finger's time; fewer give more presses for as many frames.
+        seed: Seed of trajectories and noise.
+        unit: Number of the specimen.
+        rate_hz: Frames per second of the finger's time; a lower rate gives more indentations for
+            the same number of frames.
         on_frames: Called with the frames written so far, for a progress bar.
 
     Returns:
         The electrode frames written.
 
     Raises:
-        RecordingError: The disk refuses.
+        RecordingError: The disk is full or refuses to write.
     """
     options = {
-        "model": "formula",  # endless different presses; a tape repeats its own
+        "model": "formula",  # new indentations without end; a tape would repeat its own
         "seed": seed,
         "unit": unit,
         "frames": frames,
@@ -152,7 +153,7 @@ def write_virtual_record(
                     keys[item.topic],
                     topic.codec.schema,
                     payload,
-                    # A record is in order of its log times; here they are the readings' own.
+                    # A record is ordered by log time; here it is the time of the reading.
                     log_time_ns=0 if stamp is None else stamp.wall_ns,
                     sequence=0 if stamp is None else stamp.sequence,
                 )
@@ -169,21 +170,21 @@ def write_virtual_record(
 NAME = "features-virtual"
 
 RATE_HZ = 20.0
-"""Rate at which the finger is recorded for training: neighbouring frames of a press say nearly the
-same, so the same number of frames is better spent on five times as many presses."""
+"""Rate at which the finger is recorded for training [Hz]: successive frames at 100 Hz are nearly
+alike, so the same number of frames is better used for five times as many indentations."""
 
 
 def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
-    """Record the virtual finger, ingest, train, and write the bundle whole or not at all.
+    """Record the virtual finger, ingest the record, train, and write the bundle.
 
     Args:
-        out: Folder to write; None = the next free version of the one that ships.
+        out: Folder to write; None = the next free version of the packaged bundle.
         frames: Frames of the virtual finger.
-        seed: Of the finger, and of training.
+        seed: Seed of the finger and of the training.
 
     Raises:
         MissingExtraError: The training extra is not installed.
-        BundleError: The folder exists, or the exported model is not the trained one.
+        BundleError: The folder exists, or the exported model differs from the trained one.
     """
     for module in EXTRA_MODULES:
         require(module, extra="training")
@@ -237,7 +238,7 @@ def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
 
 
 def _next_version() -> int:
-    """The version after the newest that is there."""
+    """The version after the newest."""
     there = [int(path.name) for path in (PACKAGED / NAME).glob("*") if path.name.isdigit()]
     return max(there, default=0) + 1
 

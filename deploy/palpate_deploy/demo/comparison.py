@@ -1,4 +1,4 @@
-"""Fields and synthesised electrodes of the demo, beside what is known of them."""
+"""Estimates of the demo compared with the truth: forces, locations, fields and electrodes."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from palpate.messages import (
 )
 
 _KEPT = 500
-"""Truths that wait for their estimate; five seconds at 100 Hz."""
+"""Truths that wait for their estimate: five seconds at 100 Hz."""
 
 Vector = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Streams:
-    """What is compared."""
+class TruthStreams:
+    """Streams of estimates and of their truth."""
 
     features: Subscriber[FeatureEstimate]
     wrench: Subscriber[WrenchFrame]
@@ -43,7 +43,7 @@ class Streams:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class TouchMoment:
     """One frame: forces [N], locations [m], each of shape ``(3,)``; None where there is none."""
 
     force: Vector
@@ -55,7 +55,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Medians:
+class TouchMedians:
     """Median errors: of the vectors' lengths and per axis, [N] and [m]; median age [s]."""
 
     force_n: float
@@ -65,28 +65,28 @@ class Medians:
     age_s: float
 
 
-class Comparison:
-    """Matches estimates with the truth of the same instant and keeps the errors in contact."""
+class TouchComparison:
+    """Matches estimates with the truth of the same instant; keeps the errors in contact."""
 
     def __init__(self) -> None:
         self.count = 0
-        self.newest: Moment | None = None
+        self.newest: TouchMoment | None = None
         self._wrench: OrderedDict[int, WrenchFrame] = OrderedDict()
         self._pose: OrderedDict[int, IndenterPoseFrame] = OrderedDict()
         self._force_errors: list[Vector] = []
         self._location_errors: list[Vector] = []
         self._ages_s: list[float] = []
 
-    def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> Streams:
-        """Subscribe to estimate and truth of a sensor."""
-        return Streams(
+    def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> TruthStreams:
+        """Subscribe to estimates and truth of a sensor."""
+        return TruthStreams(
             session.subscriber(FEATURES, sensor=sensor, delivery=delivery),
             session.subscriber(WRENCH, sensor=sensor, delivery=delivery),
             session.subscriber(POSE, sensor=sensor, delivery=delivery),
         )
 
-    def take(self, streams: Streams, *, timeout_s: float) -> None:
-        """Take in the next estimate and all truth that has come.
+    def take(self, streams: TruthStreams, *, timeout_s: float) -> None:
+        """Take the next estimate and all truth that has arrived.
 
         Raises:
             StreamTimeout: No estimate came in time.
@@ -95,15 +95,15 @@ class Comparison:
         self.add_truth(streams)
         self.add(received.message, received.received_monotonic_ns)
 
-    def add_truth(self, streams: Streams) -> None:
-        """Take in the truth that has come."""
+    def add_truth(self, streams: TruthStreams) -> None:
+        """Take the truth that has arrived."""
         for wrench in _all(streams.wrench):
             _remember(self._wrench, wrench.stamp.monotonic_ns, wrench)
         for pose in _all(streams.pose):
             _remember(self._pose, pose.stamp.monotonic_ns, pose)
 
     def add(self, estimate: FeatureEstimate, received_ns: int) -> None:
-        """Take in one estimate, received at ``received_ns`` of this host's monotonic clock."""
+        """Take one estimate, received at ``received_ns`` of this host's monotonic clock."""
         self.count += 1
         age_s = clock.age_s(estimate.source, monotonic_ns=received_ns)
         self._ages_s.append(age_s)
@@ -111,9 +111,9 @@ class Comparison:
         if wrench is None:
             return
         pose = self._pose.get(estimate.source.monotonic_ns)
-        # Who cannot know whether it touches counts as one who does not say.
+        # None = the source cannot tell; that counts as contact, as does a missing pose.
         touched = pose is None or pose.in_contact is not False
-        moment = Moment(
+        moment = TouchMoment(
             force=estimate.force,
             true_force=wrench.force,
             location=estimate.contact_location,
@@ -128,10 +128,10 @@ class Comparison:
         if moment.location is not None and moment.true_location is not None:
             self._location_errors.append(moment.location - moment.true_location)
 
-    def medians(self) -> Medians:
-        """Medians over all frames in contact so far; NaN where there were none."""
+    def medians(self) -> TouchMedians:
+        """TouchMedians over all frames in contact so far; NaN where there were none."""
         force, location = _rows(self._force_errors), _rows(self._location_errors)
-        return Medians(
+        return TouchMedians(
             force_n=float(np.median(np.linalg.norm(force, axis=1))),
             location_m=float(np.median(np.linalg.norm(location, axis=1))),
             force_axes_n=np.median(np.abs(force), axis=0),
@@ -165,12 +165,12 @@ _WAITING = 200
 """Estimates and frames that wait for what they are compared with."""
 
 MOVED_M = 0.05e-3
-"""A skin whose nodes move less on average counts as untouched [m]."""
+"""A skin counts as touched if its nodes move by more than this on average [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldStreams:
-    """What is compared; ``tare`` finds the one that a frame names, which may be older than we."""
+    """Streams of fields, syntheses and their truth; ``tare`` finds a tare by its id."""
 
     field: Subscriber[FieldEstimate]
     truth: Subscriber[FieldFrame]
@@ -181,11 +181,11 @@ class FieldStreams:
 
 @dataclass(frozen=True, slots=True)
 class FieldMedians:
-    """What was found so far, NaN where nothing was.
+    """Medians so far; NaN before the first comparison.
 
     Attributes:
         fields: Estimates that were compared.
-        moved_m: Median over touched moments of the mean displacement of a node [m].
+        moved_m: Median over touched frames of the mean displacement of a node [m].
         field_m: Median of the mean error of a node, touched [m].
         syntheses: Syntheses that were compared.
         counts: Median r.m.s. error of the 19 electrodes, touched [counts].
@@ -199,7 +199,7 @@ class FieldMedians:
 
 
 class FieldComparison:
-    """Matches fields with the truth, and synthesised electrodes with those that were read."""
+    """Matches fields with the truth, and synthesised electrodes with the measured ones."""
 
     def __init__(self) -> None:
         self._truth: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
@@ -221,7 +221,7 @@ class FieldComparison:
         )
 
     def take(self, streams: FieldStreams) -> None:
-        """Take in all that has come; never waits."""
+        """Take all messages that have arrived; never waits."""
         for frame in _all(streams.electrodes):
             counts = np.asarray(frame.electrodes, np.float64)
             self._counts[frame.stamp.monotonic_ns] = (frame.tare_id, counts)
@@ -236,7 +236,7 @@ class FieldComparison:
             self._compare(synthesis, streams.tare)
 
     def medians(self) -> FieldMedians:
-        """Of all that was compared so far."""
+        """Medians of all comparisons so far."""
         return FieldMedians(
             fields=len(self._errors),
             moved_m=_median(self._moved),
@@ -276,7 +276,7 @@ class FieldComparison:
             return
         try:
             rest = find(tare_id)
-        except PalpateError:  # the gateway is gone; what was compared stays
+        except PalpateError:  # the gateway has ended; earlier comparisons stay
             return
         tared = counts - np.asarray(rest.electrodes, np.float64)
         if np.abs(tared).max() < _TOUCHED_COUNTS:
@@ -286,7 +286,7 @@ class FieldComparison:
 
 
 _TOUCHED_COUNTS = 40.0
-"""Of the electrode that moved most: above noise and drift [counts]."""
+"""The sensor counts as touched if one electrode moves by this: above noise and drift [counts]."""
 
 
 def _median(values: list[float]) -> float:

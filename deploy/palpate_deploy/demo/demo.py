@@ -1,7 +1,8 @@
-"""``palpate demo``: a virtual finger is touched, and one sees how well palpate feels it."""
+"""``palpate demo``: a virtual finger is touched; estimates are compared with the truth, live."""
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from pathlib import Path
@@ -14,13 +15,18 @@ from rich.table import Table
 from palpate.bus import Delivery
 from palpate.client import Client
 from palpate.errors import LinkError, PalpateError, StreamTimeout
-from palpate_deploy.demo.comparison import Comparison, FieldComparison, FieldMedians, Moment
+from palpate_deploy.demo.comparison import (
+    FieldComparison,
+    FieldMedians,
+    TouchComparison,
+    TouchMoment,
+)
 from palpate_deploy.diagnose.records import viewer_command
 from palpate_deploy.station.host import free_endpoint
+from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile, changed, load_profile
 from palpate_deploy.station.supervisor import Supervisor
-from palpate_deploy.station.up import stop_on_signals
 
 _SENSOR = "finger"
 _REFRESH_S = 0.1
@@ -34,7 +40,7 @@ def run_demo(seconds: float, out: Path) -> int:
     """Run the demo.
 
     Args:
-        seconds: How long the finger is watched [s], from the first estimate.
+        seconds: How long to compare [s], from the first estimate.
         out: Folder of record, view and picture.
 
     Returns:
@@ -46,7 +52,7 @@ def run_demo(seconds: float, out: Path) -> int:
     from palpate_services.inference.repository import resolve
 
     console = Console()
-    endpoint = free_endpoint()  # it must not collide with a station of this host
+    endpoint = free_endpoint()  # a station may run on this host, with the usual port
     profile = changed(
         load_profile("demo"),
         router={"listen": (endpoint,)},
@@ -54,15 +60,15 @@ def run_demo(seconds: float, out: Path) -> int:
         recorder={"out": str(out)},
     )
     for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
-        resolve(bundle)  # one that is not there is said before anything starts
+        resolve(bundle)  # a missing one is an error before anything starts
     before = set(out.glob("*.mcap"))
-    stop = stop_on_signals()
+    stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     console.print(
         "virtual finger -> features, fields, synthesis -> recorder, for "
         f"{seconds:g} s after the first estimate",
         highlight=False,
     )
-    comparison, fields = Comparison(), FieldComparison()
+    comparison, fields = TouchComparison(), FieldComparison()
     with Supervisor(profile, "demo") as supervisor:
         try:
             _watch(console, profile, comparison, fields, seconds, stop)
@@ -82,7 +88,7 @@ def run_demo(seconds: float, out: Path) -> int:
 def _watch(
     console: Console,
     profile: Profile,
-    comparison: Comparison,
+    comparison: TouchComparison,
     fields: FieldComparison,
     seconds: float,
     stop: threading.Event,
@@ -116,7 +122,7 @@ def _watch(
                 redraw = now + _LINE_S
 
 
-def _table(comparison: Comparison, fields: FieldMedians, left_s: float) -> Table:
+def _table(comparison: TouchComparison, fields: FieldMedians, left_s: float) -> Table:
     moment = comparison.newest
     assert moment is not None
     table = Table(title="touch of the virtual finger", title_justify="left")
@@ -161,7 +167,7 @@ def _table(comparison: Comparison, fields: FieldMedians, left_s: float) -> Table
     return table
 
 
-def _line(moment: Moment) -> str:
+def _line(moment: TouchMoment) -> str:
     truth, force = moment.true_force, moment.force
     line = (
         f"force [N] truth {truth[0]:+.2f} {truth[1]:+.2f} {truth[2]:+.2f}"
@@ -174,9 +180,9 @@ def _line(moment: Moment) -> str:
 
 
 def _report(
-    console: Console, comparison: Comparison, fields: FieldMedians, records: list[Path]
+    console: Console, comparison: TouchComparison, fields: FieldMedians, records: list[Path]
 ) -> int:
-    """Draw the picture, print where everything is and how good it was."""
+    """Draw the picture; print median errors and the paths of the files."""
     if not comparison.count or not records:
         console.print("no estimate came; see the logs above and try: palpate doctor")
         return FAILED
@@ -203,7 +209,7 @@ def _report(
 
         plot_record(record, picture)
         print(f"picture  {picture}")
-    except PalpateError as error:  # the record is there; a picture can be made later
+    except PalpateError as error:  # the record exists; a picture can be made later
         print(f"picture  none: {error}")
     view = record.with_suffix(".rrd")
     if view.is_file():

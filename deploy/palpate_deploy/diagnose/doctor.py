@@ -1,4 +1,4 @@
-"""``palpate doctor``: what a station needs on this host, one line each, with its fix."""
+"""``palpate doctor``: checks of what a station needs on this host, each with a fix."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Grade = Literal["ok", "warn", "fail"]
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 _PYTHON_MIN = (3, 11)
 _PACKAGES = (
-    # module, distribution, extra; None = palpate cannot do without
+    # module, distribution, extra; None = always needed
     ("numpy", "numpy", None),
     ("zenoh", "eclipse-zenoh", None),
     ("google.protobuf", "protobuf", None),
@@ -56,9 +56,9 @@ class Finding:
     """One line of the report.
 
     Attributes:
-        what: What was looked at.
-        grade: ``ok``, ``warn`` (a station runs, something is missing) or ``fail``.
-        found: What was found.
+        what: What was checked.
+        grade: ``ok``, ``warn`` (a station runs, but something is missing) or ``fail``.
+        found: The result.
         fix: What to do about it.
     """
 
@@ -69,10 +69,10 @@ class Finding:
 
 
 def run_doctor(profile_name: str, *, as_json: bool) -> int:
-    """Look at everything and print it.
+    """Check everything and print the result.
 
     Returns:
-        0, or 1 if a line says fail.
+        0, or 1 if a check failed.
     """
     console = Console()
     findings: list[Finding] = []
@@ -166,14 +166,16 @@ def _router(profile: Profile) -> Finding:
     try:
         with Session.open(link, station=profile.station) as session:
             alive = sorted({one.service for one in session.alive()})
-        return Finding("router", "ok", f"answers at {where}; alive: {', '.join(alive) or 'nobody'}")
+        return Finding(
+            "router", "ok", f"answers at {where}; running: {', '.join(alive) or 'nothing'}"
+        )
     except LinkError as error:
         if "router" not in profile.processes:
             return Finding("router", "fail", error.problem, f"start the router at {where}")
     try:
         check_free(profile.router.listen)
     except LinkError as error:
-        return Finding("router", "fail", f"{error.problem}, by something else", error.remedy)
+        return Finding("router", "fail", f"{error.problem} by another program", error.remedy)
     exposed = [e for e in profile.router.listen if not is_loopback(endpoint_host_port(e)[0])]
     if exposed and profile.link.tls is not None:
         for path in (profile.link.tls.root_ca_certificate, profile.link.tls.certificate):
@@ -271,7 +273,7 @@ def _wall(profile: Profile) -> Finding:
         "wall clock",
         "warn",
         found,
-        "this profile is of several hosts: run chrony or ptp4l on each (docs/time.md)",
+        "this profile spans several hosts: run chrony or ptp4l on each (docs/time.md)",
     )
 
 
@@ -280,7 +282,9 @@ def _cpu() -> Finding:
     load = os.getloadavg()[0]
     found = f"{cpus} CPUs, load {load:.1f}"
     if cpus < 2:
-        return Finding("cpu", "warn", found, "a station wants two: estimates will be late at times")
+        return Finding(
+            "cpu", "warn", found, "a station needs two: estimates will sometimes be late"
+        )
     if load > cpus:
         return Finding("cpu", "warn", found, "stop what else runs here")
     return Finding("cpu", "ok", found)

@@ -1,17 +1,15 @@
-"""``palpate record``, ``info``, ``review`` and ``recover``: records and simulations on disk."""
+"""Records and stores of simulations: ``palpate record``, ``info``, ``review`` and ``recover``."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-import signal
 import sys
 import threading
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rich.console import Console
@@ -21,6 +19,7 @@ from palpate.bus import Session
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
+from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.status import duration_text
 
 
@@ -47,15 +46,9 @@ def record_station(
     from palpate_services.recorder.service import run_recorder
 
     config = parse_config(RecorderConfig, settings, where="command line")
-    Session.open(link, station=station).close()  # say at once that there is no router
+    Session.open(link, station=station).close()  # raises at once if there is no router
     before = set(config.out.glob("*.mcap"))
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, on_signal)
+    stop = stop_on_signals()
     if duration_s:
         timer = threading.Timer(duration_s, stop.set)
         timer.daemon = True

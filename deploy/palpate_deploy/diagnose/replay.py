@@ -1,8 +1,8 @@
 """``palpate replay``: a file through gateway, features and recorder, and the account of it.
 
-The run stands alone: its own router on a free port, its own station name, nothing shared with a
-station that may run beside it. Paced ``fast`` it is lossless, and what was published, estimated and
-recorded must be equal in number; the count that matters is read back from the record.
+The run is independent of any other station: it has a router on a free port and a station name of
+its own. With the pace ``fast`` it is lossless: as many frames must be recorded, and answered with
+estimates or a reason, as were published. The counts are read back from the record.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from palpate.messages import ServiceState, Status
 from palpate_deploy.diagnose.records import viewer_command
 from palpate_deploy.station.host import free_endpoint
 from palpate_deploy.station.logs import DEVICE, FAILED, print_error
-from palpate_deploy.station.processes import Children
+from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile, changed, load_profile
 from palpate_deploy.station.status import ask_status
 
 
 @dataclass(slots=True)
-class Outcome:
-    """What came of a replay.
+class ReplayAccount:
+    """The account of a replay: what was published, estimated and recorded.
 
     Attributes:
-        file: What was replayed.
+        file: The file that was replayed.
         seconds: How long it took [s].
         gateway: Last counters of the gateway.
         features: Last counters of the features service.
         recorded: Recorded messages by topic, read back from the records.
         records: The files written.
         error: Why the file ended early, if it did.
-        exit_status: Of the gateway.
+        exit_status: Exit status of the gateway.
     """
 
     file: Path
@@ -67,9 +67,9 @@ class Outcome:
 
     @property
     def problems(self) -> list[str]:
-        """What is not equal and ought to be.
+        """Counts that differ and should be equal.
 
-        A frame that got no estimate for a good reason is accounted for by the reason's counter.
+        A frame without estimate counts as answered if the service counted the reason.
         """
         found = []
         answered = self.estimated + sum(self.unanswered.values())
@@ -95,7 +95,7 @@ class Outcome:
 
 
 def total(counters: dict[str, int], name: str) -> int:
-    """A counter summed over sensors: one sensor's has the bare name, several have a prefix."""
+    """A counter summed over sensors: its name is bare with one sensor, prefixed with several."""
     return sum(n for key, n in counters.items() if key == name or key.endswith(f".{name}"))
 
 
@@ -108,41 +108,41 @@ def count_topics(records: list[Path]) -> dict[str, int]:
     return dict(counts)
 
 
-def as_plain(outcome: Outcome) -> dict[str, Any]:
+def as_plain(account: ReplayAccount) -> dict[str, Any]:
     """The account as plain values."""
-    error = outcome.error
+    error = account.error
     return {
-        "file": str(outcome.file),
-        "seconds": round(outcome.seconds, 3),
-        "samples": total(outcome.gateway, "samples"),
-        "frames": outcome.published,
-        "missing_frames": total(outcome.gateway, "missing_frames"),
-        "time_jumps": total(outcome.gateway, "time_jumps"),
-        "estimates": outcome.estimated,
-        "recorded": outcome.recorded,
-        "records": [str(path) for path in outcome.records],
-        "lossless": not outcome.problems,
-        "gateway": outcome.gateway,
-        "features": outcome.features,
+        "file": str(account.file),
+        "seconds": round(account.seconds, 3),
+        "samples": total(account.gateway, "samples"),
+        "frames": account.published,
+        "missing_frames": total(account.gateway, "missing_frames"),
+        "time_jumps": total(account.gateway, "time_jumps"),
+        "estimates": account.estimated,
+        "recorded": account.recorded,
+        "records": [str(path) for path in account.records],
+        "lossless": not account.problems,
+        "gateway": account.gateway,
+        "features": account.features,
         "error": None if error is None else {"problem": error.problem, "remedy": error.remedy},
     }
 
 
-def print_account(outcome: Outcome) -> None:
+def print_account(account: ReplayAccount) -> None:
     """Print the account as a table, and the files."""
-    table = Table(title=str(outcome.file), title_justify="left", show_header=False)
+    table = Table(title=str(account.file), title_justify="left", show_header=False)
     table.add_column()
     table.add_column(justify="right")
-    plain = as_plain(outcome)
+    plain = as_plain(account)
     for name in ("samples", "frames", "missing_frames", "time_jumps", "estimates"):
         table.add_row(name.replace("_", " "), f"{plain[name]:,}")
-    for reason, count in sorted(outcome.unanswered.items()):
+    for reason, count in sorted(account.unanswered.items()):
         table.add_row(f"  without estimate: {reason}", f"{count:,}")
-    for topic, count in sorted(outcome.recorded.items()):
+    for topic, count in sorted(account.recorded.items()):
         table.add_row(f"recorded {topic}", f"{count:,}")
-    table.add_row("seconds", f"{outcome.seconds:.1f}")
+    table.add_row("seconds", f"{account.seconds:.1f}")
     Console().print(table)
-    for path in outcome.records:
+    for path in account.records:
         print(path)
         if (view := path.with_suffix(".rrd")).is_file():
             print(f"{view}   look at it: {viewer_command(view)}")
@@ -174,21 +174,24 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
     """
     from palpate_services.inference.repository import resolve
 
-    resolve(bundle)  # a bundle that is not there is said before anything starts
+    resolve(bundle)  # a missing bundle is an error before anything starts
     profile = replay_profile(file, pace, out, bundle, rrd=rrd)
-    outcome = replay(profile, file, show=not as_json)
+    account = replay(profile, file, show=not as_json)
     if as_json:
-        print(json.dumps(as_plain(outcome), indent=2))
+        print(json.dumps(as_plain(account), indent=2))
     else:
-        print_account(outcome)
-    if outcome.error is not None:
-        print_error(outcome.error)
-        return DEVICE if outcome.exit_status == DEVICE else FAILED
-    # At the recorded pace a slow host may drop, as it would live; that is counted, not an error.
-    if outcome.problems and (pace == "fast" or not outcome.estimated):
-        for problem in outcome.problems:
+        print_account(account)
+    if account.error is not None:
+        print_error(account.error)
+        return DEVICE if account.exit_status == DEVICE else FAILED
+    # At the recorded pace a slow host may drop frames, as it would live; they are only counted.
+    if account.problems and (pace == "fast" or not account.estimated):
+        for problem in account.problems:
             print_error(
-                LinkError(problem, remedy="see the counters above; report it, nothing may be lost")
+                LinkError(
+                    problem,
+                    remedy="see the counters above, and report it: a replay must be lossless",
+                )
             )
         return FAILED
     return 0
@@ -215,7 +218,7 @@ def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) 
 
 
 def sensors_of(file: Path) -> list[dict[str, Any]]:
-    """What the gateway reads from a file: a record by its magic bytes, else a text log."""
+    """The gateway's sensors for a file: a record (by its magic bytes), else a text log."""
     with open(file, "rb") as stream:
         head = stream.read(len(_MCAP_MAGIC))
     path = str(file.absolute())
@@ -225,10 +228,10 @@ def sensors_of(file: Path) -> list[dict[str, Any]]:
         try:
             names = recorded_sensors(file)
         except RecordingError:
-            names = []  # a damaged record delivers what is before the damage, and then says so
+            names = []  # the driver delivers what is before the damage, then raises the error
         if not names:
             return [{"name": "finger", "driver": "record", "options": {"path": path}}]
-        # Naming the sensor spares the driver a look through the whole record.
+        # With the name of the sensor the driver need not search the whole record for it.
         return [
             {"name": name, "driver": "record", "options": {"path": path, "sensor": name}}
             for name in names
@@ -236,41 +239,41 @@ def sensors_of(file: Path) -> list[dict[str, Any]]:
     return [{"name": "finger", "driver": "text_log", "options": {"path": path}}]
 
 
-def replay(profile: Profile, file: Path, *, show: bool = False) -> Outcome:
+def replay(profile: Profile, file: Path, *, show: bool = False) -> ReplayAccount:
     """Run a replay to its end.
 
     Args:
         profile: As made by ``replay_profile``.
-        file: What is replayed, for the account.
+        file: The replayed file, for the account.
         show: Show progress on the terminal.
 
     Raises:
         LinkError: The bus cannot be joined.
         ProcessEnded: A process could not start.
     """
-    outcome = Outcome(file)
+    account = ReplayAccount(file)
     out = profile.recorder.out
     before = set(out.glob("*.mcap"))
     began = time.monotonic()
-    with Children("replay") as children:
+    with FiniteRun("replay") as children:
         children.start_profile(profile)
         link = profile.link.model_copy(update={"wait_for_router_s": _JOIN_S})
         with Session.open(link, station=profile.station) as session, _progress(show) as bar:
             task = bar.add_task(file.name, total=None, frames=0)
-            last = _follow(children, session, outcome, bar, task)
-        outcome.exit_status = last
-    outcome.seconds = time.monotonic() - began
-    outcome.records = sorted(set(out.glob("*.mcap")) - before)
-    outcome.recorded = count_topics(outcome.records)
-    if last != 0 and outcome.error is None:
-        outcome.error = children.ended("gateway", last)
-    return outcome
+            last = _follow(children, session, account, bar, task)
+        account.exit_status = last
+    account.seconds = time.monotonic() - began
+    account.records = sorted(set(out.glob("*.mcap")) - before)
+    account.recorded = count_topics(account.records)
+    if last != 0 and account.error is None:
+        account.error = children.ended("gateway", last)
+    return account
 
 
 def _follow(
-    children: Children, session: Session, outcome: Outcome, bar: Progress, task: Any
+    children: FiniteRun, session: Session, account: ReplayAccount, bar: Progress, task: Any
 ) -> int:
-    """Take over counters until the gateway has ended and its consumers have done their work.
+    """Update the counters until the gateway has ended and its consumers have finished.
 
     Returns:
         The gateway's exit status.
@@ -279,8 +282,8 @@ def _follow(
     while True:
         children.check(["router", "features", "recorder"])
         statuses = {status.service: status for status in ask_status(session)}
-        _take(outcome, statuses)
-        frames = outcome.published
+        _take(account, statuses)
+        frames = account.published
         bar.update(task, completed=frames, frames=frames)
         status = children.status("gateway")
         gateway = statuses.get("gateway")
@@ -291,28 +294,28 @@ def _follow(
         if status is not None or ended:
             settled_by = min(settled_by, time.monotonic() + _SETTLED_S)
             if status is not None and (
-                _settled(outcome, statuses) or time.monotonic() > settled_by
+                _settled(account, statuses) or time.monotonic() > settled_by
             ):
                 bar.update(task, total=max(frames, 1), completed=max(frames, 1), frames=frames)
                 return status
         time.sleep(_POLL_S)
 
 
-def _settled(outcome: Outcome, statuses: dict[str, Status]) -> bool:
+def _settled(account: ReplayAccount, statuses: dict[str, Status]) -> bool:
     """Whether every published frame was answered and recorded."""
     recorder = statuses.get("recorder")
     recorded = 0 if recorder is None else recorder.counters.get("recorded_electrodes", 0)
     return (
-        outcome.estimated + sum(outcome.unanswered.values()) >= outcome.published
-        and recorded >= outcome.published
+        account.estimated + sum(account.unanswered.values()) >= account.published
+        and recorded >= account.published
     )
 
 
-def _take(outcome: Outcome, statuses: dict[str, Status]) -> None:
+def _take(account: ReplayAccount, statuses: dict[str, Status]) -> None:
     if "gateway" in statuses:
-        outcome.gateway = dict(statuses["gateway"].counters)
+        account.gateway = dict(statuses["gateway"].counters)
     if "features" in statuses:
-        outcome.features = dict(statuses["features"].counters)
+        account.features = dict(statuses["features"].counters)
 
 
 def _progress(show: bool) -> Progress:

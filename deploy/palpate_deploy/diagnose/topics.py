@@ -1,4 +1,4 @@
-"""``palpate topic hz``: rate, jitter, bandwidth and loss of a stream."""
+"""``palpate topic``: which streams there are, their messages, rates and losses."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ def topic_named(name: str) -> Topic[Any]:
 
 
 @dataclass(slots=True)
-class _Heard:
-    """What came of one topic."""
+class _TopicCount:
+    """Messages received of one topic."""
 
     messages: int = 0
     sources: set[str] = field(default_factory=set)
 
 
 def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool) -> None:
-    """Listen to everything for a while and print the topic table.
+    """Receive all topics for a while and print them as a table.
 
     Raises:
         LinkError: There is no router.
     """
-    heard: defaultdict[str, _Heard] = defaultdict(_Heard)
+    heard: defaultdict[str, _TopicCount] = defaultdict(_TopicCount)
     with Session.open(link, station=station) as session:
         with session.tap(list(TOPICS.values())) as tap:
             began = time.monotonic()
@@ -98,7 +98,7 @@ def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool
     Console().print(table)
 
 
-def _rate_hz(heard: _Heard, seconds: float) -> float:
+def _rate_hz(heard: _TopicCount, seconds: float) -> float:
     """Messages per second of one source."""
     return heard.messages / seconds / max(1, len(heard.sources))
 
@@ -122,7 +122,7 @@ def echo_topic(
         sensor: One sensor, or ``*``.
         count: End after so many; 0 = at Ctrl-C.
         timeout_s: End when none comes for so long [s].
-        as_json: One JSON object a line.
+        as_json: Print one JSON object a line.
 
     Raises:
         ConfigError: There is no such topic.
@@ -144,7 +144,7 @@ def echo_topic(
                     )
                     if rejected:
                         raise StreamTimeout(
-                            f"{rejected} payloads of {name} came and none is valid",
+                            f"{rejected} payloads of {name} came, none is valid",
                             remedy="the publisher speaks another contract: compare its version",
                         ) from error
                     raise
@@ -155,7 +155,7 @@ def echo_topic(
 
 
 def plain(value: Any) -> Any:
-    """A message as JSON's own kinds: digests as hex, enums by name, arrays as lists."""
+    """A message as JSON types: digests as hex, enums by name, arrays as lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, bytes):
@@ -216,15 +216,15 @@ _REPORT_S = 1.0
 
 
 @dataclass(slots=True)
-class Rate:
-    """What was seen of one source.
+class StreamRate:
+    """Rate and losses of one source.
 
     Attributes:
         messages: How many came.
         bytes: Their payloads [bytes].
-        lost: Holes in the sequence of stamps, for streams whose sequences have none.
+        lost: Gaps in the sequence numbers, of streams that are contiguous.
         rejected: Payloads that do not decode.
-        missed: Frames the device itself lost, by the stamps.
+        missed: Frames that the device itself lost, from ``missed_before`` of the stamps.
         gaps_s: Time between two arrivals [s].
     """
 
@@ -258,7 +258,7 @@ class Rate:
         self._sequence = stamp.sequence
 
     def summary(self) -> dict[str, float | int | None]:
-        """Numbers for people and machines; None where two messages would be needed."""
+        """The numbers to print; None where they need two messages and there is one."""
         total_s = sum(self.gaps_s)
         some = bool(self.gaps_s) and total_s > 0
         return {
@@ -286,14 +286,14 @@ def measure(
     """Print the rate of a topic until ``seconds`` have passed (0 = Ctrl-C).
 
     Returns:
-        0, or 1 if nothing was heard.
+        0, or 1 if no message came.
 
     Raises:
         ConfigError: There is no such topic.
         LinkError: There is no router.
     """
     topic = topic_named(name)
-    rates: defaultdict[str, Rate] = defaultdict(Rate)
+    rates: defaultdict[str, StreamRate] = defaultdict(StreamRate)
     with (
         Session.open(link, station=station) as session,
         session.tap([topic], sensor=sensor, delivery=Delivery.QUEUE) as tap,
@@ -321,7 +321,7 @@ def measure(
     return 0 if rates else FAILED
 
 
-def print_rates(topic: Topic[object], rates: dict[str, Rate]) -> None:
+def print_rates(topic: Topic[object], rates: dict[str, StreamRate]) -> None:
     """Print one line for each source."""
     if not rates:
         print(f"no {topic.name} heard; see what runs: palpate status", file=sys.stderr, flush=True)

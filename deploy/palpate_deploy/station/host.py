@@ -1,4 +1,4 @@
-"""Where a run keeps its resolved profile and its logs: one folder a run, in the user's state."""
+"""What a run needs of this host: free ports, and a folder for its profile and logs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
+import tomli_w
+
 from palpate.config import endpoint_host_port
 from palpate.errors import ConfigError, LinkError
 from palpate_deploy.station.profile import Profile, plain_values
-from palpate_deploy.toml_text import toml_text
 
 
 def check_free(endpoints: Iterable[str]) -> None:
@@ -44,7 +45,7 @@ def check_free(endpoints: Iterable[str]) -> None:
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint that nothing listens at now."""
+    """A loopback endpoint at which nothing listens at present."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -55,24 +56,24 @@ def _bind(host: str, port: int) -> None:
         host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
     )[0]
     with socket.socket(family, kind, protocol) as probe:
-        # As the router does: a port whose last connection just closed is free.
+        # As the router does: without it a port stays taken for a while after its last use.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(address)
         probe.listen(1)
 
 
 KEPT_RUNS = 20
-"""Older folders are removed; recordings are never kept there."""
+"""Older folders are removed; records are never stored there."""
 
 
 def state_folder() -> Path:
-    """Folder for what palpate remembers of its runs (XDG base directories)."""
+    """Folder of the runs' profiles and logs (XDG base directories)."""
     base = os.environ.get("XDG_STATE_HOME")
     return (Path(base) if base else Path.home() / ".local" / "state") / "palpate"
 
 
 def new_run_folder(name: str) -> Path:
-    """Make an empty folder for a run and forget the oldest runs.
+    """Make an empty folder for a run, and remove those of the oldest runs.
 
     Raises:
         ConfigError: The folder cannot be made.
@@ -94,10 +95,10 @@ def new_run_folder(name: str) -> Path:
 
 
 def _in_use(folder: Path) -> bool:
-    """Whether the process that the folder is named after still runs."""
+    """Whether the process whose id ends the folder's name still runs."""
     pid = folder.name.rpartition("-")[2]
     if not pid.isdigit():
-        return True  # not one of ours
+        return True  # made by something else
     try:
         os.kill(int(pid), 0)
     except ProcessLookupError:
@@ -110,5 +111,5 @@ def _in_use(folder: Path) -> bool:
 def write_profile(profile: Profile, folder: Path) -> Path:
     """Write the resolved profile that all processes of a run read."""
     path = folder / "profile.toml"
-    path.write_text(toml_text(plain_values(profile)), encoding="utf-8")
+    path.write_text(tomli_w.dumps(plain_values(profile)), encoding="utf-8")
     return path

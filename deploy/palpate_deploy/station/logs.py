@@ -1,8 +1,7 @@
-"""Where log lines go: stderr, as text for people or one JSON object a line for machines."""
+"""What a process writes to stderr: its log lines, and the error that ends a command."""
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 import time
@@ -13,48 +12,23 @@ from palpate.errors import ConfigError, DeviceError, MissingExtraError, PalpateE
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 
-
-class JsonFormatter(logging.Formatter):
-    """One JSON object a line."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Format one record."""
-        line = {
-            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-            + f".{int(record.msecs):03d}Z",
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
-
-
-class TextFormatter(logging.Formatter):
-    """``12:34:56.789 warning palpate_gateway.service.node: message``, local time."""
-
-    default_time_format = "%H:%M:%S"
-    default_msec_format = "%s.%03d"
-
-    def __init__(self) -> None:
-        super().__init__("%(asctime)s %(level)s %(name)s: %(message)s")
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Format one record."""
-        record.level = record.levelname.lower()
-        return super().format(record)
+FAILED = 1
+USAGE = 2
+DEVICE = 3
 
 
 def configure(level: LogLevel = "warning", style: LogFormat = "text") -> None:
-    """Send log lines of this process to stderr.
+    """Send the log lines of this process to stderr.
 
     Args:
-        level: The least that is shown.
-        style: For people or for machines.
+        level: The lowest level that is written.
+        style: ``text`` for people, ``12:34:56.789 warning palpate.bus.link: message`` in local
+            time; ``json`` for machines, an object a line with ``time`` (UTC), ``level``,
+            ``logger``, ``message`` and, where there is one, ``exception``.
     """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if style == "json" else TextFormatter())
+    handler.addFilter(_add_level)
+    handler.setFormatter(_json_formatter() if style == "json" else _text_formatter())
     root = logging.getLogger()
     for old in list(root.handlers):
         root.removeHandler(old)
@@ -62,9 +36,28 @@ def configure(level: LogLevel = "warning", style: LogFormat = "text") -> None:
     root.setLevel(level.upper())
 
 
-FAILED = 1
-USAGE = 2
-DEVICE = 3
+def _add_level(record: logging.LogRecord) -> bool:
+    record.level = record.levelname.lower()
+    return True
+
+
+def _text_formatter() -> logging.Formatter:
+    formatter = logging.Formatter("%(asctime)s %(level)s %(name)s: %(message)s")
+    formatter.default_time_format, formatter.default_msec_format = "%H:%M:%S", "%s.%03d"
+    return formatter
+
+
+def _json_formatter() -> logging.Formatter:
+    from pythonjsonlogger.json import JsonFormatter
+
+    formatter = JsonFormatter(
+        ["asctime", "level", "name", "message"],
+        rename_fields={"asctime": "time", "name": "logger", "exc_info": "exception"},
+        json_ensure_ascii=False,
+    )
+    formatter.converter = time.gmtime
+    formatter.default_time_format, formatter.default_msec_format = "%Y-%m-%dT%H:%M:%S", "%s.%03dZ"
+    return formatter
 
 
 def exit_code(error: PalpateError) -> int:
@@ -77,6 +70,6 @@ def exit_code(error: PalpateError) -> int:
 
 
 def print_error(error: PalpateError) -> None:
-    """Say on stderr what was wrong and what to do about it."""
+    """Print to stderr what was wrong and what to do about it."""
     print(f"error: {error.problem}", file=sys.stderr)
     print(f"  fix: {error.remedy}", file=sys.stderr, flush=True)

@@ -1,22 +1,25 @@
-"""A finite run: processes started once, watched, and stopped; nothing is restarted."""
+"""The processes of a station: what each runs, and a finite run of them."""
 
 from __future__ import annotations
 
 import logging
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Self
 
 from palpate.errors import ConfigError, PalpateError
 from palpate_deploy.station import logs
 from palpate_deploy.station.host import new_run_folder, write_profile
-from palpate_deploy.station.parent import end_with_parent, environment_for_children
+from palpate_deploy.station.lifetime import (
+    end_with_parent,
+    environment_for_children,
+    stop_on_signals,
+)
 from palpate_deploy.station.profile import Profile, Service
 
 _log = logging.getLogger(__name__)
@@ -30,7 +33,7 @@ START_ORDER: tuple[Service, ...] = (
     "fem",
     "gateway",
 )
-"""Listeners first; stopped in reverse, so that what the gateway last sent is still recorded."""
+"""Listeners first; stopped in reverse, so that the gateway's last messages are still recorded."""
 
 
 def command_line(service: Service, profile: Path) -> list[str]:
@@ -50,73 +53,45 @@ def run_service(service: Service, profile: Profile) -> None:
         PalpateError: It cannot start or go on; the process ends and the supervisor restarts it.
     """
     logs.configure(profile.log.level, profile.log.format)
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, on_signal)
+    stop = stop_on_signals()
     end_with_parent()
     _log.info("%s starts, station %s", service, profile.station)
-    _RUN[service](profile, stop)
+    _run(service, profile, stop)
     _log.info("%s ends", service)
 
 
-def _run_router(profile: Profile, stop: threading.Event) -> None:
-    from palpate.bus import run_router
+def _run(service: Service, profile: Profile, stop: threading.Event) -> None:
+    if service == "router":
+        from palpate.bus import run_router
 
-    run_router(profile.router.listen, stop, link=profile.link)
+        run_router(profile.router.listen, stop, link=profile.link)
+        return
+    if service == "gateway" and profile.gateway.pace != "fast":
+        from palpate_gateway.one_core import stay_on_one_core
 
-
-def _run_gateway(profile: Profile, stop: threading.Event) -> None:
-    from palpate_gateway.one_core import stay_on_one_core
-    from palpate_gateway.service import node
-
-    if profile.gateway.pace != "fast":
         stay_on_one_core(profile.gateway.core)
-    node.run(profile.gateway, profile.link, profile.station, stop)
+    _entry_point(service)(getattr(profile, service), profile.link, profile.station, stop)
 
 
-def _run_features(profile: Profile, stop: threading.Event) -> None:
-    from palpate_services.inference.services import run_features
+def _entry_point(service: Service) -> Callable[..., None]:
+    """The function that runs a service, of which only its own room is imported."""
+    if service == "gateway":
+        from palpate_gateway.service import node as gateway
 
-    run_features(profile.features, profile.link, profile.station, stop)
+        return gateway.run
+    if service == "fem":
+        from palpate_fem.service import node as fem
 
+        return fem.run
+    if service == "recorder":
+        from palpate_services.recorder.service import run_recorder
 
-def _run_field(profile: Profile, stop: threading.Event) -> None:
-    from palpate_services.inference.services import run_field
+        return run_recorder
+    from palpate_services.inference import services
 
-    run_field(profile.field, profile.link, profile.station, stop)
-
-
-def _run_synthesis(profile: Profile, stop: threading.Event) -> None:
-    from palpate_services.inference.services import run_synthesis
-
-    run_synthesis(profile.synthesis, profile.link, profile.station, stop)
-
-
-def _run_recorder(profile: Profile, stop: threading.Event) -> None:
-    from palpate_services.recorder.service import run_recorder
-
-    run_recorder(profile.recorder, profile.link, profile.station, stop)
-
-
-def _run_fem(profile: Profile, stop: threading.Event) -> None:
-    from palpate_fem.service import node
-
-    node.run(profile.fem, profile.link, profile.station, stop)
-
-
-_RUN: dict[Service, Callable[[Profile, threading.Event], None]] = {
-    "router": _run_router,
-    "gateway": _run_gateway,
-    "features": _run_features,
-    "field": _run_field,
-    "synthesis": _run_synthesis,
-    "recorder": _run_recorder,
-    "fem": _run_fem,
-}
+    if service == "features":
+        return services.run_features
+    return services.run_field if service == "field" else services.run_synthesis
 
 
 def service_named(name: str) -> Service:
@@ -125,18 +100,20 @@ def service_named(name: str) -> Service:
     Raises:
         ConfigError: There is no such service.
     """
-    for service in _RUN:
+    for service in START_ORDER:
         if service == name:
             return service
-    raise ConfigError(f"service {name!r} does not exist", remedy=f"one of: {', '.join(_RUN)}")
+    raise ConfigError(
+        f"service {name!r} does not exist", remedy=f"one of: {', '.join(START_ORDER)}"
+    )
 
 
 STOP_WAIT_S = 60.0
-"""A recorder may have much to write after its source has ended [s]."""
+"""A recorder may need this long to write what has arrived before the end of its source [s]."""
 
 
 class ProcessEnded(PalpateError, RuntimeError):
-    """A process of a finite run ended before its time.
+    """A process of a finite run ended too early.
 
     Args:
         problem: What was wrong.
@@ -149,11 +126,13 @@ class ProcessEnded(PalpateError, RuntimeError):
         self.status = status
 
 
-class Children:
-    """Processes of one finite run, each with its log; they end with this process.
+class FiniteRun:
+    """Processes that are started once, watched and stopped; none is restarted.
+
+    Each writes a log of its own, and all end with this process.
 
     Args:
-        name: Stands in the name of the run's folder.
+        name: Part of the name of the run's folder.
     """
 
     def __init__(self, name: str) -> None:
@@ -173,7 +152,7 @@ class Children:
             )
 
     def start_profile(self, profile: Profile) -> None:
-        """Start every process of a profile, listeners first."""
+        """Start every process of a profile in ``START_ORDER``."""
         path = write_profile(profile, self.folder)
         for service in START_ORDER:
             if service in profile.processes:
@@ -199,7 +178,7 @@ class Children:
                 raise self.ended(name, status)
 
     def ended(self, name: str, status: int) -> ProcessEnded:
-        """The error of a process that ended: its own words, where it had any."""
+        """The error of a process that ended: the one in its log, if there is one."""
         problem, remedy = f"ended with status {status}", f"see {self.log(name)}"
         lines = self.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
         for line, following in zip(lines, [*lines[1:], ""], strict=True):

@@ -1,7 +1,7 @@
 """A profile: everything a station runs, in one TOML file (docs/conventions.md, configuration).
 
 Every room reads only its own table. An unknown key is an error that names the nearest known one.
-Environment variables win over the file: ``PALPATE_FEATURES__BUNDLE=my-bundle``.
+Environment variables override the file: ``PALPATE_FEATURES__BUNDLE=my-bundle``.
 """
 
 from __future__ import annotations
@@ -34,17 +34,22 @@ from palpate.errors import ConfigError
 from palpate_deploy.station.logs import LogFormat, LogLevel
 from palpate_fem.service.config import FemConfig
 from palpate_gateway.config import GatewayConfig
-from palpate_services.config import FeaturesConfig, FieldConfig, RecorderConfig, SynthesisConfig
+from palpate_services.config import (
+    FeaturesServiceConfig,
+    FieldServiceConfig,
+    RecorderConfig,
+    SynthesisServiceConfig,
+)
 
 PROFILES = Path(__file__).parent.parent / "profiles"
-"""Profiles that come with palpate."""
+"""Profiles that ship with palpate."""
 
 ENV_PREFIX = "PALPATE_"
 ENV_NESTED = "__"
 
 Service = Literal["router", "gateway", "features", "field", "synthesis", "recorder", "fem"]
 SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
-"""What a station runs by default; the others are named where they are wanted."""
+"""What a station runs by default; a profile names the others if it needs them."""
 
 
 class RouterConfig(StrictConfig):
@@ -68,7 +73,7 @@ class LogConfig(StrictConfig):
     """What the processes write into their logs.
 
     Attributes:
-        level: The least that is written.
+        level: The lowest level that is written.
         format: ``text`` for people, ``json`` for machines.
     """
 
@@ -80,16 +85,16 @@ class Profile(StrictConfig):
     """One station.
 
     Attributes:
-        station: Name of the station, the third chunk of every key.
+        station: Name of the station, the third part of every key on the bus.
         processes: The processes that ``palpate up`` starts here.
         link: How every process joins the bus.
         router: Where the router listens.
         gateway: The sensors.
         features: Electrodes to features.
-        field: Electrodes to displacement fields, where ``processes`` names ``field``.
-        synthesis: Displacement fields to electrodes, where ``processes`` names ``synthesis``.
+        field: Electrodes to displacement fields, if ``processes`` names ``field``.
+        synthesis: Displacement fields to electrodes, if ``processes`` names ``synthesis``.
         recorder: What is recorded, and where.
-        fem: How simulations are served, where ``processes`` names ``fem``.
+        fem: How simulations are served, if ``processes`` names ``fem``.
         log: What the processes write into their logs.
     """
 
@@ -98,9 +103,9 @@ class Profile(StrictConfig):
     link: LinkConfig = LinkConfig()
     router: RouterConfig = RouterConfig()
     gateway: GatewayConfig = Field(default_factory=GatewayConfig)
-    features: FeaturesConfig = FeaturesConfig()
-    field: FieldConfig = FieldConfig()
-    synthesis: SynthesisConfig = SynthesisConfig()
+    features: FeaturesServiceConfig = FeaturesServiceConfig()
+    field: FieldServiceConfig = FieldServiceConfig()
+    synthesis: SynthesisServiceConfig = SynthesisServiceConfig()
     recorder: RecorderConfig = RecorderConfig()
     fem: FemConfig = FemConfig()
     log: LogConfig = LogConfig()
@@ -114,7 +119,7 @@ class Profile(StrictConfig):
 
 
 class _FileAndEnvironment(BaseSettings, Profile):
-    """A profile as it is read: the environment over the file."""
+    """A profile while it is read: values of the environment override those of the file."""
 
     model_config = SettingsConfigDict(
         env_prefix=ENV_PREFIX, env_nested_delimiter=ENV_NESTED, frozen=True, extra="forbid"
@@ -129,12 +134,12 @@ class _FileAndEnvironment(BaseSettings, Profile):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """The file's values come in by the constructor; the environment wins over them."""
+        """The file's values are the constructor's arguments; the environment overrides them."""
         return env_settings, init_settings
 
 
 def profile_names() -> list[str]:
-    """Names of the profiles that come with palpate."""
+    """Names of the profiles that ship with palpate."""
     return sorted(path.stem for path in PROFILES.glob("*.toml"))
 
 
@@ -200,7 +205,7 @@ def parse_profile(values: Mapping[str, Any], *, where: str) -> Profile:
         raise ConfigError(f"{where}: {error.problem}", remedy=error.remedy) from error
     _check_router(read, where)
     if "router" in read.processes and "connect" not in read.link.model_fields_set:
-        # One port is enough to say: who starts the router connects to it.
+        # One address is enough: whoever starts the router also connects to it.
         link = read.link.model_copy(update={"connect": _connect_to(read.router.listen)})
     else:
         link = read.link
@@ -208,7 +213,7 @@ def parse_profile(values: Mapping[str, Any], *, where: str) -> Profile:
 
 
 def changed(profile: Profile, **tables: Mapping[str, Any]) -> Profile:
-    """A copy with some keys of some tables replaced, checked like a file.
+    """A copy with some keys of some tables replaced; it is checked like a file.
 
     Args:
         profile: The profile to start from.
@@ -228,7 +233,7 @@ def changed(profile: Profile, **tables: Mapping[str, Any]) -> Profile:
 
 def plain_values(profile: Profile) -> dict[str, Any]:
     """A profile as plain values: strings, numbers, lists, mappings."""
-    # Not through JSON text, which has no infinity; None means the default in every table.
+    # Not through JSON text, which has no infinity. A key without value has its default.
     return profile.model_dump(mode="json", exclude_none=True)
 
 
@@ -251,7 +256,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _check_environment() -> None:
-    """A misspelt variable must not be ignored: nothing else would tell."""
+    """Raise an error for a misspelt variable, which would otherwise have no effect at all."""
     for variable in os.environ:
         if not variable.upper().startswith(ENV_PREFIX):
             continue
@@ -266,7 +271,7 @@ def _check_environment() -> None:
 
 
 def _variable_of(loc: tuple[int | str, ...]) -> str | None:
-    """The environment variable that gave the value at ``loc``, if one did."""
+    """The environment variable that set the value at ``loc``, if there is one."""
     set_here = {variable.upper(): variable for variable in os.environ}
     for depth in range(len(loc), 0, -1):
         name = ENV_PREFIX + ENV_NESTED.join(str(part) for part in loc[:depth]).upper()
@@ -276,7 +281,7 @@ def _variable_of(loc: tuple[int | str, ...]) -> str | None:
 
 
 def _connect_to(listen: tuple[str, ...]) -> tuple[str, ...]:
-    """Where to find a router of this host that listens at ``listen``."""
+    """Endpoints at which this host reaches its router, which listens at ``listen``."""
     return tuple(
         endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
         for endpoint in listen

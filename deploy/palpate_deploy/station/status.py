@@ -1,4 +1,4 @@
-"""``palpate status``: who is there, and what each process says of itself."""
+"""``palpate status``: which processes run, and what each reports: state, counters, clocks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SMALL_PPM = 0.5
 
 
 def clock_lines(status: Status) -> list[str]:
-    """A line for each sensor whose clock is followed, and one for the host's wall clock."""
+    """Lines on the clocks of the sensors and on the host's wall clock."""
     gauges = status.gauges
     lines = []
     for name in sorted(gauges):
@@ -48,12 +48,12 @@ def clock_lines(status: Status) -> list[str]:
 
 
 def wall_words(kept: WallDiscipline | None) -> str:
-    """How the wall clock is kept, for people."""
+    """Whether and how well the wall clock is synchronised, for people."""
     if kept is None:
-        return "whether anything keeps it right is not known here"
+        return "whether it is synchronised is not known on this host"
     if not kept.synchronised:
-        return "nothing keeps it right (chrony, NTP, PTP): compare times of this host only"
-    return f"kept right, to {duration_words(kept.error_s)} by the kernel's account"
+        return "not synchronised (chrony, NTP, PTP): compare times of this host only"
+    return f"synchronised to {duration_words(kept.error_s)}, by the kernel's estimate"
 
 
 def duration_words(seconds: float) -> str:
@@ -69,7 +69,7 @@ def _sensor_clock(gauges: Mapping[str, float], prefix: str) -> str:
     except ValueError:  # of a newer palpate
         return f"quality {gauges[prefix + _QUALITY]:g}"
     if quality is ClockQuality.ARRIVAL:
-        return "it tells none; stamps are the time of arrival"
+        return "the device sends none; stamps are times of arrival"
     drift_ppm = gauges.get(prefix + "clock_drift_ppm", 0.0)
     delay_s = gauges.get(prefix + "clock_delay_p50_s")
     words = ["settling" if quality is ClockQuality.SETTLING else "followed"]
@@ -78,7 +78,7 @@ def _sensor_clock(gauges: Mapping[str, float], prefix: str) -> str:
     if delay_s is not None:
         words.append(f"frames arrive {duration_words(delay_s)} after their stamps")
     if quality is ClockQuality.ODD:
-        words.append("no quartz is that wrong: check the configured rate")
+        words.append("too much for a quartz: check the configured rate")
     return ", ".join(words)
 
 
@@ -101,8 +101,8 @@ _SENSOR_COLOURS = {
     SensorState.ENDED: "cyan",
 }
 
-# What a person wants to see of each process first; the rest is in --json.
-TELLING_COUNTERS = (
+# Counters that the table shows; --json shows all.
+_SHOWN_COUNTERS = (
     "frames_published",
     "frames_received",
     "fields_received",
@@ -119,7 +119,7 @@ _TROUBLE = (
 
 
 def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status]:
-    """What every process of the station says of itself; broken answers are left out."""
+    """Status of every process of the station; invalid replies are left out."""
     answers = session.query_all(endpoints.STATUS, ServiceRequest(), timeout_s=timeout_s)
     return [answer for answer in answers if not isinstance(answer, PalpateError)]
 
@@ -128,7 +128,7 @@ def show_status(link: LinkConfig, station: str, *, as_json: bool) -> int:
     """Print presence and status of a station.
 
     Returns:
-        0, or 1 if nobody is there or a process is degraded.
+        0; 1 if no process runs, one does not reply, or one is degraded.
 
     Raises:
         LinkError: There is no router.
@@ -150,12 +150,12 @@ def show_status(link: LinkConfig, station: str, *, as_json: bool) -> int:
     return FAILED if not present or degraded or silent else 0
 
 
-def telling(status: Status) -> str:
-    """The counters that a person wants to see: what flows, and anything that went wrong."""
+def shown_counters(status: Status) -> str:
+    """The most important counters: the flow of messages, and everything that went wrong."""
     return "  ".join(
         f"{name} {count:,}"
         for name, count in sorted(status.counters.items())
-        if name in TELLING_COUNTERS or (count and any(word in name for word in _TROUBLE))
+        if name in _SHOWN_COUNTERS or (count and any(word in name for word in _TROUBLE))
     )
 
 
@@ -199,15 +199,15 @@ def _table(
             duration_text(status.uptime_s),
             _sensors(status),
             says,
-            telling(status),
+            shown_counters(status),
         )
     if not table.row_count:
-        table.caption = f"nobody is alive at station {station!r}: start it with `palpate up`"
+        table.caption = f"no process of station {station!r} runs: start it with `palpate up`"
     return table
 
 
 def _sensors(status: Status) -> str:
-    """Each sensor with its state and what is to be said of it, as rich markup."""
+    """Each sensor with its state and its message, as rich markup."""
     if not status.sensor_states:
         return " ".join(status.sensors)
     return "\n".join(map(_sensor, status.sensor_states))

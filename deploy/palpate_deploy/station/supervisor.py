@@ -1,4 +1,4 @@
-"""Starting and keeping alive the processes of a station, with supervisord."""
+"""The processes of a station under supervisord, which restarts one that ends."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from typing import Any, Self
 
 from palpate.errors import PalpateError
 from palpate_deploy.station.host import check_free, new_run_folder, write_profile
-from palpate_deploy.station.parent import environment_for_children
+from palpate_deploy.station.lifetime import environment_for_children
 from palpate_deploy.station.processes import START_ORDER, command_line
 from palpate_deploy.station.profile import Profile, Service
 
 STOP_WAIT_S = 10
-"""A process that has not ended this long after SIGTERM is killed [s]."""
+"""A process that still runs this long after SIGTERM is killed [s]."""
 
 _START_WAIT_S = 10.0
 _RPC_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error)
 
 
 class SupervisorError(PalpateError, RuntimeError):
-    """The process manager itself does not work."""
+    """supervisord itself does not work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,11 @@ class ProcessState:
 
     Attributes:
         service: Which.
-        state: supervisord's word: ``RUNNING``, ``STARTING``, ``BACKOFF``, ``EXITED``, ...
+        state: As supervisord names it: ``RUNNING``, ``STARTING``, ``BACKOFF``, ``EXITED``, ...
         pid: Its process id; 0 = not running.
         uptime_s: Since its last start [s].
-        restarts: How often it was started again in this run, as far as it was seen.
-        exit_status: Of the last end.
+        restarts: How often it was restarted in this run, as far as that was observed.
+        exit_status: Exit status of its last run.
     """
 
     service: Service
@@ -62,7 +62,7 @@ class Supervisor:
 
     Args:
         profile: What to run.
-        name: Stands in the name of the run's folder.
+        name: Part of the name of the run's folder.
 
     Raises:
         LinkError: The router's port is in use.
@@ -76,7 +76,7 @@ class Supervisor:
         self.folder = new_run_folder(name)
         self._pids: dict[str, int] = {}
         self._restarts: dict[str, int] = {}
-        # A socket's path may have 107 bytes; a folder of one's own in /tmp is surely shorter.
+        # The path of a Unix socket is limited to 107 bytes: a folder in /tmp is short enough.
         self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-"))
         self._socket = self._socket_folder / "supervisor.sock"
         config = self.folder / "supervisord.conf"
@@ -139,18 +139,18 @@ class Supervisor:
         )
 
     def stop(self) -> None:
-        """Stop every process in reverse order of starting, then supervisord. Harmless twice."""
+        """Stop all processes in reverse order of starting, then supervisord; may be repeated."""
         if self._process.poll() is None:
             self._process.terminate()
             try:
                 self._process.wait(timeout=STOP_WAIT_S * len(self.profile.processes) + 5)
             except subprocess.TimeoutExpired:
-                self._process.kill()  # its processes notice and end themselves
+                self._process.kill()  # its processes notice that and end (lifetime.end_with_parent)
                 self._process.wait()
         shutil.rmtree(self._socket_folder, ignore_errors=True)
 
     def log_tail(self, service: str, lines: int = 5) -> str:
-        """The last lines that a process logged."""
+        """The last lines of a process's log."""
         try:
             text = (self.logs / f"{service}.log").read_text(encoding="utf-8", errors="replace")
         except OSError:
@@ -200,7 +200,7 @@ class Supervisor:
         return text.getvalue()
 
     def _program(self, service: Service, priority: int, profile: Path) -> dict[str, str]:
-        # A finite source that has come to its end is done; anything else that ends starts again.
+        # A gateway at the end of its recording stays ended; every other process is restarted.
         finite = service == "gateway" and self.profile.gateway.exit_at_end
         return {
             "command": _escaped(shlex.join(command_line(service, profile))),
@@ -209,7 +209,7 @@ class Supervisor:
             "autostart": "true",
             "autorestart": "unexpected" if finite else "true",
             "exitcodes": "0",
-            # One that ends within a second is tried again after growing pauses, not at once.
+            # A process that ends within a second is restarted after pauses that grow.
             "startsecs": "1",
             "startretries": "1000000",
             "stopsignal": "TERM",
@@ -231,7 +231,7 @@ class Supervisor:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env=environment_for_children(),
-                # Ctrl-C in the terminal is for `palpate up`, which stops the rest in order.
+                # Ctrl-C must reach only `palpate up`, which stops the rest in order.
                 start_new_session=True,
             )
 
@@ -256,7 +256,7 @@ class Supervisor:
 
 
 def _escaped(text: str) -> str:
-    """``%`` begins an expansion in supervisord's configuration."""
+    """Text for supervisord's configuration, in which ``%`` starts an expansion."""
     return text.replace("%", "%%")
 
 

@@ -16,7 +16,7 @@ from supervisor.options import ServerOptions
 from supervisor.poller import Poller
 from supervisor.supervisord import go
 
-from palpate_deploy.station.parent import PARENT_PID, end_with_parent
+from palpate_deploy.station.lifetime import PARENT_PID, end_with_parent
 
 _WAIT_S = 0.1
 

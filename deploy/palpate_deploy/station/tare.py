@@ -13,37 +13,28 @@ from palpate.messages import FloatArray, Tare, TareRequest, WrenchZero, WrenchZe
 def take_tare(
     link: LinkConfig, station: str, sensor: str, *, frames: int, timeout_s: float
 ) -> None:
-    """Tare a sensor, whichever kind it is, and print what has become zero.
+    """Tare a BioTac or zero a force/torque sensor, and print the result.
 
     Raises:
-        LinkError: There is no router, or nobody serves that sensor.
+        LinkError: There is no router, or no gateway serves that sensor.
         RemoteError: The gateway refuses.
         StreamTimeout: It does not answer in time.
     """
     with Session.open(link, station=station) as session:
         try:
-            tare = _ask_tare(session, sensor, frames, timeout_s)
-        except LinkError as nobody:
-            # A force/torque sensor has no baseline to be asked for, but a zero.
+            tare = session.query(
+                endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
+            )
+        except LinkError as not_found:
+            # A force/torque sensor has a zero instead of a tare.
+            request = WrenchZeroRequest(readings=frames)
             try:
-                zero = _ask_zero(session, sensor, frames, timeout_s)
+                zero = session.query(endpoints.ZERO, request, sensor=sensor, timeout_s=timeout_s)
             except LinkError:
-                raise nobody from None
+                raise not_found from None
             _print_zero(sensor, zero)
         else:
             _print_tare(sensor, tare)
-
-
-def _ask_tare(session: Session, sensor: str, frames: int, timeout_s: float) -> Tare:
-    return session.query(
-        endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
-    )
-
-
-def _ask_zero(session: Session, sensor: str, readings: int, timeout_s: float) -> WrenchZero:
-    return session.query(
-        endpoints.ZERO, WrenchZeroRequest(readings=readings), sensor=sensor, timeout_s=timeout_s
-    )
 
 
 def _print_tare(sensor: str, tare: Tare) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from types import FrameType
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -17,9 +16,10 @@ from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import STATUS
 from palpate.errors import StreamTimeout
 from palpate.messages import ServiceState, Status
+from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
-from palpate_deploy.station.status import duration_text, state_text, telling
+from palpate_deploy.station.status import duration_text, shown_counters, state_text
 from palpate_deploy.station.supervisor import ProcessState, Supervisor, SupervisorError
 
 _REFRESH_S = 0.25
@@ -28,24 +28,12 @@ _SILENT_AFTER_S = 3.0
 _STATE_COLOURS = {"RUNNING": "green", "STARTING": "yellow", "STOPPING": "yellow"}
 
 
-def stop_on_signals() -> threading.Event:
-    """An event that ``SIGINT``, ``SIGTERM`` and ``SIGHUP`` set."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, on_signal)
-    return stop
-
-
 def run_up(profile: Profile, name: str) -> int:
     """Run a station until a signal, or until its finite source has ended.
 
     Args:
         profile: What to run.
-        name: Its name, for the screen and the run's folder.
+        name: Part of the name of the run's folder.
 
     Returns:
         The exit code.
@@ -55,7 +43,7 @@ def run_up(profile: Profile, name: str) -> int:
         SupervisorError: supervisord does not start, or dies.
     """
     console = Console()
-    stop = stop_on_signals()
+    stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     with Supervisor(profile, name) as supervisor:
         console.print(
             f"station {profile.station!r} is up: {', '.join(profile.processes)}\n"
@@ -100,7 +88,7 @@ def _watch_on_screen(
 
 
 def _watch_plainly(console: Console, supervisor: Supervisor, stop: threading.Event) -> int | None:
-    """Say only what changes, for a log file or a service manager."""
+    """Print only changes, for a log file or a service manager."""
     before: dict[str, tuple[str, int]] = {}
     while not stop.is_set() and supervisor.running:
         processes = supervisor.processes()
@@ -121,7 +109,7 @@ def _watch_plainly(console: Console, supervisor: Supervisor, stop: threading.Eve
 
 
 def _finished(supervisor: Supervisor, processes: list[ProcessState]) -> int | None:
-    """Exit status of a finite gateway that has ended."""
+    """Exit status of a gateway that has come to the end of its recording; None otherwise."""
     if not supervisor.profile.gateway.exit_at_end:
         return None
     for process in processes:
@@ -151,7 +139,7 @@ def _screen(processes: list[ProcessState], known: dict[str, tuple[Status, float]
         says = counters = ""
         if status is not None and time.monotonic() - heard_s < _SILENT_AFTER_S:
             says = f"{state_text(status.state)} {escape(status.message)}"
-            counters = telling(status)
+            counters = shown_counters(status)
             if status.last_error is not None and status.state is ServiceState.DEGRADED:
                 problems.append(
                     f"{process.service}: {status.last_error.message}\n"

@@ -1,4 +1,9 @@
-"""From a frame to its estimate: find the tare that it names, then ask the pure function."""
+"""From one message to one estimate, or to the reason why there is none.
+
+The functions that estimate are pure: they know no clock and keep no state, so that a replayed
+record gives the same bytes again. What depends on time (how old a message is, whether its tare can
+be found) is in the classes below them.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +33,32 @@ from palpate.messages import (
     Tare,
     as_field_frame,
 )
-from palpate_services.config import AnswererConfig, ElectrodesConfig
+from palpate_services.config import ElectrodesConfig, EstimatingConfig
 from palpate_services.inference.model import Runtime
 
+E = TypeVar("E")
 
-class Refusal(StrEnum):
-    """Why a message got no estimate; the value is the name it is counted by."""
+FIRST_RETRY_S = 0.5
+"""After a first miss, the gateway is not asked for the same tare again for this long [s]."""
+
+LAST_RETRY_S = 5.0
+"""The pause doubles with every further miss, up to this [s]."""
+
+REPLAY_WAIT_S = 2.0
+"""How long a lossless replay waits for a tare that arrives later than its first frame [s]."""
+
+_MISSES_KEPT = 256
+
+
+class EstimateRefusal(StrEnum):
+    """Why a message got no estimate; the value is the name of its counter."""
 
     UNTARED = "untared"
-    """The frame was taken before any tare, or the tare given is not the one it names or has another
-    number of electrodes."""
+    """The frame was taken before any tare; or the given tare is not the one that the frame names,
+    or has another number of electrodes."""
+
+    TARE_UNKNOWN = "tare_unknown"
+    """No gateway knows the tare that the frame names."""
 
     INVALID_CHANNELS = "invalid_channels"
     """At least one electrode is marked bad."""
@@ -46,10 +67,19 @@ class Refusal(StrEnum):
     """The bundle was made for another type of sensor."""
 
     WRONG_MESH = "wrong_mesh"
-    """The field is one of another mesh than the bundle's."""
+    """The field belongs to another mesh than the bundle's."""
 
     NON_FINITE = "non_finite"
-    """The input holds NaN or infinity, or the model answered so, or with a negative deviation."""
+    """Input or output holds NaN or infinity, or a standard deviation is negative."""
+
+    STALE = "stale"
+    """The message is older than ``max_age_s``."""
+
+    REPLAYED = "replayed_refused"
+    """The message was replayed, and the service accepts only live and simulated ones."""
+
+    SKIPPED_RATE = "skipped_rate"
+    """The estimate of this period was already published (``rate_hz``)."""
 
 
 def tared_counts(frame: ElectrodeFrame, tare: Tare) -> FloatArray:
@@ -59,19 +89,19 @@ def tared_counts(frame: ElectrodeFrame, tare: Tare) -> FloatArray:
 
 def estimate(
     frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
-) -> FeatureEstimate | Refusal:
+) -> FeatureEstimate | EstimateRefusal:
     """Estimate the features of one frame.
 
     Args:
         frame: Raw counts of one sampling round.
-        tare: The tare that ``frame.tare_id`` names; None where nobody knows it.
+        tare: The tare that ``frame.tare_id`` names; None if it is not known.
         runtime: A loaded bundle of the task ``features``.
 
     Returns:
         The estimate, or why there is none. Never an estimate from bad input.
     """
     outputs = _run_on_electrodes(frame, tare, runtime)
-    if isinstance(outputs, Refusal):
+    if isinstance(outputs, EstimateRefusal):
         return outputs
     force = outputs["force"]
     x, y, z = force.tolist()
@@ -91,19 +121,19 @@ def estimate(
 
 def estimate_field(
     frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
-) -> FieldEstimate | Refusal:
+) -> FieldEstimate | EstimateRefusal:
     """Estimate the displacement of each skin node from one frame.
 
     Args:
         frame: Raw counts of one sampling round.
-        tare: The tare that ``frame.tare_id`` names; None where nobody knows it.
+        tare: The tare that ``frame.tare_id`` names; None if it is not known.
         runtime: A loaded bundle of the task ``field``.
 
     Returns:
         The estimate on the bundle's mesh, or why there is none.
     """
     outputs = _run_on_electrodes(frame, tare, runtime)
-    if isinstance(outputs, Refusal):
+    if isinstance(outputs, EstimateRefusal):
         return outputs
     return FieldEstimate(
         source=frame.stamp,
@@ -116,8 +146,10 @@ def estimate_field(
     )
 
 
-def synthesise(field: FieldFrame | FieldEstimate, runtime: Runtime) -> SynthesisEstimate | Refusal:
-    """Estimate the tared counts that go with a displacement field.
+def synthesise(
+    field: FieldFrame | FieldEstimate, runtime: Runtime
+) -> SynthesisEstimate | EstimateRefusal:
+    """Estimate the tared counts that belong to a displacement field.
 
     Args:
         field: Known or estimated, on the mesh of the bundle.
@@ -129,13 +161,13 @@ def synthesise(field: FieldFrame | FieldEstimate, runtime: Runtime) -> Synthesis
     known = as_field_frame(field)
     sample = known.displacement.reshape(-1)
     if known.mesh_sha256 != runtime.mesh_sha256 or sample.shape != runtime.sample_shape:
-        return Refusal.WRONG_MESH
-    # A network may hide it: a rectifier turns NaN into 0 on some machines.
+        return EstimateRefusal.WRONG_MESH
+    # The network may hide a NaN: a rectifier (max(x, 0)) turns it into 0 on some machines.
     if not np.isfinite(sample).all():
-        return Refusal.NON_FINITE
+        return EstimateRefusal.NON_FINITE
     outputs = runtime.run(sample)
     if outputs is None:
-        return Refusal.NON_FINITE
+        return EstimateRefusal.NON_FINITE
     return SynthesisEstimate(
         source=known.stamp,
         sensor_serial=known.sensor_serial,
@@ -148,54 +180,69 @@ def synthesise(field: FieldFrame | FieldEstimate, runtime: Runtime) -> Synthesis
 
 def _run_on_electrodes(
     frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
-) -> dict[str, FloatArray] | Refusal:
+) -> dict[str, FloatArray] | EstimateRefusal:
     """Outputs of a model for the tared counts of a frame, or why there are none."""
     if frame.sensor_type is not runtime.sensor_type:
-        return Refusal.WRONG_SENSOR
+        return EstimateRefusal.WRONG_SENSOR
     if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
-        return Refusal.UNTARED
-    if tare.electrodes.shape != frame.electrodes.shape:  # of the finger that was there before
-        return Refusal.UNTARED
+        return EstimateRefusal.UNTARED
+    if tare.electrodes.shape != frame.electrodes.shape:  # of a finger that was exchanged
+        return EstimateRefusal.UNTARED
     if not frame.electrodes_valid:
-        return Refusal.INVALID_CHANNELS
+        return EstimateRefusal.INVALID_CHANNELS
     outputs = runtime.run(tared_counts(frame, tare))
-    return Refusal.NON_FINITE if outputs is None else outputs
+    return EstimateRefusal.NON_FINITE if outputs is None else outputs
 
 
-FIRST_RETRY_S = 0.5
-"""After a first miss the same tare is asked for again no sooner than this."""
+class AgeLimit:
+    """Decides whether a message is recent enough, and of an origin, to be answered.
 
-LAST_RETRY_S = 5.0
-"""Longest time between two questions for the same tare; it doubles up to here."""
+    Args:
+        config: Holds ``max_age_s`` and ``accept_replayed``.
+    """
 
-PATIENCE_S = 2.0
-"""How long a lossless replay waits for a tare, which may overtake nothing but can be overtaken."""
+    def __init__(self, config: EstimatingConfig) -> None:
+        self._limit_s = config.max_age_s
+        self._accept_replayed = config.accept_replayed
 
-_REMEMBERED = 256
+    def refusal(self, stamp: Stamp) -> EstimateRefusal | None:
+        """Why a message with this stamp gets no estimate; None = it may get one."""
+        # The age of a replayed message says nothing: its stamp is that of the recording.
+        if stamp.origin is Origin.REPLAYED:
+            return None if self._accept_replayed else EstimateRefusal.REPLAYED
+        limit_s = self._limit_s
+        if limit_s is not None and clock.age_s(stamp) > limit_s:
+            return EstimateRefusal.STALE
+        return None
 
 
-class Baselines:
-    """Looks tares up, and after a miss leaves the gateway alone for a while. One thread only.
+class TareLookup:
+    """Finds the tares that frames name. Use from one thread.
+
+    A tare that is not found is not asked for again at once, because every question blocks the
+    thread that serves all sensors.
 
     Args:
         book: The station's tares.
-        patient: Wait for a tare instead of answering that nobody knows it (lossless replay).
+        wait: Wait up to ``REPLAY_WAIT_S`` for a tare that is not known yet (lossless replay, in
+            which frames can arrive before their tare).
     """
 
-    def __init__(self, book: TareBook, *, patient: bool) -> None:
+    def __init__(self, book: TareBook, *, wait: bool) -> None:
         self._book = book
-        self._patient = patient
+        self._wait = wait
+        # By sensor and tare id: when to ask again [s, monotonic], and the pause before that [s].
         self._misses: dict[tuple[str, int], tuple[float, float]] = {}
 
     def find(self, sensor: str, tare_id: int) -> tuple[Tare | None, bool]:
-        """The tare a frame names.
+        """The tare that a frame names.
 
         Args:
             sensor: Name of the sensor.
             tare_id: From the frame; not ``NO_TARE``.
 
         Returns:
-            The tare, or None if nobody knows it; and whether looking for it may have taken time.
+            The tare, or None if it is not known; and whether the search may have taken time.
         """
         key = (sensor, tare_id)
         miss = self._misses.get(key) if self._misses else None
@@ -206,7 +253,7 @@ class Baselines:
             try:
                 tare = self._book.baseline(sensor, tare_id)
             except PalpateError:
-                if self._patient and miss is None and time.monotonic() - began_s < PATIENCE_S:
+                if self._wait and miss is None and time.monotonic() - began_s < REPLAY_WAIT_S:
                     time.sleep(0.02)
                     continue
                 self._remember_miss(key, FIRST_RETRY_S if miss is None else 2 * miss[1])
@@ -215,48 +262,24 @@ class Baselines:
                 del self._misses[key]
             return tare, time.monotonic() - began_s > 1e-3
 
-    def _remember_miss(self, key: tuple[str, int], wait_s: float) -> None:
-        wait_s = min(wait_s, LAST_RETRY_S)
-        self._misses[key] = (time.monotonic() + wait_s, wait_s)
-        while len(self._misses) > _REMEMBERED:
+    def _remember_miss(self, key: tuple[str, int], pause_s: float) -> None:
+        pause_s = min(pause_s, LAST_RETRY_S)
+        self._misses[key] = (time.monotonic() + pause_s, pause_s)
+        while len(self._misses) > _MISSES_KEPT:
             self._misses.pop(next(iter(self._misses)))
 
 
-E = TypeVar("E")
-
-TARE_UNKNOWN = "tare_unknown"
-
-
-class Freshness:
-    """Whether a message may still be acted on.
+class TaredEstimator(Generic[E]):
+    """Estimates from electrode frames, each with the tare that it names. Use from one thread.
 
     Args:
-        config: The oldest that may, and whether replayed ones may.
-    """
-
-    def __init__(self, config: AnswererConfig) -> None:
-        self._limit_s = config.max_age_s
-        self._accept_replayed = config.accept_replayed
-
-    def refusal(self, stamp: Stamp) -> str | None:
-        """Why a message of this stamp gets no estimate; None = it may get one."""
-        if stamp.origin is Origin.REPLAYED:
-            return None if self._accept_replayed else "replayed_refused"
-        limit_s = self._limit_s
-        return "stale" if limit_s is not None and clock.age_s(stamp) > limit_s else None
-
-
-class TaredFrames(Generic[E]):
-    """Answers frames, each with its own tare. Use from one thread.
-
-    Args:
-        session: Where tares are heard of and asked for.
-        config: How long to wait for one.
+        session: Receives announced tares, and asks gateways for others.
+        config: How long a search for a tare may take.
         runtime: The loaded bundle.
         estimate: The pure function of frame, tare and bundle.
-        health: Told once of each sensor that the bundle is not for.
-        any_age: Answer a frame that has grown old while its tare was looked for: somebody asked
-            for this very frame.
+        health: Gets one error for each sensor whose type the bundle was not made for.
+        any_age: Estimate also from a frame that became too old during the search for its tare:
+            right for a request, whose sender wants this very frame.
     """
 
     def __init__(
@@ -264,45 +287,45 @@ class TaredFrames(Generic[E]):
         session: Session,
         config: ElectrodesConfig,
         runtime: Runtime,
-        estimate: Callable[[ElectrodeFrame, Tare | None, Runtime], E | Refusal],
+        estimate: Callable[[ElectrodeFrame, Tare | None, Runtime], E | EstimateRefusal],
         health: Health,
         *,
         any_age: bool = False,
     ) -> None:
         book = TareBook(session, query_timeout_s=config.tare_timeout_s)
-        self._baselines = Baselines(book, patient=config.delivery == "every")
-        self._freshness = None if any_age else Freshness(config)
+        self._tares = TareLookup(book, wait=config.delivery == "every")
+        self._age_limit = None if any_age else AgeLimit(config)
         self._runtime = runtime
         self._estimate = estimate
         self._health = health
-        self._others: set[str] = set()
+        self._wrong_sensors: set[str] = set()
 
-    def answer(self, sensor: str, frame: ElectrodeFrame) -> E | str:
-        """The estimate of a frame, or the reason why there is none.
+    def estimate(self, sensor: str, frame: ElectrodeFrame) -> E | EstimateRefusal:
+        """The estimate from a frame, or the reason why there is none.
 
         Args:
             sensor: Name of the sensor.
             frame: Raw counts of one sampling round.
         """
         if frame.sensor_type is not self._runtime.sensor_type:
-            self._tell(sensor, frame)
-            return Refusal.WRONG_SENSOR
+            self._report_wrong_sensor(sensor, frame)
+            return EstimateRefusal.WRONG_SENSOR
         tare = None
         if frame.tare_id != NO_TARE:
-            tare, waited = self._baselines.find(sensor, frame.tare_id)
+            tare, waited = self._tares.find(sensor, frame.tare_id)
             if tare is None:
-                return TARE_UNKNOWN
-            if waited and self._freshness is not None:
-                reason = self._freshness.refusal(frame.stamp)
-                if reason is not None:
-                    return reason
+                return EstimateRefusal.TARE_UNKNOWN
+            if waited and self._age_limit is not None:
+                refusal = self._age_limit.refusal(frame.stamp)
+                if refusal is not None:
+                    return refusal
         return self._estimate(frame, tare, self._runtime)
 
-    def _tell(self, sensor: str, frame: ElectrodeFrame) -> None:
-        """Say once that there will be no estimates of a sensor; all its frames are counted."""
-        if sensor in self._others:
+    def _report_wrong_sensor(self, sensor: str, frame: ElectrodeFrame) -> None:
+        """Report each such sensor once; the counter ``wrong_sensor`` counts all its frames."""
+        if sensor in self._wrong_sensors:
             return
-        self._others.add(sensor)
+        self._wrong_sensors.add(sensor)
         manifest, kind = self._runtime.manifest, frame.sensor_type
         error = RemoteError(
             f"sensor {sensor!r} is a {kind.name} with {kind.layout.electrodes} electrodes, the "
@@ -311,5 +334,5 @@ class TaredFrames(Generic[E]):
             f"{kind.name}",
             code=ErrorCode.INVALID_REQUEST,
         )
-        # The sensors it is for are served as before.
+        # Not degraded: the sensors of the right type are served as before.
         self._health.fail(error, degraded=False)

@@ -1,8 +1,7 @@
-"""A bundle, loaded and trusted: ONNX Runtime behind the contract of its task.
+"""A bundle's model, loaded and checked: ONNX Runtime behind the contract of its task.
 
-The model comes as bytes whose digest was checked by ``read_bundle``, and must hold all its weights.
-It serves only after its signature agrees with manifest and task, and after it has answered its own
-golden vectors.
+The model comes as bytes whose digest ``read_bundle`` has checked. It serves only if it holds all
+its weights, its signature agrees with manifest and task, and it reproduces its golden vectors.
 """
 
 from __future__ import annotations
@@ -28,8 +27,24 @@ from palpate.files.bundle import (
 from palpate.messages import FloatArray, ModelMetadata, SensorType
 from palpate.process import require
 
-# Message type -> field number -> message type inside; numbers of onnx.proto, which never change.
-_INSIDE: dict[str, dict[int, str]] = {
+_log = logging.getLogger(__name__)
+
+GOLDEN_TOLERANCE = 1e-5
+"""Allowed deviation from the golden outputs, relative to their largest magnitude: float32 rounding
+of another CPU's kernels stays an order of magnitude below it."""
+
+WARM_UP_RUNS = 50
+"""Runs before a model counts as warm: the first takes 5-10 times as long as the later ones."""
+
+_FEW = 64  # up to so many values plain Python is faster than NumPy's reductions
+_ALIGN = 16  # float32 values to a 64-byte cache line, the alignment ONNX Runtime's own buffers have
+
+_REMEDY = "export the bundle again with palpate_training, or serve another one"
+
+_DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(int64)": "int64"}
+
+# Message type -> field number -> type of that field; numbers of onnx.proto, which never change.
+_NESTED: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
     "function": {7: "node", 11: "attribute"},
@@ -42,8 +57,289 @@ _EXTERNAL_DATA, _DATA_LOCATION = 13, 14  # fields of TensorProto
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 
 
+def load(bundle: Bundle, task: str) -> Runtime:
+    """Load a bundle for a task and warm it up.
+
+    Args:
+        bundle: As read by ``palpate.files.bundle.read_bundle``.
+        task: The task that it shall serve, e.g. ``"features"``.
+
+    Raises:
+        BundleError: It breaks the contract; the error names what and where.
+        MissingExtraError: ONNX Runtime is not installed.
+    """
+    runtime = Runtime(bundle, task)
+    _log.info("loaded %s:%d for %s", bundle.manifest.name, bundle.manifest.version, task)
+    return runtime
+
+
+class Runtime:
+    """A loaded bundle that computes one sample at a time; it may be used from several threads.
+
+    Attributes:
+        manifest: The bundle's description of itself.
+        sha256: Digest of the manifest, 32 bytes; part of every estimate.
+        sensor_type: The type of sensor that it was made for.
+        contact_threshold_n: Net force above which there is contact [N].
+        mesh: Mesh of its fields; None for a task without.
+        mesh_sha256: Content hash of that mesh, 32 bytes; empty for a task without.
+    """
+
+    def __init__(self, bundle: Bundle, task: str) -> None:
+        manifest = bundle.manifest
+        self.manifest = manifest
+        self.sha256 = bundle.sha256
+        self.contact_threshold_n = float(manifest.contact_threshold_n)
+        self.mesh = bundle.mesh
+        self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
+        self._lock = threading.Lock()
+        self._label = f"bundle {manifest.name}:{manifest.version}"
+        _check_manifest(manifest, task, self._label)
+        self.sensor_type = SensorType[manifest.sensor_type]
+        check_bundle_mesh(bundle.mesh, manifest, self._label)
+        self._session = _open_model(bundle.model, manifest, self._label)
+        self._check_golden(bundle.golden)
+        self._bind()
+        self._warm_up()
+
+    def run(self, sample: FloatArray) -> dict[str, FloatArray] | None:
+        """Run the model on one sample.
+
+        Args:
+            sample: The model's one input without batch axis, e.g. tared counts, shape ``(19,)``,
+                or a displacement field, flat, shape ``(3 V,)``.
+
+        Returns:
+            Outputs by name without batch axis, on memory of their own; None if any value is not
+            finite or a standard deviation is negative.
+        """
+        with self._lock:
+            self._input[0] = sample
+            self._session.run_with_iobinding(self._binding)
+            values = self._output.copy()
+        return (
+            {name: values[start:stop] for name, start, stop in self._slices}
+            if self._plausible(values)
+            else None
+        )
+
+    def _plausible(self, values: FloatArray) -> bool:
+        """Whether all values are finite and no standard deviation is negative."""
+        if values.size > _FEW:
+            return bool(np.isfinite(values).all()) and all(
+                values[start:stop].min() >= 0 for start, stop in self._deviations
+            )
+        # One sum checks all values: it cannot overflow, because doubles reach far beyond float32,
+        # and NaN or infinity in any value makes the sum NaN or infinite.
+        numbers = values.tolist()
+        return isfinite(sum(numbers)) and all(
+            min(numbers[start:stop]) >= 0 for start, stop in self._deviations
+        )
+
+    @property
+    def sample_shape(self) -> tuple[int, ...]:
+        """Shape of one sample: ``(19,)``, or ``(3 V,)`` for a field."""
+        return self._input.shape[1:]
+
+    def metadata(self) -> ModelMetadata:
+        """Description of the model for clients."""
+        manifest = self.manifest
+        return ModelMetadata(
+            name=manifest.name,
+            version=manifest.version,
+            task=manifest.task,
+            bundle_sha256=self.sha256,
+            contract_version=manifest.contract_version,
+            inputs=tuple(manifest.inputs),
+            outputs=tuple(manifest.outputs),
+            training_data_sha256=manifest.training_data_sha256,
+            metrics=dict(manifest.metrics),
+            trained_on=manifest.trained_on,
+        )
+
+    def _check_golden(self, golden: Mapping[str, npt.NDArray[np.float32]]) -> None:
+        names = [tensor.name for tensor in (*self.manifest.inputs, *self.manifest.outputs)]
+        missing = [name for name in names if name not in golden]
+        if missing:
+            raise BundleError(
+                f"{self._label}: golden.npz has no {', '.join(missing)}", remedy=_REMEDY
+            )
+        feeds = {tensor.name: golden[tensor.name] for tensor in self.manifest.inputs}
+        outputs = [tensor.name for tensor in self.manifest.outputs]
+        try:
+            answers = self._session.run(outputs, feeds)
+        except Exception as error:  # ONNX Runtime's errors share no base of their own
+            raise BundleError(
+                f"{self._label}: the model does not run on its golden inputs: {_first_line(error)}",
+                remedy=_REMEDY,
+            ) from error
+        for name, answer in zip(outputs, answers, strict=True):
+            self._check_answer(name, np.asarray(answer), golden[name])
+
+    def _check_answer(
+        self, name: str, answer: npt.NDArray[Any], expected: npt.NDArray[Any]
+    ) -> None:
+        if not np.isfinite(answer).all():
+            raise BundleError(
+                f"{self._label}: output {name!r} is NaN or infinite on its golden input",
+                remedy=_REMEDY,
+            )
+        if answer.shape != expected.shape:
+            raise BundleError(
+                f"{self._label}: output {name!r} has shape {answer.shape} on its golden input, "
+                f"golden.npz says {expected.shape}",
+                remedy=_REMEDY,
+            )
+        scale = float(np.max(np.abs(expected), initial=0.0)) or 1.0
+        deviation = float(np.max(np.abs(answer - expected), initial=0.0)) / scale
+        if not deviation < GOLDEN_TOLERANCE:
+            raise BundleError(
+                f"{self._label}: output {name!r} deviates from golden.npz by {deviation:.2g} of "
+                f"its largest value, {GOLDEN_TOLERANCE:g} is allowed",
+                remedy=_REMEDY,
+            )
+
+    def _bind(self) -> None:
+        """Bind input and outputs to fixed memory once: 2 us cheaper than feeding each sample.
+
+        All outputs share one array, so that one copy and one check suffice.
+        """
+        entry = self.manifest.inputs[0]
+        self._input: FloatArray = np.zeros((1, *entry.shape[1:]), np.float32)
+        self._slices: list[tuple[str, int, int]] = []
+        end = 0
+        for tensor in self.manifest.outputs:
+            size = int(np.prod(tensor.shape[1:]))
+            self._slices.append((tensor.name, end, end + size))
+            end += -(-size // _ALIGN) * _ALIGN
+        self._deviations = [
+            (start, stop) for name, start, stop in self._slices if name.endswith("_sd")
+        ]
+        self._output: FloatArray = np.zeros(end, np.float32)
+        self._binding = self._session.io_binding()
+        self._binding.bind_input(
+            entry.name, "cpu", 0, np.float32, self._input.shape, self._input.ctypes.data
+        )
+        for tensor, (name, start, _) in zip(self.manifest.outputs, self._slices, strict=True):
+            address = self._output.ctypes.data + start * self._output.itemsize
+            self._binding.bind_output(name, "cpu", 0, np.float32, (1, *tensor.shape[1:]), address)
+
+    def _warm_up(self) -> None:
+        silence = np.zeros(self.sample_shape, np.float32)
+        for _ in range(WARM_UP_RUNS):
+            outputs = self.run(silence)
+        if outputs is None:
+            raise BundleError(
+                f"{self._label}: the output for an untouched sensor (all zero) is not finite, or a "
+                "standard deviation is negative",
+                remedy=_REMEDY,
+            )
+
+
+def _check_manifest(manifest: Manifest, task: str, label: str) -> None:
+    """Checks that ``read_bundle`` makes too, for bundles that were made in memory."""
+    if manifest.contract_version > BUNDLE_CONTRACT_VERSION:
+        raise BundleError(
+            f"{label} is written for bundle contract v{manifest.contract_version}, this palpate "
+            f"knows v{BUNDLE_CONTRACT_VERSION}",
+            remedy="upgrade palpate on this host: pip install --upgrade palpate",
+        )
+    if manifest.task != task:
+        raise BundleError(
+            f"{label} is for the task {manifest.task!r}, not {task!r}",
+            remedy=f"serve a bundle whose manifest says task = {task!r}",
+        )
+    check_task(manifest, label)
+    if manifest.sensor_type not in SensorType.__members__:
+        raise BundleError(
+            f"{label} is for the unknown sensor type {manifest.sensor_type!r}",
+            remedy=f"known sensor types: {', '.join(SensorType.__members__)}",
+        )
+
+
+def _open_model(model: bytes, manifest: Manifest, label: str) -> Any:
+    """ONNX Runtime's session of a model that agrees with its manifest."""
+    _check_self_contained(model, label)
+    session = _open_session(model, label)
+    _check_model(manifest, session, label)
+    return session
+
+
+def _check_self_contained(model: bytes, label: str) -> None:
+    try:
+        external = has_external_data(model)
+    except ValueError as error:
+        raise BundleError(
+            f"{label}: model.onnx does not load: {error}, so it is no ONNX file", remedy=_REMEDY
+        ) from error
+    if external:
+        raise BundleError(
+            f"{label}: model.onnx keeps weights in another file, which no digest covers",
+            remedy="export it with all weights inside model.onnx",
+        )
+
+
+def _open_session(model: bytes, label: str) -> Any:
+    ort: ModuleType = require("onnxruntime", extra="services")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    # Threads that spin while they wait keep a core busy between two frames, without gain at 100 Hz.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+    options.log_severity_level = 4  # fatal only: its errors are raised
+    try:
+        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's errors share no base of their own
+        text = str(error)
+        if "opset" in text.lower():
+            problem = f"{label}: ONNX Runtime {ort.__version__} does not know its opset"
+            remedy = "export for an older opset, or upgrade onnxruntime"
+        else:
+            problem = f"{label}: model.onnx does not load: {_first_line(error)}"
+            remedy = _REMEDY
+        raise BundleError(problem, remedy=remedy) from error
+
+
+def _check_model(manifest: Manifest, session: Any, label: str) -> None:
+    """The graph must have the tensors of its manifest, which were checked against the task."""
+    for side, declared, nodes in (
+        ("input", manifest.inputs, session.get_inputs()),
+        ("output", manifest.outputs, session.get_outputs()),
+    ):
+        wanted = {tensor.name: (tensor.dtype, tuple(tensor.shape)) for tensor in declared}
+        found = {node.name: _signature(node) for node in nodes}
+        if found != wanted:
+            raise BundleError(
+                f"{label}: model.onnx has {side}s {_describe(found)}; manifest.json says "
+                f"{_describe(wanted)}",
+                remedy=f"export it to the contract of the task {manifest.task!r}",
+            )
+
+
+def _signature(node: Any) -> tuple[str, tuple[int, ...]]:
+    # ONNX Runtime gives a name or None for a free batch size.
+    shape = tuple(size if isinstance(size, int) else -1 for size in node.shape)
+    return _DTYPES.get(node.type, node.type), shape
+
+
+def _describe(tensors: dict[str, tuple[str, tuple[int, ...]]]) -> str:
+    return ", ".join(
+        f"{name} {dtype}{list(shape)}" for name, (dtype, shape) in sorted(tensors.items())
+    )
+
+
+def _first_line(error: Exception) -> str:
+    """First line of ONNX Runtime's message, without the source paths of its build."""
+    return str(error).splitlines()[0].split(" : ")[-1][:200]
+
+
 def has_external_data(model: bytes) -> bool:
-    """Whether any tensor of a model points to another file.
+    """Whether a model keeps weights outside its own bytes.
+
+    No digest covers such weights, and ONNX Runtime reads them from the working directory even for a
+    model that was loaded from bytes. The ``onnx`` package is no dependency of the services, so the
+    protobuf is read by hand: only its length prefixes, never the weights.
 
     Args:
         model: Bytes of ``model.onnx``.
@@ -58,8 +354,8 @@ def has_external_data(model: bytes) -> bool:
             if kind == "tensor":
                 if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0):
                     return True
-            elif isinstance(value, memoryview) and number in _INSIDE[kind]:
-                waiting.append((_INSIDE[kind][number], value))
+            elif isinstance(value, memoryview) and number in _NESTED[kind]:
+                waiting.append((_NESTED[kind][number], value))
     return False
 
 
@@ -95,311 +391,3 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
             return value, at
         shift += 7
     raise ValueError(f"number cut off at byte {at}")
-
-
-REMEDY = "export the bundle again with palpate_training, or serve another one"
-
-_DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(int64)": "int64"}
-
-
-def open_model(model: bytes, manifest: Manifest, label: str) -> Any:
-    """Open a model.
-
-    Args:
-        model: Bytes of ``model.onnx``.
-        manifest: What its bundle says of it.
-        label: Names the bundle, for the error.
-
-    Returns:
-        ONNX Runtime's session.
-
-    Raises:
-        BundleError: The model does not load, keeps weights elsewhere, or differs from its manifest.
-        MissingExtraError: ONNX Runtime is not installed.
-    """
-    _check_self_contained(model, label)
-    session = _open_session(model, label)
-    _check_model(manifest, session, label)
-    return session
-
-
-def _check_self_contained(model: bytes, label: str) -> None:
-    try:
-        external = has_external_data(model)
-    except ValueError as error:
-        raise BundleError(
-            f"{label}: model.onnx does not load: {error}, so it is no ONNX file", remedy=REMEDY
-        ) from error
-    if external:
-        raise BundleError(
-            f"{label}: model.onnx keeps weights in another file, which no digest covers",
-            remedy="export it with all weights inside model.onnx",
-        )
-
-
-def _open_session(model: bytes, label: str) -> Any:
-    ort: ModuleType = require("onnxruntime", extra="services")
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    # Spinning threads burn a core between two frames and buy nothing at 100 Hz.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.log_severity_level = 4  # its errors come as exceptions; stderr is not a log
-    try:
-        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's errors share no base of their own
-        text = str(error)
-        if "opset" in text.lower():
-            problem = f"{label}: ONNX Runtime {ort.__version__} does not know its opset"
-            remedy = "export for an older opset, or upgrade onnxruntime"
-        else:
-            problem = f"{label}: model.onnx does not load: {first_line(error)}"
-            remedy = REMEDY
-        raise BundleError(problem, remedy=remedy) from error
-
-
-def _check_model(manifest: Manifest, session: Any, label: str) -> None:
-    """The graph must have the tensors that its manifest names; those are the task's already."""
-    for side, declared, nodes in (
-        ("input", manifest.inputs, session.get_inputs()),
-        ("output", manifest.outputs, session.get_outputs()),
-    ):
-        wanted = {tensor.name: (tensor.dtype, tuple(tensor.shape)) for tensor in declared}
-        found = {node.name: _signature(node) for node in nodes}
-        if found != wanted:
-            raise BundleError(
-                f"{label}: model.onnx has {side}s {_describe(found)}; manifest.json says "
-                f"{_describe(wanted)}",
-                remedy=f"export it to the contract of the task {manifest.task!r}",
-            )
-
-
-def _signature(node: Any) -> tuple[str, tuple[int, ...]]:
-    # ONNX Runtime gives a name or None for a free batch size.
-    shape = tuple(size if isinstance(size, int) else -1 for size in node.shape)
-    return _DTYPES.get(node.type, node.type), shape
-
-
-def _describe(tensors: dict[str, tuple[str, tuple[int, ...]]]) -> str:
-    return ", ".join(
-        f"{name} {dtype}{list(shape)}" for name, (dtype, shape) in sorted(tensors.items())
-    )
-
-
-def first_line(error: Exception) -> str:
-    """First line of a foreign message, without the source paths of whoever built it."""
-    return str(error).splitlines()[0].split(" : ")[-1][:200]
-
-
-log = logging.getLogger(__name__)
-
-GOLDEN_TOLERANCE = 1e-5
-"""Allowed deviation from the golden outputs, relative to their largest magnitude: float32 rounding
-of another CPU's kernels stays an order of magnitude below it."""
-
-WARM_UP_RUNS = 50
-"""Runs before a model counts as warm: the first is 5-10 times slower than those that follow."""
-
-_FEW = 64  # values up to which plain Python is faster than NumPy's reductions
-_ALIGN = 16  # float32 values to a 64-byte cache line, the alignment ONNX Runtime's own buffers have
-
-
-class Runtime:
-    """A loaded bundle that answers one sample at a time. Several threads wait for one another.
-
-    Attributes:
-        manifest: What the bundle says of itself.
-        sha256: Digest of the manifest, 32 bytes; stands in every estimate.
-        sensor_type: The type of sensor it was made for.
-        contact_threshold_n: Net force from which on there is contact [N].
-        mesh: Mesh of its fields; None for a task without.
-        mesh_sha256: Content hash of that mesh, 32 bytes; empty for a task without.
-    """
-
-    def __init__(self, bundle: Bundle, task: str) -> None:
-        manifest = bundle.manifest
-        self.manifest = manifest
-        self.sha256 = bundle.sha256
-        self.contact_threshold_n = float(manifest.contact_threshold_n)
-        self.mesh = bundle.mesh
-        self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
-        self._lock = threading.Lock()
-        self._label = f"bundle {manifest.name}:{manifest.version}"
-        _check_manifest(manifest, task, self._label)
-        self.sensor_type = SensorType[manifest.sensor_type]
-        check_bundle_mesh(bundle.mesh, manifest, self._label)
-        self._session = open_model(bundle.model, manifest, self._label)
-        self._check_golden(bundle.golden)
-        self._bind()
-        self._warm_up()
-
-    def run(self, sample: FloatArray) -> dict[str, FloatArray] | None:
-        """Run the model on one sample.
-
-        Args:
-            sample: The model's one input without batch axis, e.g. tared counts, shape ``(19,)``,
-                or a displacement field, flat, shape ``(3 V,)``.
-
-        Returns:
-            Outputs by name without batch axis, on memory of their own; None if any value is not
-            finite or a standard deviation is negative.
-        """
-        with self._lock:
-            self._input[0] = sample
-            self._session.run_with_iobinding(self._binding)
-            values = self._output.copy()
-        return (
-            {name: values[start:stop] for name, start, stop in self._slices}
-            if self._believable(values)
-            else None
-        )
-
-    def _believable(self, values: FloatArray) -> bool:
-        """Whether all values are finite and no standard deviation is negative."""
-        if values.size > _FEW:
-            return bool(np.isfinite(values).all()) and all(
-                values[start:stop].min() >= 0 for start, stop in self._deviations
-            )
-        # The sum of float32 values cannot overflow a double, and NaN or infinity in any of them
-        # survives it.
-        numbers = values.tolist()
-        return isfinite(sum(numbers)) and all(
-            min(numbers[start:stop]) >= 0 for start, stop in self._deviations
-        )
-
-    @property
-    def sample_shape(self) -> tuple[int, ...]:
-        """Shape of one sample: ``(19,)``, or ``(3 V,)`` for a field."""
-        return self._input.shape[1:]
-
-    def metadata(self) -> ModelMetadata:
-        """What a robot is told of the model that answers it."""
-        manifest = self.manifest
-        return ModelMetadata(
-            name=manifest.name,
-            version=manifest.version,
-            task=manifest.task,
-            bundle_sha256=self.sha256,
-            contract_version=manifest.contract_version,
-            inputs=tuple(manifest.inputs),
-            outputs=tuple(manifest.outputs),
-            training_data_sha256=manifest.training_data_sha256,
-            metrics=dict(manifest.metrics),
-            trained_on=manifest.trained_on,
-        )
-
-    def _check_golden(self, golden: Mapping[str, npt.NDArray[np.float32]]) -> None:
-        names = [tensor.name for tensor in (*self.manifest.inputs, *self.manifest.outputs)]
-        missing = [name for name in names if name not in golden]
-        if missing:
-            raise BundleError(
-                f"{self._label}: golden.npz has no {', '.join(missing)}", remedy=REMEDY
-            )
-        feeds = {tensor.name: golden[tensor.name] for tensor in self.manifest.inputs}
-        outputs = [tensor.name for tensor in self.manifest.outputs]
-        try:
-            answers = self._session.run(outputs, feeds)
-        except Exception as error:  # ONNX Runtime's errors share no base of their own
-            raise BundleError(
-                f"{self._label}: the model does not run on its golden inputs: {first_line(error)}",
-                remedy=REMEDY,
-            ) from error
-        for name, answer in zip(outputs, answers, strict=True):
-            self._check_answer(name, np.asarray(answer), golden[name])
-
-    def _check_answer(
-        self, name: str, answer: npt.NDArray[Any], expected: npt.NDArray[Any]
-    ) -> None:
-        if not np.isfinite(answer).all():
-            raise BundleError(
-                f"{self._label}: output {name!r} is NaN or infinite on its golden input",
-                remedy=REMEDY,
-            )
-        if answer.shape != expected.shape:
-            raise BundleError(
-                f"{self._label}: output {name!r} has shape {answer.shape} on its golden input, "
-                f"golden.npz says {expected.shape}",
-                remedy=REMEDY,
-            )
-        scale = float(np.max(np.abs(expected), initial=0.0)) or 1.0
-        deviation = float(np.max(np.abs(answer - expected), initial=0.0)) / scale
-        if not deviation < GOLDEN_TOLERANCE:
-            raise BundleError(
-                f"{self._label}: output {name!r} deviates from golden.npz by {deviation:.2g} of "
-                f"its largest value, {GOLDEN_TOLERANCE:g} is allowed",
-                remedy=REMEDY,
-            )
-
-    def _bind(self) -> None:
-        """Bind input and outputs to fixed memory once: 2 us cheaper than feeding each sample.
-
-        All outputs share one array, so that one copy and one check serve them all.
-        """
-        entry = self.manifest.inputs[0]
-        self._input: FloatArray = np.zeros((1, *entry.shape[1:]), np.float32)
-        self._slices: list[tuple[str, int, int]] = []
-        end = 0
-        for tensor in self.manifest.outputs:
-            size = int(np.prod(tensor.shape[1:]))
-            self._slices.append((tensor.name, end, end + size))
-            end += -(-size // _ALIGN) * _ALIGN
-        self._deviations = [
-            (start, stop) for name, start, stop in self._slices if name.endswith("_sd")
-        ]
-        self._output: FloatArray = np.zeros(end, np.float32)
-        self._binding = self._session.io_binding()
-        self._binding.bind_input(
-            entry.name, "cpu", 0, np.float32, self._input.shape, self._input.ctypes.data
-        )
-        for tensor, (name, start, _) in zip(self.manifest.outputs, self._slices, strict=True):
-            address = self._output.ctypes.data + start * self._output.itemsize
-            self._binding.bind_output(name, "cpu", 0, np.float32, (1, *tensor.shape[1:]), address)
-
-    def _warm_up(self) -> None:
-        silence = np.zeros(self.sample_shape, np.float32)
-        for _ in range(WARM_UP_RUNS):
-            outputs = self.run(silence)
-        if outputs is None:
-            raise BundleError(
-                f"{self._label}: the answer to an untouched sensor (all zero) is not finite, or a "
-                "standard deviation is negative",
-                remedy=REMEDY,
-            )
-
-
-def load(bundle: Bundle, task: str) -> Runtime:
-    """Load a bundle for a task and warm it up.
-
-    Args:
-        bundle: As read by ``palpate.files.bundle.read_bundle``.
-        task: The task it is to serve, e.g. ``"features"``.
-
-    Raises:
-        BundleError: It breaks the contract; the error names what and where.
-        MissingExtraError: ONNX Runtime is not installed.
-    """
-    runtime = Runtime(bundle, task)
-    log.info("loaded %s:%d for %s", bundle.manifest.name, bundle.manifest.version, task)
-    return runtime
-
-
-def _check_manifest(manifest: Manifest, task: str, label: str) -> None:
-    """``read_bundle`` has said most of this; a bundle made in memory has not been there."""
-    if manifest.contract_version > BUNDLE_CONTRACT_VERSION:
-        raise BundleError(
-            f"{label} is written for bundle contract v{manifest.contract_version}, this palpate "
-            f"knows v{BUNDLE_CONTRACT_VERSION}",
-            remedy="upgrade palpate on this host: pip install --upgrade palpate",
-        )
-    if manifest.task != task:
-        raise BundleError(
-            f"{label} is for the task {manifest.task!r}, not {task!r}",
-            remedy=f"serve a bundle whose manifest says task = {task!r}",
-        )
-    check_task(manifest, label)
-    if manifest.sensor_type not in SensorType.__members__:
-        raise BundleError(
-            f"{label} is for the unknown sensor type {manifest.sensor_type!r}",
-            remedy=f"known sensor types: {', '.join(SensorType.__members__)}",
-        )

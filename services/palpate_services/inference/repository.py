@@ -1,4 +1,4 @@
-"""Meshes of fields by content hash: whatever bundle holds one can lend it to a picture."""
+"""Where bundles are: packaged with palpate, or in a folder of the user; and the meshes in them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 from palpate.errors import BundleError, ConfigError
 from palpate.files.bundle import FieldMesh, read_mesh
 
+_log = logging.getLogger(__name__)
+
 MANIFEST = "manifest.json"
 
 PACKAGED = Path(__file__).parent.parent / "models"
-"""Bundles that come with palpate: ``<name>/<version>/{model.onnx,manifest.json,golden.npz}``."""
+"""Bundles that ship with palpate: ``<name>/<version>/{model.onnx,manifest.json,golden.npz}``."""
 
 
 def available(models: Path = PACKAGED) -> list[str]:
@@ -39,8 +41,8 @@ def resolve(bundle: str, models: Path = PACKAGED) -> Path:
     Raises:
         ConfigError: There is no such bundle; the error lists what exists.
     """
-    # Only a separator or a dot makes it a path: a folder of the same name in the working directory
-    # must not silently take the place of a packaged bundle.
+    # Only a slash or a leading dot makes it a path: a folder in the working directory must not
+    # replace a packaged bundle of the same name without notice.
     if "/" in bundle or bundle.startswith("."):
         folder = Path(bundle).expanduser()
         if (folder / MANIFEST).is_file():
@@ -62,11 +64,8 @@ def resolve(bundle: str, models: Path = PACKAGED) -> Path:
     )
 
 
-log = logging.getLogger(__name__)
-
-
 class MeshLibrary:
-    """Knows the meshes of the packaged bundles and of some more.
+    """The meshes of fields, by content hash: those of the packaged bundles and of some more.
 
     Args:
         bundles: More bundles, by name or folder.
@@ -92,8 +91,8 @@ class MeshLibrary:
         for folder in (*packaged, *self._folders):
             try:
                 mesh = read_mesh(folder)
-            except BundleError as error:  # a picture needs no bundle but the one with its mesh
-                log.warning("no mesh from this bundle: %s", error)
+            except BundleError as error:  # another bundle may hold the mesh that is needed
+                _log.warning("no mesh from this bundle: %s", error)
                 continue
             if mesh is not None:
                 yield mesh

@@ -1,4 +1,9 @@
-"""The three estimating services: features, field and synthesis."""
+"""The three estimating services: features, field and synthesis.
+
+Each ``run_*`` serves until ``stop`` is set. ``config`` is its table of the profile, ``link`` how it
+joins the bus, ``station`` the station that it serves, ``instance`` its name among several processes
+of its kind. The errors are those of ``palpate_services.inference.loop.serve``.
+"""
 
 from __future__ import annotations
 
@@ -13,136 +18,113 @@ from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     FieldEstimate,
-    FieldFrame,
     FieldRequest,
     SynthesisEstimate,
 )
-from palpate_services.config import FeaturesConfig, FieldConfig, SynthesisConfig
-from palpate_services.inference.estimates import TaredFrames, estimate, estimate_field, synthesise
-from palpate_services.inference.loop import Answer, Line, answered, serve
+from palpate_services.config import (
+    FeaturesServiceConfig,
+    FieldServiceConfig,
+    SynthesisServiceConfig,
+)
+from palpate_services.inference.estimates import (
+    TaredEstimator,
+    estimate,
+    estimate_field,
+    synthesise,
+)
+from palpate_services.inference.loop import EstimateFrom, ServiceRoute, reply, serve
 from palpate_services.inference.model import Runtime
 
-_FEATURES_LINE: Line[ElectrodeFrame, FeatureEstimate] = Line(
+_FEATURES: ServiceRoute[ElectrodeFrame, FeatureEstimate] = ServiceRoute(
     "features", ELECTRODES, FEATURES, "frames_received"
 )
+_FIELD: ServiceRoute[ElectrodeFrame, FieldEstimate] = ServiceRoute(
+    "field", ELECTRODES, FIELD, "frames_received"
+)
+_SYNTHESIS: dict[str, ServiceRoute[Any, SynthesisEstimate]] = {
+    "truth": ServiceRoute("synthesis", FIELD_TRUTH, SYNTHESIS, "fields_received"),
+    "estimate": ServiceRoute("synthesis", FIELD, SYNTHESIS, "fields_received"),
+}  # by SynthesisServiceConfig.source
 
 
 def run_features(
-    config: FeaturesConfig,
+    config: FeaturesServiceConfig,
     link: LinkConfig,
     station: str,
     stop: threading.Event,
     *,
     instance: str = "features",
 ) -> None:
-    """Serve until ``stop`` is set; see ``palpate_services.inference.loop.serve`` for the errors.
+    """Serve features: from electrodes to force and contact location."""
 
-    Args:
-        config: How electrodes become features.
-        link: How to join the bus.
-        station: The station to serve.
-        stop: Set it to end.
-        instance: Name of this process among several of its kind.
-    """
-
-    def make(
+    def prepare(
         session: Session, runtime: Runtime, health: Health
-    ) -> Answer[ElectrodeFrame, FeatureEstimate]:
-        return TaredFrames(session, config, runtime, estimate, health).answer
+    ) -> EstimateFrom[ElectrodeFrame, FeatureEstimate]:
+        return TaredEstimator(session, config, runtime, estimate, health).estimate
 
-    serve(_FEATURES_LINE, config, link, station, stop, instance=instance, make=make)
-
-
-_FIELD_LINE: Line[ElectrodeFrame, FieldEstimate] = Line(
-    "field", ELECTRODES, FIELD, "frames_received"
-)
+    serve(_FEATURES, config, link, station, stop, instance=instance, prepare=prepare)
 
 
 def run_field(
-    config: FieldConfig,
+    config: FieldServiceConfig,
     link: LinkConfig,
     station: str,
     stop: threading.Event,
     *,
     instance: str = "field",
 ) -> None:
-    """Serve until ``stop`` is set; see ``palpate_services.inference.loop.serve`` for the errors.
+    """Serve fields: from electrodes to the displacement of each skin node, at a limited rate.
 
-    Answers the endpoint ``estimate`` too: the field of the frame that it is asked with.
-
-    Args:
-        config: How electrodes become fields.
-        link: How to join the bus.
-        station: The station to serve.
-        stop: Set it to end.
-        instance: Name of this process among several of its kind.
+    Its endpoint ``estimate`` replies with the field of the frame in the request.
     """
 
-    def make(
+    def prepare(
         session: Session, runtime: Runtime, health: Health
-    ) -> Answer[ElectrodeFrame, FieldEstimate]:
-        # Questions come in a thread of their own, and tares are looked up by one thread each.
-        asked = TaredFrames(session, config, runtime, estimate_field, health, any_age=True)
+    ) -> EstimateFrom[ElectrodeFrame, FieldEstimate]:
+        # Requests come in a thread of their own, and an estimator belongs to one thread.
+        requested = TaredEstimator(session, config, runtime, estimate_field, health, any_age=True)
 
         def handle(request: FieldRequest) -> FieldEstimate:
-            return answered(asked.answer(request.sensor, request.frame), health)
+            return reply(requested.estimate(request.sensor, request.frame), health)
 
-        session.queryable(
-            endpoints.ESTIMATE_FIELD, handle, service=_FIELD_LINE.service, instance=instance
-        )
-        return TaredFrames(session, config, runtime, estimate_field, health).answer
+        session.queryable(endpoints.ESTIMATE_FIELD, handle, service="field", instance=instance)
+        return TaredEstimator(session, config, runtime, estimate_field, health).estimate
 
     serve(
-        _FIELD_LINE,
+        _FIELD,
         config,
         link,
         station,
         stop,
         instance=instance,
-        make=make,
+        prepare=prepare,
         rate_hz=config.rate_hz,
     )
 
 
-SERVICE = "synthesis"
-
-_OF_TRUTH: Line[FieldFrame, SynthesisEstimate] = Line(
-    SERVICE, FIELD_TRUTH, SYNTHESIS, "fields_received"
-)
-_OF_ESTIMATE: Line[FieldEstimate, SynthesisEstimate] = Line(
-    SERVICE, FIELD, SYNTHESIS, "fields_received"
-)
-LINES: dict[str, Line[Any, SynthesisEstimate]] = {"truth": _OF_TRUTH, "estimate": _OF_ESTIMATE}
-"""What is answered, by ``SynthesisConfig.source``."""
-
-
 def run_synthesis(
-    config: SynthesisConfig,
+    config: SynthesisServiceConfig,
     link: LinkConfig,
     station: str,
     stop: threading.Event,
     *,
     instance: str = "synthesis",
 ) -> None:
-    """Serve until ``stop`` is set; see ``palpate_services.inference.loop.serve`` for the errors.
+    """Serve synthesis: from displacement fields to tared counts of the electrodes.
 
-    Answers the endpoint ``synthesise`` too: the tared counts of the field that it is asked with.
-
-    Args:
-        config: How fields become electrodes.
-        link: How to join the bus.
-        station: The station to serve.
-        stop: Set it to end.
-        instance: Name of this process among several of its kind.
+    Its endpoint ``synthesise`` replies with the tared counts of the field in the request.
     """
 
-    def make(session: Session, runtime: Runtime, health: Health) -> Answer[Any, SynthesisEstimate]:
+    def prepare(
+        session: Session, runtime: Runtime, health: Health
+    ) -> EstimateFrom[Any, SynthesisEstimate]:
         session.queryable(
             endpoints.SYNTHESISE,
-            lambda field: answered(synthesise(field, runtime), health),
-            service=SERVICE,
+            lambda field: reply(synthesise(field, runtime), health),
+            service="synthesis",
             instance=instance,
         )
         return lambda _, field: synthesise(field, runtime)
 
-    serve(LINES[config.source], config, link, station, stop, instance=instance, make=make)
+    route = _SYNTHESIS[config.source]
+    serve(route, config, link, station, stop, instance=instance, prepare=prepare)

@@ -1,4 +1,4 @@
-"""The recorder: everything that is said on the bus goes to disk, and nothing waits for it."""
+"""The recorder service: writes what is published on the bus to disk; no publisher waits for it."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
 from palpate.process import avoid_pauses
 from palpate_services.config import RecorderConfig
-from palpate_services.recorder.writer import RecordKeeper
+from palpate_services.recorder.writer import RecordFiles
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 SERVICE = "recorder"
 
-_NAP_S = 0.05
-"""Samples are taken in batches: waking up for each one would cost more than writing it."""
+_BATCH_S = 0.05
+"""Samples are taken in batches: to wake up for each one would cost more than to write it [s]."""
 
-_LOOK_AFTER = 100
-"""Samples after which the disk is looked at even though more are waiting."""
+_CHECK_AFTER = 100
+"""Samples after which the disk is checked even though more samples wait."""
 
 
 def run_recorder(
@@ -36,7 +36,7 @@ def run_recorder(
     *,
     instance: str = "recorder",
 ) -> None:
-    """Record until ``stop`` is set; then write what has come and close the files.
+    """Record until ``stop`` is set; then write the samples that have arrived and close the files.
 
     Args:
         config: What is recorded, and where.
@@ -52,7 +52,7 @@ def run_recorder(
     """
     topics = _topics(config.topics)
     health = Health(SERVICE, instance)
-    keeper = RecordKeeper(config, station, health)
+    files = RecordFiles(config, station, health)
     with Session.open(link, station=station) as session:
         presence = session.presence(SERVICE, instance=instance)
         tap = session.tap(
@@ -61,35 +61,35 @@ def run_recorder(
             delivery=Delivery(config.delivery),
             capacity=config.capacity,
         )
-        keeper.start()
+        files.start()
         with HealthReporter(session, health, refresh=lambda: health.set_counts(tap.counters)):
             try:
                 avoid_pauses()
                 presence.ready()
-                while not stop.wait(_NAP_S):
-                    _drain(tap, keeper)
+                while not stop.wait(_BATCH_S):
+                    _drain(tap, files)
                 presence.not_ready()
                 if health.state is not ServiceState.DEGRADED:
                     health.set_state(ServiceState.STOPPING, "draining")
                 deadline = time.monotonic() + config.drain_s
-                while _drain(tap, keeper) and time.monotonic() < deadline:
-                    time.sleep(_NAP_S)
+                while _drain(tap, files) and time.monotonic() < deadline:
+                    time.sleep(_BATCH_S)
             finally:
                 tap.close()
-                keeper.close()
+                files.close()
 
 
-def _drain(tap: Tap, keeper: RecordKeeper) -> int:
-    """Record what waits; how many samples that were."""
+def _drain(tap: Tap, files: RecordFiles) -> int:
+    """Record all waiting samples; returns their number."""
     came = 0
     try:
         while True:
-            keeper.write(tap.next(0.0))
+            files.write(tap.next(0.0))
             came += 1
-            if came % _LOOK_AFTER == 0:
-                keeper.tick()
+            if came % _CHECK_AFTER == 0:
+                files.tick()
     except StreamTimeout:
-        keeper.tick(idle=came == 0)
+        files.tick(idle=came == 0)
     return came
 
 

@@ -1,4 +1,4 @@
-"""The files of a recorder: which is open, when the next begins, what happens on a full disk."""
+"""The files of a recorder: rotation, full disks, and records that a killed recorder left behind."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from palpate.health import Health
 from palpate.messages import ServiceState
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.repository import MeshLibrary
-from palpate_services.viewer.live import ViewWorker
-from palpate_services.viewer.timeline import SensorScene
+from palpate_services.viewer.rerun import LiveView
+from palpate_services.viewer.timeline import SensorTimeline
 
 
 class DiskError(RecordingError):
-    """The disk takes no more; recording pauses, everything else goes on."""
+    """The disk is full or refuses to write; recording pauses, everything else goes on."""
 
     code = ErrorCode.DISK
 
@@ -46,7 +46,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def disk_error(folder: Path, why: str) -> DiskError:
-    """The error for a disk that is full or refuses to write, with what is left of it."""
+    """The error for a disk that is full or refuses to write, with its free space."""
     try:
         left = f"{free_bytes(folder)} bytes free"
     except DiskError:
@@ -57,15 +57,15 @@ def disk_error(folder: Path, why: str) -> DiskError:
     )
 
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 PART = ".part"
 RECOVERED = ".recovered.mcap"
 
 
-NEWBORN_BYTES = 512
-NEWBORN_S = 10.0
-"""A part this small and young may belong to a recorder that has not locked it yet."""
+FRESH_BYTES = 512
+FRESH_S = 10.0
+"""A part as small and young as this may belong to a recorder that has not locked it yet."""
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -77,7 +77,7 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> list[Path]:
-    """Recover leftovers; one that cannot be read is left as it is.
+    """Recover leftovers; one that cannot be read stays as it is.
 
     Args:
         parts: As found by :func:`leftovers`.
@@ -96,12 +96,12 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
             else:
                 done.append(recover(part))
         except (RecordingError, OSError) as error:
-            log.warning("%s cannot be recovered: %s", part, error)
+            _log.warning("%s cannot be recovered: %s", part, error)
     return done
 
 
-class Recovery:
-    """Recovers leftovers in a thread: a large one must not delay the new record.
+class RecordRecovery:
+    """Recovers leftovers in a thread, because a large one must not delay the new record.
 
     Args:
         folder: Folder of records.
@@ -115,7 +115,7 @@ class Recovery:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Look for leftovers now, recover them by and by; nothing while it is still at it."""
+        """Look for leftovers and start to recover them, unless a recovery still runs."""
         if self._thread is not None and self._thread.is_alive():
             return
         parts = leftovers(self._folder)
@@ -126,21 +126,21 @@ class Recovery:
             self._thread.start()
 
     def stop(self) -> None:
-        """Finish the file at hand, for a moment; an unfinished one is begun again next time."""
+        """Stop after the present file; after two seconds it is left for the next start."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
 
     def _run(self, parts: list[Path]) -> None:
         for path in recover_all(parts, self._stop):
-            log.info("recovered %s", path)
+            _log.info("recovered %s", path)
             self._health.count("recovered_records", 1)
 
 
 def _alive(part: Path) -> bool:
     try:
         status = part.stat()
-        if status.st_size < NEWBORN_BYTES and time.time() - status.st_mtime < NEWBORN_S:
+        if status.st_size < FRESH_BYTES and time.time() - status.st_mtime < FRESH_S:
             return True
         return is_being_written(part)
     except (OSError, RecordingError):
@@ -148,26 +148,27 @@ def _alive(part: Path) -> bool:
 
 
 CHECK_S = 0.15
-"""Time between two looks at the disk, and from the last message before a pause to its flush: a full
-disk must be reported within a second, a killed recorder must lose no more than 0.3 s."""
+"""Time between two checks of the disk, and from the last message before a silence to its flush [s]:
+a full disk must be reported within a second, a killed recorder must lose no more than 0.3 s."""
 
 RESUME_MARGIN_BYTES = 1024**2
-"""More than ``min_free_bytes`` must be free before recording resumes, or it would flutter."""
+"""Recording resumes only with this much more than ``min_free_bytes``: without the margin it would
+start and stop in turn."""
 
 VIEW_CLOSE_S = 5.0
-"""How long a stopping recorder waits for its view to be drawn to the end."""
+"""How long a stopping recorder waits for its view to be completed [s]."""
 
 RETRY_S = 1.0
-"""Time between two attempts to open a record on a disk that refused one."""
+"""Time between two attempts to open a record on a disk that refused one [s]."""
 
 
-class RecordKeeper:
-    """Writes samples to the record of the hour and draws them beside it. Use from one thread.
+class RecordFiles:
+    """Writes samples to the present record, and draws them into its view. Use from one thread.
 
     Args:
         config: What is recorded, and where.
-        station: Stands in the names of the files.
-        health: Hears of every event.
+        station: Part of the names of the files.
+        health: Gets counters, gauges, state and errors.
 
     Raises:
         ConfigError: One of ``config.bundles`` does not exist.
@@ -179,19 +180,19 @@ class RecordKeeper:
         self._health = health
         self._counts: Counter[str] = Counter()
         self._writer: RecordWriter | None = None
-        self._view: ViewWorker | None = None
-        self._views: list[ViewWorker] = []  # the present one, and those that still draw the rest
+        self._view: LiveView | None = None
+        self._views: list[LiveView] = []  # the present one, and earlier ones that are not finished
         self._path: Path | None = None
         self._size = 0
         self._unflushed = 0
         self._opened_s = 0.0
         self._checked_s = 0.0
         self._tried_s = float("-inf")
-        self._recovery = Recovery(config.out, health)
+        self._recovery = RecordRecovery(config.out, health)
         self._meshes = MeshLibrary(config.bundles)
 
     def start(self) -> None:
-        """Make the folder, save what a killed run left behind, open the first record.
+        """Make the folder, recover what a killed run left behind, open the first record.
 
         Raises:
             RecordingError: The folder cannot be made. A full disk is no error but a state.
@@ -215,7 +216,7 @@ class RecordKeeper:
         if topic is None or topic.codec.schema != sample.schema:
             self._counts["rejected_schema"] += 1
             return
-        message, wall_ns, sequence = self._look_at(topic, sample)
+        message, wall_ns, sequence = self._decode(topic, sample)
         try:
             self._writer.write(
                 sample.key,
@@ -226,8 +227,9 @@ class RecordKeeper:
                 sequence=sequence,
             )
         except RecordingError as error:
-            # With it go those that the writer had not handed to the disk yet.
-            self._counts["lost_disk_full"] += 1 + self._unflushed
+            # Lost with it: samples that the writer still held in its buffer.
+            self._unflushed += 1
+            self._count_unflushed()
             self._pause(error.problem)
             return
         size = self._writer.bytes_written
@@ -235,13 +237,13 @@ class RecordKeeper:
         self._size = size
         self._counts[f"recorded_{sample.topic}"] += 1
         self._counts["recorded_bytes"] += len(sample.payload)
-        if self._view is not None and message is not None and sample.topic in SensorScene.TOPICS:
+        if self._view is not None and message is not None and sample.topic in SensorTimeline.TOPICS:
             self._view.offer(sample.sensor, message)
 
-    def _look_at(self, topic: Topic[Any], sample: TapSample) -> tuple[Any, int, int]:
-        """Message, wall clock [ns] and sequence of its stamp.
+    def _decode(self, topic: Topic[Any], sample: TapSample) -> tuple[Any, int, int]:
+        """Message, wall clock [ns] and sequence of its stamp; no message if it cannot be decoded.
 
-        What breaks the contract is recorded as it came, for whoever has to find out why.
+        Such a payload is recorded all the same, so that its cause can be found.
         """
         try:
             message = topic.codec.decode(sample.payload)
@@ -254,10 +256,10 @@ class RecordKeeper:
         return message, stamp.wall_ns, stamp.sequence
 
     def tick(self, *, idle: bool = False) -> None:
-        """Look at disk, size and time; call it often, it paces itself.
+        """Check disk, size and age of the record. Call it often: it does so every ``CHECK_S``.
 
         Args:
-            idle: Nothing comes at present, so no coming message will flush the last one.
+            idle: No messages arrive at present, so none will cause a flush of the last ones.
         """
         now_s = time.monotonic()
         if now_s - self._checked_s < CHECK_S:
@@ -273,7 +275,7 @@ class RecordKeeper:
         self.report()
 
     def report(self) -> None:
-        """Hand the counters over to health."""
+        """Hand the counters to health."""
         counts, self._counts = self._counts, Counter()
         for view in self._views:
             counts.update(view.take_counts())
@@ -284,7 +286,7 @@ class RecordKeeper:
         self._health.gauge("record_bytes", float(size))
 
     def close(self) -> None:
-        """Close record and view; a disk that refuses is reported, not raised."""
+        """Close record and view; a failing disk is reported, not raised."""
         self._recovery.stop()
         problem = self._close_files()
         if problem is not None:
@@ -311,7 +313,7 @@ class RecordKeeper:
         self._size = self._unflushed = 0
         self._opened_s = time.monotonic()
         if self._config.rrd:
-            self._view = ViewWorker(
+            self._view = LiveView(
                 path.with_suffix(".rrd"),
                 title=path.stem,
                 max_bytes=self._config.rrd_max_bytes,
@@ -320,7 +322,7 @@ class RecordKeeper:
             self._views.append(self._view)
         self._health.set_state(ServiceState.READY, f"recording to {path}")
         self._counts["records_opened"] += 1
-        log.info("recording to %s", path)
+        _log.info("recording to %s", path)
 
     def _new_path(self) -> Path:
         now = datetime.now(UTC)
@@ -342,14 +344,17 @@ class RecordKeeper:
             self._pause(error.problem)
 
     def _flush(self) -> None:
-        """What came last before a pause of the streams must reach the disk as well."""
-        if self._writer is not None:
-            try:
-                self._writer.flush()
-            except RecordingError as error:
-                self._counts["lost_disk_full"] += self._unflushed
-                self._pause(error.problem)
-            self._unflushed = 0
+        """Write the last messages before a silence of the streams."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.flush()
+        except RecordingError as error:
+            self._count_unflushed()
+            self._pause(error.problem)
+        else:
+            # The size too: `write` takes a larger file for the sign of a flush of its own.
+            self._size, self._unflushed = self._writer.bytes_written, 0
 
     def _check_rotation(self, now_s: float) -> None:
         config = self._config
@@ -375,23 +380,29 @@ class RecordKeeper:
             return
         self._open()
         if self._writer is not None:
-            self._recovery.start()  # what the full disk cut off
+            self._recovery.start()  # of the record that the full disk cut off
+
+    def _count_unflushed(self) -> None:
+        """Count the samples in the writer's buffer as lost; they cannot be written any more."""
+        if self._unflushed:
+            self._counts["lost_disk_full"] += self._unflushed
+            self._unflushed = 0
 
     def _pause(self, why: str) -> None:
-        self._close_files()  # it may fail for the same reason, which is told already
+        self._close_files()  # it may fail for the same reason, which is reported below
         self._fail(why)
         self._tried_s = time.monotonic()
 
     def _fail(self, why: str) -> None:
         error = disk_error(self._config.out, why)
         if self._health.state is not ServiceState.DEGRADED:
-            log.error("%s", error)
+            _log.error("%s", error)
             self._counts["disk_failures"] += 1
         self._health.fail(error)
         self.report()
 
     def _close_files(self) -> str | None:
-        """Close record and view; why the record could not be closed, if so."""
+        """Close record and view; returns the problem if the record could not be closed."""
         writer, self._writer = self._writer, None
         view, self._view = self._view, None
         self._path = None
@@ -401,7 +412,8 @@ class RecordKeeper:
                 writer.close()
             except RecordingError as error:
                 problem = error.problem
-                writer.abandon()  # the part stays; recovery saves what is whole in it
+                self._count_unflushed()
+                writer.abandon()  # the part stays; recovery saves its complete messages
         if view is not None:
             view.finish()
         return problem

@@ -1,4 +1,4 @@
-"""How simulations are laid out on the screen: a tab for each trajectory, one timeline of steps."""
+"""How records and simulations are laid out on the screen, and the colours of what never changes."""
 
 from __future__ import annotations
 
@@ -10,105 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.anatomy import ELECTRODE_POSITIONS, SP_ELECTRODE_POSITIONS
-from palpate.messages import FloatArray, SensorType
+from palpate.messages import SensorType
 from palpate.process import require
-from palpate_services.viewer.simulation_file import Floats, Ints
-
-CORE_RADIUS_M = 0.0049
-"""Just below the electrodes, which sit at 5.08 mm, so that they stand out."""
-
-SKIN_RADIUS_M = 0.0070
-"""Outer skin of an inflated BioTac, rounded."""
-
-BACK_X_M = -0.017
-"""Where the drawn part of the finger ends."""
-
-
-def core_mesh(segments: int = 32, rings: int = 12) -> tuple[FloatArray, np.ndarray, FloatArray]:
-    """Core as a mesh: vertices [m] ``(V, 3)``, triangles int32 ``(T, 3)``, normals ``(V, 3)``."""
-    profile_x, profile_r, normal_x, normal_r = _profile(CORE_RADIUS_M, rings)
-    angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
-    around = np.stack([np.zeros_like(angle), np.cos(angle), np.sin(angle)], axis=1)
-    axis = np.array([1.0, 0.0, 0.0])
-    vertices = profile_r[:, None, None] * around + profile_x[:, None, None] * axis
-    normals = normal_r[:, None, None] * around + normal_x[:, None, None] * axis
-    triangles = []
-    for ring in range(len(profile_x) - 1):
-        for at in range(segments):
-            a, b = ring * segments + at, ring * segments + (at + 1) % segments
-            triangles += [[a, b, a + segments], [b, b + segments, a + segments]]
-    return (
-        vertices.reshape(-1, 3).astype(np.float32),
-        np.array(triangles, np.int32),
-        normals.reshape(-1, 3).astype(np.float32),
-    )
-
-
-def skin_lines(lines: int = 9, hoops: int = 7) -> list[FloatArray]:
-    """Skin as a wire basket around pad and sides: polylines [m], each ``(n, 3)``."""
-    profile_x, profile_r, _, _ = _profile(SKIN_RADIUS_M, 16)
-    spread = np.radians(115.0)
-    drawn: list[FloatArray] = []
-    for angle in np.linspace(-spread, spread, lines):
-        y, z = np.sin(angle), -np.cos(angle)
-        drawn.append(np.stack([profile_x, profile_r * y, profile_r * z], 1).astype(np.float32))
-    around = np.linspace(-spread, spread, 41)
-    for x in np.linspace(BACK_X_M, 0.0, hoops):
-        ring = [np.full_like(around, x), np.sin(around), -np.cos(around)]
-        ring[1:] = [SKIN_RADIUS_M * part for part in ring[1:]]
-        drawn.append(np.stack(ring, 1).astype(np.float32))
-    for polar in np.radians([30.0, 60.0]):
-        radius, x = SKIN_RADIUS_M * np.cos(polar), SKIN_RADIUS_M * np.sin(polar)
-        ring = [np.full_like(around, x), radius * np.sin(around), -radius * np.cos(around)]
-        drawn.append(np.stack(ring, 1).astype(np.float32))
-    return drawn
-
-
-def _profile(radius_m: float, rings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Half outline from the back end to the tip: x, r [m] and the normal's x, r."""
-    polar = np.linspace(0.0, np.pi / 2, rings)
-    x = np.concatenate([[BACK_X_M], radius_m * np.sin(polar)])
-    r = np.concatenate([[radius_m], radius_m * np.cos(polar)])
-    return x, r, np.concatenate([[0.0], np.sin(polar)]), np.concatenate([[1.0], np.cos(polar)])
-
-
-_COLOURS = np.array(
-    [[150, 156, 166], [62, 116, 178], [33, 165, 150], [94, 201, 98], [253, 231, 37]], np.float64
-)
-"""From unmoved, a grey that shows the shape on a dark ground, to most moved."""
-
-
-def shades(share: Floats) -> npt.NDArray[np.uint32]:
-    """Colours of shares of the longest displacement: packed RGBA, the same shape."""
-    at = np.clip(share, 0.0, 1.0) * (len(_COLOURS) - 1)
-    low = np.minimum(at.astype(int), len(_COLOURS) - 2)
-    part = (at - low)[..., None]
-    rgb = ((1 - part) * _COLOURS[low] + part * _COLOURS[low + 1]).round().astype(np.uint32)
-    packed: npt.NDArray[np.uint32] = (
-        (rgb[..., 0] << 24) | (rgb[..., 1] << 16) | (rgb[..., 2] << 8) | 255
-    ).astype(np.uint32)
-    return packed
-
-
-def normals_of(positions: Floats, faces: Ints) -> Floats:
-    """Normals at vertices: those of their triangles, weighted by area; shape (V, 3)."""
-    corners = positions[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(positions)
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], across)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    normals: Floats = (total / np.where(length > 0, length, 1.0)).astype(np.float32)
-    return normals
-
-
-def border_of(triangles: Ints) -> npt.NDArray[np.intp]:
-    """Edges that belong to one triangle only, shape (B, 2)."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    found, count = np.unique(edges, axis=0, return_counts=True)
-    border: npt.NDArray[np.intp] = found[count == 1].astype(np.intp)
-    return border
-
+from palpate_services.viewer.surfaces import core_mesh, packed_rgba, skin_lines
 
 TIMELINE = "sensor_time"
 SEQUENCE = "seq"
@@ -122,7 +26,7 @@ QUIET_COLOUR = (120, 144, 170)
 BACKGROUND = (24, 26, 31)
 
 FIELD_FULL_M = 2e-3
-"""Displacement drawn in the last colour; the same in every file, so that files can be compared."""
+"""Displacement with the last colour of the scale; the same in all views, for comparison [m]."""
 
 _FULL_SCALE_COUNTS = 400.0
 """Tared counts at which an electrode is drawn in full colour."""
@@ -130,6 +34,11 @@ _FULL_SCALE_COUNTS = 400.0
 MAX_SENSORS = 8
 """Tabs in one view; more sensors are recorded but not laid out."""
 
+STEP = "step"
+"""The timeline: number of the step, which is that of the pose in the path; 0 = untouched."""
+
+SIDES = ("left", "right")
+"""Halves of the skin, y > 0 and y < 0; without the right one the finger is cut open."""
 
 _POSITIONS = {
     SensorType.BIOTAC: ELECTRODE_POSITIONS,
@@ -137,50 +46,38 @@ _POSITIONS = {
 }
 
 
-def electrode_names(count: int) -> list[str]:
-    """E1, E2, ..."""
-    return [f"E{at + 1}" for at in range(count)]
-
-
-def electrode_colours(count: int) -> list[tuple[int, int, int]]:
-    """One colour an electrode, in order around the colour circle."""
-    wheel = (colorsys.hls_to_rgb(at / count, 0.62, 0.65) for at in range(count))
-    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
-
-
-def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
-    """Colours of electrodes by their tared counts: cool where lowered, warm where raised.
-
-    Args:
-        tared: Tared counts, shape ``(N, 19)`` (SP: 24).
-
-    Returns:
-        Packed RGBA, uint32, of the same shape.
-    """
-    strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
-    rest = np.array([150.0, 156.0, 166.0])
-    full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))
-    rgb = (rest + strength * (full - rest)).astype(np.uint32)
-    packed = (rgb[..., 0] << 24) | (rgb[..., 1] << 16) | (rgb[..., 2] << 8) | 255
-    shades: npt.NDArray[np.uint32] = packed.astype(np.uint32)
-    return shades
-
-
-def blueprint(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
-    """Layout for these sensors: one tab each, fingertip left, signals right.
+def record_layout(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
+    """Layout of a record: a tab for each sensor, its fingertip left, its signals right.
 
     Args:
         sensors: Types of the sensors by name, in order of their tabs.
-        with_fields: Those of them that have fields, which get a row more.
+        with_fields: Those of them that have fields; their tab gets one more row.
     """
     rrb = require("rerun.blueprint", extra="services")
     tabs = [
         _sensor_tab(rrb, sensor, kind, fields=sensor in with_fields)
         for sensor, kind in [*sensors.items()][:MAX_SENSORS]
     ]
+    return _screen(rrb, tabs, timeline=TIMELINE)
+
+
+def simulation_layout(trajectories: Sequence[str], longest_m: float) -> Any:
+    """Layout of simulations: a tab for each trajectory.
+
+    Args:
+        trajectories: Ids, in order of their tabs.
+        longest_m: Displacement that has the last colour [m].
+    """
+    rrb = require("rerun.blueprint", extra="services")
+    tabs = [_trajectory_tab(rrb, name, longest_m) for name in trajectories]
+    return _screen(rrb, tabs, timeline=STEP, fps=5.0)
+
+
+def _screen(rrb: Any, tabs: list[Any], **time_panel: Any) -> Any:
     return rrb.Blueprint(
         tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs),
-        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following"),
+        # "following" shows the newest time: live data, or the last step, where most happens.
+        rrb.TimePanel(state="collapsed", play_state="following", **time_panel),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -188,29 +85,44 @@ def blueprint(sensors: Mapping[str, SensorType], *, with_fields: Collection[str]
     )
 
 
+def _curves(rrb: Any, origin: str, name: str, *, legend: bool = False) -> Any:
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
+        background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),
+    )
+
+
+def _space(
+    rrb: Any,
+    origin: str,
+    name: str,
+    position: Sequence[float],
+    look_target: Sequence[float],
+    **contents: Any,
+) -> Any:
+    return rrb.Spatial3DView(
+        origin=origin,
+        name=name,
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            position=position, look_target=look_target, eye_up=(0.0, 0.0, 1.0)
+        ),
+        **contents,
+    )
+
+
 def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any:
     def plot(origin: str, name: str, *, legend: bool = True) -> Any:
-        return rrb.TimeSeriesView(
-            origin=f"{sensor}/{origin}",
-            name=name,
-            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
-            plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
-            background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),
-        )
+        return _curves(rrb, f"{sensor}/{origin}", name, legend=legend)
 
     def body(origin: str, name: str) -> Any:
-        return rrb.Spatial3DView(
-            origin=f"{sensor}/{origin}",
-            name=name,
-            background=BACKGROUND,
-            line_grid=rrb.LineGrid3D(visible=False),
-            # From the side of the pad, tip to the left, as one looks at one's own finger.
-            eye_controls=rrb.EyeControls3D(
-                position=(0.009, -0.020, -0.024),
-                look_target=(-0.0055, 0.0, -0.003),
-                eye_up=(0.0, 0.0, 1.0),
-            ),
-        )
+        # From the side of the pad, tip to the left, as one looks at one's own finger.
+        eye, target = (0.009, -0.020, -0.024), (-0.0055, 0.0, -0.003)
+        return _space(rrb, f"{sensor}/{origin}", name, eye, target)
 
     finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
     signals = rrb.Vertical(
@@ -244,15 +156,45 @@ def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any
     return rrb.Vertical(*rows, row_shares=[1] * len(rows), name=sensor)
 
 
-def fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[str, Any]]:
+def _trajectory_tab(rrb: Any, trajectory: str, longest_m: float) -> Any:
+    def space(name: str, position: Sequence[float], *, without: str) -> Any:
+        contents = ["$origin/**", f"- $origin/{without}/**"]
+        target = (-0.005, 0.0, -0.003)
+        return _space(rrb, f"{trajectory}/finger", name, position, target, contents=contents)
+
+    def plot(entity: str, name: str, *, legend: bool = False) -> Any:
+        return _curves(rrb, f"{trajectory}/{entity}", name, legend=legend)
+
+    return rrb.Horizontal(
+        rrb.Vertical(
+            space(
+                f"Skin, indenter left out; colour: displacement, 0 to {1e3 * longest_m:.2g} mm",
+                (0.002, -0.011, -0.034),
+                without="indenter",
+            ),
+            space("Cut open at y = 0", (-0.001, -0.034, -0.010), without=f"skin/{SIDES[1]}"),
+        ),
+        rrb.Vertical(
+            plot("force", "Force on the BioTac [N]", legend=True),
+            plot("pressure", "Fluid pressure [Pa]"),
+            rrb.Horizontal(plot("area", "Contact area [m²]"), plot("newton", "Newton iterations")),
+            rrb.TextDocumentView(origin=f"{trajectory}/about", name="About"),
+            row_shares=[3, 2, 2, 2],
+        ),
+        column_shares=[3, 2],
+        name=trajectory,
+    )
+
+
+def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[str, Any]]:
     """What never changes, as entity (below the sensor) and value: names, colours, the body.
 
-    The electrodes of a BioTac SP are drawn in the frame of their table and without a body, whose
-    shape no source tells.
+    The electrodes of a BioTac SP are drawn in the sensor frame of their table and without a body,
+    because no source gives its shape.
 
     Args:
         kind: Type of the sensor.
-        again: Instead of those of another type: the finger was exchanged.
+        again: Whether these replace the fixtures of another type (an exchanged finger).
     """
     rr = require("rerun", extra="services")
 
@@ -286,48 +228,8 @@ def fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[str, An
         yield f"finger/force/{name}", rr.Arrows3D.from_fields(colors=[colour], radii=[arrow_m])
 
 
-def _body(rr: Any) -> Iterator[tuple[str, Any]]:
-    vertices, triangles, normals = core_mesh()
-    core = rr.Mesh3D(
-        vertex_positions=vertices,
-        triangle_indices=triangles,
-        vertex_normals=normals,
-        albedo_factor=(120, 130, 148),
-    )
-    skin = rr.LineStrips3D(skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
-    yield "finger/core", core
-    yield "finger/skin", skin
-
-
-STEP = "step"
-"""The timeline: number of the step, which is that of the pose in the path; 0 = untouched."""
-
-SIDES = ("left", "right")
-"""Halves of the skin, y > 0 and y < 0; without the right one the finger is cut open."""
-
-
-def layout(trajectories: Sequence[str], longest_m: float) -> Any:
-    """Blueprint of these trajectories.
-
-    Args:
-        trajectories: Ids, in order of their tabs.
-        longest_m: Displacement that has the last colour [m].
-    """
-    rrb = require("rerun.blueprint", extra="services")
-    tabs = [_tab(rrb, name, longest_m) for name in trajectories]
-    return rrb.Blueprint(
-        tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs),
-        # Following begins at the last step, where there is most to see.
-        rrb.TimePanel(timeline=STEP, state="collapsed", play_state="following", fps=5.0),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
-
-
-def series(rr: Any) -> dict[str, Any]:
-    """Looks of the curves, by entity below the trajectory."""
+def simulation_fixtures(rr: Any) -> dict[str, Any]:
+    """Colours and names of the curves, by entity below the trajectory."""
     looks = {
         f"force/{axis}": rr.SeriesLines(names=[f"F{axis}"], colors=[colour], widths=[2.0])
         for axis, colour in zip(AXES, AXIS_COLOURS, strict=True)
@@ -341,44 +243,41 @@ def series(rr: Any) -> dict[str, Any]:
     return looks
 
 
-def _tab(rrb: Any, trajectory: str, longest_m: float) -> Any:
-    def space(name: str, position: Sequence[float], *, without: str) -> Any:
-        return rrb.Spatial3DView(
-            origin=f"{trajectory}/finger",
-            contents=["$origin/**", f"- $origin/{without}/**"],
-            name=name,
-            background=BACKGROUND,
-            line_grid=rrb.LineGrid3D(visible=False),
-            eye_controls=rrb.EyeControls3D(
-                position=position, look_target=(-0.005, 0.0, -0.003), eye_up=(0.0, 0.0, 1.0)
-            ),
-        )
-
-    def plot(entity: str, name: str, *, legend: bool = False) -> Any:
-        return rrb.TimeSeriesView(
-            origin=f"{trajectory}/{entity}",
-            name=name,
-            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
-            plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
-            background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),
-        )
-
-    return rrb.Horizontal(
-        rrb.Vertical(
-            space(
-                f"Skin, indenter left out; colour: displacement, 0 to {1e3 * longest_m:.2g} mm",
-                (0.002, -0.011, -0.034),
-                without="indenter",
-            ),
-            space("Cut open at y = 0", (-0.001, -0.034, -0.010), without=f"skin/{SIDES[1]}"),
-        ),
-        rrb.Vertical(
-            plot("force", "Force on the BioTac [N]", legend=True),
-            plot("pressure", "Fluid pressure [Pa]"),
-            rrb.Horizontal(plot("area", "Contact area [m²]"), plot("newton", "Newton iterations")),
-            rrb.TextDocumentView(origin=f"{trajectory}/about", name="About"),
-            row_shares=[3, 2, 2, 2],
-        ),
-        column_shares=[3, 2],
-        name=trajectory,
+def _body(rr: Any) -> Iterator[tuple[str, Any]]:
+    vertices, triangles, normals = core_mesh()
+    core = rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=triangles,
+        vertex_normals=normals,
+        albedo_factor=(120, 130, 148),
     )
+    skin = rr.LineStrips3D(skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
+    yield "finger/core", core
+    yield "finger/skin", skin
+
+
+def electrode_names(count: int) -> list[str]:
+    """E1, E2, ..."""
+    return [f"E{at + 1}" for at in range(count)]
+
+
+def electrode_colours(count: int) -> list[tuple[int, int, int]]:
+    """One colour an electrode, in order around the colour circle."""
+    wheel = (colorsys.hls_to_rgb(at / count, 0.62, 0.65) for at in range(count))
+    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
+
+
+def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
+    """Colours of electrodes by their tared counts: blue where negative, orange where positive.
+
+    Args:
+        tared: Tared counts, shape ``(N, 19)`` (SP: 24).
+
+    Returns:
+        Packed RGBA, uint32, of the same shape.
+    """
+    strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
+    rest = np.array([150.0, 156.0, 166.0])
+    full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))
+    rgb = (rest + strength * (full - rest)).astype(np.uint32)
+    return packed_rgba(rgb)

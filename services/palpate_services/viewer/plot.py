@@ -13,7 +13,7 @@ from palpate.errors import RecordingError
 from palpate.files.record import read_record
 from palpate.messages import FeatureEstimate, IndenterPoseFrame, WrenchFrame
 from palpate.process import require
-from palpate_services.viewer.timeline import Matcher, Reading
+from palpate_services.viewer.timeline import MatchedMessages, TruthMatcher
 
 Points = npt.NDArray[np.float64]
 
@@ -21,7 +21,7 @@ _MATCHED = ("wrench", "pose", "features")
 _AXES = ("x", "y", "z")
 _COLOURS = ("#d1495b", "#2e8b57", "#2f6fb5")
 _INK = "#30343b"
-_MM_PER_M = 1e3  # people read a fingertip in millimetres; only the picture does
+_MM_PER_M = 1e3  # the picture is in millimetres, everything else in SI units
 
 
 def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> dict[str, float]:
@@ -30,7 +30,7 @@ def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> di
     Args:
         record: An MCAP record of palpate.
         picture: The PNG to write.
-        sensor: Whose; None = the sensor with the most estimates.
+        sensor: Name of the sensor; None = the one with the most estimates.
 
     Returns:
         Summary: ``estimates`` and ``matched`` (how many), ``duration_s``, ``force_median_error_n``,
@@ -41,12 +41,12 @@ def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> di
         RecordingError: The record is damaged or holds no estimates.
         MissingExtraError: matplotlib is not installed.
     """
-    name, readings = _readings(record, sensor)
-    times = np.array(sorted(ns for ns, item in readings.items() if item.estimate is not None))
-    matched = [readings[ns] for ns in times.tolist()]
+    name, instants = _instants(record, sensor)
+    times = np.array(sorted(ns for ns, item in instants.items() if item.estimate is not None))
+    matched = [instants[ns] for ns in times.tolist()]
     seconds = (times - times[0]) * 1e-9
-    force_errors = _errors(reading.force_error() for reading in matched)
-    location_errors = _errors(reading.location_error() for reading in matched)
+    force_errors = _errors(instant.force_error() for instant in matched)
+    location_errors = _errors(instant.location_error() for instant in matched)
     summary = {
         "estimates": float(len(matched)),
         "matched": float(len(force_errors)),
@@ -69,8 +69,8 @@ def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> di
     return summary
 
 
-def _readings(record: Path, sensor: str | None) -> tuple[str, dict[int, Reading]]:
-    matchers: dict[str, Matcher] = {}
+def _instants(record: Path, sensor: str | None) -> tuple[str, dict[int, MatchedMessages]]:
+    matchers: dict[str, TruthMatcher] = {}
     estimates: dict[str, int] = {}
     for item in read_record(record):
         topic, whose = item.address.topic, item.address.sensor
@@ -78,7 +78,7 @@ def _readings(record: Path, sensor: str | None) -> tuple[str, dict[int, Reading]
             continue
         message = TOPICS[topic].codec.decode(item.payload)
         assert isinstance(message, FeatureEstimate | IndenterPoseFrame | WrenchFrame)
-        matchers.setdefault(whose, Matcher(remember=None)).add(message)
+        matchers.setdefault(whose, TruthMatcher(remember=None)).add(message)
         if isinstance(message, FeatureEstimate):
             estimates[whose] = estimates.get(whose, 0) + 1
     if not estimates:
@@ -87,7 +87,7 @@ def _readings(record: Path, sensor: str | None) -> tuple[str, dict[int, Reading]
             f"{record} holds no estimates{of_whom}", remedy="record while the features service runs"
         )
     name = max(estimates, key=lambda key: estimates[key])
-    return name, dict(matchers[name].readings())
+    return name, dict(matchers[name].instants())
 
 
 def _errors(differences: Any) -> Points:
@@ -95,7 +95,7 @@ def _errors(differences: Any) -> Points:
     return np.array(found, np.float64)
 
 
-def _draw(seconds: Points, matched: list[Reading], force: Points, location: Points) -> Any:
+def _draw(seconds: Points, matched: list[MatchedMessages], force: Points, location: Points) -> Any:
     figures = require("matplotlib.figure", extra="services")
     figure = figures.Figure(figsize=(14, 9), layout="constrained", facecolor="white")
     grid = figure.add_gridspec(4, 2)
@@ -126,13 +126,13 @@ def _draw(seconds: Points, matched: list[Reading], force: Points, location: Poin
     return figure
 
 
-def _force_rows(matched: list[Reading]) -> tuple[Points, Points]:
+def _force_rows(matched: list[MatchedMessages]) -> tuple[Points, Points]:
     truth = [_or_nan(item.wrench and item.wrench.force) for item in matched]
     estimate = [_or_nan(item.estimate and item.estimate.force) for item in matched]
     return np.stack(truth), np.stack(estimate)
 
 
-def _location_rows(matched: list[Reading]) -> tuple[Points, Points]:
+def _location_rows(matched: list[MatchedMessages]) -> tuple[Points, Points]:
     truth = [
         _or_nan(item.pose.position if item.pose is not None and item.pose.in_contact else None)
         for item in matched

@@ -1,15 +1,16 @@
-"""The Rerun view of a record: messages in, one ``.rrd`` with an explicit layout out.
+"""The Rerun view of a record: one ``.rrd`` from its messages, live or afterwards.
 
-For looking only; the MCAP is the record. Columns are sent in batches, which is twenty times cheaper
-than logging each frame. With ``blueprint`` and ``field_view`` the only place that knows Rerun,
-whose names change with each release.
+The MCAP is the record; a view is only a picture of it, and may fail. Columns are sent in batches,
+which is twenty times cheaper than to log each frame. With ``layout`` and ``simulation`` the only
+module that uses Rerun, whose names change with each release.
 """
 
 from __future__ import annotations
 
 import logging
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from types import TracebackType
@@ -19,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.bus.topics import TOPICS
-from palpate.errors import RecordingError
+from palpate.errors import PalpateError, RecordingError
 from palpate.files.bundle import FieldMesh
 from palpate.files.record import read_record
-from palpate.messages import FloatArray, SensorType
+from palpate.messages import FieldEstimate, FieldFrame, FloatArray, SensorType
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.layout import (
@@ -30,19 +31,37 @@ from palpate_services.viewer.layout import (
     FIELD_FULL_M,
     SEQUENCE,
     TIMELINE,
-    blueprint,
     electrode_shades,
-    fixtures,
-    normals_of,
-    shades,
+    record_fixtures,
+    record_layout,
 )
-from palpate_services.viewer.timeline import FieldRow, Row, SensorScene
+from palpate_services.viewer.surfaces import normals_of, shades
+from palpate_services.viewer.timeline import FieldRow, SensorTimeline, TimelineRow
+
+_log = logging.getLogger(__name__)
+
+PERIOD_S = 0.5
+"""Time between two updates of a live view [s]: long enough for batches, short enough to follow."""
+
+CAPACITY = 100_000
+"""Messages that may wait for a live view; further ones are counted and left out."""
+
+FIELD_CAPACITY = 500
+"""Fields among them: 42 MB at 7,000 nodes each."""
+
+APPLICATION = "palpate"
+
+BATCH_MESSAGES = 200
+"""Messages per sensor and stream in one batch of a review."""
+
+ARROW_M_PER_N = 2e-3
+"""Length of a force arrow [m/N]."""
 
 Send = Callable[[str, list[Any], Iterable[Any]], None]
 
 
 class _Skin:
-    """The outside of a mesh with its own numbering: nodes inside would only fill the file."""
+    """The outer surface of a mesh, with node numbers of its own: inner nodes would be invisible."""
 
     def __init__(self, mesh: FieldMesh) -> None:
         used, triangles = np.unique(mesh.outer_faces, return_inverse=True)
@@ -59,9 +78,9 @@ class FieldDrawer:
 
     Args:
         rr: Rerun.
-        stream: Where the parts go that do not change.
+        stream: Rerun's recording stream, for the parts that do not change.
         send: Sends columns of an entity at the times of rows.
-        meshes: Where meshes are found.
+        meshes: Finds meshes by content hash.
     """
 
     def __init__(self, rr: Any, stream: Any, send: Send, meshes: MeshLibrary) -> None:
@@ -77,7 +96,7 @@ class FieldDrawer:
         """Draw the fields of one stream.
 
         Args:
-            entity: Where, below it one entity for each mesh.
+            entity: Its entity; each mesh gets one below it.
             rows: Fields in order of time.
         """
         for sha256, group in groupby(rows, key=lambda row: row.mesh_sha256):
@@ -99,7 +118,7 @@ class FieldDrawer:
         rr = self._rr
         if entity not in self._begun:
             self._begun.add(entity)
-            # Normals of the untouched skin: those of each field would nearly double the file.
+            # Normals of the untouched skin: normals for each field would nearly double the file.
             fixed = rr.Mesh3D.from_fields(
                 triangle_indices=skin.triangles,
                 vertex_normals=normals_of(skin.rest, skin.triangles),
@@ -113,25 +132,14 @@ class FieldDrawer:
         self._send(entity, rows, columns.partition([len(skin.used)] * len(rows)))
 
 
-log = logging.getLogger(__name__)
-
-APPLICATION = "palpate"
-
-BATCH_MESSAGES = 200
-"""Messages per sensor and stream after which an offline review sends what it has."""
-
-ARROW_M_PER_N = 2e-3
-"""Length of a force arrow in the picture."""
-
-
-class View:
-    """Writes one ``.rrd``. Not thread-safe.
+class RerunView:
+    """Writes one ``.rrd``. Use from one thread.
 
     Args:
         path: The file to write.
         title: Shown as the recording's name.
-        max_bytes: From this size on nothing more is written [bytes]; None = no bound.
-        meshes: Where the meshes of fields are found; None = in the packaged bundles.
+        max_bytes: At this size the file is closed [bytes]; None = no limit.
+        meshes: Finds the meshes of fields; None = in the packaged bundles.
     """
 
     def __init__(
@@ -146,7 +154,7 @@ class View:
         self.path = path
         self.full = False
         self._max_bytes = max_bytes
-        self._scenes: dict[str, SensorScene] = {}
+        self._scenes: dict[str, SensorTimeline] = {}
         self._drawn: dict[str, SensorType] = {}
         self._with_fields: set[str] = set()
         self._stream = self._rr.RecordingStream(APPLICATION)
@@ -155,7 +163,7 @@ class View:
         self._open = False
         self._title = title
 
-    def __enter__(self) -> View:
+    def __enter__(self) -> RerunView:
         return self
 
     def __exit__(
@@ -171,7 +179,7 @@ class View:
 
     @property
     def counters(self) -> Counter[str]:
-        """What could not be drawn, see ``FieldDrawer``."""
+        """Counts of what could not be drawn, see ``FieldDrawer``."""
         return self._fields.counters
 
     def add(self, sensor: str, message: Any) -> None:
@@ -179,17 +187,17 @@ class View:
 
         Args:
             sensor: The sensor it belongs to.
-            message: A decoded message of one of ``SensorScene.TOPICS``.
+            message: A decoded message of one of ``SensorTimeline.TOPICS``.
         """
         if self.full:
             return
         scene = self._scenes.get(sensor)
         if scene is None:
-            scene = self._scenes[sensor] = SensorScene()
+            scene = self._scenes[sensor] = SensorTimeline()
         scene.add(message)
 
     def flush(self) -> None:
-        """Draw what has come since the last time.
+        """Draw the messages since the last call.
 
         Raises:
             RecordingError: Rerun cannot write the file.
@@ -207,7 +215,7 @@ class View:
                 remedy="the MCAP record is not affected; make a view of it with: palpate review",
             ) from error
         if self._max_bytes is not None and self.size() > self._max_bytes:
-            log.warning("%s has reached %d bytes and is closed", self.path, self._max_bytes)
+            _log.warning("%s has reached %d bytes and is closed", self.path, self._max_bytes)
             self.close()
             self.full = True
 
@@ -241,7 +249,7 @@ class View:
         self._drawn.update(kinds)
         self._with_fields |= with_fields
         drawn = dict(sorted(self._drawn.items()))
-        layout = blueprint(drawn, with_fields=self._with_fields)
+        layout = record_layout(drawn, with_fields=self._with_fields)
         if self._open:
             self._stream.send_blueprint(layout)
         else:
@@ -249,10 +257,10 @@ class View:
             self._stream.send_recording_name(self._title)
             self._open = True
         for sensor in new:
-            for entity, value in fixtures(kinds[sensor], again=sensor in again):
+            for entity, value in record_fixtures(kinds[sensor], again=sensor in again):
                 self._stream.log(f"{sensor}/{entity}", value, static=True)
 
-    def _draw(self, sensor: str, scene: SensorScene) -> None:
+    def _draw(self, sensor: str, scene: SensorTimeline) -> None:
         rr = self._rr
         rows = scene.take()
         for kind in ("raw", "tared"):
@@ -286,7 +294,7 @@ class View:
             columns = rr.Scalars.columns(scalars=values)
             self._send(f"{sensor}/synthesised", rows.synthesised, columns)
 
-    def _draw_force(self, sensor: str, name: str, rows: list[Row]) -> None:
+    def _draw_force(self, sensor: str, name: str, rows: list[TimelineRow]) -> None:
         if not rows:
             return
         rr = self._rr
@@ -295,7 +303,7 @@ class View:
             columns = rr.Scalars.columns(scalars=force[:, at].astype(np.float64))
             self._send(f"{sensor}/force/{axis}/{name}", rows, columns)
 
-    def _draw_arrows(self, sensor: str, name: str, rows: list[Row]) -> None:
+    def _draw_arrows(self, sensor: str, name: str, rows: list[TimelineRow]) -> None:
         """Force on the skin, ending where the finger is pressed."""
         if not rows:
             return
@@ -308,7 +316,7 @@ class View:
         )
         self._send(f"{sensor}/finger/force/{name}", rows, columns)
 
-    def _draw_location(self, sensor: str, name: str, rows: list[Row]) -> None:
+    def _draw_location(self, sensor: str, name: str, rows: list[TimelineRow]) -> None:
         if not rows:
             return
         touching = [row.values is not None for row in rows]
@@ -318,41 +326,124 @@ class View:
         )
         self._send(f"{sensor}/finger/contact/{name}", rows, columns)
 
-    def _send_pac(self, entity: str, rows: list[Row]) -> None:
+    def _send_pac(self, entity: str, rows: list[TimelineRow]) -> None:
         """All PAC samples at their own times: electrode, PAC, electrode, PAC, ..."""
         slots = 2 * np.arange(len(rows[0].values) - 1, dtype=np.int64) + 1
-        times = np.concatenate([row.time_ns + slots * row.slot_period_ns for row in rows])
+        times_ns = np.concatenate([row.time_ns + slots * row.slot_period_ns for row in rows])
+        sequence = np.repeat([row.sequence for row in rows], len(slots))
         samples = np.concatenate([row.values[1:] for row in rows]).astype(np.float64)
-        rr = self._rr
-        self._stream.send_columns(
-            entity,
-            [
-                rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]")),
-                rr.TimeColumn(
-                    SEQUENCE,
-                    sequence=np.repeat([row.sequence for row in rows], len(slots)),
-                ),
-            ],
-            rr.Scalars.columns(scalars=samples),
-        )
+        self._send_at(entity, times_ns, sequence, self._rr.Scalars.columns(scalars=samples))
 
     def _send(self, entity: str, rows: list[Any], columns: Iterable[Any]) -> None:
-        times = np.array([row.time_ns for row in rows], np.int64).astype("datetime64[ns]")
+        times_ns = np.array([row.time_ns for row in rows], np.int64)
+        self._send_at(entity, times_ns, [row.sequence for row in rows], columns)
+
+    def _send_at(self, entity: str, times_ns: Any, sequence: Any, columns: Iterable[Any]) -> None:
         rr = self._rr
-        self._stream.send_columns(
-            entity,
-            [
-                rr.TimeColumn(TIMELINE, timestamp=times),
-                rr.TimeColumn(SEQUENCE, sequence=[row.sequence for row in rows]),
-            ],
-            columns,
-        )
+        times = [
+            rr.TimeColumn(TIMELINE, timestamp=times_ns.astype("datetime64[ns]")),
+            rr.TimeColumn(SEQUENCE, sequence=sequence),
+        ]
+        self._stream.send_columns(entity, times, columns)
 
 
-def _of_one_width(rows: list[Row]) -> list[list[Row]]:
-    """Rows by how many values they have: two kinds where a finger was exchanged for an SP."""
+def _of_one_width(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
+    """Rows by their number of values: two kinds where a finger was exchanged for an SP."""
     widths = dict.fromkeys(len(row.values) for row in rows)
     return [[row for row in rows if len(row.values) == width] for width in widths]
+
+
+class LiveView:
+    """The view beside a running record, drawn in a thread of its own: it may fail, the record not.
+
+    Counts ``view_dropped`` (messages came too fast), ``view_failed`` (the view was given up), and
+    what the view counts, e.g. ``view_no_mesh``.
+
+    Args:
+        path: The file to write.
+        title: Shown as the recording's name.
+        max_bytes: At this size the file is closed [bytes].
+        meshes: Finds the meshes of fields.
+    """
+
+    def __init__(self, path: Path, *, title: str, max_bytes: int, meshes: MeshLibrary) -> None:
+        self.path = path
+        self._counts: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._failed = False
+        self._title = title
+        self._max_bytes = max_bytes
+        self._meshes = meshes
+        self._room_for_fields = threading.Semaphore(FIELD_CAPACITY)
+        self._waiting: deque[tuple[str, Any]] = deque()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+        self._thread.start()
+
+    def offer(self, sensor: str, message: Any) -> None:
+        """Hand over a decoded message; never blocks and never raises."""
+        if self._failed:
+            return
+        full = len(self._waiting) >= CAPACITY
+        if full or (_is_field(message) and not self._room_for_fields.acquire(blocking=False)):
+            self._count({"view_dropped": 1})
+            return
+        self._waiting.append((sensor, message))
+
+    def take_counts(self) -> Counter[str]:
+        """Counts since the last call."""
+        with self._lock:
+            counts, self._counts = self._counts, Counter()
+        return counts
+
+    def finish(self) -> None:
+        """Draw the rest and close the file, without waiting for it."""
+        self._stop.set()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the file to be closed; returns whether it is."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            # Here Rerun is imported, which takes half a second: the record must not wait for it.
+            with RerunView(
+                self.path, title=self._title, max_bytes=self._max_bytes, meshes=self._meshes
+            ) as view:
+                while not self._stop.wait(PERIOD_S):
+                    self._draw(view)
+                self._draw(view)
+        except PalpateError as error:
+            _log.warning("the view is given up, the record goes on: %s", error)
+            self._give_up()
+        except Exception:
+            # A defect of the picture must be visible in the log, and must not stop the record.
+            _log.exception("the view is given up, the record goes on")
+            self._give_up()
+
+    def _give_up(self) -> None:
+        self._count({"view_failed": 1})
+        self._failed = True
+        self._waiting.clear()
+
+    def _draw(self, view: RerunView) -> None:
+        for _ in range(len(self._waiting)):
+            sensor, message = self._waiting.popleft()
+            if _is_field(message):
+                self._room_for_fields.release()
+            view.add(sensor, message)
+        view.flush()
+        self._count(view.counters)
+        view.counters.clear()
+
+    def _count(self, events: Mapping[str, int]) -> None:
+        with self._lock:
+            self._counts.update(events)
+
+
+def _is_field(message: Any) -> bool:
+    return isinstance(message, FieldEstimate | FieldFrame)
 
 
 def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = ()) -> Path:
@@ -361,7 +452,7 @@ def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = (
     Args:
         record: An MCAP record of palpate.
         view: The file to write; None = beside the record with the ending ``.rrd``.
-        bundles: Bundles that hold the meshes of its fields, beside the packaged ones.
+        bundles: Bundles that hold the meshes of its fields, in addition to the packaged ones.
 
     Returns:
         The file written.
@@ -372,14 +463,14 @@ def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = (
         MissingExtraError: Rerun is not installed.
     """
     target = record.with_suffix(".rrd") if view is None else view
-    with View(target, title=record.stem, meshes=MeshLibrary(bundles)) as drawn:
+    with RerunView(target, title=record.stem, meshes=MeshLibrary(bundles)) as drawn:
         for count, item in enumerate(read_record(record), start=1):
             topic = item.address.topic
-            if topic in SensorScene.TOPICS:
+            if topic in SensorTimeline.TOPICS:
                 drawn.add(item.address.sensor, TOPICS[topic].codec.decode(item.payload))
-            if count % (BATCH_MESSAGES * len(SensorScene.TOPICS)) == 0:
+            if count % (BATCH_MESSAGES * len(SensorTimeline.TOPICS)) == 0:
                 drawn.flush()
     for name, count in drawn.counters.items():
         if count:
-            log.warning("%s: %s %d", target, name, count)
+            _log.warning("%s: %s %d", target, name, count)
     return target

@@ -1,12 +1,13 @@
 """The Rerun view of simulations: a store in, one ``.rrd`` with an explicit layout out.
 
-For looking only. A tab for each trajectory: the pressurised skin coloured by how far it moved, the
-core, the indenter, what touches and pushes where, and curves, over the steps.
+A tab for each trajectory: the pressurised skin coloured by its displacement, the core, the
+indenter, the contact forces, and curves over the steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +15,24 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.files.simulation_store import choose_trajectories
+from palpate.files.hdf5 import text
+from palpate.files.simulation_store import SimulationFiles, choose_trajectories
 from palpate.process import require
 from palpate_services.viewer.layout import (
     AXES,
     SIDES,
     STEP,
     TRUTH_COLOUR,
-    border_of,
-    layout,
-    normals_of,
-    series,
-    shades,
+    simulation_fixtures,
+    simulation_layout,
 )
 from palpate_services.viewer.rerun import APPLICATION
-from palpate_services.viewer.simulation_file import (
-    DrawnFingertip,
-    DrawnSimulations,
-    DrawnTrajectory,
-    Floats,
-)
+from palpate_services.viewer.surfaces import Floats, Ints, border_of, normals_of, shades
+
+_FIELDS = ("displacement", "indenter_force", "core_force")
 
 MOST = 8
-"""Trajectories in one view unless asked for more: 4 MB each, and as many tabs as fit."""
+"""Trajectories in one view by default: each takes 4 MB and a tab."""
 
 LONGEST_ARROW_M = 3e-3
 """Length of a trajectory's largest nodal force."""
@@ -62,9 +58,9 @@ def review_simulations(
     Args:
         store: A folder ``NAME.sim`` or an exported file.
         view: The file to write; None = beside the store with the ending ``.rrd``.
-        trajectories: Which, by id or pattern; none = a choice from all.
+        trajectories: Which, by id or pattern; none = evenly chosen from all.
         most: How many at most.
-        progress: Told how many of how many are drawn.
+        progress: Called with the number of drawn trajectories and of all.
 
     Returns:
         The file written.
@@ -82,7 +78,7 @@ def review_simulations(
     target = store.with_suffix(".rrd") if view is None else view
     stream = rr.RecordingStream(APPLICATION)
     try:
-        stream.save(target, default_blueprint=layout(names, longest_m))
+        stream.save(target, default_blueprint=simulation_layout(names, longest_m))
         stream.send_recording_name(store.stem)
         for count, name in enumerate(names):
             if progress is not None:
@@ -106,7 +102,7 @@ def _furthest(press: DrawnTrajectory) -> float:
 
 
 class _Drawing:
-    """One trajectory on its way into the stream."""
+    """Draws one trajectory into the stream."""
 
     def __init__(
         self, rr: Any, stream: Any, finger: DrawnFingertip, press: DrawnTrajectory, longest_m: float
@@ -143,7 +139,7 @@ class _Drawing:
         self._curve("newton", press.iterations)
 
     def _fixed(self) -> None:
-        """What does not change: core, looks, words."""
+        """What does not change: the core, colours of the curves, the description."""
         rr, press, finger = self._rr, self._press, self._finger
         vertices = finger.core_vertices.astype(np.float32)
         core = rr.Mesh3D(
@@ -153,7 +149,7 @@ class _Drawing:
             albedo_factor=_CORE_COLOUR,
         )
         self._log("finger/core", core)
-        for entity, look in series(rr).items():
+        for entity, look in simulation_fixtures(rr).items():
             self._log(entity, look)
         peak = np.linalg.norm(press.force, axis=1).max(initial=0.0)
         facts = {
@@ -164,8 +160,8 @@ class _Drawing:
             **finger.facts,
         }
         lines = [f"| {name} | {value} |" for name, value in facts.items()]
-        text = "\n".join([f"**{press.id}**", "", "| | |", "|---|---|", *lines])
-        self._log("about", rr.TextDocument(text, media_type="text/markdown"))
+        about = "\n".join([f"**{press.id}**", "", "| | |", "|---|---|", *lines])
+        self._log("about", rr.TextDocument(about, media_type="text/markdown"))
 
     def _skin(self) -> None:
         """Outer and inner surface, as two halves."""
@@ -200,7 +196,7 @@ class _Drawing:
             self._log("finger/indenter/tip", rr.Points3D([[0.0, 0.0, 0.0]], radii=[3e-4]))
             return
         vertices, faces = press.shape[0].astype(np.float32), press.shape[1]
-        # Each face its own corners: an edge of a cube must look like one.
+        # Corners are not shared between faces: shared normals would round the edges of a cube.
         corners = vertices[faces].reshape(-1, 3)
         alone = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
         body = rr.Mesh3D(
@@ -212,7 +208,7 @@ class _Drawing:
         self._log("finger/indenter/shape", body)
 
     def _patch(self) -> None:
-        """Outline of the triangles that the indenter pushes at, and the centre of pressure."""
+        """Outline of the triangles that the indenter loads, and the centre of pressure."""
         rr, press = self._rr, self._press
         strips = []
         for positions, force in zip(self._positions, press.indenter_force, strict=True):
@@ -247,7 +243,7 @@ class _Drawing:
         colour: tuple[int, int, int],
         radius_m: float,
     ) -> None:
-        """Forces on the skin: each arrow ends where it pushes."""
+        """Forces on the skin; each arrow ends at its point of attack."""
         rr = self._rr
         self._log(entity, rr.Arrows3D.from_fields(colors=[colour], radii=[radius_m]))
         flat = np.concatenate(vectors).astype(np.float32)
@@ -269,3 +265,131 @@ class _Drawing:
 
 def _largest(force: Floats) -> float:
     return float(np.linalg.norm(force, axis=2).max(initial=0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnFingertip:
+    """The pressurised, untouched fingertip.
+
+    Attributes:
+        nodes: Positions [m], shape (V, 3), sensor frame.
+        outer: Triangles of the outer surface, shape (T, 3), outward.
+        inner: Triangles of the inner surface, shape (T, 3), away from the skin's solid.
+        core_vertices: The core's surface [m], shape (C, 3).
+        core_faces: Its triangles.
+        facts: What to say of it, by name with unit.
+    """
+
+    nodes: Floats
+    outer: Ints
+    inner: Ints
+    core_vertices: Floats
+    core_faces: Ints
+    facts: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnTrajectory:
+    """One trajectory as far as it is drawn: how it began and its steps, K in all.
+
+    Sensor frame, SI. At the beginning, row 0, the finger is pressurised and nothing touches it.
+
+    Attributes:
+        id: E.g. ``sphere_medium/03/normal``.
+        indenter: Its name.
+        outcome: How it ended.
+        reason: Why it did not complete.
+        pose: Position and quaternion w x y z, shape (K, 7).
+        force: Net force on the BioTac [N], shape (K, 3).
+        fluid_pressure_pa: Shape (K,).
+        contact_area_m2: Shape (K,).
+        centre_of_pressure: Shape (K, 3); NaN without contact.
+        displacement: Shape (K, V, 3) [m].
+        indenter_force: Nodal forces on the skin, shape (K, V, 3) [N].
+        core_force: Likewise of the core.
+        iterations: Newton iterations, shape (K,).
+        shape: The indenter in its own frame: vertices [m], triangles; None = not kept.
+    """
+
+    id: str
+    indenter: str
+    outcome: str
+    reason: str
+    pose: Floats
+    force: Floats
+    fluid_pressure_pa: Floats
+    contact_area_m2: Floats
+    centre_of_pressure: Floats
+    displacement: Floats
+    indenter_force: Floats
+    core_force: Floats
+    iterations: Ints
+    shape: tuple[Floats, Ints] | None
+
+
+class DrawnSimulations(SimulationFiles):
+    """A store of simulations, read for drawing."""
+
+    def fingertip(self) -> DrawnFingertip:
+        """The fingertip.
+
+        Raises:
+            DatasetError: Damaged, or a file of measured trajectories, which has none.
+        """
+        with self.head() as file:
+            tip = file["fingertip"]
+            facts = {name: f"{float(value):g}" for name, value in tip["parameters"].attrs.items()}
+            for name in ("fluid_pressure_pa", "total_thickness_m"):
+                facts[name] = f"{tip.attrs[name]:g}"
+            facts["mesh"] = f"{text(tip.attrs['mesh_name'])}, {len(tip['nodes']):,} nodes"
+            return DrawnFingertip(
+                nodes=tip["pressurised_nodes"][()],
+                outer=_triangles(tip["outer_faces"][()]),
+                # Kept with normals into the solid, which is right for a volume and not for a light.
+                inner=_triangles(tip["inner_faces"][()])[:, ::-1],
+                core_vertices=tip["core_vertices"][()],
+                core_faces=tip["core_faces"][()],
+                facts=facts,
+            )
+
+    def trajectory(self, trajectory: str) -> DrawnTrajectory:
+        """One trajectory.
+
+        Raises:
+            DatasetError: Not there, damaged, or measured, so without fields.
+        """
+        with self.head() as file:
+            rest_pa = float(file["fingertip"].attrs["fluid_pressure_pa"])
+        with self.group(trajectory) as group:
+            shape = None
+            if "indenter_vertices" in group:
+                shape = group["indenter_vertices"][()], group["indenter_faces"][()]
+            # What is added in front of the steps: the first pose, and nothing happening.
+            before = {
+                "pose": group["path"][0],
+                "fluid_pressure_pa": rest_pa,
+                "centre_of_pressure": np.nan,
+                **dict.fromkeys(("force", "contact_area_m2", *_FIELDS), 0.0),
+            }
+            return DrawnTrajectory(
+                id=trajectory,
+                indenter=text(group.attrs["indenter"]),
+                outcome=text(group.attrs["outcome"]),
+                reason=text(group.attrs["reason"]),
+                **{name: _begun(group[name][()], first) for name, first in before.items()},
+                iterations=_begun(group["convergence"]["iterations"], 0),
+                shape=shape,
+            )
+
+
+def _begun(steps: Floats, first: Any) -> Any:
+    return np.concatenate(
+        [np.broadcast_to(first, (1, *steps.shape[1:])).astype(steps.dtype), steps]
+    )
+
+
+def _triangles(faces: Ints) -> Ints:
+    """Triangles of triangles or quadrilaterals."""
+    if faces.shape[1:] != (4,):
+        return faces
+    return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])

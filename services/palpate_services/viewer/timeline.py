@@ -1,6 +1,6 @@
 """What is drawn of one sensor: messages sorted into rows, estimates matched with their truth.
 
-Knows no drawing library, so ``view`` stays a thin adapter.
+Free of any drawing library, so that ``rerun`` and ``plot`` remain thin.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from palpate.messages import (
 )
 
 DRAW_PERIOD_NS = 200_000_000
-"""Fields are drawn five times a second at most, by the clock of their stamps: 16 bytes a vertex."""
+"""At most five fields a second are drawn, by their stamps: each costs 16 bytes a vertex."""
 
 VISIBLE_M = 2e-5
-"""A field that differs less than this from the one drawn last is not drawn again: a hundredth of
-the colour scale."""
+"""A field is drawn only if it differs by this from the last one [m]: 1 % of the colour scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class FieldRow:
 
     Attributes:
         time_ns: Wall clock [ns since the Unix epoch].
-        sequence: Sequence number of the reading.
+        sequence: Sequence number of its frame.
         mesh_sha256: Content hash of its mesh.
         displacement: Nodal displacement [m], shape ``(V, 3)``.
     """
@@ -55,7 +54,7 @@ class FieldRow:
 
 
 class FieldThinner:
-    """Chooses, of one stream of fields, those to draw."""
+    """Leaves out fields of one stream that come too fast or that look like the last one drawn."""
 
     def __init__(self) -> None:
         self._period: int | None = None
@@ -86,19 +85,19 @@ def _alike(one: FieldRow, other: FieldRow) -> bool:
 Values = npt.NDArray[Any]
 
 REMEMBERED = 4096
-"""Readings whose truth and estimate may wait for one another: 40 s at 100 Hz."""
+"""Instants for which truth and estimate may wait for each other: 40 s at 100 Hz."""
 
 _NOWHERE = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One reading of one quantity.
+class TimelineRow:
+    """One quantity at one instant.
 
     Attributes:
         time_ns: Wall clock [ns since the Unix epoch].
-        sequence: Sequence number of the reading.
-        values: The quantity, shape ``(n,)``; None = nothing there (no contact).
+        sequence: Sequence number of its frame.
+        values: The quantity, shape ``(n,)``; None = there is none (no contact).
         at: Where a force acts [m], shape ``(3,)``; None = unknown or no contact.
         slot_period_ns: Time between two slots of the frame [ns].
     """
@@ -110,39 +109,43 @@ class Row:
     slot_period_ns: int = 0
 
 
-def _by_source() -> dict[str, list[Row]]:
+def _by_source() -> dict[str, list[TimelineRow]]:
     return {"truth": [], "estimate": []}
 
 
 @dataclass(slots=True)
-class Rows:
-    """What has come since the last drawing.
+class TimelineRows:
+    """The rows since the last drawing.
 
     Attributes:
         electrodes: Counts by ``raw`` or ``tared``, values of shape ``(19,)`` (SP: 24) [counts].
         pressure: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28); NaN
             where not valid, e.g. lost.
         force: Force by ``truth`` or ``estimate`` [N], shape ``(3,)``.
-        arrow: The same where it is known whether and where it acts.
+        arrow: The same, at instants whose contact location is known or known to be absent.
         location: Contact location likewise [m], shape ``(3,)`` or None.
         error: Magnitude of the error of ``force`` [N] and ``location`` [m], shape ``(1,)``.
         fields: Fields to draw by ``truth`` or ``estimate``.
         synthesised: Tared counts synthesised from a field, shape ``(19,)`` [counts].
     """
 
-    electrodes: dict[str, list[Row]] = field(default_factory=lambda: {"raw": [], "tared": []})
-    pressure: list[Row] = field(default_factory=list)
-    force: dict[str, list[Row]] = field(default_factory=_by_source)
-    arrow: dict[str, list[Row]] = field(default_factory=_by_source)
-    location: dict[str, list[Row]] = field(default_factory=_by_source)
-    error: dict[str, list[Row]] = field(default_factory=lambda: {"force": [], "location": []})
+    electrodes: dict[str, list[TimelineRow]] = field(
+        default_factory=lambda: {"raw": [], "tared": []}
+    )
+    pressure: list[TimelineRow] = field(default_factory=list)
+    force: dict[str, list[TimelineRow]] = field(default_factory=_by_source)
+    arrow: dict[str, list[TimelineRow]] = field(default_factory=_by_source)
+    location: dict[str, list[TimelineRow]] = field(default_factory=_by_source)
+    error: dict[str, list[TimelineRow]] = field(
+        default_factory=lambda: {"force": [], "location": []}
+    )
     fields: dict[str, list[FieldRow]] = field(default_factory=lambda: {"truth": [], "estimate": []})
-    synthesised: list[Row] = field(default_factory=list)
+    synthesised: list[TimelineRow] = field(default_factory=list)
 
 
 @dataclass(slots=True)
-class Reading:
-    """The messages of one reading, matched by sensor and monotonic time."""
+class MatchedMessages:
+    """Truth and estimate of one sensor at one instant, matched by monotonic time."""
 
     wrench: WrenchFrame | None = None
     pose: IndenterPoseFrame | None = None
@@ -163,37 +166,37 @@ class Reading:
         return self.estimate.contact_location.astype(np.float64) - self.pose.position
 
 
-class Matcher:
-    """Brings messages of the same reading together, whatever order they come in.
+class TruthMatcher:
+    """Matches messages of the same instant, in whatever order they arrive.
 
     Args:
-        remember: Readings kept; the oldest is forgotten first. None = all.
+        remember: Instants kept; the oldest is forgotten first. None = all.
     """
 
     def __init__(self, remember: int | None = REMEMBERED) -> None:
         self._remember = remember
-        self._readings: OrderedDict[int, Reading] = OrderedDict()
+        self._instants: OrderedDict[int, MatchedMessages] = OrderedDict()
 
-    def add(self, message: WrenchFrame | IndenterPoseFrame | FeatureEstimate) -> Reading:
-        """Add a message and return its reading as far as it is known."""
+    def add(self, message: WrenchFrame | IndenterPoseFrame | FeatureEstimate) -> MatchedMessages:
+        """Add a message; returns what is known of its instant."""
         stamp = message.source if isinstance(message, FeatureEstimate) else message.stamp
-        reading = self._readings.setdefault(stamp.monotonic_ns, Reading())
+        instant = self._instants.setdefault(stamp.monotonic_ns, MatchedMessages())
         if isinstance(message, FeatureEstimate):
-            reading.estimate = message
+            instant.estimate = message
         elif isinstance(message, WrenchFrame):
-            reading.wrench = message
+            instant.wrench = message
         else:
-            reading.pose = message
-        if self._remember is not None and len(self._readings) > self._remember:
-            self._readings.popitem(last=False)
-        return reading
+            instant.pose = message
+        if self._remember is not None and len(self._instants) > self._remember:
+            self._instants.popitem(last=False)
+        return instant
 
-    def readings(self) -> Mapping[int, Reading]:
-        """Readings by monotonic time [ns]."""
-        return self._readings
+    def instants(self) -> Mapping[int, MatchedMessages]:
+        """Matched messages by monotonic time [ns]."""
+        return self._instants
 
 
-class SensorScene:
+class SensorTimeline:
     """Sorts the messages of one sensor into rows to draw."""
 
     TOPICS: ClassVar[frozenset[str]] = frozenset(
@@ -201,14 +204,14 @@ class SensorScene:
     )
 
     def __init__(self) -> None:
-        self._rows = Rows()
-        self._matcher = Matcher()
+        self._rows = TimelineRows()
+        self._matcher = TruthMatcher()
         self._tares: dict[int, Tare] = {}
         self._thinners = {"truth": FieldThinner(), "estimate": FieldThinner()}
         self.pending = False
         self.has_fields = False
         self.sensor_type = SensorType.BIOTAC
-        """Type of the last frame; before the first that of most sensors."""
+        """Type of the last frame; before the first one the most common type."""
 
     def add(self, message: Any) -> None:
         """Take one decoded message."""
@@ -232,9 +235,9 @@ class SensorScene:
             self.has_fields = True
             self._rows.synthesised.append(_row(message.source, message.tared_counts))
 
-    def take(self) -> Rows:
-        """Hand over what has come, and start afresh."""
-        rows, self._rows, self.pending = self._rows, Rows(), False
+    def take(self) -> TimelineRows:
+        """The rows since the last call."""
+        rows, self._rows, self.pending = self._rows, TimelineRows(), False
         return rows
 
     def _add_frame(self, frame: ElectrodeFrame) -> None:
@@ -252,31 +255,33 @@ class SensorScene:
             pressure[[not frame.validity >> bit & 1 for bit in bits]] = np.nan
         stamp = frame.stamp
         self._rows.pressure.append(
-            Row(stamp.wall_ns, stamp.sequence, pressure, slot_period_ns=frame.slot_period_ns)
+            TimelineRow(
+                stamp.wall_ns, stamp.sequence, pressure, slot_period_ns=frame.slot_period_ns
+            )
         )
 
     def _add_estimate(self, estimate: FeatureEstimate) -> None:
-        reading = self._matcher.add(estimate)
+        instant = self._matcher.add(estimate)
         location = estimate.contact_location
         row = _row(estimate.source, estimate.force, at=location)
         self._rows.force["estimate"].append(row)
         self._rows.arrow["estimate"].append(row)
         self._rows.location["estimate"].append(_row(estimate.source, location))
-        self._add_error("force", estimate.source, reading.force_error())
-        self._add_location_error(estimate.source, reading)
+        self._add_error("force", estimate.source, instant.force_error())
+        self._add_location_error(estimate.source, instant)
 
     def _add_wrench(self, wrench: WrenchFrame) -> None:
-        reading = self._matcher.add(wrench)
+        instant = self._matcher.add(wrench)
         self._rows.force["truth"].append(_row(wrench.stamp, wrench.force))
-        self._add_true_arrow(reading)
-        self._add_error("force", wrench.stamp, reading.force_error())
+        self._add_true_arrow(instant)
+        self._add_error("force", wrench.stamp, instant.force_error())
 
     def _add_pose(self, pose: IndenterPoseFrame) -> None:
-        reading = self._matcher.add(pose)
+        instant = self._matcher.add(pose)
         position = pose.position if pose.in_contact else None
         self._rows.location["truth"].append(_row(pose.stamp, position))
-        self._add_true_arrow(reading)
-        self._add_location_error(pose.stamp, reading)
+        self._add_true_arrow(instant)
+        self._add_location_error(pose.stamp, instant)
 
     def _add_field(self, name: str, known: FieldFrame) -> None:
         self.has_fields = True
@@ -284,15 +289,15 @@ class SensorScene:
         if row is not None:
             self._rows.fields[name].append(row)
 
-    def _add_true_arrow(self, reading: Reading) -> None:
-        if reading.wrench is not None and reading.pose is not None:
-            at = reading.pose.position if reading.pose.in_contact else None
-            row = _row(reading.wrench.stamp, reading.wrench.force, at=at)
+    def _add_true_arrow(self, instant: MatchedMessages) -> None:
+        if instant.wrench is not None and instant.pose is not None:
+            at = instant.pose.position if instant.pose.in_contact else None
+            row = _row(instant.wrench.stamp, instant.wrench.force, at=at)
             self._rows.arrow["truth"].append(row)
 
-    def _add_location_error(self, stamp: Stamp, reading: Reading) -> None:
-        error = reading.location_error()
-        if error is None and reading.estimate is not None and reading.pose is not None:
+    def _add_location_error(self, stamp: Stamp, instant: MatchedMessages) -> None:
+        error = instant.location_error()
+        if error is None and instant.estimate is not None and instant.pose is not None:
             error = _NOWHERE  # a gap in the line, not a line across the time without contact
         self._add_error("location", stamp, error)
 
@@ -301,5 +306,5 @@ class SensorScene:
             self._rows.error[what].append(_row(stamp, np.array([np.linalg.norm(error)])))
 
 
-def _row(stamp: Stamp, values: Any, *, at: Values | None = None) -> Row:
-    return Row(stamp.wall_ns, stamp.sequence, values, at=at)
+def _row(stamp: Stamp, values: Any, *, at: Values | None = None) -> TimelineRow:
+    return TimelineRow(stamp.wall_ns, stamp.sequence, values, at=at)

@@ -20,8 +20,8 @@ from palpate.files.record import RecordWriter, check_readable, read_record
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, ServiceState
 from palpate_services.config import RecorderConfig
-from palpate_services.recorder import writer as keeper_module
-from palpate_services.recorder.writer import RecordKeeper, leftovers, recover_all
+from palpate_services.recorder import writer as writer_module
+from palpate_services.recorder.writer import RecordFiles, leftovers, recover_all
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -47,30 +47,30 @@ def sample(make_frame: Frames) -> Callable[[int], TapSample]:
 
 
 @pytest.fixture
-def open_keeper(tmp_path: Path) -> Callable[..., Any]:
+def open_files(tmp_path: Path) -> Callable[..., Any]:
     @contextmanager
-    def opened(**config: Any) -> Iterator[tuple[RecordKeeper, Health]]:
+    def opened(**config: Any) -> Iterator[tuple[RecordFiles, Health]]:
         health = Health("recorder", "recorder")
         settings = {"out": tmp_path / "runs", "rrd": False, "min_free_bytes": 0, **config}
-        keeper = RecordKeeper(RecorderConfig(**settings), "lab", health)
-        keeper.start()
+        files = RecordFiles(RecorderConfig(**settings), "lab", health)
+        files.start()
         try:
-            yield keeper, health
+            yield files, health
         finally:
-            keeper.close()
+            files.close()
 
     return opened
 
 
 def test_record_holds_what_was_written(
-    open_keeper: Any, sample: Callable[[int], TapSample], tmp_path: Path
+    open_files: Any, sample: Callable[[int], TapSample], tmp_path: Path
 ) -> None:
     samples = [sample(n) for n in range(1, 50)]
-    with open_keeper() as (keeper, health):
+    with open_files() as (files, health):
         for item in samples:
-            keeper.write(item)
-            keeper.tick()
-        assert keeper.path is not None
+            files.write(item)
+            files.tick()
+        assert files.path is not None
     (record,) = (tmp_path / "runs").iterdir()
     assert record.name.startswith("lab-2")
     check_readable(record)
@@ -80,25 +80,25 @@ def test_record_holds_what_was_written(
     assert health.counters["recorded_electrodes"] == 49
 
 
-def test_broken_payload_is_kept_and_counted(open_keeper: Any, tmp_path: Path) -> None:
-    with open_keeper() as (keeper, health):
-        keeper.write(sample_of(b"\xff" * 30))
+def test_broken_payload_is_kept_and_counted(open_files: Any, tmp_path: Path) -> None:
+    with open_files() as (files, health):
+        files.write(sample_of(b"\xff" * 30))
     (record,) = (tmp_path / "runs").iterdir()
     assert [item.payload for item in read_record(record)] == [b"\xff" * 30]
     assert health.counters["invalid_parse"] == 1
 
 
 def test_rotation_by_size_loses_nothing(
-    open_keeper: Any,
+    open_files: Any,
     sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(keeper_module, "CHECK_S", 0.0)
-    with open_keeper(rotate_bytes=64 * 1024) as (keeper, _):
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    with open_files(rotate_bytes=64 * 1024) as (files, _):
         for sequence in range(1, 1501):
-            keeper.write(sample(sequence))
-            keeper.tick()
+            files.write(sample(sequence))
+            files.tick()
     records = sorted((tmp_path / "runs").iterdir())
     assert len(records) > 1
     sequences = [item.sequence for record in records for item in read_record(record)]
@@ -106,54 +106,54 @@ def test_rotation_by_size_loses_nothing(
 
 
 def test_too_little_space_is_reported_and_recording_resumes(
-    open_keeper: Any,
+    open_files: Any,
     sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     free = [10**9]
-    monkeypatch.setattr(keeper_module, "CHECK_S", 0.0)
-    monkeypatch.setattr(keeper_module, "RETRY_S", 0.0)
-    monkeypatch.setattr(keeper_module, "free_bytes", lambda _: free[0])
-    with open_keeper(min_free_bytes=10**8) as (keeper, health):
-        keeper.write(sample(1))
-        keeper.tick()
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module, "RETRY_S", 0.0)
+    monkeypatch.setattr(writer_module, "free_bytes", lambda _: free[0])
+    with open_files(min_free_bytes=10**8) as (files, health):
+        files.write(sample(1))
+        files.tick()
         free[0] = 10**7
-        keeper.tick()
+        files.tick()
         status = health.status()
         assert status.state is ServiceState.DEGRADED
         assert status.last_error is not None
         assert status.last_error.code is ErrorCode.DISK
         assert str(tmp_path / "runs") in status.last_error.message
         assert "bytes free" in status.last_error.message
-        keeper.write(sample(2))
-        keeper.tick()
+        files.write(sample(2))
+        files.tick()
         assert health.counters["lost_disk_full"] == 1
         free[0] = 10**9
-        keeper.tick()
+        files.tick()
         assert health.state is ServiceState.READY
-        keeper.write(sample(3))
+        files.write(sample(3))
     records = sorted((tmp_path / "runs").iterdir())
     assert [[item.sequence for item in read_record(r)] for r in records] == [[1], [3]]
     assert all(record.suffix == ".mcap" for record in records)
 
 
 def test_write_error_of_the_disk_is_survived(
-    open_keeper: Any,
+    open_files: Any,
     sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     until: Until,
 ) -> None:
     """A limit on the size of files stands for a disk that refuses in the middle of a record."""
-    monkeypatch.setattr(keeper_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with open_keeper() as (keeper, health):
+    with open_files() as (files, health):
         try:
             resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
             for sequence in range(1, 2001):
-                keeper.write(sample(sequence))
-                keeper.tick(idle=True)  # flushes, so that the limit is met after whole messages
+                files.write(sample(sequence))
+                files.tick(idle=True)  # flushes, so that the limit is met after whole messages
                 if health.state is ServiceState.DEGRADED:
                     break
         finally:
@@ -162,10 +162,10 @@ def test_write_error_of_the_disk_is_survived(
         error = health.status().last_error
         assert error is not None
         assert error.code is ErrorCode.DISK
-        assert keeper.path is None
-        monkeypatch.setattr(keeper_module, "RETRY_S", 0.0)
-        keeper.tick()
-        keeper.write(sample(5000))
+        assert files.path is None
+        monkeypatch.setattr(writer_module, "RETRY_S", 0.0)
+        files.tick()
+        files.write(sample(5000))
         until(lambda: health.counters.get("recovered_records") == 1)
     kept = [
         item.sequence
@@ -176,8 +176,49 @@ def test_write_error_of_the_disk_is_survived(
     assert kept == [*range(1, len(kept)), 5000]
 
 
+def test_unflushed_samples_are_counted_as_lost_when_the_disk_refuses(
+    open_files: Any,
+    sample: Callable[[int], TapSample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    until: Until,
+) -> None:
+    """Each sample is in a record or counted, whether a write, a flush or the end of it fails."""
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(how: str, size: int) -> tuple[int, Health]:
+        sent = 0
+        with open_files(out=tmp_path / how) as (files, health):
+            files.write(sample(sent := sent + 1))
+            files.tick(idle=True)
+            (part,) = (tmp_path / how).glob("*.part")
+            try:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (part.stat().st_size + size, hard))
+                while health.state is not ServiceState.DEGRADED:
+                    files.write(sample(sent := sent + 1))
+                    if how != "write" and sent == 8:
+                        break
+                if how == "flush":
+                    files.tick(idle=True)
+                if how == "end":
+                    files.close()
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            assert health.state is ServiceState.DEGRADED
+            files.tick()
+        return sent, health
+
+    for how, size in (("write", 20_000), ("flush", 10), ("end", 10)):
+        sent, health = fill(how, size)
+        recover_all(leftovers(tmp_path / how))
+        kept = sum(1 for path in (tmp_path / how).glob("*.mcap") for _ in read_record(path))
+        assert kept >= 1
+        assert health.counters["lost_disk_full"] == sent - kept > 1, how
+
+
 def test_leftovers_are_recovered_but_not_those_of_the_living(
-    open_keeper: Any, sample: Callable[[int], TapSample], tmp_path: Path, until: Until
+    open_files: Any, sample: Callable[[int], TapSample], tmp_path: Path, until: Until
 ) -> None:
     runs = tmp_path / "runs"
     writer = RecordWriter(runs / "lab-dead.mcap")
@@ -186,9 +227,9 @@ def test_leftovers_are_recovered_but_not_those_of_the_living(
         writer.write(item.key, item.schema, item.payload, log_time_ns=1, sequence=sequence)
     writer.flush()
     writer.abandon()
-    with open_keeper() as (keeper, health):
+    with open_files() as (files, health):
         until(lambda: health.counters.get("recovered_records") == 1)
-        keeper.write(sample(1))
+        files.write(sample(1))
         assert leftovers(runs) == []
         assert recover_all(leftovers(runs)) == []
     items = list(read_record(runs / "lab-dead.recovered.mcap"))
@@ -197,15 +238,15 @@ def test_leftovers_are_recovered_but_not_those_of_the_living(
 
 
 def test_view_that_fails_leaves_the_record_alone(
-    open_keeper: Any,
+    open_files: Any,
     sample: Callable[[int], TapSample],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with open_keeper(rrd=True) as (keeper, health):
+    with open_files(rrd=True) as (files, health):
         for sequence in range(1, 21):
-            keeper.write(sample(sequence))
+            files.write(sample(sequence))
     (record,) = (tmp_path / "runs").iterdir()
     assert [item.sequence for item in read_record(record)] == list(range(1, 21))
     assert health.counters["view_failed"] == 1
@@ -213,10 +254,10 @@ def test_view_that_fails_leaves_the_record_alone(
 
 def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.viewer.rerun import View
+    from palpate_services.viewer.rerun import RerunView
 
     path = tmp_path / "view.rrd"
-    with View(path, title="view", max_bytes=1) as view:
+    with RerunView(path, title="view", max_bytes=1) as view:
         sizes = []
         for sequence in range(1, 31):
             view.add("finger", make_frame(sequence))

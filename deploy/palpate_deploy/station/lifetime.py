@@ -1,0 +1,65 @@
+"""How a process ends: by a signal, and together with the process that started it.
+
+A parent that is killed with ``kill -9`` cannot stop its children, so they watch it: the environment
+names the parent's process id, and each child gets ``SIGTERM`` when that process is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType
+
+PARENT_PID = "_PALPATE_PARENT_PID"
+"""Environment variable with the process id of the parent; a process without it ends alone."""
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_POLL_S = 0.5
+
+
+def stop_on_signals(*signals: signal.Signals) -> threading.Event:
+    """An event that each of these signals sets; none given = ``SIGINT`` and ``SIGTERM``."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in signals or (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    return stop
+
+
+def environment_for_children() -> dict[str, str]:
+    """This process's environment for children that must end with it.
+
+    Without the variables that change a profile: children read the resolved profile from a file, and
+    the same variables applied twice would undo what a command changed in it.
+    """
+    kept = {k: v for k, v in os.environ.items() if not k.upper().startswith("PALPATE_")}
+    return {**kept, PARENT_PID: str(os.getpid())}
+
+
+def end_with_parent() -> None:
+    """Arrange ``SIGTERM`` for this process at the end of its parent, if the environment names one.
+
+    Call it after the handler of ``SIGTERM`` is in place.
+    """
+    parent = os.environ.get(PARENT_PID)
+    if parent is None:
+        return
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    else:  # no such signal: poll
+        threading.Thread(target=_watch, args=(int(parent),), daemon=True).start()
+    if os.getppid() != int(parent):  # it ended before the signal was arranged
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_POLL_S)
+    os.kill(os.getpid(), signal.SIGTERM)
