@@ -28,6 +28,7 @@ from palpate_deploy.bench.alignment import (
     SPAN_COUNTS,
     SPAN_M,
     SPAN_N,
+    AlignmentResult,
     apart,
     page_of,
     spread,
@@ -166,7 +167,7 @@ def test_of_nothing_there_is_no_spread() -> None:
     assert np.isnan(nothing.p95_s)
     stamps = {"x": spread(np.array([1e-3, 2e-3]))}
     host = {"cpus": 2, "cpu": "a", "load_1min": 0.1}
-    text = page_of(1.0, 0.5, stamps, {}, {"a.clock_drift_ppm": 3.0}, host)
+    text = page_of(AlignmentResult(1.0, 0.5, stamps, {}, {"a.clock_drift_ppm": 3.0}), host)
     assert "| x | 2 | 1.500 ms |" in text
     assert "`a.clock_drift_ppm` | 3 |" in text
 

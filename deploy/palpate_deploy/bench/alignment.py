@@ -200,23 +200,16 @@ time what the two show was there. The goal is 1 ms.
 """
 
 
-def page_of(
-    seconds: float,
-    kept: float,
-    stamps: dict[str, ErrorSpread],
-    apart: dict[str, ErrorSpread],
-    gauges: dict[str, float],
-    machine: dict[str, Any],
-) -> str:
+def page_of(result: AlignmentResult, machine: dict[str, Any]) -> str:
     """The page as Markdown."""
     told = ["| gauge | |", "| --- | ---: |"]
-    told += [f"| `{name}` | {value:.6g} |" for name, value in gauges.items()]
+    told += [f"| `{name}` | {value:.6g} |" for name, value in result.gauges.items()]
     return _HEAD.format(
-        seconds=seconds,
-        kept=kept,
+        seconds=result.seconds,
+        kept=result.kept,
         machine=f"{machine['cpus']} CPUs ({machine['cpu']}), load {machine['load_1min']}",
-        stamps=_table(stamps),
-        apart=_table(apart),
+        stamps=_table(result.stamps),
+        apart=_table(result.apart),
         gauges="\n".join(told),
     )
 
@@ -281,15 +274,7 @@ class _Received:
 def run_alignment(
     *, seconds: float, settle_seconds: float, page: Path | None, as_json: bool, save: bool
 ) -> None:
-    """Measure and print; append to the history on request.
-
-    Args:
-        seconds: Duration of the measurement [s].
-        settle_seconds: Time for the clocks to settle before it [s].
-        page: Write a page of it.
-        as_json: Print JSON.
-        save: Append to the history.
-    """
+    """``palpate bench alignment``, whose help explains the options: measure, print, keep."""
     with progress_bar() as bar:
         result = measure_alignment(seconds, settle_seconds, bar)
     values = {
@@ -297,10 +282,7 @@ def run_alignment(
         "alignment.goal_met": all(one.p95_s <= GOAL_S for one in result.apart.values()),
     }
     if page is not None:
-        text = page_of(
-            result.seconds, result.kept, result.stamps, result.apart, result.gauges, machine()
-        )
-        page.write_text(text, encoding="utf-8")
+        page.write_text(page_of(result, machine()), encoding="utf-8")
     finish("alignment", values, lambda: _print(result), as_json=as_json, save=save)
 
 

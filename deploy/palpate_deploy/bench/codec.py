@@ -17,13 +17,7 @@ GOAL_S = 25e-6
 
 
 def run_codec(rounds: int, *, as_json: bool, save: bool) -> None:
-    """Measure and print; append to the history on request.
-
-    Args:
-        rounds: How often all frames are encoded and decoded.
-        as_json: Print JSON.
-        save: Append to the history.
-    """
+    """``palpate bench codec``, whose help explains the options: measure, print, keep."""
     frames = [_frame(index) for index in range(KINDS)]
     payloads = [ELECTRODE_FRAME.encode(frame) for frame in frames]
     both = _median_s(lambda i: ELECTRODE_FRAME.decode(ELECTRODE_FRAME.encode(frames[i])), rounds)

@@ -208,18 +208,7 @@ def run_e2e(
     as_json: bool,
     save: bool,
 ) -> None:
-    """Measure and print; append to the history on request.
-
-    Args:
-        seconds: Length of one round [s].
-        rounds: Rounds of each side.
-        sensors: Fingers of the load test.
-        load_seconds: Length of the load test [s].
-        ramp: Raise the rate until a frame is lost.
-        bundle: Bundle that is served.
-        as_json: Print JSON.
-        save: Append to the history.
-    """
+    """``palpate bench e2e``, whose help explains the options: measure, print, keep."""
     folder = resolve(bundle)
     with progress_bar() as bar:
         palpate, floor = measure_latency(

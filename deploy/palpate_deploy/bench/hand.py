@@ -194,14 +194,7 @@ _SETTLE_S = 4.0
 
 
 def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool) -> None:
-    """Measure and print; append to the history on request.
-
-    Args:
-        seconds: Length of the measurement [s].
-        floor_seconds: Length of the floor's [s].
-        as_json: Print JSON.
-        save: Append to the history.
-    """
+    """``palpate bench hand``, whose help explains the options: measure, print, keep."""
     with progress_bar() as bar:
         result = measure_hand(seconds, floor_seconds, bar)
     values = {

@@ -26,9 +26,19 @@ from palpate.messages import (
     Tare,
     WrenchFrame,
 )
+from palpate_services.viewer.timeline import TruthMatcher
 
 _KEPT = 500
-"""Truths that wait for their estimate: five seconds at 100 Hz."""
+"""Instants whose truth and estimate may wait for each other: five seconds at 100 Hz."""
+
+_WAITING = 200
+"""Estimates and frames that wait for what they are compared with."""
+
+MOVED_M = 0.05e-3
+"""A skin counts as touched if its nodes move by more than this on average [m]."""
+
+_TOUCHED_COUNTS = 40.0
+"""The sensor counts as touched if one electrode moves by this: above noise and drift [counts]."""
 
 Vector = npt.NDArray[Any]
 
@@ -71,8 +81,7 @@ class TouchComparison:
     def __init__(self) -> None:
         self.count = 0
         self.newest: TouchMoment | None = None
-        self._wrench: OrderedDict[int, WrenchFrame] = OrderedDict()
-        self._pose: OrderedDict[int, IndenterPoseFrame] = OrderedDict()
+        self._matcher = TruthMatcher(_KEPT)
         self._force_errors: list[Vector] = []
         self._location_errors: list[Vector] = []
         self._ages_s: list[float] = []
@@ -97,20 +106,18 @@ class TouchComparison:
 
     def add_truth(self, streams: TruthStreams) -> None:
         """Take the truth that has arrived."""
-        for wrench in _all(streams.wrench):
-            _remember(self._wrench, wrench.stamp.monotonic_ns, wrench)
-        for pose in _all(streams.pose):
-            _remember(self._pose, pose.stamp.monotonic_ns, pose)
+        for message in (*_all(streams.wrench), *_all(streams.pose)):
+            self._matcher.add(message)
 
     def add(self, estimate: FeatureEstimate, received_ns: int) -> None:
         """Take one estimate, received at ``received_ns`` of this host's monotonic clock."""
         self.count += 1
         age_s = clock.age_s(estimate.source, monotonic_ns=received_ns)
         self._ages_s.append(age_s)
-        wrench = self._wrench.get(estimate.source.monotonic_ns)
+        instant = self._matcher.add(estimate)
+        wrench, pose = instant.wrench, instant.pose
         if wrench is None:
             return
-        pose = self._pose.get(estimate.source.monotonic_ns)
         # None = the source cannot tell; that counts as contact, as does a missing pose.
         touched = pose is None or pose.in_contact is not False
         moment = TouchMoment(
@@ -153,21 +160,6 @@ def _all(stream: Subscriber[Any]) -> list[Any]:
             return found
 
 
-def _remember(known: OrderedDict[int, Any], key: int, value: Any) -> None:
-    known[key] = value
-    while len(known) > _KEPT:
-        known.popitem(last=False)
-
-
-Values = npt.NDArray[Any]
-
-_WAITING = 200
-"""Estimates and frames that wait for what they are compared with."""
-
-MOVED_M = 0.05e-3
-"""A skin counts as touched if its nodes move by more than this on average [m]."""
-
-
 @dataclass(frozen=True, slots=True)
 class FieldStreams:
     """Streams of fields, syntheses and their truth; ``tare`` finds a tare by its id."""
@@ -202,9 +194,9 @@ class FieldComparison:
     """Matches fields with the truth, and synthesised electrodes with the measured ones."""
 
     def __init__(self) -> None:
-        self._truth: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
-        self._waiting: deque[tuple[int, Values]] = deque(maxlen=_WAITING)
-        self._counts: OrderedDict[int, tuple[int, Values]] = OrderedDict()
+        self._truth: deque[tuple[int, Vector]] = deque(maxlen=_WAITING)
+        self._waiting: deque[tuple[int, Vector]] = deque(maxlen=_WAITING)
+        self._counts: OrderedDict[int, tuple[int, Vector]] = OrderedDict()
         self._moved: list[float] = []
         self._errors: list[float] = []
         self._electrodes: list[float] = []
@@ -257,8 +249,8 @@ class FieldComparison:
                 self._moved.append(moved)
                 self._errors.append(float(np.linalg.norm(estimate - truth, axis=1).mean()))
 
-    def _truth_at(self, at: int) -> Values | None:
-        before: tuple[int, Values] | None = None
+    def _truth_at(self, at: int) -> Vector | None:
+        before: tuple[int, Vector] | None = None
         for when, field in self._truth:
             if when == at:
                 return field
@@ -283,10 +275,6 @@ class FieldComparison:
             return
         difference = np.asarray(synthesis.tared_counts, np.float64) - tared
         self._electrodes.append(float(np.sqrt(np.mean(difference**2))))
-
-
-_TOUCHED_COUNTS = 40.0
-"""The sensor counts as touched if one electrode moves by this: above noise and drift [counts]."""
 
 
 def _median(values: list[float]) -> float:
