@@ -102,13 +102,13 @@ def test_the_shipped_sample_trains_a_field_that_services_serve(
 ) -> None:
     pytest.importorskip("torch")
     from palpate_training.datasets.experiment import read_mixed
-    from palpate_training.tasks.fields import FieldConfig, field_bundle
+    from palpate_training.tasks.fields import FieldFitConfig, field_bundle
 
     path = Path(str(resources.files("palpate_training").joinpath("samples/twin.h5")))
     assert path.stat().st_size < 1.5e6
     sample = read_mixed(path)
     assert set(sample.experiment.unit_names) == {"biotac-1", "biotac-2", "biotac-3"}
-    metrics = field_bundle(sample, tmp_path / "field", config=FieldConfig(epochs=3))
+    metrics = field_bundle(sample, tmp_path / "field", config=FieldFitConfig(epochs=3))
     assert metrics["nodal_all_m"] < 0.5e-3
     runtime = load(read_bundle(tmp_path / "field"), "field")
     tares = {message.tare_id: message for message in played if isinstance(message, Tare)}
