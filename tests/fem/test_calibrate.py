@@ -17,7 +17,7 @@ from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.calibration.recover import Planned, recover
 from palpate_fem.calibration.result import Evaluation, read_parameters, write_calibration
-from palpate_fem.calibration.runs import SimulatedIndentation
+from palpate_fem.calibration.runs import SimulatedRun
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -61,7 +61,7 @@ class Formula:
 
     def simulate(
         self, parameters: FingertipParameters, indenter: str, path: Floats
-    ) -> SimulatedIndentation:
+    ) -> SimulatedRun:
         if indenter == self.refuses:
             raise SimulationError("the mesh is folded", remedy="none")
         if not self.thicknesses_m[0] < parameters.skin_thickness_m < self.thicknesses_m[1]:
@@ -93,7 +93,7 @@ class Formula:
                 outcome, count = end, int(at.argmax())
         volume = 366e-9 + 474e-9 * bulge / 1.46e-3
         reason = "" if outcome is IndentationOutcome.COMPLETE else "by design"
-        return SimulatedIndentation(force[:count], way[:count], total, volume, outcome, reason)
+        return SimulatedRun(force[:count], way[:count], total, volume, outcome, reason)
 
 
 def press(

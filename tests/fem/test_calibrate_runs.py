@@ -12,7 +12,7 @@ import pytest
 from palpate.errors import ConfigError, SimulationError
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.measured import MeasuredIndentation
-from palpate_fem.calibration.runs import SimulatedIndentation, SimulationRuns
+from palpate_fem.calibration.runs import SimulatedRun, SimulationRuns
 from palpate_fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
@@ -26,12 +26,12 @@ class Spring:
 
     def simulate(
         self, parameters: FingertipParameters, indenter: str, path: Floats
-    ) -> SimulatedIndentation:
+    ) -> SimulatedRun:
         if indenter == "unknown":
             raise ConfigError("no such indenter", remedy="none")
         way = path_lengths(path)
         force = np.outer(way * parameters.shear_modulus_pa, np.array([0.0, 0.0, 1.0]))
-        return SimulatedIndentation(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
+        return SimulatedRun(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
 
 
 def press(
@@ -66,7 +66,7 @@ def test_a_refused_run_is_that_runs_trouble_only() -> None:
 def test_a_solvers_steps_begin_at_the_second_pose() -> None:
     path = press().pose
     stopped = IndentationResult("cube", path, (), IndentationOutcome.DIVERGED, "at once")
-    run = SimulatedIndentation.of(stopped, thickness_m=0.0151, fluid_volume_m3=8e-7)
+    run = SimulatedRun.of(stopped, thickness_m=0.0151, fluid_volume_m3=8e-7)
     np.testing.assert_array_equal(run.forces, np.zeros((1, 3)))
     np.testing.assert_array_equal(run.travel, [0.0])
     assert run.reason == "at once"
@@ -85,8 +85,8 @@ def test_an_executor_changes_nothing_but_the_order_of_reports() -> None:
 class Dying(Executor):
     """An executor whose process dies."""
 
-    def submit(self, *_: object, **__: object) -> Future[SimulatedIndentation]:  # type: ignore[override]
-        future: Future[SimulatedIndentation] = Future()
+    def submit(self, *_: object, **__: object) -> Future[SimulatedRun]:  # type: ignore[override]
+        future: Future[SimulatedRun] = Future()
         future.set_exception(BrokenProcessPool("killed"))
         return future
 

@@ -13,7 +13,7 @@ import pytest
 from palpate.errors import DatasetError
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
-from palpate_fem.calibration.runs import SimulatedIndentation, simulate_all
+from palpate_fem.calibration.runs import SimulatedRun, simulate_all
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
@@ -53,10 +53,8 @@ def measured(name: str, indenter: str, sensor: str = "biotac1") -> MeasuredInden
 
 def run(
     force: Floats, outcome: IndentationOutcome = IndentationOutcome.COMPLETE, reason: str = ""
-) -> SimulatedIndentation:
-    return SimulatedIndentation(
-        force, path_lengths(way())[: len(force)], 0.0151, 8e-7, outcome, reason
-    )
+) -> SimulatedRun:
+    return SimulatedRun(force, path_lengths(way())[: len(force)], 0.0151, 8e-7, outcome, reason)
 
 
 @pytest.fixture
@@ -185,7 +183,7 @@ class Counting:
 
     def simulate(
         self, parameters: FingertipParameters, indenter: str, path: Floats
-    ) -> SimulatedIndentation:
+    ) -> SimulatedRun:
         self.runs += 1
         return run(ramp() * parameters.shear_modulus_pa / 2.8e5)
 

@@ -94,7 +94,7 @@ class AlignedCurves:
 
     Attributes:
         displacement_m: Since each curve's own threshold force [m], shape (N,).
-        simulated_n: SimulatedIndentation force [N], shape (N, 3).
+        simulated_n: SimulatedRun force [N], shape (N, 3).
         measured_n: Measured force [N], shape (N, 3).
         depth_offset_m: Travel at the threshold, simulation minus measurement [m]: positive if the
             simulation touches later, that is deeper. The comparison of forces does not see it.
@@ -326,7 +326,7 @@ def cost(
 
     Args:
         pairs: Every compared trajectory.
-        thickness_m: SimulatedIndentation total thickness [m].
+        thickness_m: SimulatedRun total thickness [m].
         weights: Of force and thickness.
         target_m: Thickness to reach [m].
     """

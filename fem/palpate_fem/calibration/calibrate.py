@@ -30,7 +30,7 @@ from palpate_fem.calibration.point import (
     fit_modulus,
 )
 from palpate_fem.calibration.result import Calibration, Evaluation, axis_rms, trajectory_fits
-from palpate_fem.calibration.runs import SimulatedIndentation, SimulationRuns, Simulator
+from palpate_fem.calibration.runs import SimulatedRun, SimulationRuns, Simulator
 from palpate_fem.calibration.settings import (
     FRICTION,
     STEPS,
@@ -137,7 +137,7 @@ class _Search:
             self._note_early_ends(batch)
         return [SimulatedPoint.of(p, batch) for p, batch in zip(points, batches, strict=True)]
 
-    def _note_early_ends(self, batch: Sequence[SimulatedIndentation]) -> None:
+    def _note_early_ends(self, batch: Sequence[SimulatedRun]) -> None:
         for case, result in zip(self.cases, batch, strict=True):
             if result.outcome is not IndentationOutcome.COMPLETE:
                 why = f" ({result.reason})" if result.reason else ""

@@ -21,7 +21,7 @@ from palpate_fem.calibration.alignment import (
     thickness_error_m,
 )
 from palpate_fem.calibration.measured import MeasuredIndentation
-from palpate_fem.calibration.runs import SimulatedIndentation
+from palpate_fem.calibration.runs import SimulatedRun
 from palpate_fem.calibration.settings import MODULUS, CalibrationSettings
 
 _GRID = 13
@@ -71,7 +71,7 @@ class SimulatedPoint:
     fluid_volume_m3: float
 
     @classmethod
-    def of(cls, point: Floats, runs: Sequence[SimulatedIndentation]) -> SimulatedPoint:
+    def of(cls, point: Floats, runs: Sequence[SimulatedRun]) -> SimulatedPoint:
         """From the runs of all cases; refused runs have no thickness."""
         known = [run for run in runs if math.isfinite(run.thickness_m)]
         first = known[0] if known else runs[0]

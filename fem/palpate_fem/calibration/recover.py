@@ -19,7 +19,7 @@ from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.result import Calibration, Evaluation
-from palpate_fem.calibration.runs import SimulatedIndentation, SimulationRuns, Simulator
+from palpate_fem.calibration.runs import SimulatedRun, SimulationRuns, Simulator
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -92,7 +92,7 @@ class ParameterRecovery:
 
 def noisy(
     planned: Planned,
-    run: SimulatedIndentation,
+    run: SimulatedRun,
     sensor: str,
     noise_n: float,
     random: np.random.Generator,

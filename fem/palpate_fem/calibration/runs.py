@@ -25,7 +25,7 @@ _PLACES = 9
 
 
 @dataclass(frozen=True, slots=True)
-class SimulatedIndentation:
+class SimulatedRun:
     """One simulated indentation, reduced to what a comparison needs.
 
     Attributes:
@@ -48,7 +48,7 @@ class SimulatedIndentation:
     @classmethod
     def of(
         cls, trajectory: IndentationResult, *, thickness_m: float, fluid_volume_m3: float
-    ) -> SimulatedIndentation:
+    ) -> SimulatedRun:
         """From a solver's result, whose steps begin at the second pose, and its finger."""
         forces = from_rest(trajectory.forces)
         return cls(
@@ -80,7 +80,7 @@ class Simulator(Protocol):
 
     def simulate(
         self, parameters: FingertipParameters, indenter: str, path: Floats
-    ) -> SimulatedIndentation:
+    ) -> SimulatedRun:
         """Indent a finger of these parameters along a path, shape (K, 7)."""
         ...
 
@@ -106,12 +106,12 @@ class SimulationRuns:
         self._simulator = simulator
         self._executor = executor
         self._on_run = on_run
-        self._memo: dict[Key, SimulatedIndentation] = {}
+        self._memo: dict[Key, SimulatedRun] = {}
         self.count = 0
 
     def run(
         self, jobs: Iterable[tuple[FingertipParameters, MeasuredIndentation]]
-    ) -> list[SimulatedIndentation]:
+    ) -> list[SimulatedRun]:
         """Results in the order of the jobs; what ran before is not run again.
 
         A run that the simulator refuses gives a result without steps, with the reason.
@@ -130,12 +130,12 @@ class SimulationRuns:
 
     def _results(
         self, new: dict[Key, tuple[FingertipParameters, MeasuredIndentation]]
-    ) -> Iterable[tuple[Key, SimulatedIndentation]]:
+    ) -> Iterable[tuple[Key, SimulatedRun]]:
         if self._executor is None:
             for key, (parameters, item) in new.items():
                 yield key, _simulate(self._simulator, parameters, item.indenter, item.pose)
             return
-        futures: dict[Future[SimulatedIndentation], Key] = {}
+        futures: dict[Future[SimulatedRun], Key] = {}
         try:
             for key, (parameters, item) in new.items():
                 future = self._executor.submit(
@@ -156,13 +156,13 @@ class SimulationRuns:
 
 def _simulate(
     simulator: Simulator, parameters: FingertipParameters, indenter: str, path: Floats
-) -> SimulatedIndentation:
+) -> SimulatedRun:
     """One run; if it is refused, only this trajectory has no result."""
     try:
         return simulator.simulate(parameters, indenter, path)
     except (SimulationError, ConfigError) as error:
         nothing = np.empty(0)
-        return SimulatedIndentation(
+        return SimulatedRun(
             np.empty((0, 3)),
             nothing,
             math.nan,
@@ -185,7 +185,7 @@ def simulate_all(
     *,
     executor: Executor | None = None,
     on_run: Callable[[int, int], None] | None = None,
-) -> dict[str, SimulatedIndentation]:
+) -> dict[str, SimulatedRun]:
     """Simulate every measured trajectory; sensors that share a path share its run.
 
     Returns:

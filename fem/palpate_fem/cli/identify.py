@@ -23,7 +23,7 @@ from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
 from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
-from palpate_fem.calibration.runs import SimulatedIndentation, simulate_all
+from palpate_fem.calibration.runs import SimulatedRun, simulate_all
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
 from palpate_fem.config import EDGE_M, FingertipParameters
@@ -125,7 +125,7 @@ def validate_command(
 
 def _simulated(
     chosen: Sequence[MeasuredIndentation], model: FingertipModel, workers: int
-) -> dict[str, SimulatedIndentation]:
+) -> dict[str, SimulatedRun]:
     with simulator_for(model, workers, len(chosen)) as (simulator, executor), _search_bar() as bar:
         return simulate_all(
             simulator, model.parameters, chosen, executor=executor, on_run=bar.on_run

@@ -18,7 +18,7 @@ from typing import Protocol
 
 from palpate.errors import RemoteError, SimulationError
 from palpate.process import Closing
-from palpate_fem.calibration.runs import SimulatedIndentation
+from palpate_fem.calibration.runs import SimulatedRun
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import check_path
@@ -348,7 +348,7 @@ class PoolSimulator(Closing):
 
     def simulate(
         self, parameters: FingertipParameters, indenter: str, path: Floats
-    ) -> SimulatedIndentation:
+    ) -> SimulatedRun:
         """Indent a finger of these parameters along a path, shape (K, 7).
 
         Raises:
@@ -371,9 +371,7 @@ class PoolSimulator(Closing):
                 raise SimulationError(event.problem, remedy=event.remedy)
             elif isinstance(event, JobEnded):
                 done = event.trajectory(indenter, poses, steps)
-                return SimulatedIndentation.of(
-                    done, thickness_m=thickness_m, fluid_volume_m3=fluid_m3
-                )
+                return SimulatedRun.of(done, thickness_m=thickness_m, fluid_volume_m3=fluid_m3)
 
     def close(self) -> None:
         """End the workers."""

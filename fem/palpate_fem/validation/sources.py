@@ -17,7 +17,7 @@ from palpate_fem.calibration.measured import (
     is_file_of,
     read_indentations,
 )
-from palpate_fem.calibration.runs import SimulatedIndentation, from_rest
+from palpate_fem.calibration.runs import SimulatedRun, from_rest
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.store.content import TrajectorySummary
 from palpate_fem.store.read import SimulationStore
@@ -69,7 +69,7 @@ def measured_from(path: Path) -> tuple[tuple[MeasuredIndentation, ...], dict[str
 
 def simulated_from(
     store: SimulationStore, measured: Sequence[MeasuredIndentation]
-) -> tuple[dict[str, SimulatedIndentation], dict[str, str]]:
+) -> tuple[dict[str, SimulatedRun], dict[str, str]]:
     """The stored simulation of each measured trajectory.
 
     One simulation serves every sensor: ``sphere_medium/03/normal`` belongs to
@@ -87,7 +87,7 @@ def simulated_from(
         DatasetError: The store is damaged.
     """
     tip, there = store.fingertip(), set(store.ids())
-    found: dict[str, SimulatedIndentation] = {}
+    found: dict[str, SimulatedRun] = {}
     refused: dict[str, str] = {}
     for item in measured:
         names = (item.name, item.name.removesuffix(f"/{item.sensor}"))
@@ -101,7 +101,7 @@ def simulated_from(
             continue
         force = from_rest(summary.force)
         ahead = _direction(item.pose) @ (summary.path[0, :3] - item.pose[0, :3])
-        found[item.name] = SimulatedIndentation(
+        found[item.name] = SimulatedRun(
             force,
             path_lengths(summary.path)[: len(force)] + ahead,
             tip.total_thickness_m,

@@ -35,7 +35,7 @@ from palpate_fem.calibration.alignment import (
 )
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.result import write_json
-from palpate_fem.calibration.runs import SimulatedIndentation
+from palpate_fem.calibration.runs import SimulatedRun
 from palpate_fem.result import IndentationOutcome
 
 PAPER_RANGE_N = (0.226, 0.486)
@@ -154,7 +154,7 @@ class Validation:
 
 def validate(
     measured: Sequence[MeasuredIndentation],
-    simulated: Mapping[str, SimulatedIndentation],
+    simulated: Mapping[str, SimulatedRun],
     *,
     threshold_n: float = THRESHOLD_N,
     increments: int = INCREMENTS,
@@ -191,7 +191,7 @@ def validate(
 
 
 def _compare(
-    item: MeasuredIndentation, run: SimulatedIndentation, threshold_n: float, increments: int
+    item: MeasuredIndentation, run: SimulatedRun, threshold_n: float, increments: int
 ) -> ComparedTrajectory:
     pair = align(
         run.curve, curve(item.pose, item.force), threshold_n=threshold_n, increments=increments
