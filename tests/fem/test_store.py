@@ -17,6 +17,7 @@ import pytest
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.service.biotac import biotac
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreMismatchError, StoreTakenError
 from palpate_fem.store.read import SimulationStore
@@ -265,3 +266,28 @@ def test_measured_trajectories_need_poses_and_forces_only(tmp_path: Path) -> Non
         store.trajectory("cube/01")
     with pytest.raises(DatasetError, match="fingertip"):
         store.fingertip()
+
+
+def test_settings_keep_the_names_that_stores_have() -> None:
+    """A store of before goes on only if the names of all settings are those that it holds."""
+    tip = biotac(edge_m=1e-3, layers=1)(FingertipParameters(), lambda _: None).describe()
+    assert sorted(tip.settings) == [
+        "contact.complement",
+        "contact.margin_m",
+        "contact.stiffness",
+        "contact.tangential_stiffness",
+        "force_limit_n",
+        "newton.creep_iterations",
+        "newton.gap_tolerance_m",
+        "newton.iterations",
+        "newton.keep_elastic",
+        "newton.keep_factor",
+        "newton.largest_move_m",
+        "newton.tolerance",
+        "newton.traction_tolerance",
+        "newton.volume_tolerance",
+        "predict",
+        "smallest_increment",
+        "solver",
+        "volume_barrier",
+    ]

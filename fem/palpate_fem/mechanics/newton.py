@@ -60,7 +60,7 @@ class NewtonSettings:
     gap_tolerance_m: float = 0.1e-6
     traction_tolerance: float = 0.01
     iterations: int = 20
-    pseudo_transient_iterations: int = 40
+    pseudo_transient_iterations: int = field(default=40, metadata={"stored_as": "creep_iterations"})
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
     keep_elastic: float = 0.15

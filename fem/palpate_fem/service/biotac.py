@@ -117,5 +117,6 @@ def _named(settings: object, above: str = "") -> list[tuple[str, Setting]]:
         if is_dataclass(value):
             found += _named(value, f"{above}{field.name}.")
         elif isinstance(value, bool | int | float | str):
-            found.append((above + field.name, value))
+            # Stores compare these names: a setting that was renamed keeps the name it is stored as.
+            found.append((above + field.metadata.get("stored_as", field.name), value))
     return found
