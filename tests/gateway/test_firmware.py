@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.gateway.spi_words import encode_word
 
 from palpate_gateway.protocols.bridge import (
     BridgeDecoder,
@@ -20,7 +21,7 @@ from palpate_gateway.protocols.bridge import (
     BridgeStatus,
 )
 from palpate_gateway.protocols.channels import SEQUENCES
-from palpate_gateway.protocols.spi import channel_of_command, encode_word
+from palpate_gateway.protocols.spi import channel_of_command
 
 FIRMWARE = Path(__file__).parents[2] / "deploy" / "firmware" / "bridge"
 

@@ -342,19 +342,6 @@ class RobotousSerialDecoder(FrameFinder[bytes]):
         super().__init__({_HEAD: data_bytes + _EXTRA_BYTES}, _is_good, lambda frame: frame[1:-2])
 
 
-def can_messages(
-    payload: bytes, first_id: int = FIRST_ID, second_id: int = SECOND_ID
-) -> tuple[tuple[int, bytes], tuple[int, bytes]]:
-    """Id and data of the two messages that carry one answer.
-
-    Raises:
-        ValueError: There are not 16 data bytes.
-    """
-    if len(payload) != REPLY_BYTES:
-        raise ValueError(f"{len(payload)} data bytes are not {REPLY_BYTES}")
-    return (first_id, payload[:_HALF_BYTES]), (second_id, payload[_HALF_BYTES:])
-
-
 class RobotousCanDecoder:
     """Data bytes out of CAN messages.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from tests.fuzz.streams import parts
+from tests.gateway.spi_words import decode_word
 
 from palpate_gateway.protocols.can_slots import (
     FINGERS_MAX,
@@ -13,7 +14,7 @@ from palpate_gateway.protocols.can_slots import (
 )
 from palpate_gateway.protocols.channels import CHANNEL_NAMES, SEQUENCES
 from palpate_gateway.protocols.slot_clock import learn_order
-from palpate_gateway.protocols.spi import channel_of_command, decode_word
+from palpate_gateway.protocols.spi import channel_of_command
 
 
 def check(data: bytes) -> None:

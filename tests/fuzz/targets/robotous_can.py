@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from tests.fuzz.streams import parts
 from tests.fuzz.targets.robotous_serial import check_answer
+from tests.gateway.robotous_messages import can_messages
 
 from palpate_gateway.protocols.robotous import (
     FIRST_ID,
     SECOND_ID,
     RobotousCanDecoder,
-    can_messages,
 )
 
 

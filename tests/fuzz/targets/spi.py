@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from tests.gateway.spi_words import CHANNEL_MAX, command_byte, decode_word, encode_word
 
 from palpate.messages import COUNTS_MAX
 from palpate_gateway.protocols.spi import (
-    CHANNEL_MAX,
     ERROR_WORDS,
     WordKind,
     channel_of_command,
-    command_byte,
-    decode_word,
     decode_words,
-    encode_word,
     printable_prefix,
 )
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.gateway import spi_words
 from tests.gateway.bridge_packets import encode, encode_packet, sealed_packet
 
-from palpate_gateway.protocols import spi
 from palpate_gateway.protocols.bridge import (
     BridgeBody,
     BridgeDecoder,
@@ -88,10 +88,10 @@ def test_slots_are_read_as_those_of_a_bus() -> None:
 @pytest.mark.parametrize("name", ["biotac_e1_first", "biotac_pac_first"])
 def test_bridge_times_place_slots_without_doubt(name: str) -> None:
     decoder, clock = BridgeDecoder(), SlotClock(sequence=SEQUENCES[name], exact=True)
-    words = spi.encode_word(2040)
+    words = spi_words.encode_word(2040)
     group = BridgeSlots(
         1,
-        tuple(bytes((spi.command_byte(c),)) + words for c in SEQUENCES[name]),
+        tuple(bytes((spi_words.command_byte(c),)) + words for c in SEQUENCES[name]),
     )
     places = []
     for number in [0, 1, 2, 5, 6]:

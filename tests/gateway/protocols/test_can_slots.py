@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.gateway import spi_words
 
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.protocols import spi
@@ -45,7 +46,7 @@ def decode(decoder: SlotDecoder, *payloads: bytes) -> list[Told]:
 
 
 def slot(channel: int, *words: str) -> bytes:
-    return bytes((spi.command_byte(channel),)) + bytes.fromhex("".join(words))
+    return bytes((spi_words.command_byte(channel),)) + bytes.fromhex("".join(words))
 
 
 def test_vector_of_three_fingers() -> None:
@@ -98,10 +99,10 @@ def test_every_error_word_has_its_counter(letter: str) -> None:
 def test_every_word_is_what_the_rule_says() -> None:
     """All 65,536 of them, by the table and by the rule for one word."""
     decoder = SlotDecoder(fingers=1)
-    command = bytes((spi.command_byte(17),))
+    command = bytes((spi_words.command_byte(17),))
     payloads = [command + bytes(divmod(word, 256)) for word in range(1 << 16)]
     told = decode(decoder, *payloads)
-    rules = [spi.decode_word(payload[1:]) for payload in payloads]
+    rules = [spi_words.decode_word(payload[1:]) for payload in payloads]
     assert told == [(17, [rule.value], [rule.kind]) for rule in rules]
     counts = decoder.finger_counters[0]
     assert counts["absent"] == sum(rule.kind is WordKind.ABSENT for rule in rules)
@@ -178,7 +179,7 @@ def test_every_frame_is_accounted_for(frames: list[bytes], at_once: int) -> None
     st.lists(st.integers(0, 4095), min_size=3, max_size=3),
 )
 def test_words_of_a_finger_survive(channel: int, values: list[int]) -> None:
-    data = slot(channel) + b"".join(map(spi.encode_word, values))
+    data = slot(channel) + b"".join(map(spi_words.encode_word, values))
     assert decode(CanSlotDecoder(fingers=3), data) == [(channel, values, [WordKind.GOOD] * 3)]
 
 

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.spi_words import decode_word
 
 from palpate_gateway.protocols import bota, kms40, optoforce, pic32, robotous
 from palpate_gateway.protocols.framing import crc16_x25
 from palpate_gateway.protocols.rdt import HEX, NET_FT, RdtDecoder, RdtScale, hex_filter_request
 from palpate_gateway.protocols.robotous import RobotousSerialDecoder, serial_frame
-from palpate_gateway.protocols.spi import WordKind, channel_of_command, decode_word
+from palpate_gateway.protocols.spi import WordKind, channel_of_command
 
 SENT: dict[str, tuple[Callable[[], bytes], str]] = {
     "3.1 identity": (

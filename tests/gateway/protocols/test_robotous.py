@@ -5,6 +5,7 @@ import struct
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from tests.gateway.robotous_messages import can_messages
 
 from palpate_gateway.protocols import robotous as framing
 from palpate_gateway.protocols import robotous as rft
@@ -240,7 +241,7 @@ CAN_ORDERS = {
 
 def can_message(name: str) -> tuple[int, bytes]:
     payload = payload_of([int(name[1])] * 6)
-    return framing.can_messages(payload)[name[0] == "s"]
+    return can_messages(payload)[name[0] == "s"]
 
 
 @pytest.mark.parametrize(("order", "wanted"), CAN_ORDERS.items())
@@ -260,7 +261,7 @@ def test_can_halves(order: str, wanted: tuple[list[int], int, int, int]) -> None
 
 def test_can_ids_are_settings() -> None:
     decoder = framing.RobotousCanDecoder(first_id=0x21, second_id=0x20)
-    first, second = framing.can_messages(DATA, 0x21, 0x20)
+    first, second = can_messages(DATA, 0x21, 0x20)
     assert framing.REQUEST_ID == 0x64
     assert decoder.feed(1, b"12345678") == []
     assert decoder.feed(*first) == []
@@ -270,7 +271,7 @@ def test_can_ids_are_settings() -> None:
         with pytest.raises(ValueError, match=r"1\.\.255"):
             framing.RobotousCanDecoder(*ids)
     with pytest.raises(ValueError, match="not 16"):
-        framing.can_messages(DATA[:8])
+        can_messages(DATA[:8])
 
 
 def test_can_message_of_wrong_length_takes_its_sample_with_it() -> None:

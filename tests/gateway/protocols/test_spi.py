@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.gateway import spi_words
 
 from palpate.messages import BIOTAC_LAYOUT, BIOTAC_SP_LAYOUT, FrameLayout
 from palpate_gateway.protocols import channels, spi
@@ -25,20 +26,20 @@ byte = st.integers(0, 255)
 
 @pytest.mark.parametrize(("channel", "command"), COMMANDS.items())
 def test_command_vectors(channel: int, command: int) -> None:
-    assert spi.command_byte(channel) == command
+    assert spi_words.command_byte(channel) == command
     assert spi.channel_of_command(command) == channel
 
 
 @pytest.mark.parametrize(("value", "word"), WORDS.items())
 def test_word_vectors(value: int, word: str) -> None:
-    assert spi.encode_word(value) == bytes.fromhex(word)
-    decoded = spi.decode_word(bytes.fromhex(word))
-    assert decoded == spi.SpiWord(spi.WordKind.GOOD, value, False, "")
+    assert spi_words.encode_word(value) == bytes.fromhex(word)
+    decoded = spi_words.decode_word(bytes.fromhex(word))
+    assert decoded == spi_words.SpiWord(spi.WordKind.GOOD, value, False, "")
 
 
 @pytest.mark.parametrize("word", ["0000", "FFFF"])
 def test_absent_finger(word: str) -> None:
-    assert spi.decode_word(bytes.fromhex(word)).kind is spi.WordKind.ABSENT
+    assert spi_words.decode_word(bytes.fromhex(word)).kind is spi.WordKind.ABSENT
 
 
 @pytest.mark.parametrize(
@@ -55,16 +56,16 @@ def test_absent_finger(word: str) -> None:
     ],
 )
 def test_error_words_are_named(letter: str, meaning: str) -> None:
-    word = spi.decode_word(b"\xa5" + letter.encode())
+    word = spi_words.decode_word(b"\xa5" + letter.encode())
     assert (word.kind, word.value, word.error) == (spi.WordKind.DEVICE_ERROR, 0, meaning)
 
 
 def test_unnamed_error_word_is_a_bit_error() -> None:
-    assert spi.decode_word(b"\xa5Z").kind is spi.WordKind.BIT_ERROR
+    assert spi_words.decode_word(b"\xa5Z").kind is spi.WordKind.BIT_ERROR
 
 
 def test_set_low_bits_are_suspicious_not_fatal() -> None:
-    word = spi.decode_word(bytes((0x01, spi.with_odd_parity(0x0E))))
+    word = spi_words.decode_word(bytes((0x01, spi_words.with_odd_parity(0x0E))))
     assert (word.kind, word.value, word.suspicious) == (spi.WordKind.GOOD, 1, True)
 
 
@@ -99,34 +100,34 @@ def test_frame_rates() -> None:
 @pytest.mark.parametrize("channel", [-1, 64])
 def test_command_out_of_range(channel: int) -> None:
     with pytest.raises(ValueError, match=r"not in 0\.\.63"):
-        spi.command_byte(channel)
+        spi_words.command_byte(channel)
 
 
 @pytest.mark.parametrize("value", [-1, 4096])
 def test_value_out_of_range(value: int) -> None:
     with pytest.raises(ValueError, match="4095"):
-        spi.encode_word(value)
+        spi_words.encode_word(value)
 
 
 @given(st.integers(0, 63), st.integers(0, 7))
 def test_commands_survive_and_flips_show(channel: int, bit: int) -> None:
-    command = spi.command_byte(channel)
+    command = spi_words.command_byte(channel)
     assert spi.channel_of_command(command) == channel
     assert spi.channel_of_command(command ^ 1 << bit) is None
 
 
 @given(st.integers(0, 4095), st.integers(0, 15))
 def test_any_flipped_bit_is_detected(value: int, bit: int) -> None:
-    word = int.from_bytes(spi.encode_word(value), "big")
-    assert spi.decode_word(word.to_bytes(2, "big")).value == value
-    flipped = spi.decode_word((word ^ 1 << bit).to_bytes(2, "big"))
+    word = int.from_bytes(spi_words.encode_word(value), "big")
+    assert spi_words.decode_word(word.to_bytes(2, "big")).value == value
+    flipped = spi_words.decode_word((word ^ 1 << bit).to_bytes(2, "big"))
     assert flipped.kind is not spi.WordKind.GOOD
 
 
 @given(st.lists(st.tuples(byte, byte), max_size=64))
 def test_vectorised_agrees_and_never_raises(words: list[tuple[int, int]]) -> None:
     many = spi.decode_words(np.array(words, np.uint8).reshape(-1, 2))
-    single = [spi.decode_word(bytes(word)) for word in words]
+    single = [spi_words.decode_word(bytes(word)) for word in words]
     assert many.kind.tolist() == [int(word.kind) for word in single]
     assert many.value.tolist() == [word.value for word in single]
     assert many.suspicious.tolist() == [word.suspicious for word in single]
