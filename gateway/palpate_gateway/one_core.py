@@ -47,9 +47,9 @@ def stay_on_one_core(choice: CoreChoice) -> int | None:
             return None
         choice = _idlest(allowed)
     elif choice not in allowed:
-        told = ", ".join(map(str, sorted(allowed)))
+        numbers = ", ".join(map(str, sorted(allowed)))
         raise ConfigError(
-            f"[gateway] core {choice}: this process may run on {told}",
+            f"[gateway] core {choice}: this process may run on {numbers}",
             remedy='name one of them, or "idlest", or "any" to let the system decide',
         )
     for task in _TASKS.iterdir():

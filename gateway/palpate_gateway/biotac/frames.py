@@ -93,7 +93,7 @@ class FrameAssembler:
         if not len(block):
             return []
         self._count(block)
-        slots = SlotBlock.joined([self._pending, block])
+        slots = SlotBlock.joined([self._pending, block]) if len(self._pending) else block
         readings: list[ElectrodeReading] = []
         at = self._take_usual(slots, readings)
         slots = self._without_late(slots.part(at, len(slots)) if at else slots)

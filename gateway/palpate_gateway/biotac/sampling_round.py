@@ -170,9 +170,9 @@ class PacNumbers:
         """Learn the order from a whole frame; None of another."""
         if len(frame) < self._layout.slots:
             return None
-        told = bool((frame.position >= 0).all())
-        in_order = np.argsort(frame.position, kind="stable") if told else np.arange(len(frame))
-        if told and not np.diff(frame.position[in_order]).all():
+        known = bool((frame.position >= 0).all())
+        in_order = np.argsort(frame.position, kind="stable") if known else np.arange(len(frame))
+        if known and not np.diff(frame.position[in_order]).all():
             return None  # a position came twice, so another may be missing
         channels = frame.channel[in_order]
         if self.round is None or channels.tobytes() != self.round.channel_bytes:

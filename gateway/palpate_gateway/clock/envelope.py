@@ -101,14 +101,14 @@ class ClockEnvelope:
         if span_s < _SLOPE_S:
             self._lie_under(points, self._slope)  # after a long silence the earlier slope stays
             return
-        believed = _PPM * (_WILD_PPM if span_s >= SETTLED_S else QUARTZ_PPM)
+        accepted = _PPM * (_WILD_PPM if span_s >= SETTLED_S else QUARTZ_PPM)
         slope = middle_slope(points)
-        if abs(slope) <= believed:
+        if abs(slope) <= accepted:
             self._lie_under(points, slope)
             return
         # No clock drifts like that, so its past is no guide: only the last second counts.
         recent = tuple(point for point in points if point[0] >= points[-1][0] - _SLOPE_S)
-        self._lie_under(recent, math.copysign(believed, slope))
+        self._lie_under(recent, math.copysign(accepted, slope))
 
     def _lie_under(self, points: Sequence[EnvelopePoint], slope: float) -> None:
         at_s = points[-1][0]

@@ -175,9 +175,9 @@ class KernelStamps:
             return np.full(len(stamps_ns), arrival_ns)
         received_ns = stamps_ns - self._wall.offset_ns
         waited_ns = arrival_ns - received_ns
-        believed = (waited_ns >= -_EARLY_NS) & (waited_ns <= self._oldest_ns(arrival_ns))
-        self.refused += int(len(believed) - np.count_nonzero(believed))
-        came_ns = np.where(believed, np.minimum(received_ns, arrival_ns), arrival_ns)
+        plausible = (waited_ns >= -_EARLY_NS) & (waited_ns <= self._oldest_ns(arrival_ns))
+        self.refused += int(len(plausible) - np.count_nonzero(plausible))
+        came_ns = np.where(plausible, np.minimum(received_ns, arrival_ns), arrival_ns)
         return np.minimum.accumulate(came_ns[::-1])[::-1]
 
     def _oldest_ns(self, arrival_ns: int) -> int:

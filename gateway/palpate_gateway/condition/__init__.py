@@ -1,1 +1,1 @@
-"""How a sensor does, told from its frames: whether it is touched, settled, warm and intact."""
+"""The condition of a sensor, judged from its frames: still, untouched, warm, intact."""

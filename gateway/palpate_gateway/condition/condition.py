@@ -277,15 +277,15 @@ class Condition:
     @property
     def message(self) -> str:
         """One line for the status; empty = all is well."""
-        told = [describe(self.faults)] if self.faults else []
+        parts = [describe(self.faults)] if self.faults else []
         if self.warming and self._warm_up.slope_counts_per_min is not None:
-            told.append("warming up, so the baseline drifts: tare before you measure")
+            parts.append("warming up, so the baseline drifts: tare before you measure")
         level = self._level
         if level.touch is TouchState.UNTOUCHED and level.drift_counts > DRIFT_COUNTS:
-            told.append(f"E{level.drift_electrode + 1} has drifted from the tare: tare again")
+            parts.append(f"E{level.drift_electrode + 1} has drifted from the tare: tare again")
         elif level.touch is TouchState.HELD:
-            told.append("still, but not where it rested: it is held, or has to be tared again")
-        return "; ".join(told)
+            parts.append("still, but not where it rested: it is held, or has to be tared again")
+        return "; ".join(parts)
 
     def gauges(self) -> dict[str, float]:
         """Present values; may be called from any thread."""

@@ -117,8 +117,8 @@ class Datagrams:
                 raise OSError(number, os.strerror(number))
             count = 0
         taken, control = headers[:count], self._control[:count]
-        told = (taken["control_size"] >= _STAMP_SIZE) & (control[:, 1] == _STAMP_KIND)
-        stamps_ns = np.where(told, control[:, 2] * 1_000_000_000 + control[:, 3], NO_STAMP)
+        stamped = (taken["control_size"] >= _STAMP_SIZE) & (control[:, 1] == _STAMP_KIND)
+        stamps_ns = np.where(stamped, control[:, 2] * 1_000_000_000 + control[:, 3], NO_STAMP)
         whole = (taken["flags"] & _MSG_TRUNC) == 0
         return DatagramBatch(self._data[:count], taken["size"] * whole, stamps_ns)
 

@@ -316,7 +316,7 @@ def query_request(query: KmsQuery) -> bytes:
 
 
 def identify_requests() -> tuple[bytes, ...]:
-    """Ask who the device is: identity, serial number and version, one request each."""
+    """Ask for identity, serial number and version, one request each."""
     return tuple(map(query_request, (KmsQuery.IDENTITY, KmsQuery.SERIAL_NUMBER, KmsQuery.VERSION)))
 
 

@@ -1,4 +1,4 @@
-"""Stalls of the host and losses of frames, told apart by the stamps of a steady stream.
+"""Stalls of the host and losses of frames, distinguished by the stamps of a steady stream.
 
 Delays are never negative (hardware reference 5.2). After a stall of the host the late slots come in
 a burst, and the delay returns to its usual value; after a loss it stays larger. A busy sender or
@@ -25,7 +25,7 @@ _SCATTER_S = 1.5e-3
 """Delays whose spread exceeds the usual one by more than this are not steady [s]."""
 
 _ENVELOPE_S = 0.1
-"""How long the least delay is remembered [s]."""
+"""The smallest delay is taken over this time and the one before [s]."""
 
 _SPREADS = 30
 """The smallest spread in so many of these times is the usual one."""

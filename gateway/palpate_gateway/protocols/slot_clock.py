@@ -62,7 +62,7 @@ class SlotPlaces:
 
 
 _LEARNT_FROM = 128
-"""Slots in a row that must repeat before their order is believed: two cycles of up to 64."""
+"""Slots in a row that must repeat before their order is accepted: two cycles of up to 64."""
 
 _SCATTER_S = 2e-3
 """No stamp is too early by more than this [s]."""
@@ -232,8 +232,8 @@ class SlotClock:
         stamped = zip(channels.tolist(), stamps_s.tolist(), strict=True)
         places = [self.place(*slot) for slot in stamped]
         kept = [number for number, place in enumerate(places) if place is not None]
-        told = [(p.run, p.frame, p.position) for p in places if p is not None]
-        run, frame, position = np.array(told, np.int64).reshape(-1, 3).T
+        placed = [(p.run, p.frame, p.position) for p in places if p is not None]
+        run, frame, position = np.array(placed, np.int64).reshape(-1, 3).T
         times = np.array([p.time_s for p in places if p is not None], np.float64)
         return SlotPlaces(np.array(kept, np.int64), run, frame, position, times)
 

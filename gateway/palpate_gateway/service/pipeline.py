@@ -132,8 +132,9 @@ class Pipeline:
             What is to be published, in order.
         """
         out: list[DueMessage] = []
+        ledger = self.ledger
         for reading in readings:
-            item = self._stamper.message(reading, arrival_ns, self.ledger.current_id)
+            item = self._stamper.message(reading, arrival_ns, ledger.current_id)
             if isinstance(item.message, ElectrodeFrame):
                 self._counts["missing_frames"] += item.message.stamp.missed_before
                 self._pass(item, out)

@@ -196,7 +196,7 @@ class SensorWorker:
         try:
             self._serve()
         except LinkError as error:
-            # Without the bus no sensor can be served: the supervisor starts the process afresh.
+            # Without the bus no sensor can be served: the supervisor restarts the process.
             if not self._stop.is_set():
                 self.crash = error
         except PalpateError as error:
