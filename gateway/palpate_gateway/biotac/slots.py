@@ -56,7 +56,7 @@ class SlotBlock:
     def part(self, start: int, stop: int) -> SlotBlock:
         """Slots ``start`` to ``stop - 1`` as views."""
         cut = slice(start, stop)
-        # Spelled out, for this runs for every block: a loop over the columns takes 1.5 times as long.
+        # Spelled out, as it runs for every block: a loop over the columns takes 1.5 times as long.
         return SlotBlock(
             self.channel[cut],
             self.value[cut],
