@@ -103,6 +103,32 @@ def _real_force() -> Iterator[Claim]:
             figures[f"angle{finger}"] = f"{metrics['force_angle_median_rad']:.3f}"
         cells = (f"{bold}{{force{finger}}} N, {{angle{finger}}} rad{bold}" for finger in "12")
         yield Claim("README.md", f"| {label} | {' | '.join(cells)} |", figures)
+    figures = {
+        f"{model}{finger}{metric}": f"{rows[f'lasa-finger{finger}, {held}', name][key]:.{digits}f}"
+        for finger in "12"
+        for model, name, held, metric, key, digits in (
+            ("net", "MLP", "20 blocks", "n", "force_magnitude_median_n", 3),
+            ("net", "MLP", "20 blocks", "rad", "force_angle_median_rad", 3),
+            (
+                "constant",
+                "constant (training mean)",
+                "20 blocks",
+                "n",
+                "force_magnitude_median_n",
+                3,
+            ),
+            ("line", "linear fit", "20 blocks", "n", "force_magnitude_median_n", 3),
+            ("long", "MLP", "10 blocks", "n", "force_magnitude_median_n", 3),
+            ("unseen", "MLP", "unseen", "n", "force_magnitude_median_n", 2),
+        )
+    }
+    yield Claim(
+        "training/README.md",
+        "magnitude {net1n} N and {net2n} N, angle {net1rad} rad and {net2rad} rad (medians;"
+        " constant {constant1n} and {constant2n} N, line {line1n} and {line2n} N). With 18 s blocks"
+        " finger 2 has {long2n} N, and an unseen finger {unseen1n} to {unseen2n} N",
+        figures,
+    )
 
 
 def _twin() -> Iterator[Claim]:

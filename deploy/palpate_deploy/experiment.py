@@ -1,7 +1,7 @@
 """The finite elements as the experiment of the training room uses them.
 
-Training says in `palpate_training.experiment.generate.simulator` what it needs; this module is the
-implementation, and the only place where the two rooms meet.
+Training states in `palpate_training.experiment.generate.simulator` what it needs; this module is
+the implementation, and the only place where the two rooms meet.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
     OnProgress,
     SimulatedFingertip,
-    SimulatedIndentation,
     SimulatedStep,
+    SimulatedTrajectory,
     Specimen,
 )
 from palpate_training.experiment.generate.workers import RayCluster
@@ -157,7 +157,7 @@ class FemSpecimens:
         """Ideal counts of each untouched specimen."""
         return self._population.rest_counts
 
-    def clear_steps(self, indentation: SimulatedIndentation) -> int:
+    def clear_steps(self, indentation: SimulatedTrajectory) -> int:
         """How many steps there are before the indenter bears on what holds the finger."""
         return clear_steps(cast("IndentationResult", indentation), self._held)
 
@@ -342,7 +342,7 @@ class FemSimulator:
         units = tuple(cast("FemSpecimen", specimen).member.specimen for specimen in specimens)
         return FemSpecimensOf(cast("StoredFingertip", fingertip), units)
 
-    def clear_steps(self, indentation: SimulatedIndentation, fingertip: SimulatedFingertip) -> int:
+    def clear_steps(self, indentation: SimulatedTrajectory, fingertip: SimulatedFingertip) -> int:
         """How many steps there are before the indenter bears on what holds the finger."""
         held = cast("StoredFingertip", fingertip).mesh.fixed
         return clear_steps(cast("IndentationResult", indentation), held)

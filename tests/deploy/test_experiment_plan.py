@@ -133,7 +133,7 @@ def test_plan_for_arms_of_ones_own(empty: Path, registration: Path, tmp_path: Pa
         ((*arm, "flange", "--tool-mm", 2000), "all 4 trajectories are eliminated"),
         ((*arm, "wrist"), "no frame 'wrist'"),
         (("--urdf", f"left={urdf}", "--tip-frame", "flange"), "no registration"),
-        (("--edge-mm", 1.0), "have no say"),
+        (("--edge-mm", 1.0), "cannot be given too"),
     ):
         result = run(*words, *more)
         assert result.exit_code == 2

@@ -25,7 +25,7 @@ MakeData = Callable[..., FeatureDataset]
 MAGNITUDE, ANGLE = "force_magnitude_median_n", "force_angle_median_rad"
 TARGET_MAGNITUDE_N = 0.13
 TARGET_ANGLE_RAD = 0.06
-SHORT = FeaturesFitConfig(epochs=25, batch_rows=512)
+SHORT = FeaturesFitConfig(epochs=8, batch_rows=512)
 SHORT_ALLOWANCE = 1.25
 """What a single, short training may be worse than the mean of five full ones."""
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
@@ -121,7 +121,7 @@ def test_published_results_meet_the_target() -> None:
 
 @pytest.mark.slow
 def test_force_on_real_biotacs(shared_data: Path) -> None:
-    """One network for each fold, trained for half as long as the published ones."""
+    """One network for each fold, trained for a sixth as long as the published ones."""
     source = shared_data / "lasa_force_calibration" / "force_calibration.npz"
     if not source.is_file():
         pytest.skip("the LASA force calibration is not among the real data")

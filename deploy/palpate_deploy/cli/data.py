@@ -1,7 +1,7 @@
 """``palpate train`` and ``palpate data``: the training room's commands, and those that add fem.
 
 The training room needs an extra that a station does not have, so its commands are imported when
-one is asked for. The commands of this module run the experiment: they give the training room the
+one is used. The commands of this module run the experiment: they give the training room the
 finite elements.
 """
 
@@ -30,7 +30,7 @@ EXTRA_MODULES = ("torch", "onnx", "h5py", "matplotlib")
 
 
 class _LazyGroup(typer.core.TyperGroup):
-    """A group whose commands are imported when they are asked for, not when palpate starts."""
+    """A group whose commands are imported when one is used, not when palpate starts."""
 
     room = ""
 
@@ -288,7 +288,7 @@ def data_plan(
 
     if store is not None and (edge_mm is not None or fill_ml is not None):
         raise ConfigError(
-            "--store gives the skin, so --edge-mm and --fill-ml have no say",
+            "--store gives the skin, so --edge-mm and --fill-ml cannot be given too",
             remedy="leave them out, or the store",
         )
     spec = ExperimentSpec(

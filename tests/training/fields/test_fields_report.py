@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -133,7 +134,10 @@ def test_files_and_the_papers_rows(
     assert f" {1e3 * value:.3f} (" in row
 
 
-def test_one_command_writes_the_table(mixed: MixedDataset, tmp_path: Path) -> None:
+def test_one_command_writes_the_table(
+    make_mixed: Callable[..., MixedDataset], tmp_path: Path
+) -> None:
+    mixed = make_mixed(trajectories=10, steps=4)  # the numbers are tested above, here the command
     write_mixed(tmp_path / "mixed.h5", mixed)
     write_experiment(tmp_path / "experiment.h5", mixed.experiment)
     few = ["--epochs", "2"]

@@ -128,7 +128,7 @@ def data_export(
     palpate data export twin.h5 twin.csv --csv
     """
     if published == csv:
-        raise ConfigError("say one of --published and --csv", remedy="see palpate data export -h")
+        raise ConfigError("give one of --published and --csv", remedy="see palpate data export -h")
     _, data = load(path)
     if csv:
         console.print(f"wrote {out}: {export_csv(out, data)} rows")
@@ -145,7 +145,7 @@ def data_features(
     ] = UNTOUCHED_ROWS,
     assumed_rest: Annotated[
         int | None,
-        typer.Option(min=0, max=4095, help="Rest [counts] of trials that do not tell theirs."),
+        typer.Option(min=0, max=4095, help="Rest [counts] of trials whose file has none."),
     ] = None,
     axes: AxesOption = "x,y,z",
     force_on_indenter: ForceOption = False,

@@ -241,7 +241,7 @@ def _when(
     if len(given) != 1:
         raise ConfigError(
             f"{len(given)} of --start-wall-ns, --start and --starts are given",
-            remedy="say once when the plan started",
+            remedy="give exactly one of them",
         )
     if start_wall_ns is not None:
         return start_wall_ns

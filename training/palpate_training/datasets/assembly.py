@@ -121,7 +121,7 @@ def interpolate(at: Floats, where: Floats, values: Values) -> Values:
 def _aligned(
     name: str, simulated: SimulatedTrial
 ) -> tuple[Floats, Floats, npt.NDArray[np.float32]]:
-    """Travel since 0.5 N, force and displacement of the steps to be believed."""
+    """Travel since 0.5 N, force and displacement of the steps before the divergence."""
     believed = slice(0, simulated.converged)
     force = simulated.force[believed]
     if not (np.isfinite(force).all() and np.isfinite(simulated.displacement[believed]).all()):
@@ -306,7 +306,7 @@ def _check_trial(rows: TrialRows) -> None:
                 " with at least one row",
                 remedy="give one row of every quantity for each displacement",
             )
-        if what != "rest":  # NaN there says that the source does not tell
+        if what != "rest":  # NaN there means that the source does not hold it
             _check_finite(rows, what, values)
 
 

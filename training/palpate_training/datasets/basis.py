@@ -191,7 +191,7 @@ def subset(
             keeps the modes.
 
     Raises:
-        DatasetError: A trial does not exist, or none is asked for.
+        DatasetError: A trial does not exist, or none is given.
     """
     if isinstance(data, ExperimentDataset):
         return _experiment(data, trials)
@@ -244,7 +244,7 @@ def _rows(
     outside = [trial for trial in trials if not 0 <= trial < data.trials]
     if outside or not len(trials):
         raise DatasetError(
-            f"no trial {outside[0]}" if outside else "no trials were asked for",
-            remedy=f"ask for some of 0..{data.trials - 1}",
+            f"no trial {outside[0]}" if outside else "no trials are given",
+            remedy=f"give some of 0..{data.trials - 1}",
         )
     return np.isin(data.trial, np.asarray(trials))

@@ -125,7 +125,7 @@ def write_header(
     provenance: Provenance,
     numbers: Mapping[str, float | str | int],
 ) -> None:
-    """Write what a file says of itself, as its attributes."""
+    """Write schema, content hash, numbers and provenance as attributes of the file."""
     file.attrs.update(
         {
             **schema.facts,
@@ -199,7 +199,7 @@ def read_tables(
 
 
 def read_provenance(attributes: Mapping[str, Any]) -> Provenance:
-    """Where a file comes from, by its attributes; empty where it does not say."""
+    """Where a file comes from, by its attributes; empty where it has none."""
     return Provenance(
         **{
             key: text(attributes.get(f"provenance.{key}", ""))

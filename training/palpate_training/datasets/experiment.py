@@ -48,7 +48,7 @@ class ExperimentDataset:
         trial_unit: Index into ``unit_names`` of each trial, shape (M,).
         trial_trajectory: Index into ``trajectories`` of each trial, shape (M,).
         trial_rest: Untouched counts of each trial [counts], shape (M, 19); NaN where the source,
-            such as the published files, does not tell.
+            such as the published files, does not hold them.
         trial: Index of the trial of each row, shape (N,), never decreasing.
         travel_m: Travel since 0.5 N [m], shape (N,).
         tared: Tared electrodes over full scale [1], shape (N, 19).
@@ -257,9 +257,9 @@ def _check_finite(data: ExperimentDataset, name: str, values: FloatArray) -> Non
 
 
 EXPERIMENT_SCHEMA = Hdf5Schema(
-    "palpate.experiment", 1, "`palpate data inspect` says what the file is"
+    "palpate.experiment", 1, "`palpate data inspect` shows what the file is"
 )
-MIXED_SCHEMA = Hdf5Schema("palpate.mixed", 1, "`palpate data inspect` says what the file is")
+MIXED_SCHEMA = Hdf5Schema("palpate.mixed", 1, "`palpate data inspect` shows what the file is")
 
 UNITS = {"trial_rest": "counts", "travel_m": "m", "force": "N", "location": "m"}
 """Units of the arrays of a trial or row; all others are numbers."""
@@ -365,7 +365,7 @@ Data = TypeVar("Data")
 
 
 def _named(path: Path, build: Callable[[], Data]) -> Data:
-    """Build a data set; what its own checks say is said of the file."""
+    """Build a data set; errors of its own checks name the file."""
     try:
         return build()
     except DatasetError as error:

@@ -43,7 +43,7 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
 
     The number is the one that the unit's name ends with (``biotac-3``), else its place. Groups
     ``electrode_vals``, ``contact_loc`` [m], ``force_vec`` [N] and ``indenter_type`` have an array
-    ``data`` each; the attribute ``names`` of the last says which indenter a number means. Of a
+    ``data`` each; the attribute ``names`` of the last maps its numbers to indenters. Of a
     mixed data set ``biotac1_simulated.hdf5`` and so on hold the simulated force ``force_res`` [N]
     and the nodal displacement ``nodal_res`` [m], row by row.
 
@@ -203,7 +203,7 @@ def features(
         data: Every row is at 0.5 N or more, so in contact.
         untouched_rows: Rows put before each trial at rest: baseline counts, zero force, no contact
             location.
-        assumed_rest: Rest of every electrode [counts] in trials that do not tell theirs, such as
+        assumed_rest: Rest of every electrode [counts] in trials without one, such as
             published ones. Only differences count for the features; 3300 leaves room for the
             published ranges, -0.78 to 0.17 of full scale.
 
@@ -220,7 +220,7 @@ def features(
             raise DatasetError(
                 f"rest of {data.trial_name(int(np.flatnonzero(unknown)[0]))} is not known"
                 f" ({unknown.sum()} of {data.trials} trials)",
-                remedy="say which rest to assume, e.g. 3300 counts",
+                remedy="state the rest to assume: --assumed-rest 3300",
             )
         rest[unknown] = assumed_rest
     # Where each row of the result comes from: a row of the data, or the rest of a trial (-1).

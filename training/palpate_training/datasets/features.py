@@ -46,7 +46,7 @@ class FeatureDataset:
         sensor_names: Names of the sensors.
         provenance: Where it comes from.
         contact_location: Tip of the indenter [m], sensor frame, shape ``(N, 3)``; NaN where there
-            is no contact; None where nobody knows.
+            is no contact; None where it is not known.
         in_contact: Whether the indenter touches, shape ``(N,)``; None = not known.
         time_ns: Time of the row [ns] on one clock per sensor, shape ``(N,)``; None = not known.
     """

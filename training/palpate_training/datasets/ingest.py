@@ -46,7 +46,8 @@ from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 _log = logging.getLogger(__name__)
 
 TOUCH_N = 0.2
-"""Where no pose says so, a force above this is contact [N]; above the noise of a 6-axis sensor."""
+"""Without a pose that knows contact, a force above this is contact [N]; it is above the noise of a
+6-axis sensor."""
 
 Times = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -68,7 +69,8 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
     A row is a valid, tared electrode frame in whose middle there is a wrench (and a pose, where the
     record has poses of that sensor): between two readings that are at most three periods apart. A
     group is a press: it ends halfway between two contacts.
-    Where the source of the poses cannot know whether it touches, a force above ``TOUCH_N`` says so.
+    Where the source of the poses cannot know whether it touches, a force above ``TOUCH_N`` counts
+    as contact.
 
     Args:
         path: ``NAME.mcap``.

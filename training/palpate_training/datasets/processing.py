@@ -80,8 +80,8 @@ def filter_force(raw: RawTrial) -> RawTrial:
     Forward and backward nothing is delayed, but the backward pass also looks ahead: over the whole
     stream it would draw the step to the next increment into the last sample of each dwell, which is
     the very sample that is kept, and shift the force by up to half an increment. So each increment
-    is filtered by itself, mirrored at its ends. (Turned round a point at its ends, as is SciPy's
-    default, the last sample would keep all its noise.)
+    is filtered on its own, mirrored at its ends. (With SciPy's default, odd extension, the
+    last sample would keep all its noise.)
 
     Args:
         raw: A trial as recorded, before any subsampling (see the head of this file).
@@ -138,9 +138,9 @@ def last_of_increments(raw: RawTrial) -> RawTrial:
     ends = raw.increment_end
     travel_m = raw.travel_m[ends]
     if (np.diff(travel_m) <= 0).any():
-        stuck = int(np.flatnonzero(np.diff(travel_m) <= 0)[0]) + 1
+        first = int(np.flatnonzero(np.diff(travel_m) <= 0)[0]) + 1
         raise DatasetError(
-            f"{trial_name(raw.header)}: travel does not grow at increment {stuck}",
+            f"{trial_name(raw.header)}: travel does not grow at increment {first}",
             remedy="record the press only, without the way back",
         )
     return replace(
@@ -347,7 +347,7 @@ class ForceOnset:
 
     @property
     def exact(self) -> bool:
-        """Whether the first kept row is at exactly 0.5 N by itself, so that none is prepended."""
+        """Whether the first kept row is at exactly 0.5 N, so that none is prepended."""
         return self.share > 1.0 - _SAME
 
     def row(self, values: Values) -> Values:

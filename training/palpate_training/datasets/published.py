@@ -78,10 +78,10 @@ def read_published(
         axes: Where the sensor frame's x, y and z are in the file: ``("x", "-z", "y")`` if its y is
             dorsal.
         force_on_indenter: Whether the file holds the force on the indenter, of opposite sign.
-        command: The command that asked, for the provenance.
+        command: The command line, for the provenance.
 
     Returns:
-        Rows in SI, sensor frame; ``trial_rest`` is NaN, as the files do not tell.
+        Rows in SI, sensor frame; ``trial_rest`` is NaN, as the files do not hold it.
 
     Raises:
         DatasetError: A file or group is missing or damaged, values are not plausible in their unit
@@ -128,7 +128,7 @@ def _present(folder: Path, units: Sequence[int] | None) -> list[int]:
         there = [unit for unit in UNITS if published_file(folder, unit).is_file()]
         raise DatasetError(
             f"{folder}: {', '.join(missing) or 'no unit'} is missing",
-            remedy=f"download it, or ask for the units that are there: {there or 'none'}",
+            remedy=f"download it, or choose among the units that are there: {there or 'none'}",
         )
     return wanted
 
@@ -282,7 +282,7 @@ def _check_frame(folder: Path, files: list[_PublishedFile]) -> None:
         raise DatasetError(
             f"{folder}: contacts lie about {np.round(where * 1e3, 1)} mm and push with"
             f" {np.round(push, 2)} N; in the sensor frame the pad looks to -z and is pushed to +z",
-            remedy="say which axes the files have, and whether the force is that on the indenter",
+            remedy="give --axes, and --force-on-indenter if the force is that on the indenter",
         )
 
 
@@ -324,7 +324,7 @@ class PublishedRun:
         rows: Where.
         indenter: By name.
         start: Tip at 0.5 N [m], shape (3,).
-        direction: Of the path, a unit vector; zero where the path is too short to tell.
+        direction: Of the path, a unit vector; zero where the path is too short.
         travel_m: Of each row along the path, from 0 [m], shape (R,).
     """
 

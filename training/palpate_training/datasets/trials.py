@@ -93,7 +93,7 @@ class RawTrial:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedTrial:
-    """What finite elements say of a trajectory, step by step, from first contact on.
+    """A trajectory in finite elements, step by step, from first contact on.
 
     Attributes:
         trajectory: Its id.
@@ -101,7 +101,7 @@ class SimulatedTrial:
             origin.
         force: Net force on the BioTac [N], shape (S, 3).
         displacement: Of every node from the pressurised state [m], shape (S, V, 3), float32.
-        converged: How many of the steps are to be believed: those before a divergence.
+        converged: How many of the steps count: those before a divergence.
     """
 
     trajectory: str
@@ -149,7 +149,7 @@ class MixedRows:
 
 _log = logging.getLogger(__name__)
 
-TRIALS_SCHEMA = Hdf5Schema("palpate.trials", 1, "`palpate data inspect` says what the file is")
+TRIALS_SCHEMA = Hdf5Schema("palpate.trials", 1, "`palpate data inspect` shows what the file is")
 GROUP = "trials"
 
 COLUMNS: dict[str, StoredColumn] = {
@@ -189,7 +189,7 @@ def write_trials(path: Path, trials: Iterable[RawTrial], provenance: Provenance)
 
     Args:
         path: File to write (``.h5``).
-        trials: May be a stream: each is written before the next is asked for.
+        trials: May be a stream: each is written before the next is taken.
         provenance: Where they come from.
 
     Returns:

@@ -3,8 +3,8 @@
 The paper gives the worst clearance of pin and liner (0.3 mm), the repeatability (0.02 mm) and the
 outcome: 0.5 to 1.5 mm "over the full range of robot joint configurations and end-effector positions
 traversed during testing". Clearance alone explains a tenth of that; the rest is the arm, whose
-links are not as long, and whose joints not as straight, as its kinematic model says. Such an error
-is smooth in the joint angles. Registration takes up what pin and indenter share of it and leaves
+links and joints differ from its kinematic model. Such an error
+is smooth in the joint angles. Registration removes what pin and indenter have in common and leaves
 what differs between the plate, with the pin upright, and the finger, with the indenter turned.
 
 Not from the paper, which leaves it open: the geometry of the plate and the errors of the links.
@@ -40,7 +40,7 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 @dataclass(frozen=True, slots=True)
 class RegistrationErrorModel:
-    """What is not as it should be.
+    """How far a real arm and plate are from the drawing.
 
     Attributes:
         clearance_m: Diameter of liner minus diameter of pin, at worst (paper: 0.3 mm) [m]. The pin
@@ -140,7 +140,7 @@ def simulate_registrations(
     Args:
         arm: By its kinematic model; pin and indenters have the same tip.
         sensor_robot: True pose of the robot frame in the sensor frame.
-        poses: Of the tip where the error is asked for, sensor frame, shape (P, 7).
+        poses: Of the tip at which the error is computed, sensor frame, shape (P, 7).
         model: What is off; None = the defaults.
         draws: Number D of registrations.
         seed: Of the draws.
@@ -165,7 +165,7 @@ def simulate_registrations(
     sd = np.tile(np.repeat([model.link_sd_m, model.joint_sd_rad], 3), count)
     links = random.normal(size=(draws, 6 * count)) * sd
 
-    # The pin is truly at hole + play; the model, which lacks the links' errors, says less of them.
+    # The pin is truly at hole + play; the kinematic model lacks the links' errors.
     # What inverse kinematics would change of the joints for that is of second order.
     play = _play(random, model, (draws, len(holes)))
     in_sensor = holes + play - np.einsum("hik,dk->dhi", at_holes, links)
@@ -175,10 +175,10 @@ def simulate_registrations(
     modelled = poses[None, :, :3] - np.einsum("pik,dk->dpi", at_poses, links)
     modelled += _missed(random, model, (draws, len(poses)))
     for i in range(draws):
-        # a wild model is to be measured here, not refused
+        # a large error is to be measured here, not refused
         found = register(robot_sensor.apply(in_sensor[i]), holes, tolerance_m=math.inf)
-        believed = found.sensor_robot.apply(robot_sensor.apply(modelled[i]))
-        errors[i], residuals[i] = believed - poses[:, :3], found.residual_m
+        by_registration = found.sensor_robot.apply(robot_sensor.apply(modelled[i]))
+        errors[i], residuals[i] = by_registration - poses[:, :3], found.residual_m
     return RegistrationErrors(errors, residuals)
 
 

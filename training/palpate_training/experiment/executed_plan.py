@@ -1,14 +1,11 @@
 """A real experiment: a record and the plan that was executed -> raw trials, as the twin makes them.
 
-The record (`palpate record`, or the station's own) holds electrodes and wrench of the finger, and
-the indenter's pose; instead of poses the robot's joint angles may come as a CSV file. The plan is
-the trajectory file that the robot executed. When it did so is the one thing neither holds: the
+The record (`palpate record`, or the recorder of a running station) holds electrodes and wrench of
+the finger, and the indenter's pose; instead of poses the robot's joint angles may come as a CSV
+file. The plan is the trajectory file that the robot executed. Neither holds when it did so: the
 robot's program notes the wall-clock instant at which it stood at a start pose and began, for the
-whole plan or for each trajectory. Whether the tip then moved as commanded is checked at the end of
-every increment.
-
-
-Joint angles that a robot logged, as a CSV file.
+whole plan or for each trajectory. At the end of every increment the tip is compared with its
+command.
 """
 
 from __future__ import annotations
@@ -209,7 +206,7 @@ def _cut(
     """One trial: the samples from its start to its end that have everything."""
     item = motion.trajectory
     where = f"{record}: trajectory {item.trajectory!r}"
-    # the wall clock says when it started; from there on the steadier one counts
+    # The wall clock gives the start; after it the monotonic clock is used, which never jumps.
     first = int((samples.wall_ns >= start_ns).argmax())
     since_ns = samples.time_ns - samples.time_ns[first] + samples.wall_ns[first] - start_ns
     kept = np.flatnonzero(known & (since_ns >= 0) & (since_ns < round(item.duration_s * 1e9)))
@@ -251,7 +248,7 @@ def _cut(
 def _check_schedule(where: str, missed: Floats) -> None:
     """Compare tip and command where it starts and at the ends of increments.
 
-    The start is what tells a schedule that is early by a whole increment, the end one that is late.
+    A schedule that is early by a whole increment shows at the start, one that is late at the end.
 
     Args:
         where: For the message.

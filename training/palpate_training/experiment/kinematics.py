@@ -202,7 +202,8 @@ class ArmKinematics:
                 np.linalg.norm(off.translation),
                 np.linalg.norm(self._pin.log3(off.rotation)),
             )
-            if i == 0 and errors[0, 0] > 100 * ACCURACY_M:  # hopeless: spare the rest of the path
+            if i == 0 and errors[0, 0] > 100 * ACCURACY_M:
+                # Out of reach: the rest of the path is not solved.
                 rows[:], errors[:] = rows[0], errors[0]
                 break
         return JointSolution(rows, errors[:, 0], errors[:, 1])
@@ -215,7 +216,8 @@ class ArmKinematics:
             if np.abs(twist[:3]).max() < 1e-8 and np.abs(twist[3:]).max() < 1e-8:
                 break
             jacobian = self._jacobian(joints)
-            for _ in joints:  # a joint at its limit that wants to go on is taken out, then again
+            # Joints at a limit that would move further are taken out, and the step is solved again.
+            for _ in joints:
                 gram = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
                 step = jacobian.T @ np.linalg.solve(gram, twist)
                 stuck = ((joints <= self.lower) & (step < 0)) | (

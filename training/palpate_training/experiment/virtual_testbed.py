@@ -79,7 +79,7 @@ def perform(
             one vector for a unit and arm.
         repeatability_m: Root mean square distance by which each increment is missed [m].
         contact_m: Commanded travel at which the skin is first touched [m]: 3 mm as planned, or what
-            `contact_travel` says of a robot that stands wrong by its registration error.
+            `contact_travel` gives for a robot with a registration error.
         length_m: Commanded travel in all [m]; None = to the end of the result, in whole increments.
         since_power_on_s: Age of the force/torque sensor when the trial starts [s].
         seed: Same seed, same trial, where ``read_electrodes`` is deterministic.
@@ -244,7 +244,7 @@ class WrenchSensor:
         seed: int | np.random.Generator,
         since_power_on_s: float = 1800.0,
     ) -> Floats:
-        """What the sensor says of a wrench.
+        """Readings of the sensor for a true wrench.
 
         Args:
             wrench: True wrench, shape (T, 6), or force alone, shape (T, 3).

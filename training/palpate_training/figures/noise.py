@@ -47,7 +47,7 @@ _REAL = {  # the sensor that rests while the other one is pressed
     "finger2_idle_finger1_electrodes_raw": "real, finger 1 idle",
 }
 _SHORTEST_S = 60.0
-"""Drift is told over minutes; a shorter stream says nothing about it."""
+"""Drift shows over minutes; a shorter stream does not show it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def _checked(path: Path, key: str, stream: IdleStream) -> IdleStream:
     if len(stream.counts) < _SHORTEST_S * stream.rate_hz:
         raise DatasetError(
             f"{path}: {key} lasts {len(stream.counts) / stream.rate_hz:.3g} s",
-            remedy=f"record at least {_SHORTEST_S:g} s: drift is told over minutes",
+            remedy=f"record at least {_SHORTEST_S:g} s: drift shows over minutes",
         )
     return stream
 
@@ -286,7 +286,7 @@ def draw_noise(path: Path, streams: Sequence[IdleStream]) -> str:
 
 
 def _about_real(streams: Sequence[IdleStream]) -> str:
-    """What the caption says of the real sensors; empty where there are none."""
+    """The caption's sentence on the real sensors; empty where there are none."""
     if not streams:
         return ""
     repeats = [(np.diff(stream.counts, axis=0) == 0).all(axis=1).mean() for stream in streams]

@@ -1,4 +1,4 @@
-"""Outlines of a fingertip to draw on where no mesh is at hand, and the unwrapped core.
+"""Outlines of a fingertip to draw on where there is no mesh, and the unwrapped core.
 
 Core radius as in the electrode table (docs/conventions.md); the skin's profile is the one of the
 electrode map, rounded: it only shows where the skin is, nothing is measured against it.

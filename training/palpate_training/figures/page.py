@@ -214,7 +214,7 @@ def size_table(statistics: DatasetStatistics) -> str:
 
 
 def unit_table(units: Sequence[SpecimenStatistics], paper: Sequence[int | None]) -> str:
-    """What the paper tells of each BioTac, and ours.
+    """The paper's numbers for each BioTac beside those of this data set.
 
     Args:
         units: The units.

@@ -1,4 +1,4 @@
-"""Numbers of a data set that the paper tells about its own, and its targets for the twin."""
+"""The statistics that the paper reports of its data set, for any data set; targets of the twin."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHEARED = 0.3
 
 @dataclass(frozen=True, slots=True)
 class PaperSpecimen:
-    """What the captions of the paper's figures say of a BioTac."""
+    """What the captions of the paper's figures state about one BioTac."""
 
     tared_min: float
     tared_max: float

@@ -60,7 +60,7 @@ def export_features(
         golden_inputs: Rows of tared counts to ship with their answers, shape ``(G, 19)``.
         contact_threshold_n: Below this estimated force there is no contact [N].
         seed: Seed of the random rows of the parity check.
-        described: What `_export` wants for the manifest.
+        described: Name, version, metrics and so on for the manifest; see `_export`.
 
     Returns:
         The bundle's digest, 32 bytes.
@@ -114,7 +114,7 @@ def export_fields(
         inputs: Held-out inputs for the parity check, shape ``(N, 19)`` [counts] or ``(N, 3V)`` [m];
             the first four are shipped with their answers.
         mesh: Whose nodes move.
-        described: What `_export` wants for the manifest.
+        described: Name, version, metrics and so on for the manifest; see `_export`.
 
     Returns:
         The bundle's digest, 32 bytes.

@@ -225,7 +225,7 @@ def pooling(mesh: SkinMesh) -> FilmPooling:
     if not len(mesh.inner_faces):
         raise DatasetError(
             "the skin mesh has no inner faces, so the film under it is unknown",
-            remedy="generate the data set anew with a mesh that tells its inner surface",
+            remedy="generate the data set anew with a mesh that marks its inner surface",
         )
     inner = np.unique(mesh.inner_faces).astype(np.int64)
     points = mesh.nodes[inner]

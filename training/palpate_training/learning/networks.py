@@ -34,8 +34,8 @@ _SMALLEST_SD = 1e-6
 class Mlp(nn.Module):
     """Tared counts ``(N, 19)`` -> one quantity, by default ``(N, 3)``, in its own unit.
 
-    Standardisation of the inputs and of the outputs are constants of the graph, so whoever runs
-    it needs to know nothing about the training data.
+    Standardisation of the inputs and of the outputs are constants of the graph, so that
+    it runs without any knowledge of the training data.
 
     Args:
         widths: Hidden layers.
@@ -106,7 +106,7 @@ THINNEST_FILM = 0.02
 """Relative thickness below which a film counts as closed; keeps the logarithm finite."""
 
 SMALLEST_MODE = 0.1
-"""Modes that vary less than this share of the first are not blown up to unit variance: they hold
+"""Modes that vary less than this share of the first are not scaled to unit variance: they hold
 little but the rounding and the peculiarities of single trajectories."""
 
 

@@ -64,7 +64,7 @@ def contiguous_folds(
         if len(starts) < 2 * folds:
             raise DatasetError(
                 f"recording {one} has {len(starts)} blocks, {folds} folds need {2 * folds}",
-                remedy="cut the recording into more blocks, or ask for fewer folds",
+                remedy="cut the recording into more blocks, or use fewer folds",
             )
         first_row = np.array([rows[inverse == i][0] for i in range(len(starts))])
         position[rows] = np.argsort(np.argsort(first_row))[inverse]
@@ -171,8 +171,8 @@ def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> RowSplit:
     """Deal 70, 20 and 10 % of the unique trajectories to train, test and validation.
 
     The paper keeps a trajectory's rows together (section "Contiguity"); here every execution of
-    it, on whatever unit, is also on the same side, so that no network has seen the same press on a
-    sister finger.
+    it, on whatever unit, is also on the same side, so that no network has seen the same trajectory
+    on another specimen.
 
     Args:
         data: Rows with their unique trajectories.
@@ -198,7 +198,7 @@ def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> 
     unknown = [unit for unit in units if unit not in data.unit_names]
     if unknown or not units:
         raise DatasetError(
-            f"the data set has no unit {', '.join(unknown) or '(none was asked for)'}",
+            f"the data set has no unit {', '.join(unknown) or '(none was given)'}",
             remedy=f"choose from {', '.join(data.unit_names)}",
         )
     wanted = np.isin(data.row_unit, [data.unit_names.index(unit) for unit in units])
@@ -220,7 +220,7 @@ def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> 
 
 
 def unit_sets(data: ExperimentDataset) -> list[tuple[str, ...]]:
-    """Each unit that has rows by itself, then all of them together if there are several."""
+    """Each specimen that has rows, alone; then all of them together if there are several."""
     present = [name for i, name in enumerate(data.unit_names) if bool(np.any(data.row_unit == i))]
     each = [(name,) for name in present]
     return each + ([tuple(present)] if len(present) > 1 else [])

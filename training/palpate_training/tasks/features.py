@@ -117,7 +117,7 @@ def train_features(
         DatasetError: The data set breaks its schema or has too few presses.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
-    if bundle_dir.exists():  # say so before minutes of training, not after
+    if bundle_dir.exists():  # refuse before minutes of training, not after
         raise BundleError(
             f"{bundle_dir} exists and bundles are immutable", remedy="write the next version"
         )
@@ -209,7 +209,7 @@ def _contact_threshold(data: FeatureDataset, estimate: FloatArray, split: RowSpl
 def _force_report(
     data: FeatureDataset, x: FloatArray, estimate: FloatArray, split: RowSplit, threshold: float
 ) -> dict[str, float]:
-    """Force metrics of the rows in contact, and how often contact itself is told right."""
+    """Force metrics of the rows in contact, and how often contact itself is recognised."""
     truth = data.force[split.test]
     touching = (
         data.in_contact[split.test]
@@ -221,9 +221,9 @@ def _force_report(
         ("constant", baselines.constant(x[split.train], data.force[split.train])),
         ("linear", baselines.linear(x[split.train], data.force[split.train])),
     ):
-        rival = force_metrics(fitted.predict(x[split.test])[touching], truth[touching])
+        baseline = force_metrics(fitted.predict(x[split.test])[touching], truth[touching])
         for key in ("force_magnitude_median_n", "force_angle_median_rad"):
-            metrics[f"{model}_{key}"] = rival[key]
+            metrics[f"{model}_{key}"] = baseline[key]
     errors = force_errors(estimate[touching], truth[touching])
     wanted = {key: errors[key] for key in ("magnitude_n", "angle_rad")}
     ends = cluster_bootstrap(wanted, data.group[split.test][touching])
@@ -231,10 +231,10 @@ def _force_report(
         quantity, unit = key.split("_")
         metrics[f"force_{quantity}_median_ci95_low_{unit}"] = low
         metrics[f"force_{quantity}_median_ci95_high_{unit}"] = high
-    said = np.linalg.norm(estimate, axis=1) >= threshold
-    metrics["contact_found_share"] = float(np.mean(said[touching]))
+    found = np.linalg.norm(estimate, axis=1) >= threshold
+    metrics["contact_found_share"] = float(np.mean(found[touching]))
     if not touching.all():
-        metrics["contact_false_share"] = float(np.mean(said[~touching]))
+        metrics["contact_false_share"] = float(np.mean(found[~touching]))
         untouched = np.linalg.norm(estimate[~touching], axis=1)
         metrics["force_untouched_median_n"] = float(np.median(untouched))
     return metrics
@@ -253,8 +253,8 @@ def _location_report(
         ("constant", baselines.constant(x[fit_on], where[fit_on])),
         ("linear", baselines.linear(x[fit_on], where[fit_on])),
     ):
-        rival = location_metrics(fitted.predict(x[test_on]), where[test_on])
-        metrics[f"{model}_location_distance_median_m"] = rival["location_distance_median_m"]
+        baseline = location_metrics(fitted.predict(x[test_on]), where[test_on])
+        metrics[f"{model}_location_distance_median_m"] = baseline["location_distance_median_m"]
     ends = cluster_bootstrap(location_errors(estimate, where[test_on]), data.group[test_on])
     low, high = ends["distance_m"]
     metrics["location_distance_median_ci95_low_m"] = low
@@ -325,7 +325,9 @@ def evaluate_features(
                 RIDGE: [line.predict(test)],
                 OWN: [predict(net, test) for net in nets[units]],
             }
-            if quantity == "force":  # a contact at the origin of the frame is nobody's guess
+            if (
+                quantity == "force"
+            ):  # a location of zero, the origin of the frame, is no sensible baseline
                 estimates = {ZERO: [baselines.zero(seen, y[fold.train]).predict(test)], **estimates}
             if len(units) == 1 and len(sets) > 1:
                 estimates[ALL] = [predict(net, test) for net in nets[sets[-1]]]

@@ -2,8 +2,8 @@
 
 Every specimen has a network of its own; where there are several, one more is trained on all of them
 and tested on each, because electrode values differ from specimen to specimen. The network that
-ships is by default the one for all, since a finger that a robot asks about is none of them. What is
-reported was measured with exactly the weights that are shipped.
+ships is by default the one for all, since the finger of a robot is none of the training specimens.
+What is reported was measured with exactly the weights that are shipped.
 
 Networks are trained on coefficients of modes, never on whole fields. Modes are orthonormal, so the
 root mean square error over the nodes is the norm of the coefficients' error over the root of the
@@ -372,7 +372,7 @@ def refuse_existing(folder: Path) -> None:
     Raises:
         BundleError: The folder exists.
     """
-    if folder.exists():  # say so before minutes of training, not after
+    if folder.exists():  # refuse before minutes of training, not after
         raise BundleError(
             f"{folder} exists and bundles are immutable", remedy="write the next version"
         )

@@ -23,7 +23,7 @@ from palpate_training.experiment.generate.simulator import (
     IndentationStore,
     OnProgress,
     SimulatedFingertip,
-    SimulatedIndentation,
+    SimulatedTrajectory,
 )
 from palpate_training.experiment.generate.trials import file_of, read_trials
 
@@ -136,7 +136,7 @@ def join(
 
 
 def simulated_trial(
-    name: str, trajectory: SimulatedIndentation, believed: int, clearance_m: float
+    name: str, trajectory: SimulatedTrajectory, believed: int, clearance_m: float
 ) -> SimulatedTrial:
     """A simulated trajectory from first contact on, as it is mixed with trials.
 
@@ -191,7 +191,7 @@ def skin_mesh(fingertip: SimulatedFingertip) -> SkinMesh:
 def ventral_subset(nodes: Floats, outer: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """128 nodes of the ventral outer surface, each as far as can be from those before.
 
-    The paper takes 128 nodes of its mesh and does not say which.
+    The paper takes 128 nodes of its mesh without stating which.
 
     Args:
         nodes: [m], shape (V, 3).

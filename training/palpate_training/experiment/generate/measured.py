@@ -35,7 +35,7 @@ from palpate_training.experiment.generate.data_sets import join, simulated_trial
 from palpate_training.experiment.generate.simulator import (
     IndentationStore,
     OnProgress,
-    SimulatedIndentation,
+    SimulatedTrajectory,
     TwinSimulator,
 )
 
@@ -230,7 +230,7 @@ def _nothing_mixed(store: IndentationStore, left_out: Sequence[tuple[str, str]])
     )
 
 
-def _away(rows: TrialRows, trajectory: SimulatedIndentation) -> float:
+def _away(rows: TrialRows, trajectory: SimulatedTrajectory) -> float:
     """Distance of the tip from the line along which the indenter was simulated [m]."""
     start, end = trajectory.path[0, :3], trajectory.path[-1, :3]
     along = (end - start) / np.linalg.norm(end - start)

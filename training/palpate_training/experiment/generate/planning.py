@@ -1,4 +1,4 @@
-"""The paper's plan for a real robot: the simulated skin says where to press, the arms who can."""
+"""The paper's plan for a real robot, aimed at the simulated skin, for the arms that reach it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _trajectory(plan: IndentationPlan, bases: Mapping[str, ArmBase]) -> PlannedT
 
 
 def _check_same(plans: Sequence[IndentationPlan], store: IndentationStore) -> None:
-    """Names alone do not tell: with another seed they are the same, and the points are not."""
+    """Refuse a store of another seed: its trajectories have the same names and other points."""
     there = set(store.ids())
     for plan in plans:
         if plan.name not in there:

@@ -26,7 +26,7 @@ from palpate_training.experiment.generate.data_sets import skin_mesh
 from palpate_training.experiment.generate.pipeline import EXPERIMENT, MIXED, STORE, TRIALS
 from palpate_training.experiment.generate.simulator import (
     IndentationStore,
-    SimulatedIndentation,
+    SimulatedTrajectory,
     Specimen,
     TwinSimulator,
 )
@@ -155,9 +155,7 @@ def _write_tape(
     write_tape(path, build)
 
 
-def _press(
-    name: str, trajectory: SimulatedIndentation, counts: Floats, rest_pa: float
-) -> TapePress:
+def _press(name: str, trajectory: SimulatedTrajectory, counts: Floats, rest_pa: float) -> TapePress:
     """Untouched, then a few of the converged steps."""
     steps = trajectory.steps[: counts.shape[1] - 1]
     some = np.unique(np.linspace(0, len(steps) - 1, TAPE_STEPS).round().astype(int))

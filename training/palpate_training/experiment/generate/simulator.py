@@ -1,6 +1,6 @@
 """Settings of an experiment, and what it needs of a simulation of the fingertip.
 
-Training must not import the finite elements. These protocols are what it asks of them, and deploy
+Training must not import the finite elements. These protocols are what it needs of them, and deploy
 passes an implementation in. Arrays are in the sensor frame, SI.
 """
 
@@ -25,7 +25,7 @@ OnProgress = Callable[[int, int, str], None]
 """Called with how many are done, of how many, and a word on them."""
 
 FLUID_VOLUME_M3 = 6.0e-7
-"""Fill of the twin [m^3]: docs/adr/0016 says why not what 15.1 mm of thickness would need."""
+"""Fill of the twin [m^3]: docs/adr/0016 explains why it is less than 15.1 mm of thickness needs."""
 
 EDGE_M = 0.6e-3
 """Edge of the mesh on the pad [m]; the mesh study puts its force error below 1 %."""
@@ -113,7 +113,7 @@ class SimulatedStep(Protocol):
         """Above ambient [Pa]."""
 
 
-class SimulatedIndentation(Protocol):
+class SimulatedTrajectory(Protocol):
     """A simulated trajectory; what converged of it."""
 
     @property
@@ -122,7 +122,7 @@ class SimulatedIndentation(Protocol):
 
     @property
     def path(self) -> Floats:
-        """Poses that were asked for, the first one clear of the skin, shape (K + 1, 7)."""
+        """Requested poses, the first one clear of the skin, shape (K + 1, 7)."""
 
     @property
     def steps(self) -> Sequence[SimulatedStep]:
@@ -182,7 +182,7 @@ class IndentationStore(Protocol):
     def fingertip(self) -> SimulatedFingertip:
         """What was pressed."""
 
-    def indentation(self, name: str) -> SimulatedIndentation:
+    def indentation(self, name: str) -> SimulatedTrajectory:
         """A trajectory with its fields."""
 
     def start_pose(self, name: str) -> Floats:
@@ -246,7 +246,7 @@ class PressedSpecimens(Protocol):
     def rest_counts(self) -> Mapping[str, Floats]:
         """Ideal counts of each untouched specimen, by name, shape (19,)."""
 
-    def clear_steps(self, indentation: SimulatedIndentation) -> int:
+    def clear_steps(self, indentation: SimulatedTrajectory) -> int:
         """How many steps there are before the indenter bears on what holds the finger."""
 
     def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
@@ -304,5 +304,5 @@ class TwinSimulator(Protocol):
     ) -> MakeSpecimens:
         """What makes the specimens' electrodes in a worker process."""
 
-    def clear_steps(self, indentation: SimulatedIndentation, fingertip: SimulatedFingertip) -> int:
+    def clear_steps(self, indentation: SimulatedTrajectory, fingertip: SimulatedFingertip) -> int:
         """As `PressedSpecimens.clear_steps`, without any electrodes."""

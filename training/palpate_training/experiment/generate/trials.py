@@ -30,8 +30,8 @@ from palpate_training.experiment.generate.simulator import (
     MakeSpecimens,
     OnProgress,
     PressedSpecimens,
-    SimulatedIndentation,
     SimulatedStep,
+    SimulatedTrajectory,
     Specimen,
     TwinSimulator,
 )
@@ -117,7 +117,7 @@ def registration_errors(specimens: Sequence[Specimen], seed: int) -> dict[str, F
     """Tip by kinematics and registration minus true tip [m], for each arm (U, 3), sensor frame.
 
     Sideways it is what the registration procedure leaves, drawn by its own error model. Along the
-    dorsal axis it is what each specimen was fitted to: published forces tell how deep they were
+    dorsal axis it is what each specimen was fitted to: published forces show how deep they were
     pressed.
 
     Args:
@@ -156,7 +156,7 @@ class TrialTask:
     arm: str
     direction: Floats
     planned_m: float
-    trajectory: SimulatedIndentation
+    trajectory: SimulatedTrajectory
     specimens: tuple[Specimen, ...]
     errors_m: Floats
     clearance_m: float

@@ -70,7 +70,7 @@ class WorkerProcesses:
         """See `TaskRunner.run`.
 
         Raises:
-            WorkerLostError: A worker died, e.g. for want of memory.
+            WorkerLostError: A worker died, e.g. because memory ran out.
         """
         pending: dict[Future[Answer], Task] = {}
         more = iter(tasks)
@@ -102,7 +102,7 @@ class WorkerProcesses:
 
 
 def _check_reachable(address: str) -> None:
-    """Ray itself asks a dead address for minutes, then ends the process.
+    """Check that a cluster listens: Ray itself would try for minutes, then end the process.
 
     Raises:
         LinkError: Nothing listens there, or it is no address.
