@@ -45,7 +45,7 @@ def test_a_unit_without_rows_is_no_set(make_mixed: Callable[..., MixedDataset]) 
 
 
 @pytest.mark.parametrize(
-    ("units", "named"), [(["biotac-7"], "no unit biotac-7"), ([], "no unit (none was asked for)")]
+    ("units", "named"), [(["biotac-7"], "no unit biotac-7"), ([], "no unit (none was given)")]
 )
 def test_unknown_units_are_named(mixed: MixedDataset, units: list[str], named: str) -> None:
     split = by_trajectory(mixed.experiment)

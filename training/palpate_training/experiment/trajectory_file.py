@@ -1,10 +1,10 @@
 """The trajectory file: what a robot executes, as JSON lines.
 
 Line 1 holds schema, version, frame, units, registrations, names of the joints and the SHA-256 of
-all bytes after it. Every other line is a trajectory: what it is, when it starts, and for its start and
-the end of each increment the time, the travel, the pose of the tip in sensor and robot frame, and
-the joints where kinematics were given. Lengths in metres, angles in radians, times in seconds since
-the start of the plan; a pose is x y z and a unit quaternion w x y z.
+all bytes after it. Every other line is a trajectory: what it is, when it starts, and for its start
+and the end of each increment the time, the travel, the pose of the tip in sensor and robot frame,
+and the joints where kinematics were given. Lengths are in metres, angles in radians, times in
+seconds since the start of the plan; a pose is x y z and a unit quaternion w x y z.
 
 The reader checks everything: a changed byte, an unknown key, a missing line, a pose that is not
 where target and direction put it, or a time off the schedule is an error.

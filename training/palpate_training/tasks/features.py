@@ -325,9 +325,8 @@ def evaluate_features(
                 RIDGE: [line.predict(test)],
                 OWN: [predict(net, test) for net in nets[units]],
             }
-            if (
-                quantity == "force"
-            ):  # a location of zero, the origin of the frame, is no sensible baseline
+            # A location of zero is the origin of the frame, so zero is a baseline for force only.
+            if quantity == "force":
                 estimates = {ZERO: [baselines.zero(seen, y[fold.train]).predict(test)], **estimates}
             if len(units) == 1 and len(sets) > 1:
                 estimates[ALL] = [predict(net, test) for net in nets[sets[-1]]]
