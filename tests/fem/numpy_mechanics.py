@@ -1,8 +1,6 @@
-"""NumPy twin of the element kernels: short, slow, and the definition of what they compute.
+"""NumPy twins of the kernels of elements, fluid and contact: short, slow, and their definition.
 
-NumPy twin of the fluid kernels: the volume that a surface encloses, and its derivatives.
-
-NumPy twin of the contact laws and of the kernels that use them, at points.
+Each computes what a kernel of `palpate_fem.mechanics` computes, in the words of its formula.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Elements:
-    """What the elements of a mesh contribute at one state.
+    """Contributions of the elements of a mesh at one state.
 
     Attributes:
         energy: Stored energy of the isochoric part [J].
@@ -165,7 +163,7 @@ class Friction:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """What points contribute, per reference area.
+    """Contributions of contact points, per undeformed area.
 
     Attributes:
         status: 0 apart, 1 touches without friction, 2 sticks, 3 slides, (N,).
@@ -177,7 +175,7 @@ class Contact:
         misfit: What the force lacks to that by the law, but ``coupled`` [Pa], (N, 3).
         coupled: What it lacks because friction follows the wanted pressure, negative [Pa], (N, 3).
         tangent: Symmetric approximation of minus the derivative of the law's force, (N, 3, 3).
-        rest: What ``tangent`` lacks, (N, 3, 3).
+        rest: Its unsymmetric rest, (N, 3, 3).
     """
 
     status: Ints

@@ -90,6 +90,8 @@ def first_contact(
     # A few points give an upper limit of the travel, with which most of the others are dropped.
     limit = _trace(indenter, points[:: max(1, len(points) // 200)], move, start, end)
     limit = _trace(indenter, points, move, start, limit)
+    # A face may be touched between its samples. There the gap is smaller than at the nearest sample
+    # by at most their distance, so only faces with a gap below the spacing are sampled more finely.
     faces, spacing = np.arange(len(surface.faces)), 2.0 * sizes
     samples = (surface.nodes[surface.faces] - target) @ turn
     for count in _LEVELS:

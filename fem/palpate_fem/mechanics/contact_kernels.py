@@ -365,6 +365,7 @@ def core_contact(
         x = wp.vec3d()
         for a in range(k):
             x += shape[q, a] * position_in[faces[f, a]]
+        # The cell of the point, clamped so that its 4 x 4 x 4 coefficients exist.
         u = (x - origin) / spacing
         i = wp.clamp(int(wp.floor(u[0])), 1, coefficients.shape[0] - 3)
         j = wp.clamp(int(wp.floor(u[1])), 1, coefficients.shape[1] - 3)
@@ -379,6 +380,7 @@ def core_contact(
             tx = u[0] - wp.float64(i)
             ty = u[1] - wp.float64(j)
             tz = u[2] - wp.float64(m)
+            # Value, gradient and hessian of the tensor product: 0, 1, 2 are orders of derivative.
             x0 = bspline(tx, 0)
             x1 = bspline(tx, 1)
             x2 = bspline(tx, 2)
@@ -432,4 +434,5 @@ def core_contact(
                 curvature = wp.mat33d(
                     hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz
                 ) / (spacing * spacing)  # fmt: skip
+                # -d(p n)/dx: stiffness along the normal, and the turn of the normal under p.
                 tangent_out[f, q] = w * (answer[1] * wp.outer(normal, normal) - p * curvature)

@@ -64,6 +64,7 @@ def element_state(
     for a in range(n):
         volume_gradient_out[e, a] = wp.vec3d()
     for q in range(weight.shape[1]):
+        # F = sum_a x_a (x) grad N_a, by the gradients on the undeformed element.
         f = wp.mat33d()
         for a in range(n):
             f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
@@ -80,6 +81,7 @@ def element_state(
         for a in range(n):
             g = gradient[e, q, a]
             wp.atomic_add(force_out, elements[e, a], stress * g)
+            # dJ/dF = J F^-T
             volume_gradient_out[e, a] = volume_gradient_out[e, a] + (w * j) * (inverse_t * g)
     volume_out[e] = volume
     smallest_jacobian_out[e] = smallest
@@ -163,6 +165,7 @@ def element_tangent(
         for b in range(n):
             block = pair[e, a, b]
             if block >= 0:
+                # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
                 k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
                 diagonal = wp.float64(0.0)
                 for q in range(points):

@@ -162,11 +162,13 @@ class LoadStepping:
                 size = min(size, 1.0 - done)
                 goal = done + size
                 if 1.0 - goal < 1e-6:
-                    goal = 1.0
+                    goal = 1.0  # the poses of the path are reached exactly
                 pose = interpolate_pose(self.path[k - 1], self.path[k], goal)
                 before = replace(self.at)
                 report, balance = self.increment(pose, size)
                 cost.add(report)
+                # Converged, but so far beyond the force limit that the end is not resolved: go
+                # back.
                 if report.converged and self._overshoots(balance, size):
                     self.at = before
                     size *= 0.5

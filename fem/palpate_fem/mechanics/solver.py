@@ -119,6 +119,7 @@ class Fingertip:
         wanted = parameters.total_thickness_m
         outer = self.geometry.mesh.outer_nodes
         area = float(np.ptp(state.position[outer, 0]) * np.ptp(state.position[outer, 1]))
+        # Secant on thickness(volume), with steps short enough for Newton's method.
         low = (self.cavity_m3, self.total_thickness_m)
         if wanted < low[1] - THICKNESS_TOLERANCE_M:
             raise SimulationError(

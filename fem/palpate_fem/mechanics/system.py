@@ -321,6 +321,8 @@ class EquilibriumSystem:
             volume_gradient=gradient,
             volume=self._cavity.volume,
             unbalanced=internal.reshape(-1)[free] + external,
+            # All forces that have to cancel, reactions of the supports included: without them the
+            # scale of a body that only its supports deform would be rounding error.
             scale=float(
                 np.linalg.norm(fluid.reshape(-1)[free])
                 + np.linalg.norm(indenter.reshape(-1)[free])

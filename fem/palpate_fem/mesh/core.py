@@ -102,6 +102,7 @@ class DistanceGrid:
         xz = contract(slope, value, slope)
         xy = contract(slope, slope, value)
         hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1) / self.spacing**2
+        # Outside the grid: extrapolated by the distance to it, see above.
         away = np.linalg.norm(grid - inside, axis=1) * self.spacing
         hessian[away > 0] = 0.0
         return distance + away, gradient, hessian.reshape(-1, 3, 3)
@@ -218,6 +219,7 @@ def signed_distance(points: Floats, vertices: Floats, faces: Ints) -> tuple[Floa
         rows = np.arange(len(p))
         face, bary = tried[rows, pick], where[rows, pick]
         foot = np.einsum("nk,nki->ni", bary, corner[rows, pick])
+        # One vanishing barycentric coordinate: the foot lies on an edge; two: in a node.
         zero = bary < 1e-9
         normal = flat[face].copy()
         on = np.flatnonzero(zero.sum(axis=1) == 1)
@@ -298,6 +300,7 @@ def tabulate(vertices: Floats, faces: Ints, at: Floats, *, band_m: float = 0.6e-
     rough, _ = cKDTree(sample).query(flat, distance_upper_bound=band_m)
     near = np.isfinite(rough).reshape(at.shape[:-1])
     distance, foot = signed_distance(flat[near.ravel()], vertices, faces)
+    # Outside the band the sign is that of the connected region: node [0, 0, 0] lies outside.
     label, _ = ndimage.label(~near)
     sign = np.where(~near & (label != label[0, 0, 0]), -1.0, 1.0)
     sign[near] = np.where(distance < 0, -1.0, 1.0)

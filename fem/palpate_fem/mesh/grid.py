@@ -318,6 +318,7 @@ def relax(
     first = held(project(field, held(places.copy())))
     now = first
     for _ in range(ROUNDS):
+        # Springs of stiffness 1 / wanted length: at rest, edges are as long as wanted.
         weight = 1 / size((now[pairs[:, 0]] + now[pairs[:, 1]]) / 2)
         pull = coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(len(own), len(own))).tocsr()
         total = np.asarray(pull.sum(axis=1)).ravel()

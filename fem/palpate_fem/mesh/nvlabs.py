@@ -242,6 +242,8 @@ def _core(body: TriangleSurface, cavity: TriangleSurface) -> RigidCore:
     probes = np.concatenate(
         [inner, corner.mean(axis=1), (corner + np.roll(corner, 1, 1)).reshape(-1, 3) / 2]
     )
+    # max() of two distances is the intersection of the bodies; the blur rounds its edges, which may
+    # bring the core back towards the skin, so the clearance grows until the spline keeps it.
     clearance = CLEARANCE_M
     for _ in range(8):
         values = ndimage.gaussian_filter(np.maximum(core, room + clearance), ROUNDING_M / SPACING_M)

@@ -151,6 +151,8 @@ class DenseFront:
         scale, lost = np.abs(self._diagonal), LOST[self.lower.dtype]
         matrix = self.lower.copy(order="F") if self.lower.dtype == np.float64 else None
         definite = self._cholesky()
+        # The diagonal of L is the square root of the pivots: a small pivot relative to the entry
+        # that it was eliminated from has lost its digits by cancellation.
         if not definite or (self._diagonal**2 < lost * scale).any():
             if matrix is None:
                 raise UnsafePivotError
@@ -313,7 +315,7 @@ class FrontalFactor:
                     self._dense[i].fill((places.own[i], mine[:own]), (places.below[i], mine[own:]))
                     self._dense[i].eliminate()
 
-        self._both(redo)
+        self._both(redo)  # independent halves of the tree, then what both contribute to
         redo(self._top)
         self._values = arranged
         self.redone = int(changed.sum())
