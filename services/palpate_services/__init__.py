@@ -1,1 +1,1 @@
-"""Model bundles to estimates on the bus; everything that was said to records and pictures."""
+"""Estimates from model bundles, records of everything on the bus, and views of both."""

@@ -141,7 +141,7 @@ def test_recorded_and_drawn(make_frame: Frames, make_tare: Tares, tmp_path: Path
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
-    from palpate_services.viewer.rerun import review
+    from palpate_services.viewer.record_view import review
 
     def frames(kind: SensorType, first: int) -> list[Any]:
         sequences = range(first, first + 40)

@@ -128,7 +128,7 @@ def test_recorded_and_drawn(
     until: Until,
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.viewer.rerun import review
+    from palpate_services.viewer.record_view import review
 
     mine = str(bundles.write(tmp_path / "mine", "field"))
     stop = threading.Event()
@@ -193,7 +193,7 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
     make_frame: Frames, tmp_path: Path
 ) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.viewer.rerun import RerunView
+    from palpate_services.viewer.record_view import RerunView
 
     meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
     field = bundles.truth(stamp_at(make_frame().stamp, 0.0))

@@ -254,7 +254,7 @@ def test_view_that_fails_leaves_the_record_alone(
 
 def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    from palpate_services.viewer.rerun import RerunView
+    from palpate_services.viewer.record_view import RerunView
 
     path = tmp_path / "view.rrd"
     with RerunView(path, title="view", max_bytes=1) as view:

@@ -131,7 +131,7 @@ def test_record_view_and_picture_of_a_session(
     from rerun.chunk import RrdReader
 
     from palpate_services.viewer.plot import plot_record
-    from palpate_services.viewer.rerun import review
+    from palpate_services.viewer.record_view import review
 
     with station(lossless=True, out=tmp_path) as session:
         answers = session.subscriber(FEATURES, delivery=Delivery.EVERY)

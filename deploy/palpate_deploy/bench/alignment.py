@@ -392,7 +392,7 @@ def _catch(
     missing += [] if received.poses else ["pose"]
     if missing or not told:
         raise LinkError(
-            f"nothing came of {', '.join(missing) or 'the gateway'}",
+            f"no message of {', '.join(missing) or 'the gateway'} came",
             remedy=f"see the logs in {children.folder / 'logs'}",
         )
     return received, dict(told[0].gauges)

@@ -92,7 +92,7 @@ def existing_file(path: Path) -> Path:
 
 
 SHOWN = 10
-"""How many people are told of."""
+"""Number of lines that are printed without ``--json``."""
 
 
 def show_left_out(pairs: Sequence[tuple[str, str]]) -> None:

@@ -26,7 +26,7 @@ from palpate_deploy.station.host import free_endpoint
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile, changed, load_profile
-from palpate_deploy.station.supervisor import Supervisor
+from palpate_deploy.station.supervision import Supervisor
 
 _SENSOR = "finger"
 _REFRESH_S = 0.1
@@ -74,7 +74,7 @@ def run_demo(seconds: float, out: Path) -> int:
             _watch(console, profile, comparison, fields, seconds, stop)
         except LinkError as error:
             raise LinkError(
-                f"{error.problem}; the router says: {supervisor.log_tail('router') or 'nothing'}",
+                f"{error.problem}; the router's log: {supervisor.log_tail('router') or 'empty'}",
                 remedy=f"see {supervisor.logs}",
             ) from error
         if not comparison.count:

@@ -245,7 +245,10 @@ def _clock() -> Finding:
     year = time.gmtime().tm_year
     if year < _YEAR_MIN:
         return Finding(
-            "clock", "fail", f"the wall clock says {year}", "set it, and keep it set: chrony"
+            "clock",
+            "fail",
+            f"the wall clock says {year}",
+            "set it and synchronise it: chrony",
         )
     lateness = []
     for _ in range(50):

@@ -161,7 +161,7 @@ def review_record(
         RecordingError: The record is damaged or not palpate's.
         MissingExtraError: Rerun or matplotlib is not installed.
     """
-    from palpate_services.viewer.rerun import review
+    from palpate_services.viewer.record_view import review
 
     written = review(path, view, bundles=bundles)
     print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
@@ -201,7 +201,7 @@ def _review_store(
 
 
 def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
-    """The overview of a store, or the last step of the one trajectory that is asked for."""
+    """An overview of a store, or the last step of the one trajectory that is named."""
     from palpate.files.simulation_store import choose_trajectories
     from palpate_fem.plot.step import plot_step
     from palpate_fem.plot.trajectories import plot_overview

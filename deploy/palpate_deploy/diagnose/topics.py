@@ -324,7 +324,11 @@ def measure(
 def print_rates(topic: Topic[object], rates: dict[str, StreamRate]) -> None:
     """Print one line for each source."""
     if not rates:
-        print(f"no {topic.name} heard; see what runs: palpate status", file=sys.stderr, flush=True)
+        print(
+            f"no {topic.name} came; see what runs: palpate status",
+            file=sys.stderr,
+            flush=True,
+        )
     for source, rate in sorted(rates.items()):
         numbers = rate.summary()
         if numbers["rate_hz"] is None:

@@ -20,7 +20,7 @@ from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import duration_text, shown_counters, state_text
-from palpate_deploy.station.supervisor import ProcessState, Supervisor, SupervisorError
+from palpate_deploy.station.supervision import ProcessState, Supervisor, SupervisorError
 
 _REFRESH_S = 0.25
 _SILENT_AFTER_S = 3.0

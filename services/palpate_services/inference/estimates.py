@@ -122,16 +122,7 @@ def estimate(
 def estimate_field(
     frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
 ) -> FieldEstimate | EstimateRefusal:
-    """Estimate the displacement of each skin node from one frame.
-
-    Args:
-        frame: Raw counts of one sampling round.
-        tare: The tare that ``frame.tare_id`` names; None if it is not known.
-        runtime: A loaded bundle of the task ``field``.
-
-    Returns:
-        The estimate on the bundle's mesh, or why there is none.
-    """
+    """Estimate the displacement of each node of the bundle's mesh; as ``estimate`` otherwise."""
     outputs = _run_on_electrodes(frame, tare, runtime)
     if isinstance(outputs, EstimateRefusal):
         return outputs

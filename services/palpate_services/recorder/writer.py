@@ -20,7 +20,7 @@ from palpate.health import Health
 from palpate.messages import ServiceState
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.repository import MeshLibrary
-from palpate_services.viewer.rerun import LiveView
+from palpate_services.viewer.record_view import LiveView
 from palpate_services.viewer.timeline import SensorTimeline
 
 

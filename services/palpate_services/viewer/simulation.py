@@ -26,7 +26,7 @@ from palpate_services.viewer.layout import (
     simulation_fixtures,
     simulation_layout,
 )
-from palpate_services.viewer.rerun import APPLICATION
+from palpate_services.viewer.record_view import APPLICATION
 from palpate_services.viewer.surfaces import Floats, Ints, border_of, normals_of, shades
 
 _FIELDS = ("displacement", "indenter_force", "core_force")

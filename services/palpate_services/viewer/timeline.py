@@ -1,6 +1,6 @@
 """What is drawn of one sensor: messages sorted into rows, estimates matched with their truth.
 
-Free of any drawing library, so that ``rerun`` and ``plot`` remain thin.
+Free of any drawing library, so that ``record_view`` and ``plot`` remain thin.
 """
 
 from __future__ import annotations
