@@ -75,6 +75,10 @@ def test_no_solution_is_a_failure_with_a_reason() -> None:
     assert "inside out" in check.note
 
 
+def test_shared_data_lie_beside_the_checkout() -> None:
+    assert Path(__file__).resolve().parents[3] / "shared" / "data" == verify.SHARED_DATA
+
+
 def test_what_is_absent_is_skipped_with_a_reason(tmp_path: Path) -> None:
     def measure() -> Measurement:
         raise MissingDataError("no such part")

@@ -27,7 +27,7 @@ from palpate_fem.verify.check import VerificationCase, VerificationCheck
 __all__ = ["VerificationCase", "VerificationCheck", "run", "suite"]
 
 # Beside a checkout of the project; an installed palpate has none, and its checks are skipped.
-SHARED_DATA = Path(__file__).resolve().parents[5] / "shared" / "data"
+SHARED_DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 PUBLIC_SKIN = "nvlabs_biotac_mesh"
 
 
