@@ -13,6 +13,7 @@ from tests.fem.numpy_mechanics import cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics import newton as newton_module
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
@@ -351,3 +352,20 @@ def test_frictions_unsymmetric_share_is_answered(strength: float, left: float | 
     after = before - more - np.linalg.solve(symmetric, unsymmetric @ more)
     assert np.linalg.norm(before) > 0.3 * np.linalg.norm(answer)
     assert np.linalg.norm(after) <= left * np.linalg.norm(before)
+
+
+def test_settings_are_those_that_results_were_made_with() -> None:
+    settings = NewtonSettings()
+    assert (settings.tolerance, settings.volume_tolerance) == (1e-6, 1e-6)
+    assert (settings.gap_tolerance_m, settings.traction_tolerance) == (1e-7, 0.01)
+    assert (settings.iterations, settings.pseudo_transient_iterations) == (20, 40)
+    assert (settings.largest_move_m, settings.keep_factor, settings.keep_elastic) == (
+        0.25e-3, 0.3, 0.15,
+    )  # fmt: skip
+    assert (newton_module.FIRST_VISCOSITY, newton_module.NO_VISCOSITY) == (1.0, 3e-3)
+    assert (newton_module.LEAST_VISCOSITY, newton_module.MOST_VISCOSITY) == (1e-2, 100.0)
+    assert (newton_module.VISCOSITY_FALL, newton_module.VISCOSITY_RISE, newton_module.STALLED) == (
+        0.3,
+        3.0,
+        0.8,
+    )

@@ -108,6 +108,9 @@ def test_holes_in_the_sequence_are_lost_on_the_bus(frame_of: FrameOf) -> None:
         bus.send(frame_of(sequence))
     assert bus.come(1) == [12]
     assert (bus.count("lost_on_bus"), bus.count("dropped")) == (3, 3)
+    bus.send(frame_of(14))
+    assert bus.come(1) == [14]
+    assert bus.count("lost_on_bus") == 4
 
 
 def test_each_sender_has_an_account_of_its_own(frame_of: FrameOf) -> None:

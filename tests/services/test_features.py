@@ -98,6 +98,20 @@ def test_answers_frames_and_says_what_it_is(
         assert metadata.bundle_sha256 == got.message.bundle_sha256
 
 
+def test_one_sensor_of_the_station_is_served(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    with serve(max_age_s=10.0, sensors=("finger",)) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        for sensor in ("thumb", "finger"):
+            announce(session, sensor, make_tare())
+            session.publisher(ELECTRODES, sensor=sensor).put(make_frame(1))
+        assert estimates.next(5.0).sensor == "finger"
+        until(lambda: counters(session).get("frames_received") == 1)
+        with pytest.raises(StreamTimeout):
+            estimates.next(0.1)
+
+
 def test_latency_counts_from_the_reading_and_of_a_replay_from_the_arrival(
     serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
 ) -> None:

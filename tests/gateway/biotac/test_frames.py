@@ -135,6 +135,13 @@ def test_missing_frames_restarts_and_jumps() -> None:
     assert assembler.counters["time_jumps"] == 2  # over two frames, and back
 
 
+def test_a_million_frames_may_be_lost_and_no_more() -> None:
+    for lost, restarts in ((1_000_000, 0), (1_000_001, 1)):
+        readings, assembler = assemble(slots_of(5) + slots_of(6 + lost))
+        assert assembler.counters["counter_restarts"] == restarts
+        assert readings[1].missed_before == (0 if restarts else lost)
+
+
 def test_time_jump_is_more_than_a_millisecond_off_the_grid() -> None:
     near, far = slots_of(1), slots_of(1)
     near[10:] = [s._replace(time_s=s.time_s + 0.9e-3) for s in near[10:]]

@@ -1,0 +1,176 @@
+"""What a service publishes, counts and measures of each message, by a clock that tests set."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from palpate import clock
+from palpate.bus import ReceivedMessage
+from palpate.bus.topics import ELECTRODES, FEATURES
+from palpate.messages import ElectrodeFrame, Origin
+from palpate_services.config import FeaturesServiceConfig
+from palpate_services.inference import loop
+from palpate_services.inference.estimates import EstimateRefusal
+from palpate_services.inference.loop import EstimatePublisher, ServiceRoute
+
+MS = 1_000_000
+START_NS = 10**12
+ROUTE = ServiceRoute("features", ELECTRODES, FEATURES, "frames_received")
+
+Frames = Callable[..., ElectrodeFrame]
+
+
+class Station:
+    """Session, health and clock of one publisher, and what it did with them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_ns = START_NS
+        self.work_ns = 0
+        self.put: list[tuple[str, int]] = []
+        self.counts: Counter[str] = Counter()
+        self.gauges: dict[str, float] = {}
+        self.sensors: tuple[str, ...] = ()
+        self.refused: EstimateRefusal | None = None
+        monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic_ns=lambda: self.now_ns))
+
+    def estimate(self, sensor: str, frame: ElectrodeFrame) -> Any:
+        self.now_ns += self.work_ns
+        return self.refused or frame.stamp.sequence
+
+    def make(self, *, rate_hz: float | None = None, **config: Any) -> EstimatePublisher[Any, Any]:
+        def publisher(topic: object, *, sensor: str, lossless: bool) -> object:
+            assert topic is FEATURES
+            assert not lossless
+            return SimpleNamespace(put=lambda estimate: self.put.append((sensor, estimate)))
+
+        def count(name: str, by: int = 1) -> None:
+            self.counts[name] += by
+
+        session = SimpleNamespace(publisher=publisher)
+        health = SimpleNamespace(
+            count=count,
+            gauge=self.gauges.__setitem__,
+            set_sensors=lambda sensors: setattr(self, "sensors", sensors),
+        )
+        given: Any = {"bundle": "any", "max_age_s": None, "accept_replayed": True, **config}
+        return EstimatePublisher(
+            ROUTE,
+            session,  # type: ignore[arg-type]
+            FeaturesServiceConfig(**given),
+            health,  # type: ignore[arg-type]
+            self.estimate,
+            rate_hz=rate_hz,
+        )
+
+
+@pytest.fixture
+def station(monkeypatch: pytest.MonkeyPatch) -> Station:
+    return Station(monkeypatch)
+
+
+@pytest.fixture
+def came(make_frame: Frames) -> Callable[..., ReceivedMessage[ElectrodeFrame]]:
+    """A message as a subscriber hands it over."""
+
+    def make(
+        sequence: int, at_ns: int, *, sensor: str = "finger", arrived_ns: int = 0, **frame: Any
+    ) -> ReceivedMessage[ElectrodeFrame]:
+        message = make_frame(sequence, monotonic_ns=at_ns, **frame)
+        return ReceivedMessage(message, b"", "lab", sensor, arrived_ns or at_ns)
+
+    return make
+
+
+Came = Callable[..., ReceivedMessage[ElectrodeFrame]]
+
+
+def test_the_first_message_of_each_period_is_answered(station: Station, came: Came) -> None:
+    """By the stamps, and each sensor by itself: 20 of 100 a second."""
+    publisher = station.make(rate_hz=20.0)
+    for k in range(12):
+        publisher.take(came(k, START_NS + 10 * k * MS))
+    publisher.take(came(50, START_NS, sensor="thumb"))
+    publisher.report(last=True)
+    assert station.put == [("finger", 0), ("finger", 5), ("finger", 10), ("thumb", 50)]
+    assert station.counts == {
+        "frames_received": 13, "estimates_published": 4, "skipped_rate": 9,
+    }  # fmt: skip
+    assert station.sensors == ("finger", "thumb")
+
+
+def test_a_message_without_an_estimate_leaves_its_period_to_the_next(
+    station: Station, came: Came
+) -> None:
+    publisher = station.make(rate_hz=20.0)
+    station.refused = EstimateRefusal.UNTARED
+    publisher.take(came(1, START_NS))
+    station.refused = None
+    publisher.take(came(2, START_NS + MS))
+    publisher.report(last=True)
+    assert station.put == [("finger", 2)]
+    assert station.counts["untared"] == 1
+
+
+def test_sensors_of_others_are_not_even_counted(station: Station, came: Came) -> None:
+    publisher = station.make(sensors=("finger",))
+    publisher.take(came(1, START_NS, sensor="thumb"))
+    publisher.take(came(2, START_NS))
+    publisher.report(last=True)
+    assert station.put == [("finger", 2)]
+    assert station.counts["frames_received"] == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "latency_s"),
+    [
+        ({}, 0.0035),
+        ({"origin": Origin.REPLAYED}, 0.0025),
+        ({"clock_id": clock.CLOCK_ID ^ 1}, 0.0025),
+    ],
+)
+def test_latency_counts_from_the_reading_where_its_clock_is_ours(
+    station: Station, came: Came, changes: dict[str, Any], latency_s: float
+) -> None:
+    """Read at 0, arrived at 1 ms, taken at 3 ms, answered at 3.5 ms."""
+    publisher = station.make()
+    clock_id = changes.pop("clock_id", clock.CLOCK_ID)
+    received = came(1, START_NS, arrived_ns=START_NS + MS, **changes)
+    object.__setattr__(received.message.stamp, "clock_id", clock_id)
+    station.now_ns, station.work_ns = START_NS + 3 * MS, MS // 2
+    publisher.take(received)
+    publisher.report(last=True)
+    assert station.gauges["latency_p50_s"] == pytest.approx(latency_s)
+
+
+def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
+    publisher = station.make()
+    for k in range(1, 101):  # of 1 to 100 ms
+        station.now_ns, station.work_ns = START_NS + 5 * k * MS, MS
+        publisher.take(came(k, station.now_ns - (k - 1) * MS))
+    station.now_ns = START_NS + 999 * MS
+    publisher.report()
+    assert not station.gauges, "a second is not over"
+    station.now_ns = START_NS + 1000 * MS
+    publisher.report()
+    assert station.gauges["busy_ratio"] == pytest.approx(0.1)
+    assert station.gauges["latency_p50_s"] == pytest.approx(0.0505)
+    assert station.gauges["latency_p99_s"] == pytest.approx(0.09901)
+    station.gauges.clear()
+    publisher.report(last=True)  # no time has passed, and nothing was published
+    assert station.gauges == {"busy_ratio": 0.0}
+
+
+def test_counts_are_handed_over_five_times_a_second(station: Station, came: Came) -> None:
+    publisher = station.make()
+    publisher.take(came(1, START_NS))
+    for after_ms, received in ((199, 0), (200, 1), (300, 1), (400, 2)):
+        if after_ms == 300:
+            publisher.take(came(2, START_NS))
+        station.now_ns = START_NS + after_ms * MS
+        publisher.report()
+        assert station.counts["frames_received"] == received
