@@ -23,11 +23,6 @@ from palpate.messages import (
 )
 from palpate.sampling import slots_of
 from palpate_deploy.bench.alignment import (
-    LOW_COUNTS,
-    LOW_N,
-    SPAN_COUNTS,
-    SPAN_M,
-    SPAN_N,
     AlignmentResult,
     apart,
     page_of,
@@ -36,8 +31,13 @@ from palpate_deploy.bench.alignment import (
 )
 from palpate_deploy.bench.alignment_parts import (
     LATE_S,
+    LOW_COUNTS,
+    LOW_N,
     MARGIN_S,
     RAMP_S,
+    SPAN_COUNTS,
+    SPAN_M,
+    SPAN_N,
     Lateness,
     OnTime,
     share_at,
