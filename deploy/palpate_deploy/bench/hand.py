@@ -115,6 +115,7 @@ def account(
     """
     with np.load(rows_file, allow_pickle=False) as archive:
         names, rows, lost = archive["sensors"], archive["rows"], int(archive["dropped"])
+    # Selected by arrival, so that frames still on their way at the end do not count as lost.
     rows = rows[(rows[:, 4] >= begin_ns) & (rows[:, 4] < end_ns)]
     of_finger = np.array([str(name).startswith("finger") for name in names])
     for number in range(len(names)):

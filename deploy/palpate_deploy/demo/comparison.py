@@ -101,6 +101,7 @@ class TouchComparison:
             StreamTimeout: No estimate came in time.
         """
         received = streams.features.next(timeout_s)
+        # After the wait: the truth of this estimate was published before it.
         self.add_truth(streams)
         self.add(received.message, received.received_monotonic_ns)
 

@@ -291,6 +291,8 @@ def _follow(
             ServiceState.FINISHED,
             ServiceState.DEGRADED,
         )
+        # The gateway ends before its last frames are estimated and recorded; what is still missing
+        # after the wait is reported as a loss.
         if status is not None or ended:
             settled_by = min(settled_by, time.monotonic() + _SETTLED_S)
             if status is not None and (

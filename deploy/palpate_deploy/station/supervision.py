@@ -123,6 +123,7 @@ class Supervisor:
 
     def _state(self, info: dict[str, Any]) -> ProcessState:
         name, pid = info["name"], int(info["pid"])
+        # supervisord does not count restarts; a new process id between two looks is one.
         if pid and pid != self._pids.get(name, pid):
             self._restarts[name] = self._restarts.get(name, 0) + 1
         if pid:

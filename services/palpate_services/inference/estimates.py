@@ -104,6 +104,7 @@ def estimate(
     if isinstance(outputs, EstimateRefusal):
         return outputs
     force = outputs["force"]
+    # In doubles and without NumPy: three values are faster so, and the threshold is a double.
     x, y, z = force.tolist()
     in_contact = sqrt(x * x + y * y + z * z) >= runtime.contact_threshold_n
     return FeatureEstimate(

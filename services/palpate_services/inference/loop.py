@@ -277,6 +277,7 @@ def serve(
         MissingExtraError: ONNX Runtime is not installed.
         LinkError: The bus cannot be joined.
     """
+    # Before the bus is joined: no message may wait while the model loads and warms up.
     runtime = load(read_bundle(resolve(config.bundle)), route.service)
     health = Health(route.service, instance)
     with Session.open(link, station=station) as session:
@@ -296,6 +297,7 @@ def serve(
             manifest = runtime.manifest
             health.set_state(ServiceState.READY, f"serving {manifest.name}:{manifest.version}")
             avoid_pauses()
+            # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
             while not stop.is_set():
                 try:
@@ -303,6 +305,7 @@ def serve(
                 except StreamTimeout:
                     pass
                 publisher.report()
+            # Withdrawn first, so that no client relies on this service while it drains.
             presence.not_ready()
             health.set_state(ServiceState.STOPPING, "draining")
             deadline = time.monotonic() + config.drain_s

@@ -118,6 +118,8 @@ class RecordRecovery:
         """Look for leftovers and start to recover them, unless a recovery still runs."""
         if self._thread is not None and self._thread.is_alive():
             return
+        # Looked up before the thread starts: the new record that the caller opens after this call
+        # must not be taken for a leftover.
         parts = leftovers(self._folder)
         if parts:
             self._thread = threading.Thread(
@@ -232,6 +234,7 @@ class RecordFiles:
             self._count_unflushed()
             self._pause(error.problem)
             return
+        # The writer flushes by its own clock; that the file has grown is the sign of it.
         size = self._writer.bytes_written
         self._unflushed = self._unflushed + 1 if size == self._size else 0
         self._size = size
@@ -279,6 +282,7 @@ class RecordFiles:
         counts, self._counts = self._counts, Counter()
         for view in self._views:
             counts.update(view.take_counts())
+        # Views of earlier records stay in the list until their threads have ended, to be counted.
         self._views = [v for v in self._views if v is self._view or not v.join(0.0)]
         for name, count in counts.items():
             self._health.count(name, count)

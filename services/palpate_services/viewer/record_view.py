@@ -368,7 +368,10 @@ class LiveView:
         self._title = title
         self._max_bytes = max_bytes
         self._meshes = meshes
+        # Fields have a limit of their own: 100,000 of them would take 8 GB.
         self._room_for_fields = threading.Semaphore(FIELD_CAPACITY)
+        # Filled by the recorder's thread, emptied by the view's: append and popleft of a deque are
+        # atomic, so only the counts need the lock.
         self._waiting: deque[tuple[str, Any]] = deque()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
@@ -422,6 +425,7 @@ class LiveView:
         self._waiting.clear()
 
     def _draw(self, view: RerunView) -> None:
+        # Only what waits now: messages that arrive meanwhile are drawn in the next period.
         for _ in range(len(self._waiting)):
             sensor, message = self._waiting.popleft()
             if _is_field(message):
