@@ -57,7 +57,7 @@ class EmulateCommand:
 
     Attributes:
         help: Its help.
-        options: Its options, besides those of the fault plan and the duration.
+        options: Its options, in the order of its help.
         examples: Two lines for the end of its help.
         faults: Remark on its faults.
     """
@@ -69,79 +69,65 @@ class EmulateCommand:
 
 
 def _option(
-    name: str, type_: Any, default: Any, help_: str, *flags: str, **limits: Any
+    name: str, default: Any, help_: str, *flags: str, type_: Any = None, **limits: Any
 ) -> Parameter:
-    """A parameter of a command."""
+    """A parameter of a command; its type is that of the default, if it is not given."""
     option = typer.Option(default, *flags, help=help_, **limits)
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=option, annotation=type_)
+    annotation = type_ or type(default)
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
+
+
+def _many(name: str, metavar: str, help_: str) -> Parameter:
+    """An option that can be repeated."""
+    return _option(name, None, help_, f"--{name}", type_=list[str] | None, metavar=metavar)
 
 
 def _baud(default: int, help_: str = "Its speed [bit/s].", **limits: int) -> Parameter:
-    return _option("baud", int, default, help_, **limits)
+    return _option("baud", default, help_, **limits)
 
 
 def _fingers(most: int, help_: str) -> Parameter:
-    return _option("fingers", int, 3, help_, min=1, max=most)
+    return _option("fingers", 3, help_, min=1, max=most)
 
 
-_HOST = _option("host", str, "127.0.0.1", "Address to listen at.")
-_PORT = _option("port", int, 0, "Port to listen at; 0 = any free one.", min=0, max=65535)
-_LINK = _option(
-    "link", Path | None, None, "Name of the serial line; else a new one.", metavar="PATH"
+_HOST = _option("host", "127.0.0.1", "Address to listen at.")
+_PORT = _option("port", 0, "Port to listen at; 0 = any free one.", min=0, max=65535)
+_LINE = "Name of the serial line; else a new one."
+_LINK = _option("link", None, _LINE, type_=Path | None, metavar="PATH")
+_CHANNEL = _option("channel", MULTICAST, "Name of the bus.")
+_SLOT_RATE = _option(
+    "slot_rate_hz", 4400, "Sampled channels each second.", type_=float, min=1, max=10_000
 )
-_CHANNEL = _option("channel", str, MULTICAST, "Name of the bus.")
-_SLOTS = (_option("slot_rate_hz", float, 4400, "Sampled channels each second.", min=1, max=10_000),)
 _ROUND = (
-    _option("pac_first", bool, False, "A round begins with PAC, not with E1.", "--pac-first"),
-    _option(
-        "electrodes",
-        ElectrodeCount,
-        ElectrodeCount.BIOTAC,
-        "24 = BioTac SP, rounds of 54 slots.",
-    ),
+    _option("pac_first", False, "A round begins with PAC, not with E1.", "--pac-first"),
+    _option("electrodes", ElectrodeCount.BIOTAC, "24 = BioTac SP, rounds of 54 slots."),
 )
 _PLAY = (
-    _option("play", Play, Play.TWIN, "The digital twin, nothing, or a slow press without physics."),
-    _option("seed", int, 0, "Seed of the twin; finger N of a line has this one plus N - 1.", min=0),
+    _option("play", Play.TWIN, "The digital twin, nothing, or a slow press without physics."),
+    _option("seed", 0, "Seed of the twin; finger N of a line has this one plus N - 1.", min=0),
 )
 _FINGER = _option(
-    "finger", int, 1, "The finger of the line that it belongs to, with the same seed.", min=1
+    "finger", 1, "The finger of the line that it belongs to, with the same seed.", min=1
 )
-_UNIT = _option(
-    "unit", str, "", "The twin's specimen, a name or number; else another for each seed."
-)
+_UNIT = _option("unit", "", "The twin's specimen, a name or number; else another for each seed.")
 _END = (
+    _many("trajectory", "ID", "A trajectory of the twin; repeatable. Else all."),
     _option(
-        "trajectory",
-        list[str] | None,
-        None,
-        "A trajectory of the twin; repeatable. Else all.",
-        "--trajectory",
-        metavar="ID",
-    ),
-    _option(
-        "epoch",
-        float,
-        0.0,
-        "When the twin's loops begin [s since 1970]; the same for all of a scene.",
+        "epoch", 0.0, "When the twin's loops begin [s since 1970]; the same for all of a scene."
     ),
     _option(
         "drift_ppm",
-        float,
         200.0,
         "Excess speed of its clock, during clock_drift [1e-6].",
         min=-100_000,
         max=100_000,
     ),
-    _option(
+    _many(
         "fault",
-        list[str] | None,
-        None,
+        "NAME@START[+SECONDS]",
         "A fault that starts after so many seconds, once or for a time; repeatable.",
-        "--fault",
-        metavar="NAME@START[+SECONDS]",
     ),
-    _option("seconds", float, 0, "End after this time [s]; 0 = at Ctrl-C.", min=0),
+    _option("seconds", 0, "End after this time [s]; 0 = at Ctrl-C.", type_=float, min=0),
 )
 _ON_WRENCH = (*_PLAY, _FINGER, *_END)
 _ON_FINGERS = (*_PLAY, _UNIT, *_END)
@@ -149,25 +135,23 @@ _ON_FINGERS = (*_PLAY, _UNIT, *_END)
 COMMANDS = {
     "kms40": EmulateCommand(
         "A Weiss KMS 40 over TCP; its client sets the rate.",
-        (
-            _HOST,
-            _PORT,
-            _option("serial", int, 310042, "Its serial number.", min=0),
-            *_ON_WRENCH,
-        ),
+        (_HOST, _PORT, _option("serial", 310042, "Its serial number.", min=0), *_ON_WRENCH),
         ("kms40 --port 10000", "kms40 --fault silence@10+3"),
     ),
     "rdt": EmulateCommand(
         "An ATI Net F/T or Axia, a Schunk FTN or an OnRobot HEX over UDP.",
         (
-            _option("product", RdtProduct, RdtProduct.NET_FT, "Which of them."),
+            _option("product", RdtProduct.NET_FT, "Which of them."),
             _HOST,
             _PORT,
+            _option("http_port", 0, "Port of its web page; 0 = any free one.", min=0, max=65535),
             _option(
-                "http_port", int, 0, "Port of its web page; 0 = any free one.", min=0, max=65535
-            ),
-            _option(
-                "rate_hz", float, 0, "Records each second; 0 = 1000, of a HEX 100.", min=0, max=8000
+                "rate_hz",
+                0,
+                "Records each second; 0 = 1000, of a HEX 100.",
+                type_=float,
+                min=0,
+                max=8000,
             ),
             *_ON_WRENCH,
         ),
@@ -181,10 +165,10 @@ COMMANDS = {
         (
             _LINK,
             _baud(115200, "Speed of the serial line [bit/s]."),
-            _option("interface", str, "", "python-can's kind of bus; on a serial line without it."),
+            _option("interface", "", "python-can's kind of bus; on a serial line without it."),
             _CHANNEL,
-            _option("model", str, "RFT64-SB01", "The model that it reports."),
-            _option("serial", str, "RFT-1", "Its serial number."),
+            _option("model", "RFT64-SB01", "The model that it reports."),
+            _option("serial", "RFT-1", "Its serial number."),
             *_ON_WRENCH,
         ),
         ("robotous --link ./rft", f"robotous --interface udp_multicast --channel {MULTICAST}"),
@@ -200,22 +184,14 @@ COMMANDS = {
         (
             _option(
                 "interface",
-                str,
                 "udp_multicast",
                 "python-can's kind of bus; udp_multicast needs no hardware.",
             ),
             _CHANNEL,
-            _option(
-                "bus",
-                list[str] | None,
-                None,
-                "More options of python-can; repeatable.",
-                "--bus",
-                metavar="KEY=VALUE",
-            ),
+            _many("bus", "KEY=VALUE", "More options of python-can; repeatable."),
             _fingers(3, "BioTacs on the bus."),
-            _option("can_id", int, 1, "Identifier of frames.", min=0, max=0x7FF),
-            *_SLOTS,
+            _option("can_id", 1, "Identifier of frames.", min=0, max=0x7FF),
+            _SLOT_RATE,
             *_ROUND,
             *_ON_FINGERS,
         ),
@@ -230,9 +206,9 @@ COMMANDS = {
             _LINK,
             _baud(460800, min=1),
             _fingers(5, "BioTacs that it samples."),
-            _option("source_id", int, 1, "The bridge's id.", min=0, max=255),
-            *_SLOTS,
-            _option("slots_per_packet", int, 44, "Slots of a packet, 5 to 10 ms.", min=22, max=44),
+            _option("source_id", 1, "The bridge's id.", min=0, max=255),
+            _SLOT_RATE,
+            _option("slots_per_packet", 44, "Slots of a packet, 5 to 10 ms.", min=22, max=44),
             *_ROUND,
             *_ON_FINGERS,
         ),
@@ -243,9 +219,7 @@ COMMANDS = {
         (
             _LINK,
             _baud(230400, min=1),
-            _option(
-                "electrodes_first", bool, False, "It has the older firmware.", "--electrodes-first"
-            ),
+            _option("electrodes_first", False, "It has the older firmware.", "--electrodes-first"),
             *_ON_FINGERS,
         ),
         ("biotac-pic32 --link ./pic32", "biotac-pic32 --electrodes-first --fault cut@10"),
@@ -253,22 +227,21 @@ COMMANDS = {
     "robot": EmulateCommand(
         "A robot that carries an indenter and publishes the pose of its flange over Zenoh.",
         (
-            _option("name", str, "arm", "Its name on the bus.", "--robot"),
+            _option("name", "arm", "Its name on the bus.", "--robot"),
             _option(
                 "connect",
-                str,
                 "",
                 "Endpoint of a router, e.g. tcp/127.0.0.1:7447; else it runs its own.",
             ),
             _PORT,
-            _option("station", str, "lab", "Station on which it publishes."),
-            _option("rate_hz", float, 250, "Poses each second.", min=1, max=2000),
+            _option("station", "lab", "Station on which it publishes."),
+            _option("rate_hz", 250, "Poses each second.", type_=float, min=1, max=2000),
             *_ON_WRENCH,
         ),
         ("robot --rate-hz 1000", "robot --connect tcp/127.0.0.1:7447 --fault restart@20+2"),
     ),
 }
-"""The commands, by name; ``emulate_devices`` has a maker for each device."""
+"""The commands by name; ``emulate_devices`` has a maker for each device."""
 
 
 def _add(name: str, command: EmulateCommand) -> None:

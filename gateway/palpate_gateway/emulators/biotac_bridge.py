@@ -136,6 +136,7 @@ class BiotacBridgeEmulator(SerialEmulator):
             step_s = 1.0 / (self.rate_hz * (1.0 + drift))
             if now_s - self._due_s > _STOPPED_S:  # this process stood still
                 self._due_s = now_s
+            # A packet is sent once its last slot has been sampled, not at its first one.
             while now_s - self._due_s >= self._together * step_s and not self._stop.is_set():
                 self._announce()
                 self._sample(step_s)

@@ -172,6 +172,7 @@ class SlotBlocks:
         if not isinstance(source, CountTrack):
             slots = zip(times_s.tolist(), places.tolist(), strict=True)
             return np.array([count_at(source(t, finger), place) for t, place in slots], np.int64)
+        # E20..E24 of a BioTac SP are made of nearby electrodes, as in ``count_at``.
         known = places < CHANNELS
         repeated = np.array(_SP_REPEATS)[np.where(known, 0, places - CHANNELS)]
         counts = source.slots(times_s, np.where(known, places, repeated), finger)

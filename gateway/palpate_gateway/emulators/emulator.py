@@ -172,5 +172,6 @@ class SampleTicker:
         if left_s > 0.0:
             self._stop.wait(left_s)
         elif left_s < -0.5:
+            # Shorter delays are caught up by ticks in quick succession, as a device would send.
             self._next_s = time.monotonic()
         return self._next_s

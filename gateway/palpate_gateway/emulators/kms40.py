@@ -144,6 +144,7 @@ class Kms40Emulator(Emulator):
     def _restart(self) -> None:
         """Lose power: reset the connection and forget all settings."""
         if self._client is not None:
+            # Linger time 0 makes close() send RST instead of FIN, as after a loss of power.
             self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._power_up()
         self._drop_client()

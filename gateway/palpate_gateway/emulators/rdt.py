@@ -338,6 +338,7 @@ class RdtEmulator(Emulator):
         if self.faulty("junk"):
             link.sendto(self._random.randbytes(self._random.choice((1, 8, 35, 37, 100))), client)
         if self.faulty("late"):
+            # Kept until the next record has been sent.
             self._held = whole
             return
         self._packet.append(whole)

@@ -238,6 +238,7 @@ class RobotousSerialEmulator(SerialEmulator, RobotousEmulator):
         self._line.keep_plugged(not self.faulty("unplug"))
         self._came += self._line.read(timeout_s)
         out = []
+        # A request has 11 bytes: 55, D1 to D8, sum, AA. Bytes outside a valid one are skipped.
         while len(self._came) >= 11:
             frame, length = self._came[:11], 1
             if frame[0] == 0x55 and frame[10] == 0xAA and frame[9] == sum(frame[1:9]) % 256:

@@ -190,6 +190,7 @@ class TwinCounts(CountTrack, _LoopPlayer):
         column = np.where(dynamic, 0, places)
         before, after = loop.frames[lower, column], loop.frames[lower + 1, column]
         frame = np.rint(before + (at - lower) * (after - before)).astype(np.int64)
+        # PAC has 22 samples in each frame, so it is not interpolated.
         nearest = np.rint(at * PAC_SAMPLES).astype(np.int64) % len(loop.pac)
         return np.where(dynamic, loop.pac[nearest], frame)
 

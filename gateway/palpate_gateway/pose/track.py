@@ -70,6 +70,7 @@ class PoseTrack:
                 self._lose(ahead - 1)
                 self._last = frame
             return self._drop("repeated_poses")
+        # With a run id a restart shows by a new id, so an old sequence number is only late.
         if ahead <= 0 and frame.run_id:
             return self._drop("late_poses")
         if ahead <= 0 and frame.time_ns > last.time_ns:

@@ -160,6 +160,7 @@ class TextLogReader:
 
     def _rebuilt_time(self, frame: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """Times on the grid of slots, with gaps for frames that are missing by their counter."""
+        # A log without times still counts its frames: each missing one leaves a gap of a round.
         before = frame[0] if self._frame_before is None else self._frame_before
         missing = np.maximum(np.diff(frame, prepend=before) - 1, 0)
         index = self._slots_before + np.arange(len(frame))

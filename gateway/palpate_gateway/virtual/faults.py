@@ -84,6 +84,7 @@ class _ActiveFault:
 
     def __init__(self, fault: VirtualFault, rate_hz: float, seed: list[int]) -> None:
         self.kind = fault.kind
+        # The margin keeps a time such as 0.3 s at 100 Hz on frame 30 in spite of rounding.
         self.first = math.ceil(fault.at_s * rate_hz - 1e-6)
         frames = max(1, round(fault.for_s * rate_hz)) if fault.for_s else None
         self.end = math.inf if frames is None else self.first + frames
@@ -183,6 +184,8 @@ class FaultPlan:
         self, reading: ElectrodeReading, active: list[_ActiveFault]
     ) -> ElectrodeReading | None:
         lost = False
+        # All faults act, also on a lost frame: otherwise their random numbers would depend on the
+        # losses, and the counts after them would differ from those of a run without losses.
         for one in active:
             if one.kind == "lost":
                 hit = one.random.random() < one.value

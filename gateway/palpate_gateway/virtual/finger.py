@@ -168,6 +168,7 @@ class VirtualFinger(Device):
         if due_s > now_s:
             time.sleep(due_s - now_s)
         elif now_s - due_s > _RESYNC_S:
+            # The gap goes into the ticks, so the next frame reports it as missed frames.
             self._skipped += int((now_s - due_s) * rate_hz)
 
     def _readings(self, group: Group) -> list[Reading]:

@@ -242,6 +242,7 @@ def contact(touch: Touch, time_s: Array, indenter_radius_m: float) -> FormulaCon
     depth = np.maximum(travel, 0.0)
     normal = touch.place.normal
     relative = _relative_radius(indenter_radius_m)
+    # Hertz, 4/3 E sqrt(R) d^1.5; the last factor stiffens the skin as it comes near the core.
     normal_force = (
         (4.0 / 3.0)
         * _MODULUS_PA
@@ -280,9 +281,11 @@ def films(touch: Touch, state: FormulaContact, indenter_radius_m: float) -> Arra
     dragged = drag * reach * (SKIN_NORMALS @ touch.direction - ahead * facing)
     gap = REST_GAPS_M + bulge * (1.0 - share) - depth * share * facing + dragged
 
+    # Pressure on the closed film: the normal force over the area of the footprint.
     patch = np.pi * (relative * depth + 4e-6)
     load = state.normal_force[:, None] * share / patch
     residual = _FILM_FLOOR_M + _ASPERITY_M / (1.0 + load / _FILM_PRESSURE_PA)
+    # A smooth maximum of gap and residual film: counts must not have a kink at closure.
     closed: Array = residual + _SOFTNESS_M * np.logaddexp(0.0, (gap - residual) / _SOFTNESS_M)
     return closed
 

@@ -138,6 +138,7 @@ class TwinSensor:
 
     def _crept(self, ideal: Array) -> Array:
         """Counts with creep: a share of every change decays in with one time constant."""
+        # Exact solution of the first-order lag for an input that is constant during a frame.
         late = self._unit.creep_share * (ideal - self._rest)
         crept = np.empty_like(ideal)
         for k in range(len(ideal)):
@@ -158,6 +159,8 @@ class TwinSensor:
             warmth[:, None] - 1
         )
         factor = np.exp(shift)
+        # With Z/R = 4095 / counts - 1, Z/R divided by ``factor`` gives the counts below; the clip
+        # keeps the division defined at the ends of the range.
         inside = np.clip(counts, 0.0, COUNTS_MAX)
         warmed: Array = COUNTS_MAX * inside * factor / (COUNTS_MAX - inside + inside * factor)
         return warmed

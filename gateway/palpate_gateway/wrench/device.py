@@ -65,6 +65,7 @@ class Mount:
         quaternion = np.array(options.orientation_wxyz)
         rotation = rotation_matrices(quaternion / np.linalg.norm(options.orientation_wxyz))
         x, y, z = options.origin_m
+        # The matrix of the cross product with ``origin_m``: torque gets the force times its arm.
         arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         sign = 1.0 if options.carries == "biotac" else -1.0
         zero = np.zeros((3, 3))

@@ -196,6 +196,7 @@ class WrenchKms40(WrenchDevice):
                 continue
             self._heard_s = time.monotonic()
             arrival_ns = next(times_ns)
+            # The time of an invalid sample is used up above, so that the others keep theirs.
             if self._faulty:
                 self._counts["invalid_samples"] += 1
                 continue

@@ -148,6 +148,7 @@ class CounterClock:
         counter = unwrap(raw, self._last[0])
         if new_epoch:
             self._check_restart(counter - self._last[0], arrival_s - self._last[1])
+        # Unwrapped, the counter is a Python integer and never overflows.
         self._last = counter, arrival_s
         if self._rate_hz is None:
             return None

@@ -66,6 +66,7 @@ class Zeroing:
         if not self._requests:
             return
         request = self._requests[0]
+        # The caller may have given up waiting in the meantime.
         if request.future.cancelled():
             self._done(request)
             return
@@ -95,6 +96,7 @@ class Zeroing:
                 )
 
     def _go_on(self, request: _ZeroRequest) -> None:
+        # First pass: mean before the zero, then the zero. Second pass: mean after it.
         request.readings = request.readings[-request.count :]
         wrenches = np.array([(*one.force, *one.torque) for one in request.readings], np.float64)
         if request.before is None:
