@@ -1,4 +1,4 @@
-"""Poses of the indenter from recorded robot poses: a CSV file (``table``), or a palpate record.
+"""Poses of the indenter from recorded robot poses: a CSV file, or a palpate record.
 
 A record may also hold poses of the indenter, as they were published; the driver ``record`` replays
 those. This driver computes them again from the robot's poses, e.g. with a better ``base_sensor``.

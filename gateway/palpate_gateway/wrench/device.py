@@ -146,7 +146,7 @@ class WrenchDevice(Device):
         self._prompt_s = 0.0
         self._tick = 0
         self._silent_since: float | None = None
-        self._tells_time = True
+        self._has_clock = True
         """Whether its readings have the device's time; final once it is connected."""
 
     @property
@@ -202,7 +202,7 @@ class WrenchDevice(Device):
         return DeviceIdentity(
             self._serial or serial,
             slot_period_s=1.0 / self.info.rate_hz,
-            has_clock=self._tells_time,
+            has_clock=self._has_clock,
         )
 
     def _read(self, timeout_s: float) -> list[Reading]:

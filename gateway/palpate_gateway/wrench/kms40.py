@@ -91,7 +91,7 @@ class WrenchKms40(WrenchDevice):
         model = f"Weiss KMS 40 at {options.host}"
         super().__init__("wrench_kms40", model, rate_hz, options)
         self._filter, self._flags_every_s = options.filter_number, options.flags_every_s
-        self._tells_time = False
+        self._has_clock = False
         self._port = TcpPort(options.host, options.port)
         self._patience_s = max(_PATIENCE_S, 5.0 / rate_hz)
         self._arrivals = ArrivalTimes(1.0 / rate_hz)

@@ -310,7 +310,7 @@ class WrenchRdt(WrenchDevice):
             counter_hz = None
         wrong, self._clock = self._clock.wrong, CounterClock(counter_hz, self.info.model)
         self._clock.wrong = wrong
-        self._tells_time = counter_hz is not None
+        self._has_clock = counter_hz is not None
         return serial
 
     def _start(self) -> None:

@@ -85,8 +85,8 @@ class Zeroing:
     def give_up(self, why: str) -> None:
         """Fail all requests, because the device is lost."""
         with self._lock:
-            request, self._requests = self._requests, []
-        for one in request:
+            requests, self._requests = self._requests, []
+        for one in requests:
             if one.future.set_running_or_notify_cancel():
                 one.future.set_exception(
                     DeviceError(
