@@ -66,6 +66,7 @@ class TareCollector:
         pdc = np.array([frame.pdc for frame in window], np.float64)
         pac = np.concatenate([_valid_pac(frame) for frame in window]).astype(np.float64)
         last = window[-1]
+        # Judged as one window, not frame by frame: a slow shift shows only between its halves.
         motion = evidence_of(electrodes, pac, pdc).motion(self._limits)
         if motion:
             raise DeviceError(

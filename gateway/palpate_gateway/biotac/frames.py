@@ -232,6 +232,7 @@ class FrameAssembler:
         counters["incomplete_frames"] += int(np.count_nonzero(present < layout.slots))
         counters["frames"] += frames
 
+        # 64 bits: a frame of a BioTac SP has 54 slots.
         validity = np.where(valid, self._bits, np.uint64(0)).sum(axis=1, dtype=np.uint64)
         readings = []
         for k, start in enumerate(starts.tolist()):

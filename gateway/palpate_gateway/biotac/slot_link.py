@@ -156,6 +156,7 @@ class SlotLink:
         """
         with cls._guard:
             link = cls._open.get(key)
+            # A line that failed stays in the table until its last finger leaves it.
             if link is not None and link._failed:
                 link = None  # broken; its fingers will leave it
             if link is None:

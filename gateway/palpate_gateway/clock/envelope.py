@@ -71,6 +71,7 @@ class ClockEnvelope:
             x_s: Device time [s].
             late_ns: Arrival minus device time [ns]; any origin, the same for all.
         """
+        # Between two fits the line only moves down, at once, when a reading lies below it.
         above_ns = late_ns - self.at(x_s)
         if above_ns < self._low_ns:
             self._low_ns, self._lowest = above_ns, (x_s, late_ns)

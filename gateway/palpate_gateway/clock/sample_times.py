@@ -41,10 +41,12 @@ class ArrivalTimes:
         step_ns, read_ns = self._period_ns, self._read_ns
         self._read_ns = now_ns
         worth_ns = count * step_ns
+        # After a pause count on from the last sample; else count back from now.
         if read_ns is not None and self._waited(worth_ns, now_ns - read_ns):
             times = [min(self._last_ns + k * step_ns, now_ns) for k in range(1, count + 1)]
         else:
             if read_ns is not None:
+                # Never before the last sample: a clump that came early is packed closer.
                 step_ns = min(step_ns, max(now_ns - self._last_ns, 0) // count)
             times = [now_ns - k * step_ns for k in range(count - 1, -1, -1)]
         self._last_ns = times[-1]
@@ -113,6 +115,7 @@ class SampleClock:
         if ahead_us == 0:
             self.counters["repeated_samples"] += 1
             return SampleVerdict.REPEATED
+        # Modulo the wrap a step back looks like a large step ahead; the host's clock rules that out.
         steps = round(ahead_us / self._period_us)
         host_us = round(1e6 * (now_s - self._arrived_s))
         if steps < 1 or ahead_us > host_us + 1e6 * _BACKLOG_S:

@@ -97,6 +97,7 @@ class WallClock:
             pair = self._read()
             offset_ns = pair.wall_ns - pair.monotonic_ns
             change_ns = offset_ns - self.offset_ns
+            # Either reading of both clocks may be off by the time between its two parts.
             unsure_ns = pair.apart_ns + self._apart_ns
             parted_ns = _STEERED * (pair.monotonic_ns - self.looked_ns)
             self.looked_ns = pair.monotonic_ns

@@ -90,6 +90,7 @@ class UntouchedLevel:
         """
         if self._level is None or self._tare is None:
             return
+        # Near the last untouched level, and near the tare: small steps must not add up to a press.
         if not (
             is_drift(electrodes - self._level[0], pdc - self._level[1], usable)
             and is_drift(electrodes - self._tare[0], pdc - self._tare[1], usable)

@@ -144,10 +144,13 @@ class Silences:
             # The sender or host is catching up, or was held up again while it did.
             gap.low_s = gap.high_s = delay_s
             gap.until_s = stamp_s + settle_s
+        # A broken order shows that slots were lost, so this silence is no mere stall; except where
+        # the host has stalled for as long before, and both may have come together.
         at_once = broken and delay_s - usual_s >= max(0.75 * self._gap_s, 2 * self._stall_s)
         if not at_once and (stamp_s < min(gap.until_s, gap.give_up_s) or not edge):
             return NO_LOSS
         late_s = delay_s if at_once else gap.low_s if stamp_s >= gap.until_s else gap.least_s
+        # What remains of the delay after whole frames moves the grid of slots.
         frames = math.floor((late_s - usual_s) / self._frame_s + 0.5)
         self._begin(stamp_s, usual_s)
         return FrameLoss(frames, late_s - usual_s - frames * self._frame_s)

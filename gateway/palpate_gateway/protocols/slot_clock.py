@@ -347,12 +347,16 @@ class SlotClock:
             return False
         missing = 0
         if anchored:
+            # Only here is the position certain: slots counted since the last anchor are those that
+            # came, so the rest of the way between both anchors was lost.
             missing = max(target - self._sure[0] - 1 - self._since, 0)
             self._sure = (target, stamp_s)
             self._since = 0
         else:
             self._since += 1
         before, self._index, self._last_s = self._index, target, stamp_s
+        # Exact stamps show whole lost frames too. The order of channels shows only what is lost
+        # besides whole cycles; those are found by ``Silences``.
         frames, slots = divmod(missing, order.size) if self._exact else (0, missing)
         if not self._exact:
             certain = target == self._sure[0] + self._since
@@ -379,6 +383,7 @@ class SlotClock:
         if self._exact:
             expected = (stamp_s - last_s) / self._period_s
             return index + order.steps_near(index % size, channel, expected)
+        # Without exact stamps the shortest way is taken; whole cycles are found by ``Silences``.
         target = index + order.steps(index % size, channel)
         ahead = self._index - target
         # PAC may have run ahead, by a repetition or else by more than half a frame.
