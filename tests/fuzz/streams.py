@@ -87,7 +87,7 @@ def same_in_pieces(
 def plain_search(
     stream: bytes, lengths: Mapping[bytes, int], is_good: Callable[[bytes], bool]
 ) -> list[bytes]:
-    """Frames of a whole stream, byte by byte: what ``resync.FrameFinder`` must find in pieces."""
+    """Frames of a whole stream, byte by byte: what ``framing.FrameFinder`` must find in pieces."""
     frames = []
     at = 0
     while at < len(stream):

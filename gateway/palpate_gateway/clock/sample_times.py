@@ -115,7 +115,7 @@ class SampleClock:
         if ahead_us == 0:
             self.counters["repeated_samples"] += 1
             return SampleVerdict.REPEATED
-        # Modulo the wrap a step back looks like a large step ahead: the host's clock tells them apart.
+        # Modulo the wrap a step back looks like a large step ahead; the host's clock decides.
         steps = round(ahead_us / self._period_us)
         host_us = round(1e6 * (now_s - self._arrived_s))
         if steps < 1 or ahead_us > host_us + 1e6 * _BACKLOG_S:
