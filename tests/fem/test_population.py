@@ -19,7 +19,13 @@ from palpate_fem.electrodes.gap import Gap
 from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.population.fitting import OVERTRAVELS_M, DeepStates, fit_specimen, overtravel_for
+from palpate_fem.population.fitting import (
+    OVERTRAVELS_M,
+    DeepStates,
+    TaredRange,
+    fit_specimen,
+    overtravel_for,
+)
 from palpate_fem.population.members import (
     PAPER,
     Member,
@@ -27,7 +33,7 @@ from palpate_fem.population.members import (
     read_population,
     write_population,
 )
-from palpate_fem.population.responses import TaredRange, clear_steps
+from palpate_fem.population.responses import clear_steps
 from palpate_fem.result import IndentationResult, IndentationStep
 
 Floats = NDArray[np.float64]
@@ -67,12 +73,14 @@ def test_fit_finds_the_range_of_a_planted_specimen(
     start = replace(SpecimenParameters(), name="one")
     before = TaredRange.of(tared(sensor.with_specimen(start), pressed, rest))
     assert max(abs(before.low - ends.low), abs(before.high - ends.high)) > 0.01
-    fitted = fit_specimen(sensor.with_specimen(start), pressed, rest, (ends.low, ends.high))
-    assert fitted.found.low == pytest.approx(ends.low, abs=4e-3)
-    assert fitted.found.high == pytest.approx(ends.high, abs=4e-3)
-    again = TaredRange.of(tared(sensor.with_specimen(fitted.specimen), pressed, rest))
-    assert (again.low, again.high) == pytest.approx((fitted.found.low, fitted.found.high))
-    assert fitted.specimen.name == "one"
+    specimen, found = fit_specimen(
+        sensor.with_specimen(start), pressed, rest, (ends.low, ends.high)
+    )
+    assert found.low == pytest.approx(ends.low, abs=4e-3)
+    assert found.high == pytest.approx(ends.high, abs=4e-3)
+    again = TaredRange.of(tared(sensor.with_specimen(specimen), pressed, rest))
+    assert (again.low, again.high) == pytest.approx((found.low, found.high))
+    assert specimen.name == "one"
 
 
 def test_thinner_films_at_the_sides_rest_lower_and_rise_more(

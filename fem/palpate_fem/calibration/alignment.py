@@ -94,7 +94,7 @@ class AlignedCurves:
 
     Attributes:
         displacement_m: Since each curve's own threshold force [m], shape (N,).
-        simulated_n: SimulatedRun force [N], shape (N, 3).
+        simulated_n: Simulated force [N], shape (N, 3).
         measured_n: Measured force [N], shape (N, 3).
         depth_offset_m: Travel at the threshold, simulation minus measurement [m]: positive if the
             simulation touches later, that is deeper. The comparison of forces does not see it.
@@ -310,11 +310,6 @@ def relative_rms(pair: AlignedCurves) -> float:
     return rms_n(pair) / peak_n(pair)
 
 
-def thickness_error_m(thickness_m: float, target_m: float = TARGET_THICKNESS_M) -> float:
-    """Absolute error of the total thickness [m]."""
-    return abs(thickness_m - target_m)
-
-
 def cost(
     pairs: Sequence[AlignedCurves],
     thickness_m: float,
@@ -326,9 +321,9 @@ def cost(
 
     Args:
         pairs: Every compared trajectory.
-        thickness_m: SimulatedRun total thickness [m].
+        thickness_m: Simulated total thickness [m].
         weights: Of force and thickness.
-        target_m: Thickness to reach [m].
+        target_m: Required thickness [m].
     """
     force = float(axis_rms_n(pairs).sum())
-    return weights.force * force + weights.thickness * thickness_error_m(thickness_m, target_m)
+    return weights.force * force + weights.thickness * abs(thickness_m - target_m)

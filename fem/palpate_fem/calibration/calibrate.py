@@ -61,7 +61,7 @@ def calibrate(
     """Find the parameters that bring simulated forces closest to measured ones.
 
     Args:
-        simulator: SimulationRuns indentations; the sensor is not part of a run.
+        simulator: Runs indentations, which do not depend on the sensor.
         measured: Trajectories of one or several sensors. Friction is visible only where the
             indenter slips, so include angled ones. Thickness and modulus act alike until the skin
             is pinched on the core: one indentation with the long cylinder and noise of 0.02 N gives

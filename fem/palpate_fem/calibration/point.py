@@ -15,10 +15,9 @@ from palpate_fem.calibration.alignment import (
     Floats,
     ForceCurve,
     align,
-    axis_rms_n,
+    cost,
     curve,
     from_contact,
-    thickness_error_m,
 )
 from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.calibration.runs import SimulatedRun
@@ -92,7 +91,7 @@ class ModulusFit:
     Attributes:
         cost: Total cost [N]; infinite if a case cannot be compared.
         modulus_pa: Best modulus [Pa].
-        pairs: AlignedCurves curves, one for each case.
+        pairs: Aligned curves, one for each case.
         failures: Index of each case that cannot be compared, and why.
     """
 
@@ -141,13 +140,13 @@ def fit_modulus(
         method="bounded",
         options={"xatol": 1e-4},
     )
-    log, cost = (found.x, found.fun) if found.fun < costs[best] else (grid[best], costs[best])
+    log, lowest = (found.x, found.fun) if found.fun < costs[best] else (grid[best], costs[best])
     factor = math.exp(log) / settings.reference_shear_modulus_pa
     pairs = tuple(
         compare(line, case, factor, settings)
         for line, case in zip(state.curves, cases, strict=True)
     )
-    return ModulusFit(float(cost), math.exp(log), pairs, {})
+    return ModulusFit(float(lowest), math.exp(log), pairs, {})
 
 
 def failures_at(
@@ -195,9 +194,7 @@ def force_and_thickness_cost(
             return math.inf
         if pairs[-1].coverage < settings.least_coverage:
             return math.inf
-    error = thickness_error_m(thickness_m, settings.target_thickness_m)
-    weights = settings.weights
-    return weights.force * float(axis_rms_n(pairs).sum()) + weights.thickness * error
+    return cost(pairs, thickness_m, weights=settings.weights, target_m=settings.target_thickness_m)
 
 
 def _failures(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
 from palpate.process import require
+from palpate.rigid import rotation_matrices
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.style import (
     CORE,
@@ -215,15 +216,7 @@ def _draw_below(
 
 def _placed(body: Outline, pose: Floats) -> Outline:
     """A surface in the indenter's frame, moved to where the indenter is."""
-    w, x, y, z = pose[3:]
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return np.asarray(body[0], np.float64) @ turn.T + pose[:3], body[1]
+    return np.asarray(body[0], np.float64) @ rotation_matrices(pose[3:]).T + pose[:3], body[1]
 
 
 def _frame(panels: Any, points: Floats) -> None:

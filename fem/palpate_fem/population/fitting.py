@@ -24,7 +24,7 @@ from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.specimen import LIMITS, LOG_SD, SpecimenParameters
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.population.members import Member, PublishedRange
-from palpate_fem.population.responses import TaredRange, clear_steps
+from palpate_fem.population.responses import clear_steps
 from palpate_fem.store.read import SimulationStore
 
 Floats = NDArray[np.float64]
@@ -39,20 +39,16 @@ KEPT = 3
 
 
 @dataclass(frozen=True, slots=True)
-class FittedSpecimen:
-    """A specimen and what it was fitted to.
+class TaredRange:
+    """Smallest and largest tared value of all electrodes and states, over full scale."""
 
-    Attributes:
-        specimen: Its parameters.
-        found: Its range over all states.
-        wanted: Smallest and largest tared value that it should have.
-        rounds: How often the extreme states were selected again.
-    """
+    low: float
+    high: float
 
-    specimen: SpecimenParameters
-    found: TaredRange
-    wanted: tuple[float, float]
-    rounds: int
+    @classmethod
+    def of(cls, tared: Floats) -> TaredRange:
+        """Range of tared values over full scale, shape (N, 19)."""
+        return cls(float(tared.min()), float(tared.max()))
 
 
 def fit_specimen(
@@ -62,7 +58,7 @@ def fit_specimen(
     wanted: tuple[float, float],
     *,
     rounds: int = 4,
-) -> FittedSpecimen:
+) -> tuple[SpecimenParameters, TaredRange]:
     """Fit a specimen, starting from its present parameters.
 
     A range is set by a few extreme states, so only those are evaluated while fitting; they are
@@ -72,7 +68,7 @@ def fit_specimen(
         sensor: Model of the specimen to start from; its parameters are the centre of the priors.
         states: Gaps at the deep states of many trajectories.
         rest: Gap of the untouched finger.
-        wanted: Smallest and largest tared value over full scale.
+        wanted: Smallest and largest tared value over full scale that it should have.
         rounds: How often the extreme states are selected again, at most.
 
     Returns:
@@ -90,9 +86,7 @@ def fit_specimen(
 
     scaled = np.zeros(len(centre))
     chosen: set[int] = set()
-    done = 0
-    while done < rounds:
-        done += 1
+    for _ in range(rounds):
         tared = _tared(sensor.with_specimen(specimen_at(scaled)), states, rest)
         picked = _extreme(tared)
         if picked <= chosen:
@@ -108,9 +102,7 @@ def fit_specimen(
         found = least_squares(misfit, scaled, diff_step=1e-2, x_scale=1.0, max_nfev=25)
         scaled = found.x
     specimen = specimen_at(scaled)
-    return FittedSpecimen(
-        specimen, TaredRange.of(_tared(sensor.with_specimen(specimen), states, rest)), wanted, done
-    )
+    return specimen, TaredRange.of(_tared(sensor.with_specimen(specimen), states, rest))
 
 
 def _tared(sensor: ElectrodeModel, states: Sequence[Gap], rest: Gap) -> Floats:
@@ -275,13 +267,13 @@ def fit_member(
         for deep in states
         if published.pressed_with(deep.indenter) and (gap := deep.gaps[extra]) is not None
     ]
-    fitted = fit_specimen(
+    specimen, reached = fit_specimen(
         ElectrodeModel(geometry, start), gaps, rest, (published.low, published.high)
     )
     found = {
-        "low": fitted.found.low,
-        "high": fitted.found.high,
+        "low": reached.low,
+        "high": reached.high,
         "max_force_n": force,
         "states": float(len(gaps)),
     }
-    return Member(fitted.specimen, published, float(OVERTRAVELS_M[extra]), found)
+    return Member(specimen, published, float(OVERTRAVELS_M[extra]), found)

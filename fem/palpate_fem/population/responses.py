@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -121,27 +120,6 @@ def _sharing_films(models: Mapping[str, ElectrodeModel]) -> list[list[str]]:
     for name, model in models.items():
         groups.setdefault(id(model.finder), []).append(name)
     return list(groups.values())
-
-
-@dataclass(frozen=True, slots=True)
-class TaredRange:
-    """Smallest and largest tared value of one specimen, over full scale.
-
-    Attributes:
-        low: Smallest over all electrodes and states.
-        high: Largest over all electrodes and states.
-        by_electrode: Low and high of each electrode, shape (2, 19).
-    """
-
-    low: float
-    high: float
-    by_electrode: Floats
-
-    @classmethod
-    def of(cls, tared: Floats) -> TaredRange:
-        """Range of tared values over full scale, shape (N, 19)."""
-        ends = np.stack([tared.min(axis=0), tared.max(axis=0)])
-        return cls(float(ends[0].min()), float(ends[1].max()), ends)
 
 
 MOUNT_SHARE = 0.05
