@@ -112,7 +112,7 @@ def data_generate(
     ] = None,
     units: Annotated[
         Path | None,
-        typer.Option("--units", metavar="FILE.json", help="Population; none = the shipped three."),
+        typer.Option("--units", metavar="FILE.json", help="Specimens; none = the three that ship."),
     ] = None,
     edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
     fill_ml: Annotated[float, typer.Option(help="Fluid under the skin [ml].")] = 0.6,
@@ -189,7 +189,7 @@ def data_sample(
     ] = None,
     units: Annotated[
         Path | None,
-        typer.Option("--units", metavar="FILE.json", help="Population; none = the shipped three."),
+        typer.Option("--units", metavar="FILE.json", help="Specimens; none = the three that ship."),
     ] = None,
 ) -> None:
     """Take a small part of an experiment: a data set for tests, a tape for the virtual finger."""

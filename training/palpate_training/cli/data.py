@@ -262,7 +262,7 @@ def data_figures(
     ] = None,
     idle: Annotated[
         Path | None,
-        typer.Option(help="Untouched twin (.npz): rate_hz, and counts (T, 19) for each unit."),
+        typer.Option(help="Untouched twin (.npz): rate_hz, and counts (T, 19) for each specimen."),
     ] = None,
     public_data: Annotated[
         Path | None,

@@ -81,7 +81,7 @@ def data_ingest(
     record: Annotated[Path, typer.Argument(metavar="RECORD.mcap", help="What was recorded.")],
     plan: Annotated[Path, typer.Argument(metavar="PLAN.jsonl", help="What was executed.")],
     out: Annotated[Path, typer.Argument(metavar="OUT.h5", help="Trials to write.")],
-    unit: Annotated[str, typer.Option(help="Name of the BioTac, e.g. biotac-1.")],
+    unit: Annotated[str, typer.Option(help="Name of the specimen, e.g. biotac-1.")],
     sensor: Annotated[str, typer.Option(help="Name of the sensor in the record.")],
     start_wall_ns: Annotated[
         int | None, typer.Option(help="Wall clock when the plan started [ns since 1970].")

@@ -30,7 +30,7 @@ def train_field(
     data: Mixed,
     out: Bundle,
     units: Annotated[
-        str, typer.Option(help="Units to train on, with commas between; empty = all.")
+        str, typer.Option(help="Specimens to train on, with commas between; empty = all.")
     ] = "",
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "field",
     version: Version = 1,
@@ -64,7 +64,7 @@ def train_field(
 def train_synthesis(
     data: Mixed,
     out: Bundle,
-    unit: Annotated[str, typer.Option(help="The unit whose electrodes are synthesised.")],
+    unit: Annotated[str, typer.Option(help="The specimen whose electrodes are synthesised.")],
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "synthesis",
     version: Version = 1,
     seed: Seed = 0,

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from palpate import __version__
 from palpate.errors import DatasetError
-from palpate.files.hdf5 import opened
+from palpate.files.hdf5 import opened, text
 from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
@@ -244,7 +244,7 @@ def _turned(values: Floats, axes: Sequence[str]) -> Floats:
 def _indenters(path: Path, kinds: npt.NDArray[Any], names: Any) -> Texts:
     """Names: from the file's own list where it has one, else the texts or numbers it holds."""
     if kinds.dtype.kind not in "fiu":
-        return np.array([_text(kind) for kind in kinds], dtype=object)
+        return np.array([text(kind) for kind in kinds], dtype=object)
     if not np.array_equal(kinds, np.floor(kinds)) or kinds.min() < 0:
         raise DatasetError(
             f"{path}: indenter_type is not made of whole numbers", remedy="download the file again"
@@ -256,11 +256,7 @@ def _indenters(path: Path, kinds: npt.NDArray[Any], names: Any) -> Texts:
             f"{path}: indenter_type {int(kinds.max())} has no name in its list of {len(names)}",
             remedy="export the file again",
         )
-    return np.array([_text(names[int(kind)]) for kind in kinds], dtype=object)
-
-
-def _text(value: object) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+    return np.array([text(names[int(kind)]) for kind in kinds], dtype=object)
 
 
 def _check_unique(path: Path, rows: Floats) -> None:
