@@ -15,7 +15,7 @@ import math
 import sys
 import time
 
-from palpate.client import Client
+from palpate import Client
 from palpate.errors import PalpateError
 
 PERIOD_S = 0.004

@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import uuid
 
-from palpate.client import Client
+from palpate import Client
 from palpate.client.simulations import straight_path
 from palpate.errors import PalpateError
 from palpate.messages import SimulationRequest, SimulationStep

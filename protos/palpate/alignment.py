@@ -7,9 +7,10 @@
     force, known = linear(at_ns, times_of(wrenches, clock), forces)
     turned, known = slerp(at_ns, times_of(poses, clock), orientations)
 
-Between two readings values run straight, orientations along the shorter arc. Nothing is invented:
-before the first reading, after the last, and across a gap of more than three periods there is no
-value. One host's streams meet on its monotonic clock, others on wall clocks (docs/time.md).
+Between two readings, values are interpolated linearly and orientations along the shorter arc. There
+is no extrapolation: before the first reading, after the last, and across a gap of more than three
+periods the value is NaN. Streams of one host are compared on its monotonic clock, others on wall
+clocks (docs/time.md).
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def common_clock(*streams: Iterable[Stamped]) -> AlignmentClock:
 def times_of(stream: Iterable[Stamped], clock: AlignmentClock) -> Times:
     """Times of messages [ns], int64, shape ``(N,)``."""
     stamps = [message.stamp for message in stream]
-    told = [s.monotonic_ns if clock is AlignmentClock.MONOTONIC else s.wall_ns for s in stamps]
-    return np.array(told, np.int64)
+    times = [s.monotonic_ns if clock is AlignmentClock.MONOTONIC else s.wall_ns for s in stamps]
+    return np.array(times, np.int64)
 
 
 def electrode_instants(frames: Sequence[ElectrodeFrame], clock: AlignmentClock) -> Times:
@@ -87,7 +88,7 @@ def frame_instants(frames: Sequence[ElectrodeFrame], clock: AlignmentClock) -> T
 def linear(
     at_ns: Times, times_ns: Times, values: npt.ArrayLike, *, period_s: float | None = None
 ) -> tuple[Values, Known]:
-    """Values at other times, straight between neighbours.
+    """Values at other times, interpolated linearly.
 
     Args:
         at_ns: When [ns], of any shape.
@@ -96,10 +97,10 @@ def linear(
         period_s: Of the stream [s]; None = the median of its gaps.
 
     Returns:
-        Values of shape ``(*at_ns.shape, K)``, NaN where there is none; and where there is one.
+        Values of shape ``(*at_ns.shape, K)``, NaN where unknown; and a mask of the known ones.
 
     Raises:
-        DatasetError: Times and values do not belong together.
+        DatasetError: Times and values have different lengths or wrong shapes.
     """
     around = _Around(at_ns, times_ns, values, period_s)
     share = around.share[..., None]
@@ -121,11 +122,11 @@ def slerp(
         period_s: Of the stream [s]; None = the median of its gaps.
 
     Returns:
-        Unit quaternions of shape ``(*at_ns.shape, 4)``, NaN where there is none; and where there is
-        one.
+        Unit quaternions of shape ``(*at_ns.shape, 4)``, NaN where unknown; and a mask of the known
+        ones.
 
     Raises:
-        DatasetError: Times and quaternions do not belong together.
+        DatasetError: Times and quaternions have different lengths or wrong shapes.
     """
     around = _Around(at_ns, times_ns, quaternions, period_s)
     turned = rigid.slerp(around.before, around.after, around.share)
@@ -141,7 +142,7 @@ class _Around:
         times, rows = np.asarray(times_ns, np.int64), np.asarray(values, np.float64)
         if times.ndim != 1 or rows.ndim != 2 or len(rows) != len(times) or not len(times):
             raise DatasetError(
-                f"{times.shape} times and {rows.shape} values are no stream",
+                f"{times.shape} times and {rows.shape} values do not form a stream",
                 remedy="give one time and one row of values for each reading, one reading at least",
             )
         order = np.argsort(times, kind="stable")

@@ -15,7 +15,7 @@ def _clock_id() -> int:
     """One number per host and boot: monotonic times compare only where it agrees."""
     try:
         name = _BOOT_ID.read_bytes()
-    except OSError:  # not Linux: the host's name and start of the clock have to do
+    except OSError:  # not Linux: use the host's name and the start of its clock
         import platform
 
         name = f"{platform.node()}:{round(time.time() - time.monotonic(), -1)}".encode()

@@ -25,14 +25,14 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 
 
 def check_name(name: str, what: str = "name") -> str:
-    """Return ``name`` if it may stand in a key.
+    """Check that a name may be part of a key, and return it.
 
     Args:
         name: The name.
         what: What it names, for the error.
 
     Raises:
-        ConfigError: It may not; the error names it and the rule.
+        ConfigError: It may not be; the error names it and the rule.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(
@@ -74,7 +74,7 @@ class LinkConfig(StrictConfig):
         direct: Whether processes link to one another directly (least latency). False = all data
             through the router: one path, so that nothing is overtaken while a direct link comes
             up. A lossless replay needs that.
-        wait_for_router_s: How long opening waits for a router [s]; negative = for ever (services).
+        wait_for_router_s: How long opening waits for a router [s]; negative = no limit (services).
         lease_s: A peer silent for this long is gone [s].
         tls: Certificates; required for any listener that is not loopback.
     """

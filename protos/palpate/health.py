@@ -1,6 +1,6 @@
-"""Health: what a process counts and how its sensors do.
+"""Health of a process: its counters, gauges and state, and the states of its sensors.
 
-Told once a second, at once when a state changes, and when asked.
+Published once a second and on each change of state, and given when asked.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 _APART_S = 5e-3
-"""However fast states change, statuses are this far apart [s]: they are work too."""
+"""Least time between two statuses [s], however fast states change."""
 
 
 class Health:
@@ -54,7 +54,7 @@ class Health:
         self._started = time.monotonic()
         self._version = __version__
         self.changed = threading.Event()
-        """Set when the state changed, so that the reporter tells it at once."""
+        """Set when the state changed, so that the reporter publishes it at once."""
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a counter."""
@@ -62,7 +62,7 @@ class Health:
             self._counters[name] += by
 
     def set_counts(self, counts: Mapping[str, int]) -> None:
-        """Take over totals that someone else counts (a subscriber's, a device's)."""
+        """Take over totals that are counted elsewhere, e.g. by a subscriber or a device."""
         with self._lock:
             self._counters.update({k: v - self._counters[k] for k, v in counts.items()})
 
@@ -81,7 +81,7 @@ class Health:
         self.changed.set()
 
     def set_state(self, state: ServiceState, message: str = "") -> None:
-        """Say what this process does now."""
+        """Set the state of this process."""
         with self._lock:
             different = state is not self._state
             self._state = state
@@ -113,7 +113,7 @@ class Health:
         faults: Sequence[ChannelFault] = (),
         message: str = "",
     ) -> None:
-        """Say how a sensor does; a change of its state or faults is told at once."""
+        """Set the state of a sensor; a change of state or faults is published at once."""
         status = SensorStatus(name, state, time.monotonic_ns(), tuple(faults), message)
         with self._lock:
             before = self._sensor_states.get(name)
@@ -125,7 +125,7 @@ class Health:
             self.changed.set()
 
     def status(self) -> Status:
-        """All of it as a message."""
+        """Everything as a message."""
         monotonic_ns, wall_ns = clock.now()
         with self._lock:
             return Status(

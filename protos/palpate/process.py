@@ -1,4 +1,4 @@
-"""What every process of palpate needs: how things are closed, optional packages, no pauses."""
+"""For every process of palpate: ``with`` blocks, optional packages, provenance, no pauses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from palpate.errors import MissingExtraError
 
 
 class Closing(ABC):
-    """Closed at the end of its ``with`` block, on every path."""
+    """Base of what has to be closed: a ``with`` block closes it on every path."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Release threads, files and sessions."""
 
     def __enter__(self) -> Self:
         return self
@@ -53,23 +53,23 @@ def require(module: str, *, extra: str) -> ModuleType:
 
 
 def typed_command() -> str:
-    """The command line as typed, without the folder of the program."""
+    """The command line as typed, without the folder of the program, for provenance."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 _YOUNG_OBJECTS = 50_000
-"""Collect after so many new container objects; frames and estimates hold no cycles."""
+"""New container objects between two collections; frames and estimates hold no cycles."""
 
 _SWITCH_S = 0.0005
-"""How long a busy thread may keep another from the interpreter [s]; Python's default is 5 ms."""
+"""How long a busy thread may hold the interpreter lock [s]; Python's default is 5 ms."""
 
 
 def avoid_pauses() -> None:
-    """Call once, when everything is imported and loaded and the first frame may come.
+    """Prevent long pauses of Python. Call once, after everything is loaded, before serving.
 
-    A full garbage collection looks at every object of every imported module, which takes 10 ms and
-    more: a frame's whole period. Those objects live as long as the process, so they are taken out
-    of its sight.
+    A full garbage collection visits every object of every imported module, which takes 10 ms or
+    more: the whole period of a frame. These objects live as long as the process, so the collector
+    is told to ignore them (``gc.freeze``).
     """
     gc.collect()
     gc.freeze()

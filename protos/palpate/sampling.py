@@ -1,9 +1,9 @@
 """When each channel of a frame was sampled: a round takes 10 ms, and PAC has 22 instants in it.
 
 A frame's stamp is the instant of its first slot; slot k follows k slot periods later. E1..E19, PDC,
-TAC, TDC stand in this order with PAC beside each of them, before or behind it. Which of the two a
-frame does not say: frames that palpate reads live begin with E1 unless they are configured
-otherwise, those of logs as the log has them. Who takes the wrong one is off by a slot (227 us).
+TAC, TDC stand in this order with PAC beside each of them, before or behind it. A frame does
+not say which: frames that palpate reads live begin with E1 unless configured otherwise, those of
+logs as the log has them. The wrong choice shifts all instants by one slot (227 us).
 """
 
 from __future__ import annotations

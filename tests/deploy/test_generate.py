@@ -250,8 +250,8 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     lost = np.linalg.norm(small.displacement(rows) - whole.displacement(rows), axis=2)
     assert lost.mean() < 10e-6
     tape = read_tape(tmp_path / "t.npz")
-    assert [unit.name for unit in tape.units] == ["biotac-1", "biotac-2"]
+    assert [unit.name for unit in tape.specimens] == ["biotac-1", "biotac-2"]
     press = next(one for one in tape.trajectories if one.id.endswith("/normal"))
-    np.testing.assert_allclose(press.counts[0, 0], tape.units[0].rest_counts)
+    np.testing.assert_allclose(press.counts[0, 0], tape.specimens[0].rest_counts)
     assert np.linalg.norm(press.force[-1]) > np.linalg.norm(press.force[1])
     assert done.dataset_bytes + done.tape_bytes < 3e6

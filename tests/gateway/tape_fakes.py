@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.files.tape import Tape, TapeUnit
-from palpate.files.tape_build import TapePress, build_tape, tape_unit
+from palpate.files.tape import Tape, TapeSpecimen
+from palpate.files.tape_build import TapePress, build_tape, tape_specimen
 
 STEPS = 6
 REST_PRESSURE_PA = 1750.0
@@ -37,7 +37,7 @@ def nodes() -> Any:
     return np.stack([x.ravel(), y.ravel(), np.full(9, -8e-3)], axis=1)
 
 
-def presses(units: list[TapeUnit]) -> list[TapePress]:
+def presses(units: list[TapeSpecimen]) -> list[TapePress]:
     """Straight presses, each with a direction, a depth and a footprint of its own."""
     made = []
     share = np.linspace(0.0, 1.0, STEPS)
@@ -75,10 +75,11 @@ def make_tape(**electrics: float) -> Tape:
     """The tape; both units with these electrics instead of the usual ones."""
     text = json.dumps({**ELECTRICS, **electrics})
     units = [
-        tape_unit(f"unit{u + 1}", text, 2500.0 + 200.0 * u + 10.0 * np.arange(19)) for u in range(2)
+        tape_specimen(f"unit{u + 1}", text, 2500.0 + 200.0 * u + 10.0 * np.arange(19))
+        for u in range(2)
     ]
     return build_tape(
-        units=units,
+        specimens=units,
         presses=presses(units),
         rest_pressure_pa=REST_PRESSURE_PA,
         nodes=nodes(),

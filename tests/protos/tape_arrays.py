@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.files.tape_build import TapePress, tape_unit
+from palpate.files.tape_build import TapePress, tape_specimen
 
 ELECTRICS = {
     "noise_counts": 0.4,
@@ -60,7 +60,7 @@ def arrays(side: int = 3, count: int = 2) -> dict[str, Any]:
     nodes = patch(side)
     text = json.dumps(ELECTRICS)
     return {
-        "units": [tape_unit("biotac1", text, REST), tape_unit("biotac2", text, REST)],
+        "specimens": [tape_specimen("biotac1", text, REST), tape_specimen("biotac2", text, REST)],
         "presses": [
             a_press(f"p{k}", nodes, at=-2e-3 + 4e-3 * k / count, depth_m=(1 + k % 3) * 1e-3)
             for k in range(count)

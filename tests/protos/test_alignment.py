@@ -126,9 +126,9 @@ def test_streams_of_two_hosts_meet_on_wall_clocks() -> None:
 
 
 def test_what_is_no_stream_is_said() -> None:
-    with pytest.raises(DatasetError, match="no stream"):
+    with pytest.raises(DatasetError, match="do not form a stream"):
         linear(np.array([1]), np.array([], np.int64), np.zeros((0, 3)))
-    with pytest.raises(DatasetError, match="no stream"):
+    with pytest.raises(DatasetError, match="do not form a stream"):
         slerp(np.array([1]), np.array([1, 2]), np.zeros((1, 4)))
     with pytest.raises(DatasetError, match="different numbers of electrodes"):
         electrode_instants([frame(0), frame(1, SensorType.BIOTAC_SP)], AlignmentClock.MONOTONIC)

@@ -166,7 +166,7 @@ def test_newest_keeps_one_unless_told_otherwise(frame_of: FrameOf) -> None:
 
 def test_latest_is_the_newest_of_all_or_of_one_sensor(frame_of: FrameOf) -> None:
     bus = Bus(Delivery.NEWEST)
-    with pytest.raises(StaleError, match="has ever arrived"):
+    with pytest.raises(StaleError, match="has arrived yet"):
         bus.subscriber.latest(10.0)
     bus.send(frame_of(1), "finger")
     bus.send(frame_of(2), "thumb")

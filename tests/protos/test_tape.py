@@ -15,7 +15,7 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.tape import Tape, check_tape, read_tape, write_tape
-from palpate.files.tape_build import build_tape, tape_unit
+from palpate.files.tape_build import build_tape, tape_specimen
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("tape_arrays")
@@ -123,7 +123,7 @@ def test_a_wrong_tape_is_not_written(tape: Tape, tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"presses": []}, "at least one press"),
-        ({"units": []}, "no units"),
+        ({"specimens": []}, "no specimens"),
         ({"nodes": fakes.patch(2)}, r"'p0' has shape \(5, 9, 3\), not \(K, 4, 3\)"),
         ({"mesh_sha256": b"short"}, "mesh_sha256"),
     ],
@@ -138,8 +138,8 @@ def test_arrays_that_make_no_tape(change: dict[str, Any], message: str) -> None:
     [("{", "no JSON"), ("[]", "no number 'noise_counts'"), ('{"noise_counts": true}', "no number")],
 )
 def test_parameters_that_make_no_unit(text: str, message: str) -> None:
-    with pytest.raises(DatasetError, match=f"unit 'one'.*{message}"):
-        tape_unit("one", text, fakes.REST)
+    with pytest.raises(DatasetError, match=f"specimen 'one'.*{message}"):
+        tape_specimen("one", text, fakes.REST)
 
 
 def test_presses_that_displace_nothing() -> None:

@@ -180,6 +180,6 @@ def test_questions_without_an_answer_say_why(
 def test_nobody_to_ask(link: LinkConfig, make_frame: Frames) -> None:
     with (
         Client(link.connect[0], timeout_s=5.0) as robot,
-        pytest.raises(LinkError, match="nobody answers"),
+        pytest.raises(LinkError, match="no service answers"),
     ):
         robot.estimate_field("finger", make_frame())

@@ -12,8 +12,8 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from palpate import Client
 from palpate.bus import Delivery
-from palpate.client import Client
 from palpate.errors import LinkError, PalpateError, StreamTimeout
 from palpate_deploy.demo.comparison import (
     FieldComparison,

@@ -83,7 +83,7 @@ def loop_options(
         ConfigError: No tape ships.
     """
     if unit == 0:
-        unit = 1 + (seed + finger) % len(read_tape(_tape()).units)
+        unit = 1 + (seed + finger) % len(read_tape(_tape()).specimens)
     return VirtualOptions(
         model="tape",
         unit=unit,

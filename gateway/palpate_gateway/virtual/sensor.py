@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate.anatomy import ELECTRODE_POSITIONS
-from palpate.files.tape import TapeUnit
+from palpate.files.tape import TapeSpecimen
 from palpate.messages import COUNTS_MAX, PAC_SAMPLES, CountArray
 from palpate_gateway.virtual.model import Array
 
@@ -82,7 +82,7 @@ class TwinSensor:
         seed: Seed of noise and of the temperature gradient over the core.
     """
 
-    def __init__(self, unit: TapeUnit, *, rate_hz: float, on_for_s: float, seed: int) -> None:
+    def __init__(self, unit: TapeSpecimen, *, rate_hz: float, on_for_s: float, seed: int) -> None:
         self._unit = unit
         self._rate_hz = rate_hz
         self._on_for_s = on_for_s

@@ -179,7 +179,7 @@ class TapeModel:
         self._options = options
         self._tape = tape = read_tape(path)
         self._at = _specimen_index(options.unit, tape, path)
-        self._specimen = tape.units[self._at]
+        self._specimen = tape.specimens[self._at]
         self._played = _chosen(options, tape, path)
         self._modes = tape.scaled_modes()
         self._line = (
@@ -272,7 +272,7 @@ def _periods(tick: int, share: float) -> int:
 
 
 def _specimen_index(unit: int | str, tape: Tape, path: Path) -> int:
-    names = [one.name for one in tape.units]
+    names = [one.name for one in tape.specimens]
     if isinstance(unit, int) and 1 <= unit <= len(names):
         return unit - 1
     if unit in names:

@@ -40,7 +40,7 @@ def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
     wait_s = INDIRECT_WAIT_S if link.wait_for_router_s < 0 else link.wait_for_router_s
     settings: dict[str, Any] = {
         "mode": mode,
-        # A peer retries for ever in the background; Session.open does the waiting and names what is
+        # A peer retries in the background without end; Session.open waits and names what is
         # missing. A client cannot open without its router.
         "connect": {
             "endpoints": list(link.connect),
@@ -138,7 +138,7 @@ def open_zenoh(link: LinkConfig, mode: str) -> zenoh.Session:
 def run_router(
     listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
 ) -> None:
-    """Be the router until ``stop`` is set.
+    """Run the router until ``stop`` is set.
 
     Args:
         listen: Endpoints, e.g. ``("tcp/127.0.0.1:7447",)``.
@@ -170,7 +170,7 @@ K = TypeVar("K", bound=_Closable)
 
 
 class Session(Closing):
-    """A process's place on the bus. Always used as a context manager.
+    """A process's connection to the bus. Always used as a context manager.
 
     A process that ends with an open Zenoh session may hang in its thread shutdown; ``with`` closes
     it on every path.
@@ -364,7 +364,7 @@ class Session(Closing):
         return self._keep(Presence(self._raw, self.station, service, instance))
 
     def alive(self, *, station: str | None = None) -> list[AliveService]:
-        """Who is alive, and who is ready."""
+        """Which processes are alive, and which of them are ready."""
         return alive(self._raw, self.station if station is None else station)
 
     def has_router(self) -> bool:

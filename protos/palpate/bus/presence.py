@@ -1,4 +1,4 @@
-"""Presence: who is alive, and who is ready, by liveliness tokens."""
+"""Presence: which processes are alive, and which are ready, by liveliness tokens."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SETTLE_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class AliveService:
-    """A process that is there, and whether it is ready to serve."""
+    """A process that is alive, and whether it is ready to serve."""
 
     station: str
     service: str
@@ -29,10 +29,10 @@ class AliveService:
 
 
 class Presence(Closing):
-    """Declares that this process is alive, and when it says so, ready.
+    """Declares that this process is alive and, after ``ready``, that it serves.
 
-    Both vanish for others within milliseconds when the process dies, and within the link's lease
-    when its host freezes.
+    Other processes see both end within milliseconds when this process dies, and within the lease
+    of the link when its host freezes.
     """
 
     def __init__(self, session: zenoh.Session, station: str, service: str, instance: str) -> None:
@@ -47,7 +47,7 @@ class Presence(Closing):
             self._ready = self._liveliness.declare_token(self._ready_key)
 
     def not_ready(self) -> None:
-        """Withdraw it; done first when a process stops."""
+        """Withdraw ``ready``; the first step of stopping."""
         if self._ready is not None:
             self._ready.undeclare()
             self._ready = None
@@ -59,7 +59,7 @@ class Presence(Closing):
 
 
 def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> list[AliveService]:
-    """Everyone who is alive at a station (``"*"`` = any)."""
+    """All processes that are alive at a station (``"*"`` = any)."""
     found: dict[tuple[str, str, str], bool] = {}
     key = live_key(station, "*", "*", "*")
     for reply in session.liveliness().get(key, timeout=timeout_s):
@@ -78,7 +78,7 @@ class CallerToken(Closing):
         self._token = session.liveliness().declare_token(key)
 
     def close(self) -> None:
-        """Withdraw it."""
+        """Withdraw the token."""
         try:
             self._token.undeclare()
         except zenoh.ZError:  # the session is gone, and the token with it
@@ -123,7 +123,7 @@ class CallerWatch(Closing):
                 return
 
     def close(self) -> None:
-        """Watch no longer."""
+        """Stop watching."""
         self._subscriber.undeclare()
         self._vanished.put(None)
         self._worker.join(timeout=2)

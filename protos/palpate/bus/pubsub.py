@@ -47,19 +47,19 @@ class DeliveryQueue(Protocol[T]):
         """Called by the bus; never raises, and blocks only for ``EVERY``."""
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """Next item and how many of its key were lost here so far; None = none came in time."""
+        """Next item, and how many items of its key were dropped so far; None = none in time."""
 
     def close(self) -> None:
         """Release a blocked sender."""
 
 
 class NewestQueue(Generic[T]):
-    """Per key only the newest items wait; keys are served in the order in which they waited.
+    """Keeps the newest items of each key; serves keys in the order of their oldest waiting item.
 
     Args:
         counters: Where dropped items are counted.
-        depth: Items that may wait per key. More than one lets a consumer that was held up for a
-            moment catch up without loss; how old an item may be is the consumer's to check.
+        depth: Items that may wait per key. With more than one, a consumer that was delayed for a
+            moment catches up without loss; it has to check the age of items itself.
     """
 
     def __init__(self, counters: Counter[str], depth: int) -> None:
@@ -82,7 +82,7 @@ class NewestQueue(Generic[T]):
                 self._lost[key] += 1
                 self._counters["dropped"] += 1
             items.append(item)
-        if not full:  # else the turn of the dropped item is this one's
+        if not full:  # else the new item takes the turn of the dropped one
             self._order.put(key)
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
@@ -95,7 +95,7 @@ class NewestQueue(Generic[T]):
             return self._waiting[key].popleft(), self._lost[key]
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Does nothing: this queue never blocks a sender."""
 
 
 class FifoQueue(Generic[T]):
@@ -144,7 +144,7 @@ class FifoQueue(Generic[T]):
 def queue_for(
     delivery: Delivery, capacity: int, counters: Counter[str], *, depth: int = 1
 ) -> DeliveryQueue[T]:
-    """The queue that keeps ``delivery``'s promise; ``depth`` is for ``NEWEST``."""
+    """The queue for a kind of delivery; ``depth`` is for ``NEWEST``."""
     if delivery is Delivery.NEWEST:
         return NewestQueue(counters, depth)
     return FifoQueue(counters, capacity, sender_waits=delivery is Delivery.EVERY)
@@ -213,7 +213,7 @@ class Publisher(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class ReceivedMessage(Generic[M]):
-    """A valid message and how it came.
+    """A valid message, where it came from and when.
 
     Attributes:
         message: The message.
@@ -253,7 +253,7 @@ class Subscriber(Generic[M], Closing):
     """Receives one topic. Made by ``Session.subscriber``; use it from one thread.
 
     ``counters``: ``received``, ``delivered``, ``dropped`` (newest wins), ``overflow``,
-    ``lost_on_bus`` (holes in the sequence that nobody here dropped), ``reordered``, ``restarts``
+    ``lost_on_bus`` (gaps in the sequence that were not dropped here), ``reordered``, ``restarts``
     of the sender, and ``rejected_<reason>``.
     """
 
@@ -334,7 +334,7 @@ class Subscriber(Generic[M], Closing):
         ]
         if not candidates:
             raise StaleError(
-                f"no {self.topic.name} on {self.key} has ever arrived",
+                f"no {self.topic.name} on {self.key} has arrived yet",
                 remedy="check that its publisher runs: palpate status",
             )
         sample, received_ns = max(candidates, key=lambda item: item[1])
@@ -367,7 +367,7 @@ class Subscriber(Generic[M], Closing):
         return ReceivedMessage(message, payload, address.station, address.sensor, received_ns)
 
     def _in_order(self, received: ReceivedMessage[M], lost_here: int) -> bool:
-        """Account for holes, restarts and duplicates; False = do not deliver."""
+        """Count gaps, restarts and duplicates in the sequence; False = do not deliver."""
         stamp = self.topic.stamp_of(received.message)
         if stamp is None:
             return True

@@ -315,6 +315,6 @@ def raise_errors(replies: Iterator[R | PalpateError], key: str) -> Iterator[R]:
 def no_reply(key: str) -> LinkError:
     """The error for a question that had no reply at all."""
     return LinkError(
-        f"nobody answers on {key}",
+        f"no service answers on {key}",
         remedy="start the service: palpate up; see what runs: palpate status",
     )

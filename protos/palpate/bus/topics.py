@@ -1,11 +1,11 @@
-"""The topic table: every stream of the bus, its key, message, rate and manners.
+"""The topic table: every stream of the bus with its key, message, rate and priority.
 
 Keys (docs/adr/0004-keys-and-qos.md)::
 
     palpate/@v1/<station>/<sensor>/<stream>                          sensor streams
-    palpate/@v1/<station>/@service/<service>/<instance>/<endpoint>   what a process says and answers
+    palpate/@v1/<station>/@service/<service>/<instance>/<endpoint>   status, endpoints
     palpate/@v1/@live/<station>/<service>/<instance>/<alive|ready>   presence (liveliness tokens)
-    palpate/@v1/@asking/<station>/<digest of a request's id>          a caller still waits (token)
+    palpate/@v1/@asking/<station>/<digest of a request's id>          a caller that waits (token)
 
 ``@v1`` is a verbatim chunk: ``*`` and ``**`` never match it, so a future contract cannot be taken
 for this one by accident.
@@ -114,7 +114,7 @@ ROBOT_POSE: Topic[RobotPoseFrame] = Topic(
     _RT,
     True,
     False,
-    "where a robot's flange is, told by its program",
+    "pose of a robot's flange, published by its program",
 )
 FIELD_TRUTH: Topic[FieldFrame] = Topic(
     "field_truth",
@@ -159,7 +159,7 @@ STATUS: Topic[Status] = Topic(
     Priority.BACKGROUND,
     True,
     False,
-    "what a process says of itself",
+    "state and counters of a process",
     per_service=True,
 )
 
@@ -191,7 +191,7 @@ def sensor_key(station: str, sensor: str, stream: str) -> str:
 
 
 def service_key(station: str, service: str, instance: str, endpoint: str) -> str:
-    """Key of what a process says or answers; ``"*"`` for any."""
+    """Key of a stream or endpoint of a process; ``"*"`` for any."""
     return (
         f"{ROOT}/{_chunk(station, 'station')}/@service/"
         f"{_chunk(service, 'service')}/{_chunk(instance, 'instance')}/{endpoint}"
@@ -221,7 +221,7 @@ def _chunk(name: str, what: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class StreamAddress:
-    """What a key says: station, sensor (or ``service/instance``) and topic."""
+    """Parts of a key: station, sensor (or ``service/instance``) and topic."""
 
     station: str
     sensor: str
@@ -266,6 +266,6 @@ def check_schema(encoding: str, wanted: str) -> None:
         )
     raise WireError(
         f"payload is {encoding!r}, not {ENCODING_PREFIX + wanted!r}",
-        remedy="publish the message that the key promises, with its encoding",
+        remedy="publish the message that belongs to the key, with its encoding",
         reason="schema",
     )

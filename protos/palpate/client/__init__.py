@@ -1,4 +1,4 @@
-"""What a robot uses: estimates now, simulations, tare, who is alive, telling its own pose."""
+"""The client of a robot: current estimates, simulations, tare, presence, its own pose."""
 
 from palpate.client.robot import Client
 

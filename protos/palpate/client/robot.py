@@ -1,14 +1,14 @@
-"""What a robot uses: features and fields now, tare, who is alive, telling its own pose.
+"""The client of a robot: current features and fields, tare, simulations, its own pose.
 
 Five lines::
 
-    from palpate.client import Client
+    from palpate import Client
 
     with Client() as robot:
         estimate = robot.features("finger", max_age_s=0.05)
         print(estimate.force, estimate.contact_location)
 
-Every failure is a ``PalpateError``: nothing hangs, nothing old is returned as fresh.
+Every failure is a ``PalpateError``; no call hangs, and no old reading is returned as a new one.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Client(Closing):
             max_age_s: The oldest reading that may be used [s], by the time it was taken.
 
         Raises:
-            StaleError: There is none so young.
+            StaleError: There is none, or the newest is older.
         """
         return self._latest(FEATURES, sensor, max_age_s)
 
@@ -152,9 +152,9 @@ class Client(Closing):
         return self._subscriber(FEATURES, sensor).next(timeout_s)
 
     def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
-        """Tell where the flange of a robot is: ``put`` it from the control loop.
+        """A publisher of the poses of a robot's flange: call ``put`` from the control loop.
 
-        A gateway with the driver ``pose_zenoh`` makes poses of the indenter of it.
+        A gateway with the driver ``pose_zenoh`` turns them into poses of the indenter.
 
         Args:
             robot: Name of the robot, as the gateway's option ``robot`` has it.
@@ -163,7 +163,7 @@ class Client(Closing):
         return self._publishers[-1]
 
     def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
-        """Take the untouched finger as zero now.
+        """Tare: take the present counts of the untouched finger as its baseline.
 
         Args:
             sensor: Name of the sensor.
@@ -186,7 +186,7 @@ class Client(Closing):
             timeout_s: How long it may take [s].
 
         Raises:
-            LinkError: Nobody serves a force/torque sensor of this name.
+            LinkError: No gateway serves a force/torque sensor of this name.
             RemoteError: The gateway refuses, e.g. because the load is not still.
         """
         return self.session.query(
@@ -229,7 +229,7 @@ class Client(Closing):
     def cancel_simulation(
         self, request_id: str, *, sensor: str = "twin", timeout_s: float = 5.0
     ) -> bool:
-        """Stop a simulation; whoever asked for it gets what has converged.
+        """Stop a simulation; its caller gets the steps that have converged.
 
         Returns:
             Whether it was waiting or running.
@@ -242,17 +242,17 @@ class Client(Closing):
         ).found
 
     def model(self, *, service: str = "features") -> ModelMetadata:
-        """What the served bundle says of itself."""
+        """Description of the served bundle."""
         return self.session.query(
             endpoints.MODEL, ServiceRequest(), service=service, timeout_s=self._timeout_s
         )
 
     def alive(self) -> list[AliveService]:
-        """Who is there, and who is ready."""
+        """Which processes are alive, and which of them are ready."""
         return self.session.alive()
 
     def status(self) -> list[Status]:
-        """What every process of the station says of itself; broken answers are left out."""
+        """Status of every process of the station; broken answers are left out."""
         answers = self.session.query_all(
             endpoints.STATUS, ServiceRequest(), timeout_s=self._timeout_s
         )

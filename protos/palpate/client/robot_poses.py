@@ -1,4 +1,4 @@
-"""Telling the poses of a robot's flange from inside its control loop, which must never wait.
+"""Publishing the poses of a robot's flange from inside its control loop, which must never wait.
 
 ``put`` checks, encodes and hands over; a thread of its own publishes. Made by
 ``Client.robot_pose_publisher``.
@@ -65,7 +65,7 @@ class RobotPosePublisher(Closing):
         *,
         wall_ns: int | None = None,
     ) -> None:
-        """Tell where the flange is; never waits for the bus.
+        """Publish where the flange is; never waits for the bus.
 
         Args:
             position: Of the flange in the robot's base frame [m], three numbers.
@@ -99,7 +99,7 @@ class RobotPosePublisher(Closing):
         self._waiting.put(self._robot, payload)
 
     def matched(self) -> bool:
-        """Whether anyone listens at present, e.g. a gateway or a recorder."""
+        """Whether a gateway, recorder or other process subscribes at present."""
         return self._publisher.matched()
 
     def close(self) -> None:

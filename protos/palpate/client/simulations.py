@@ -1,4 +1,4 @@
-"""Asking for a simulation: a straight path, and the parts of the answer joined into one reply."""
+"""Requests of simulations: straight paths, and the parts of the answer joined into one reply."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OnStep = Callable[[int, SimulationStep], None]
 
 GRACE_S = 8.0
 """How long after its deadline an answer is still waited for [s]: a solver that does not stop by
-itself is ended by the service 5 s after the deadline, which says so."""
+itself is ended by the service 5 s after the deadline, and the service then answers."""
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -63,8 +63,8 @@ def ask_simulation(
 ) -> SimulationReply:
     """Ask the finite-element service and join its answer.
 
-    While this waits, a token shows that somebody does; if this process ends, or is interrupted, the
-    service stops the simulation.
+    While this call waits, a token on the bus shows it. If this process ends or is interrupted, the
+    token vanishes and the service stops the simulation.
 
     Args:
         session: The bus.
@@ -81,7 +81,7 @@ def ask_simulation(
         LinkError: No finite-element service runs.
         RemoteError: It refuses, or cannot go on. Steps that had converged were given to
             ``on_step``.
-        StreamTimeout: It did not even say that the deadline has passed.
+        StreamTimeout: No answer within ``GRACE_S`` after the deadline.
         WireError: The request, or an answer, breaks the contract.
     """
     deadline_s = min(request.deadline_s or math.inf, timeout_s)

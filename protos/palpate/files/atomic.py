@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writing files atomically: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from palpate.errors import DatasetError
 
 @contextlib.contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """A place beside a file, to write to; it gets the file's name when the block ends well.
+    """A temporary path beside a file; renamed to the file when the block ends without an error.
 
     Args:
         path: The file; its folder is made. One that is there stays until then.
 
     Raises:
-        DatasetError: The disk refused.
+        DatasetError: The disk is full, or the folder cannot be written.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -32,7 +32,7 @@ BUNDLE_CONTRACT_VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a bundle says of itself.
+    """Description of a bundle: what the model is, and digests of its files.
 
     Attributes:
         name: Name of the bundle.
@@ -248,7 +248,7 @@ class Bundle:
     """A bundle in memory, its digests checked.
 
     Attributes:
-        manifest: What it says of itself.
+        manifest: Its description.
         model: ONNX bytes.
         golden: Inputs and expected outputs by name, batch first.
         sha256: Digest of the manifest, 32 bytes.
@@ -274,7 +274,7 @@ def check_bundle_mesh(mesh: FieldMesh | None, manifest: Manifest, where: str) ->
 
     Args:
         mesh: What the bundle holds.
-        manifest: What it says of itself.
+        manifest: Its description.
         where: Names it, for the error.
 
     Raises:
@@ -310,7 +310,7 @@ def write_bundle(
     manifest: Manifest,
     mesh: FieldMesh | None = None,
 ) -> bytes:
-    """Write a bundle as a whole or not at all.
+    """Write a bundle; the folder appears complete or not at all.
 
     Args:
         folder: Created; a bundle already there is refused, bundles are immutable.

@@ -79,8 +79,8 @@ class RecordWriter:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: IO[bytes] = open(self.part, "xb")
-            # Alive for as long as this process: the kernel drops the lock with it, and recovery
-            # leaves a locked part alone. Whoever is looking at it lets go at once.
+            # The kernel drops the lock when this process ends, and recovery refuses a locked part.
+            # Waiting for the lock is short: others hold it only to test it.
             fcntl.flock(self._file, fcntl.LOCK_EX)
         except FileExistsError as error:
             raise RecordingError(
@@ -359,7 +359,7 @@ def _reader(stream: IO[bytes]) -> StreamReader:
 
 
 def metadata_of(path: Path) -> dict[str, str]:
-    """Facts written at the start; none where the file is too damaged to tell."""
+    """Facts written at the start; empty where the file is too damaged to read them."""
     try:
         with open(path, "rb") as stream:
             for record in _reader(stream).records:

@@ -76,7 +76,7 @@ class SimulationFiles:
             path: A folder ``NAME.sim`` or a file in the same schema.
 
         Raises:
-            DatasetError: There is none, it is damaged, or of another schema or version.
+            DatasetError: It does not exist, is damaged, or has another schema or version.
             MissingExtraError: h5py is not installed.
         """
         store = cls(path)
@@ -230,7 +230,7 @@ def choose_trajectories(ids: Sequence[str], patterns: Sequence[str], most: int) 
         most: How many at most; from more, evenly spaced ones, so that all indenters have a chance.
 
     Raises:
-        DatasetError: A pattern fits none, or there is none at all.
+        DatasetError: A pattern matches no id, or the store is empty.
     """
     if not ids:
         raise DatasetError("the store holds no trajectory yet", remedy="wait for the first")

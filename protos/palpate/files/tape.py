@@ -35,7 +35,7 @@ ELECTRODES = 19
 """Electrodes of a BioTac."""
 
 REST_COUNTS = 0.5
-"""A step 0 whose ideal counts are farther from the untouched unit's is not untouched [counts]."""
+"""A step 0 whose ideal counts are farther from ``rest_counts`` is not untouched [counts]."""
 
 REST_PRESSURE_PA = 18.25
 """The same for the pressure: half a count of PDC [Pa]."""
@@ -49,8 +49,8 @@ _REMEDY = "build the tape again with palpate.files.tape_build"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TapeUnit:
-    """One sensor: what a player needs beside the ideal counts.
+class TapeSpecimen:
+    """One BioTac: what a player needs besides the ideal counts.
 
     Attributes:
         name: Of the sensor, e.g. ``"biotac1"``; part of its serial number.
@@ -86,12 +86,12 @@ class TapeUnit:
     tac_offset: float
 
 
-UNIT_NUMBERS = tuple(
+SPECIMEN_NUMBERS = tuple(
     name
-    for name in TapeUnit.__dataclass_fields__
+    for name in TapeSpecimen.__dataclass_fields__
     if name not in ("name", "parameters", "rest_counts")
 )
-"""The fields of a unit that are single numbers."""
+"""The fields of a specimen that are single numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +107,8 @@ class TapeTrajectory:
         torque: Torque on the BioTac about the sensor frame's origin [N m], float32, shape
             ``(K, 3)``; step 0 is zero.
         fluid_pressure_pa: Pressure of the fluid above ambient [Pa], float32, shape ``(K,)``.
-        counts: Ideal counts of each unit before noise and rounding, float32, shape
-            ``(U, K, 19)``; step 0 is the unit's ``rest_counts``.
+        counts: Ideal counts of each specimen before noise and rounding, float32, shape
+            ``(U, K, 19)``; step 0 is the specimen's ``rest_counts``.
         coefficients: Of the displacement in the tape's basis, float32, shape ``(K, C)``; step 0
             decodes to about zero.
     """
@@ -125,10 +125,10 @@ class TapeTrajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tape:
-    """Simulated presses of one fingertip with one or more units. Sensor frame, SI.
+    """Simulated presses of one fingertip with one or more specimens. Sensor frame, SI.
 
     Attributes:
-        units: The sensors; the mechanics is the same for all.
+        specimens: The BioTacs; the mechanics is the same for all.
         trajectories: The presses.
         rest_pressure_pa: Fluid pressure of the pressurised, untouched finger above ambient [Pa].
         mean: Mean displacement of the basis [m], float32, shape ``(V, 3)``.
@@ -142,7 +142,7 @@ class Tape:
         source: Where it comes from and its licence, for people.
     """
 
-    units: tuple[TapeUnit, ...]
+    specimens: tuple[TapeSpecimen, ...]
     trajectories: tuple[TapeTrajectory, ...]
     rest_pressure_pa: float
     mean: FloatArray
@@ -173,19 +173,19 @@ def check_tape(tape: Tape, *, where: str = "the tape") -> None:
         where: File or object, for the error.
 
     Raises:
-        DatasetError: Names ``where``, the trajectory or unit, the field, and what is wrong.
+        DatasetError: Names ``where``, the trajectory or specimen, the field, and what is wrong.
     """
-    if not tape.units or not tape.trajectories:
-        raise DatasetError(f"{where} has no units or no trajectories", remedy=_REMEDY)
-    _check_names([unit.name for unit in tape.units], f"{where}: units")
+    if not tape.specimens or not tape.trajectories:
+        raise DatasetError(f"{where} has no specimens or no trajectories", remedy=_REMEDY)
+    _check_names([specimen.name for specimen in tape.specimens], f"{where}: specimens")
     _check_names([one.id for one in tape.trajectories], f"{where}: trajectories")
     _check_mesh(tape, where)
     if not _is_number(tape.rest_pressure_pa):
         raise _wrong(where, "rest_pressure_pa", "is no finite number")
     if not isinstance(tape.source, str):
         raise _wrong(where, "source", "is no text")
-    for unit in tape.units:
-        _check_unit(unit, f"{where}: unit {unit.name!r}")
+    for specimen in tape.specimens:
+        _check_specimen(specimen, f"{where}: specimen {specimen.name!r}")
     scaled = tape.scaled_modes()
     for one in tape.trajectories:
         _check_trajectory(one, tape, scaled, f"{where}: trajectory {one.id!r}")
@@ -245,20 +245,20 @@ def _check_mesh(tape: Tape, where: str) -> None:
         raise _wrong(where, "mesh_sha256", "is not 32 bytes")
 
 
-def _check_unit(unit: TapeUnit, where: str) -> None:
-    _check_array(unit.rest_counts, np.float32, (ELECTRODES,), where, "rest_counts")
-    for field in UNIT_NUMBERS:
-        value = getattr(unit, field)
+def _check_specimen(specimen: TapeSpecimen, where: str) -> None:
+    _check_array(specimen.rest_counts, np.float32, (ELECTRODES,), where, "rest_counts")
+    for field in SPECIMEN_NUMBERS:
+        value = getattr(specimen, field)
         if not _is_number(value):
             raise _wrong(where, field, f"= {value!r} is no finite number")
     for field in ("noise_counts", "gradient_sd", "creep_share"):
-        if getattr(unit, field) < 0.0:
-            raise _wrong(where, field, f"= {getattr(unit, field)} is negative")
+        if getattr(specimen, field) < 0.0:
+            raise _wrong(where, field, f"= {getattr(specimen, field)} is negative")
     for field in ("heating_tau_s", "creep_tau_s"):
-        if getattr(unit, field) <= 0.0:
-            raise _wrong(where, field, f"= {getattr(unit, field)} is no time constant")
+        if getattr(specimen, field) <= 0.0:
+            raise _wrong(where, field, f"= {getattr(specimen, field)} is no time constant")
     try:
-        readable = isinstance(json.loads(unit.parameters), dict)
+        readable = isinstance(json.loads(specimen.parameters), dict)
     except (ValueError, TypeError, RecursionError):
         readable = False
     if not readable:
@@ -274,7 +274,7 @@ def _check_trajectory(one: TapeTrajectory, tape: Tape, scaled: FloatArray, where
     _check_array(one.force, np.float32, (count, 3), where, "force")
     _check_array(one.torque, np.float32, (count, 3), where, "torque")
     _check_array(one.fluid_pressure_pa, np.float32, (count,), where, "fluid_pressure_pa")
-    _check_array(one.counts, np.float32, (len(tape.units), count, ELECTRODES), where, "counts")
+    _check_array(one.counts, np.float32, (len(tape.specimens), count, ELECTRODES), where, "counts")
     _check_array(one.coefficients, np.float32, (count, len(tape.modes)), where, "coefficients")
     if np.abs(np.linalg.norm(one.poses[:, 3:], axis=1) - 1.0).max() > _UNIT_NORM:
         raise _wrong(where, "poses", "has a quaternion that is not of length 1")
@@ -282,9 +282,9 @@ def _check_trajectory(one: TapeTrajectory, tape: Tape, scaled: FloatArray, where
         raise _wrong(where, "force", "or torque is not zero at step 0, the untouched state")
     if abs(float(one.fluid_pressure_pa[0]) - tape.rest_pressure_pa) > REST_PRESSURE_PA:
         raise _wrong(where, "fluid_pressure_pa", "at step 0 is not rest_pressure_pa")
-    for unit, counts in zip(tape.units, one.counts, strict=True):
-        if np.abs(counts[0] - unit.rest_counts).max() > REST_COUNTS:
-            raise _wrong(where, "counts", f"at step 0 are not the rest_counts of {unit.name!r}")
+    for specimen, counts in zip(tape.specimens, one.counts, strict=True):
+        if np.abs(counts[0] - specimen.rest_counts).max() > REST_COUNTS:
+            raise _wrong(where, "counts", f"at step 0 are not the rest_counts of {specimen.name!r}")
     moved = tape.mean + (one.coefficients[0] @ scaled).reshape(-1, 3)
     if np.linalg.norm(moved, axis=1).mean() > REST_FIELD_M:
         raise _wrong(where, "coefficients", "at step 0 do not decode to zero displacement")
@@ -471,14 +471,14 @@ def _parts(tape: Tape) -> tuple[dict[str, Any], Arrays]:
         "rest_pressure_pa": float(tape.rest_pressure_pa),
         "mesh_sha256": tape.mesh_sha256.hex(),
         "fingers": [
-            {"name": unit.name, "parameters": unit.parameters}
-            | {key: float(getattr(unit, key)) for key in UNIT_NUMBERS}
-            for unit in tape.units
+            {"name": specimen.name, "parameters": specimen.parameters}
+            | {key: float(getattr(specimen, key)) for key in SPECIMEN_NUMBERS}
+            for specimen in tape.specimens
         ],
         "trajectories": [{"id": one.id, "indenter": one.indenter} for one in presses],
     }
     arrays: Arrays = {
-        "rest_counts": np.stack([unit.rest_counts for unit in tape.units]),
+        "rest_counts": np.stack([specimen.rest_counts for specimen in tape.specimens]),
         "steps": np.array([len(one.poses) for one in presses], np.int32),
         "poses": np.concatenate([one.poses for one in presses]),
         "force": np.concatenate([one.force for one in presses]),
@@ -501,8 +501,8 @@ def _tape(header: dict[str, Any], arrays: Arrays) -> Tape:
     cut = [np.split(arrays[name], ends[:-1]) for name in by_step]
     counts = np.split(arrays["counts"], ends[:-1], axis=1)
     return Tape(
-        units=tuple(
-            TapeUnit(**finger, rest_counts=rest)
+        specimens=tuple(
+            TapeSpecimen(**finger, rest_counts=rest)
             for finger, rest in zip(header["fingers"], arrays["rest_counts"], strict=True)
         ),
         trajectories=tuple(

@@ -1,4 +1,4 @@
-"""Making a tape from arrays: the basis, its rounding, and what a unit's parameters say.
+"""Making a tape from arrays: the basis, its rounding, and the electrical parameters of a specimen.
 
 The basis is the leading left part of a singular value decomposition of all displacements, not
 centred, so that no displacement has no coefficients and decodes to exactly zero. Modes are rounded
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.files.tape import UNIT_NUMBERS, Tape, TapeTrajectory, TapeUnit, check_tape
+from palpate.files.tape import SPECIMEN_NUMBERS, Tape, TapeSpecimen, TapeTrajectory, check_tape
 from palpate.messages import FloatArray
 
 Array = npt.NDArray[Any]
@@ -45,7 +45,7 @@ class TapePress:
         force: Force on the BioTac [N], shape ``(K, 3)``.
         torque: Torque about the sensor frame's origin [N m], shape ``(K, 3)``.
         fluid_pressure_pa: Above ambient [Pa], shape ``(K,)``.
-        counts: Ideal counts by unit, shape ``(U, K, 19)``.
+        counts: Ideal counts by specimen, shape ``(U, K, 19)``.
         displacement: From the pressurised state [m], shape ``(K, V, 3)``.
     """
 
@@ -59,33 +59,33 @@ class TapePress:
     displacement: Array
 
 
-def tape_unit(name: str, parameters: str, rest_counts: npt.ArrayLike) -> TapeUnit:
-    """A unit from the JSON of its electrical parameters.
+def tape_specimen(name: str, parameters: str, rest_counts: npt.ArrayLike) -> TapeSpecimen:
+    """A specimen from the JSON of its electrical parameters.
 
     Args:
         name: Of the sensor.
-        parameters: JSON object that has a number for each of ``UNIT_NUMBERS``; kept as it is.
+        parameters: JSON object that has a number for each of ``SPECIMEN_NUMBERS``; kept as it is.
         rest_counts: Ideal counts of the untouched sensor, shape ``(19,)``.
 
     Raises:
-        DatasetError: No JSON object, or a number is missing; names unit and key.
+        DatasetError: No JSON object, or a number is missing; names specimen and key.
     """
     try:
         values = json.loads(parameters)
     except ValueError as error:
         raise DatasetError(
-            f"parameters of unit {name!r} are no JSON: {error}", remedy="give a JSON object"
+            f"parameters of specimen {name!r} are no JSON: {error}", remedy="give a JSON object"
         ) from error
     numbers: dict[str, float] = {}
-    for key in UNIT_NUMBERS:
+    for key in SPECIMEN_NUMBERS:
         value = values.get(key) if isinstance(values, Mapping) else None
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise DatasetError(
-                f"parameters of unit {name!r} have no number {key!r}",
-                remedy="give all electrical parameters of the unit as a JSON object",
+                f"parameters of specimen {name!r} have no number {key!r}",
+                remedy="give all electrical parameters of the specimen as a JSON object",
             )
         numbers[key] = float(value)
-    return TapeUnit(
+    return TapeSpecimen(
         name=name,
         parameters=parameters,
         rest_counts=np.asarray(rest_counts, np.float32),
@@ -95,7 +95,7 @@ def tape_unit(name: str, parameters: str, rest_counts: npt.ArrayLike) -> TapeUni
 
 def build_tape(
     *,
-    units: Sequence[TapeUnit],
+    specimens: Sequence[TapeSpecimen],
     presses: Sequence[TapePress],
     rest_pressure_pa: float,
     nodes: npt.ArrayLike,
@@ -109,7 +109,7 @@ def build_tape(
     """A tape, checked.
 
     Args:
-        units: The sensors, in the order of the presses' counts.
+        specimens: The BioTacs, in the order of the presses' counts.
         presses: The trajectories.
         rest_pressure_pa: Fluid pressure of the untouched finger above ambient [Pa].
         nodes: Nodes of the pressurised, untouched skin [m], shape ``(V, 3)``.
@@ -142,7 +142,7 @@ def build_tape(
     steps, scales, coefficients = _basis(fields.astype(np.float32), modes, step_m)
     ends = np.cumsum([len(one.displacement) for one in presses])[:-1]
     tape = Tape(
-        units=tuple(units),
+        specimens=tuple(specimens),
         trajectories=tuple(
             TapeTrajectory(
                 id=one.id,
@@ -176,7 +176,7 @@ def _basis(
     """Rounded modes (C, 3V), their scales (C,), and coefficients (S, C) of fields (S, 3V)."""
     gram = (fields @ fields.T).astype(np.float64)  # few fields, many nodes
     values, vectors = np.linalg.eigh(gram)
-    # What float32 fields cannot tell from nothing is no mode.
+    # Modes below the rounding of float32 fields are noise.
     kept = np.flatnonzero(values > 1e-10 * max(float(values[-1]), 1e-30))[::-1][: max(modes, 1)]
     if not len(kept):
         raise DatasetError("no press displaces anything", remedy="give presses that touch")

@@ -1,4 +1,4 @@
-"""Tasks: what the model of each takes and gives (docs/adr/0008-bundle.md)."""
+"""Tasks: inputs and outputs of the model of each (docs/adr/0008-bundle.md)."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from palpate.errors import BundleError
 from palpate.messages import SensorType, TensorInfo
 
 SENSOR_TYPE = SensorType.BIOTAC
-"""Whose electrodes the tasks of this contract take and give; there is none for a BioTac SP."""
+"""Sensor whose electrodes are inputs and outputs; there are no tasks for a BioTac SP."""
 
 BY_MESH = 0
-"""Width of a tensor that has so many values for each node of the bundle's mesh."""
+"""Stands for a width that depends on the number of nodes of the bundle's mesh."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskContract:
-    """What a model of this task takes and gives.
+    """Inputs and outputs of a model of this task.
 
     Attributes:
         inputs: Tensors it takes.

@@ -257,8 +257,8 @@ class RobotPoseFrame:
         sequence: Contiguous in one run of the robot's program, from 1; a hole = a pose was lost.
         time_ns: When it was there, by a monotonic clock of the program's own [ns].
         pose_base_flange: Position [m] and unit quaternion w x y z of the flange in the base.
-        run_id: Another one at each start of the program; 0 = not told.
-        wall_ns: Wall clock at the same instant [ns since the Unix epoch]; 0 = not told.
+        run_id: Another one at each start of the program; 0 = unknown.
+        wall_ns: Wall clock at the same instant [ns since the Unix epoch]; 0 = unknown.
     """
 
     robot: str

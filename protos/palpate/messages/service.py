@@ -11,7 +11,7 @@ from palpate.messages.frames import NO_TARE, ElectrodeFrame, FloatArray, Stamp
 
 
 class SensorState(IntEnum):
-    """How a sensor does. Those from ``LIVE`` to ``ZERO_LOST`` deliver."""
+    """State of a sensor; it delivers frames from ``LIVE`` to ``ZERO_LOST``."""
 
     UNKNOWN = 0
     STARTING = 1
@@ -47,14 +47,14 @@ class ChannelFault:
 
 @dataclass(frozen=True, slots=True)
 class SensorStatus:
-    """How one sensor of a gateway does.
+    """State of one sensor of a gateway.
 
     Attributes:
         name: Its name in keys.
         state: See ``SensorState``.
         since_monotonic_ns: Host monotonic clock when it came into this state [ns].
-        faults: Channels that are not to be trusted; empty = none.
-        message: One line for people; empty = nothing to say.
+        faults: Channels that must not be used; empty = none.
+        message: One line for people; empty = none.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Tare:
 
 @dataclass(frozen=True, slots=True)
 class TareRequest:
-    """Tare now (``tare_id = NO_TARE``), or tell me the tare of this id."""
+    """Tare now (``tare_id = NO_TARE``), or look up the tare of this id."""
 
     tare_id: int = NO_TARE
     frames: int = 0
@@ -158,7 +158,7 @@ class ServiceRequest:
 
 
 class ServiceState(IntEnum):
-    """What a process says of itself."""
+    """State of a process."""
 
     STARTING = 1
     READY = 2
@@ -186,7 +186,7 @@ class ErrorReply:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a process says of itself: once a second, when a state changes, and when asked.
+    """State and counters of a process: sent each second, on a change of state, and when asked.
 
     Attributes:
         service: ``gateway``, ``features``, ``recorder``, ...
@@ -231,7 +231,7 @@ class TensorInfo:
 
 @dataclass(frozen=True, slots=True)
 class ModelMetadata:
-    """What a served bundle says of itself.
+    """Description of a served bundle.
 
     Attributes:
         name: Name of the bundle.

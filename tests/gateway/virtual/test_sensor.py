@@ -55,7 +55,7 @@ def test_warm_up_moves_electrodes_and_temperatures(tape_path: Write) -> None:
     path = tape_path(noise_counts=0.0)
     options = {"untouched_s": 2.0, "frames": 100}
     cold, late, warm = (frames(play(path, on_for_s=s, **options)) for s in (0.0, 300.0, 1e6))
-    rest = read_tape(path).units[0].rest_counts
+    rest = read_tape(path).specimens[0].rest_counts
     assert np.abs(warm[50].electrodes - rest).max() <= 0.5
     # The film's impedance goes with 1 / conductivity, which cold is exp(-0.25) of the warm one.
     shift = np.exp(-0.025 * 10.0)

@@ -164,7 +164,7 @@ def test_starts_untouched_so_that_a_tare_succeeds(tape_path: Write) -> None:
             while got := device.read(1.0):
                 out += pipeline.push(got, 0)
         (tare,) = [item.message for item in out if isinstance(item.message, Tare)]
-        rest = read_tape(path).units[0].rest_counts
+        rest = read_tape(path).specimens[0].rest_counts
         # After half an hour the core is 1.4 K short of its end: -3.4 % of conductivity.
         assert np.abs(tare.electrodes - rest).max() < 60
         assert (tare.electrodes_sd < 1.0).all()

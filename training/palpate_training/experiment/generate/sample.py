@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
 from palpate.files.tape import write_tape
-from palpate.files.tape_build import TapePress, build_tape, tape_unit
+from palpate.files.tape_build import TapePress, build_tape, tape_specimen
 from palpate_training.datasets.basis import encode, fit_basis, subset
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
@@ -143,7 +143,7 @@ def _write_tape(
         rest_pa = fingertip.fluid_pressure_pa
         presses.append(_press(name, store.indentation(name), counts, rest_pa))
     build = build_tape(
-        units=[tape_unit(one.name, one.to_json(), rests[one.name]) for one in specimens],
+        specimens=[tape_specimen(one.name, one.to_json(), rests[one.name]) for one in specimens],
         presses=presses,
         rest_pressure_pa=fingertip.fluid_pressure_pa,
         nodes=mesh.nodes,
