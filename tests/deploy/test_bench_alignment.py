@@ -185,4 +185,4 @@ def test_it_runs_the_whole_way(palpate: Palpate, tmp_path: Path) -> None:
     assert found["kept"] < 0.1 or all(one["count"] for one in found["stamps"].values())
     assert found["gauges"]["kms40.clock_quality"] == 0.0
     assert {"finger.clock_drift_ppm", "rdt.clock_delay_p50_s"} <= set(found["gauges"])
-    assert "# Alignment on one host" in page.read_text(encoding="utf-8")
+    assert "# Errors of stamps and of alignment on one host" in page.read_text(encoding="utf-8")

@@ -161,40 +161,40 @@ def apart(
 
 
 _HEAD = """\
-# Alignment on one host: what was measured
+# Errors of stamps and of alignment on one host
 
 Made by `palpate bench alignment --seconds {seconds:g} --page docs/results/alignment.md`
 on {machine}.
 
-Emulated devices, each in a process of its own, and a robot's program show one signal whose time is
-known by the host's monotonic clock: a ramp up and down, 0.25 s each. They go the whole way through
-driver, pipeline and bus to a client. Nothing here is hardware: what a real device delays before it
-sends (filters, conversion, adapters) comes on top, and is the same for every reading of it
-([time.md](../time.md#what-no-stamp-can-know)). The clocks of finger, RDT and Bota run 200 ppm fast,
-the robot's is another than the host's and 40 ppm fast.
+Emulated devices, each in a process of its own, and a robot's program send one signal whose time is
+known by the host's monotonic clock: a ramp up and down, 0.25 s each. Their readings pass driver,
+pipeline and bus to a client. No hardware takes part: the delay inside a real device (filters,
+conversion, adapters) is added to these errors, and is the same for each of its readings
+([time.md](../time.md#what-no-stamp-can-know)). The clocks of finger, RDT and Bota run 200 ppm fast;
+the robot has a clock of its own, 40 ppm fast.
 
-The host is shared, and puts emulators aside as it never does with sensors: what they sent more
-than 5 ms late, and what lies around it, is left out. {kept:.0%} of the time counts.
+The host is shared, and delays emulators as it never delays a sensor: readings sent more than 5 ms
+late, and those around them, are left out. {kept:.0%} of the time counts.
 
 ## Stamps
 
-A reading's stamp less the instant at which its value was there; late is positive. Median with its
-sign, the others of the sizes.
+Stamp minus the true time of a reading; late is positive. The median has its sign, the other columns
+are magnitudes.
 
 {stamps}
 
-Of the finger every channel counts at its own instant (`palpate.sampling`); a count is worth
-0.07 ms here, which is part of the numbers. The row "all at the stamp" is the same readings for
-whoever forgets that a frame takes 10 ms.
+Every channel of the finger has its own instant (`palpate.sampling`); one count equals 0.07 ms here,
+which is part of the numbers. The row "all at the stamp" shows the error of a program that ignores
+that a frame takes 10 ms.
 
 ## Electrodes, wrench and pose
 
-Every stream brought to the instant of each electrode (`palpate.alignment`); how far apart in
-time what the two show was there. The goal is 1 ms.
+Every stream is interpolated at the instant of each electrode (`palpate.alignment`); the error is
+the difference between the times of both values. The goal is 1 ms.
 
 {apart}
 
-## What the gateway told
+## Gauges of the gateway
 
 {gauges}
 """
