@@ -153,6 +153,7 @@ def from_contact(whole: ForceCurve, *, side: str, threshold_n: float = THRESHOLD
     peak = int(magnitude.argmax())
     if magnitude[peak] < threshold_n:
         raise AlignmentError(side, AlignmentProblem.NEVER_REACHES, threshold_n)
+    # From the peak backwards, so that noise before contact is not taken for the crossing.
     below = np.flatnonzero(magnitude[:peak] < threshold_n)
     if whole.begins_at(threshold_n):
         return whole

@@ -211,6 +211,8 @@ class _Search:
             trial = self.simulate([state.point * np.exp(shift)])[0]
             trial_fit = self.evaluate(trial, "step")
             won = fit.cost - trial_fit.cost
+            # A trust region: accept a step that wins a tenth of what the model promised, and let
+            # the reach grow if the model was good, shrink if it was not.
             if won > 0.1 * gain:
                 state, fit, model = trial, trial_fit, None
                 reach = np.minimum(reach * (1.5 if won > 0.75 * gain else 1.0), largest)

@@ -187,6 +187,7 @@ def _round(model: LocalModel, start: Floats, reach: Floats) -> Floats:
     hessian, _ = curvature(
         model.slopes(start[:-1], start[-1]), model.residuals(start[:-1], start[-1])
     )
+    # Coordinates w with logarithms = start + stretch @ w have unit curvature at the start.
     bend, directions = np.linalg.eigh(hessian)
     stretch = directions / np.sqrt(np.maximum(bend, max(_FLATTEST * bend[-1], 1e-300)))
     low, high = _limits(model, reach)
@@ -333,6 +334,7 @@ def _variance(
     directions = basis @ directions
     inverse = directions[:, seen] / bend[seen]
 
+    # Delta method: the optimum moves by -H^-1 times the change of the gradient.
     carried = _noise(model, slopes, weight, residuals, log_modulus, shift)
     gradient_cov = carried.T @ carried
     half = inverse @ directions[:, seen].T

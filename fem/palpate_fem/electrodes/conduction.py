@@ -200,6 +200,8 @@ class FilmConduction:
         )
         columns, self._rows = np.divmod(entries, size)
         self._starts = np.searchsorted(columns, np.arange(size + 1))
+        # All entries are linear in the sheet conductance of the triangles and in the transfer of
+        # the discs, so a new film needs one product with a sparse matrix, and no assembly.
         stiff = np.einsum("fai,fbi,f->fab", self.slopes, self.slopes, self.areas).ravel()
         shares = np.arange(len(node))
         weights = [stiff, np.ones(len(node)), -np.ones(2 * live.sum()), np.ones(live.sum())]

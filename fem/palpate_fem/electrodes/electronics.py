@@ -180,6 +180,8 @@ class ElectrodeSignals:
             Counts, uint16, shape (T, 19).
         """
         specimen = self.specimen
+        # The slow response replaces a share of the immediate one, so the settled counts are the
+        # ideal.
         late = specimen.creep_share * (ideal - self.rest)
         creep = _followed(late, elapsed_s / specimen.creep_tau_s, self._creep)
         if len(creep):

@@ -108,6 +108,8 @@ class GapFinder:
         """
         position = np.asarray(position, np.float64)
         face = self._start.copy()
+        # Walk from triangle to triangle over the edge with the most negative barycentric
+        # coordinate.
         active = np.arange(len(face))
         for _ in range(MOST_STEPS):
             weights, _ = self._meet(position, active, face[active])
@@ -263,6 +265,7 @@ def thickness(
     Returns:
         Thickness h [m], dh/d gap and dh/d pressure [m/Pa], each of the same shape.
     """
+    # A softplus instead of max(gap, 0): its slope is needed for gradients, and is continuous.
     t = gap / ROUNDING_M
     above, slope = ROUNDING_M * np.logaddexp(0.0, t), 0.5 * (1 + np.tanh(t / 2))
     squeezed = 1 + pressure / specimen.squeeze_pa

@@ -96,6 +96,8 @@ def fit_specimen(
 
         def misfit(scaled: Floats, some: list[Gap] = some) -> Floats:
             ends = TaredRange.of(_tared(sensor.with_specimen(specimen_at(scaled)), some, rest))
+            # Misfit and priors in one vector of residuals: the fit is a maximum a posteriori
+            # estimate.
             missed = np.array([ends.low - wanted[0], ends.high - wanted[1]]) / TOLERANCE
             return np.concatenate([missed, scaled])
 

@@ -198,6 +198,7 @@ class SimulationBatch(Closing):
         report = BatchReport(total)
         steps: dict[str, list[IndentationStep]] = {}
         while True:
+            # Cancelled jobs still end with an event; the loop goes on until all of them have.
             if stop.is_set() and not report.stopped:
                 report.stopped = True
                 ahead = None

@@ -258,6 +258,7 @@ class SimulationService(Closing):
         self.pool.close()
 
     def _on_event(self, active: ActiveSimulation, event: JobEvent) -> None:
+        # Forgotten before the last reply, so that the caller may use the same request_id again.
         over = isinstance(event, JobEnded | JobFailed)
         if over:
             self._forget(active)
