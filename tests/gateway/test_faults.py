@@ -29,6 +29,8 @@ from tests.gateway.fault_names import (
     why_untold,
 )
 
+from palpate.errors import DeviceLost
+
 LASTS_S = 0.25
 """Longer than any sensor may be silent before it is said to be lost."""
 
@@ -117,8 +119,11 @@ def test_a_fault_shows_and_nothing_wrong_is_published(
             assert not outcome.counted.get(name), outcome
     if not why_untold(case, fault):
         assert told_by(fault, lasting.counted, lasting.errors), lasting
+    # On a busy machine the fault may last until the device is lost; then its clock starts again,
+    # and the gap is not counted.
+    lost = any(isinstance(error, DeviceLost) for error in lasting.errors)
     for name in entry_of(COUNTERS, case, fault).split():
-        assert lasting.counted.get(name), (name, lasting)
+        assert lasting.counted.get(name) or (lost and name == "lost_samples"), (name, lasting)
 
 
 def test_every_fault_has_a_name() -> None:
