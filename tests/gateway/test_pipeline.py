@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,26 @@ def test_sequences_go_on_when_the_device_is_opened_again() -> None:
     made.begin(IDENTITY, LiveClock())
     out = frames(made.push(readings(5), 2 * 10**9))
     assert [frame.stamp.sequence for frame in out] == [6, 7, 8, 9, 10]
+
+
+def test_a_tare_outlives_the_same_finger_opened_again() -> None:
+    made = pipeline(live=True)
+    (tare,) = tares(made.push(readings(12), 10**9))
+    made.begin(IDENTITY, LiveClock())
+    out = made.push(readings(30, first=12), 2 * 10**9)
+    assert not tares(out)
+    assert {frame.tare_id for frame in frames(out)} == {tare.tare_id}
+
+
+@pytest.mark.parametrize("tare", ["still", "query"])
+def test_a_finger_of_another_kind_has_no_tare_yet(tare: Any) -> None:
+    made = Pipeline(info(live=True), tare=tare, tare_frames=10)
+    made.begin(IDENTITY, LiveClock())
+    made.ask_tare(10)
+    assert tares(made.push(readings(12), 10**9))
+    made.begin(replace(IDENTITY, sensor_type=SensorType.BIOTAC_SP), LiveClock())
+    assert made.ledger.current_id == NO_TARE
+    assert made._tares.attempting == (tare == "still"), "of itself, unless tares are asked for"
 
 
 def test_gaps_are_stamped_and_counted() -> None:
