@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from palpate import clock
-from palpate.bus import ReceivedMessage
+from palpate.bus import Delivery, ReceivedMessage, Session
 from palpate.bus.topics import ELECTRODES, FEATURES
-from palpate.messages import ElectrodeFrame, Origin
+from palpate.config import LinkConfig
+from palpate.health import Health
+from palpate.messages import ElectrodeFrame, FeatureEstimate, Origin
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import loop
 from palpate_services.inference.estimates import EstimateRefusal
@@ -174,3 +180,48 @@ def test_counts_are_handed_over_five_times_a_second(station: Station, came: Came
         station.now_ns = START_NS + after_ms * MS
         publisher.report()
         assert station.counts["frames_received"] == received
+
+
+def test_what_has_come_is_answered_before_it_leaves(
+    link: LinkConfig, make_bundle: Callable[..., Path], make_frame: Frames
+) -> None:
+    """Five frames; the service is told to stop while it works on the first."""
+    stop, begun, go = threading.Event(), threading.Event(), threading.Event()
+    kept: list[Health] = []
+
+    def prepare(session: Session, runtime: object, health: Health) -> Any:
+        kept.append(health)
+
+        def slow(sensor: str, frame: ElectrodeFrame) -> FeatureEstimate:
+            begun.set()
+            assert go.wait(20)
+            place = np.zeros(3, np.float32)
+            return FeatureEstimate(
+                frame.stamp, "BT", bytes(32), 5, True, place + 1, place, place, place
+            )
+
+        return slow
+
+    config = FeaturesServiceConfig(bundle=str(make_bundle()), delivery="every", max_age_s=None)
+    service = threading.Thread(
+        target=loop.serve,
+        args=(ROUTE, config, link, "lab", stop),
+        kwargs={"instance": "features", "prepare": prepare},
+    )
+    service.start()
+    with Session.open(link) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        sender = session.publisher(ELECTRODES, sensor="finger", lossless=True)
+        deadline = time.monotonic() + 20
+        while not sender.matched():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        for sequence in range(1, 6):
+            sender.put(make_frame(sequence))
+        assert begun.wait(20)
+        time.sleep(0.3)  # the others arrive meanwhile
+        stop.set()
+        go.set()
+        service.join(20)
+        assert [estimates.next(5.0).message.source.sequence for _ in range(5)] == [1, 2, 3, 4, 5]
+    assert kept[0].counters["estimates_published"] == 5
