@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.errors import ConfigError, SimulationError
+from palpate_fem.electrodes import film
 from palpate_fem.electrodes.film import FilmMesh, film_mesh, onto
 from palpate_fem.electrodes.gap import CLAMP_X_M, GapFinder, gap_adjustment, thickness
 from palpate_fem.electrodes.specimen import (
@@ -116,6 +117,17 @@ def test_film_mesh_is_the_one_that_results_were_made_on(
     middle_m = mesh.nodes.mean(axis=0)
     assert middle_m[0] * 1e3 == pytest.approx(back_mm, abs=6e-3)
     assert abs(middle_m[1]) < 1e-12, "symmetric"
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_edges_are_flipped_until_opposite_angles_are_small(tilt: float) -> None:
+    """A rhombus: cut along its long diagonal, and then along the short one. In space, too."""
+    corners = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, -1.0, tilt], [0.0, 1.0, tilt]])
+    long_cut = np.array([[0, 1, 3], [1, 0, 2]], np.int32)
+    short_cut = np.array([[2, 3, 0], [3, 2, 1]], np.int32)
+    for faces in (long_cut, short_cut):
+        found = {frozenset(face) for face in film._flipped(1e-3 * corners, faces).tolist()}
+        assert found == {frozenset({0, 2, 3}), frozenset({1, 2, 3})}
 
 
 @pytest.mark.parametrize("key", ["edge_m", "disc_diameter_m", "recess_m"])
