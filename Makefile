@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check bench fuzz docs fmt proto bundle build clean
+.PHONY: help setup demo quick test durations check mutants bench fuzz docs fmt proto bundle build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -60,6 +60,11 @@ bench: $(VENV)/.dev  ## latency and throughput beside their bare floor | 2-5 min
 fuzz: $(VENV)/.dev  ## fuzz the gateway's decoders: make fuzz DECODER=kms40 SECONDS=600 | 10 min each, Linux only
 	@$(pip_install) -e '.[fuzz]' | $(show)
 	$(BIN)/python -m tests.fuzz.run $(or $(DECODER),all) --seconds $(or $(SECONDS),600)
+
+mutants: $(VENV)/.dev  ## plant small faults in the central modules: which do the tests notice? | 1 h, Linux only
+	@$(pip_install) -e '.[mutants]' | $(show)
+	$(BIN)/python -m tests.mutation.run $(MODULES)
+	$(BIN)/python -m tests.mutation.page
 
 docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links | 20 s
 	$(BIN)/python docs/make_messages.py
