@@ -11,17 +11,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
+from palpate_fem.arrays import Floats
 from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.result import IndentationOutcome
 from palpate_fem.trajectory import press_path
-
-Floats = NDArray[np.float64]
 
 EDGES_M = (1.0e-3, 0.7e-3, 0.5e-3, 0.35e-3)
 STEPS = (10, 20, 40, 80)

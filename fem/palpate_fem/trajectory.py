@@ -26,12 +26,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigError
 from palpate.rigid import facing, unit
+from palpate_fem.arrays import Floats
 from palpate_fem.indenter.approach import OuterSurface, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mesh.surface import node_normals
-
-Floats = NDArray[np.float64]
 
 STEPS = 20  # paper, "Finite element model configuration"
 POINTS = 10  # per indenter; paper, "Experimental testing procedure", as are the next four

@@ -16,15 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from palpate.errors import SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
-from palpate_fem.result import (
-    Convergence,
-    Floats,
-    IndentationOutcome,
-    IndentationResult,
-    IndentationStep,
-)
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.fingertips import OnFraction
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.sample import sample_fingertip

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
-from palpate_fem.indenter.outline import SPACING_M, Floats, Ints, outline_of
+from palpate_fem.indenter.outline import SPACING_M, outline_of
 from palpate_fem.indenter.shape import signed_distance
 
 ROUNDING_M = 1e-12

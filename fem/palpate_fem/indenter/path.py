@@ -6,11 +6,10 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from palpate.errors import ConfigError
-
-Floats = NDArray[np.float64]
+from palpate_fem.arrays import Floats
 
 COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 REACH_M = 0.2  # a position farther from the origin is a mistake of units

@@ -23,6 +23,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
+
 
 class PrimitiveKind(IntEnum):
     """Kinds of primitives; the kernels use the numbers."""
@@ -65,7 +67,7 @@ class Indenter:
     name: str
     primitives: tuple[Primitive, ...]
 
-    def packed(self) -> NDArray[np.float64]:
+    def packed(self) -> Floats:
         """Rows for the kernels: kind, axis, centre (3), sizes (4), rounding; shape (P, 10)."""
         return np.array(
             [
@@ -75,8 +77,6 @@ class Indenter:
             np.float64,
         ).reshape(-1, 10)
 
-
-Floats = NDArray[np.float64]
 
 # [m]; closer to its axis a solid of revolution has no radial direction: far below any length that
 # matters, far above what rounds to zero.

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from palpate.rigid import rotation_matrices
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE, scalars, vec3s
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels
@@ -20,8 +20,6 @@ from palpate_fem.mechanics.contact_kernels import ContactLaw
 from palpate_fem.mechanics.reference_element import corner_element, face_element
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mesh.core import DistanceGrid
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +86,7 @@ class ContactSurface:
     The contact points are the corners of the faces; arrays have the shape (faces, corners).
     """
 
-    def __init__(self, nodes: Floats, faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> None:
+    def __init__(self, nodes: Floats, faces: Ints, pairs: Ints) -> None:
         """Prepare the arrays.
 
         Args:

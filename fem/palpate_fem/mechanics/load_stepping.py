@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.rigid import interpolate_pose
+from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.material import VOLUME_BARRIER
@@ -21,8 +21,6 @@ from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSol
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
-
-Floats = NDArray[np.float64]
 
 CONTACT_SHARE = 1e-3
 """A surface point counts as touching if its pressure exceeds this share of the largest."""

@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from palpate_fem.arrays import Floats
 
 VOLUME_BARRIER = 60.0
 """Stiffness of the barrier in shear moduli; ADR 0013 says how little it changes forces."""

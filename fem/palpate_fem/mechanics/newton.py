@@ -11,17 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from palpate.errors import SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import SparseFactor
-
-Floats = NDArray[np.float64]
 
 DAMP_FROM = 6
 """Iterations after which an error that does not decrease is taken for a cycle."""

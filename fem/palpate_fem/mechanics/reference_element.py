@@ -7,11 +7,9 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.mesh.solid import SolidMesh
-
-Floats = NDArray[np.float64]
 
 _GAUSS = 1.0 / np.sqrt(3.0)
 _CORNERS = np.array(

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.mechanics import element_kernels
 from palpate_fem.mechanics.contact import ContactSurface
 from palpate_fem.mechanics.reference_element import rest_gradients, volume_form
 from palpate_fem.mesh.solid import SolidMesh
-
-Floats = NDArray[np.float64]
 
 
 class SkinElements:
@@ -21,7 +19,7 @@ class SkinElements:
     def __init__(
         self,
         mesh: SolidMesh,
-        pairs: NDArray[np.int32],
+        pairs: Ints,
         *,
         shear_modulus_pa: float,
         bulk_ratio: float,

@@ -10,9 +10,9 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.path import check_path
@@ -25,8 +25,6 @@ from palpate_fem.mesh.check import check_mesh
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.sparse.factor import make_factor
-
-Floats = NDArray[np.float64]
 
 STEPS_TO_PRESSURISE = 4
 REFERENCE_MODULUS_PA = 2.8e5

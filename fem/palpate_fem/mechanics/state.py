@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.solid import SolidMesh
-
-Floats = NDArray[np.float64]
 
 FORCE_FLOOR_N = 1e-6
 """Least scale of the forces [N], for a body without load; rounding errors are far below."""
@@ -68,7 +66,7 @@ class SolutionState:
         )
 
 
-def _points(faces: NDArray[np.int32]) -> int:
+def _points(faces: Ints) -> int:
     """Contact points of a face: its corners."""
     return int(faces.shape[1]) if faces.ndim == 2 else 0
 

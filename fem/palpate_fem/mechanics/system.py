@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.mechanics import contact_kernels, element_kernels
 from palpate_fem.mechanics.contact import (
@@ -29,9 +30,6 @@ from palpate_fem.mechanics.skin import FluidCavity, SkinElements
 from palpate_fem.mechanics.state import TRACTION_FLOOR_PA, ForceBalance, SolutionState
 from palpate_fem.mesh.core import DistanceGrid
 from palpate_fem.mesh.solid import SolidMesh
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.mesh.surface import components, enclosed_volume, open_edges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 # The three neighbours of each corner, in the order that makes their triple product positive.
 HEXAHEDRON_CORNERS = (

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.surface import face_vectors, node_normals
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 
 def _weights(t: Floats) -> tuple[Floats, Floats, Floats]:

@@ -14,13 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.shape import Field, cast, project
 from palpate_fem.mesh.surface import edges
-
-Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,6 @@ def bag(rings: int, a: int, b: int) -> BagTopology:
     faces = np.ascontiguousarray(np.concatenate([back, tube, cap]), np.int32)
     return BagTopology(ring, proximal, tip, faces, mirror)
 
-
-Floats = NDArray[np.float64]
 
 REACH_M = 15e-3  # every ray leaves the body within
 DENSE = 401  # samples of a curve

@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.check import check_mesh
 from palpate_fem.mesh.core import (
     DistanceGrid,
@@ -24,9 +24,6 @@ from palpate_fem.mesh.core import (
 )
 from palpate_fem.mesh.solid import FingertipGeometry, check_limits, extrude
 from palpate_fem.mesh.surface import components, edges, enclosed_volume, node_normals, open_edges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 REMEDY = "fetch the file anew from the NVlabs/biotac_sim repository, folder assets"
 

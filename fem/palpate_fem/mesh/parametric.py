@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.config import EDGE_M
 from palpate_fem.mesh.check import check_mesh
 from palpate_fem.mesh.core import DistanceGrid, RigidCore, box_around, grid_points, spread
@@ -14,9 +14,6 @@ from palpate_fem.mesh.grid import BagTopology, RayOrigins, Spacing, lay
 from palpate_fem.mesh.shape import CavityShape, CoreShape, Field, nearest
 from palpate_fem.mesh.solid import FingertipGeometry, check_limits, extrude
 from palpate_fem.mesh.surface import enclosed_volume
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 # Underside of the nail on the skin, measured on the public nail slab: x from the clamp to the tip.
 NAIL_X_M = (-13.96e-3, 3.42e-3)

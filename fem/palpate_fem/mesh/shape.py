@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from palpate_fem.arrays import Floats
+
 Value = tuple[Floats, Floats]
 # Positions [m], shape (N, 3) -> value [m], shape (N,), and its exact gradient, shape (N, 3).
 Field = Callable[[Floats], Value]

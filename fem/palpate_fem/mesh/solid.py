@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.core import RigidCore
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from palpate_fem.arrays import Floats, Ints
 
 
 def face_vectors(points: Floats, faces: Ints) -> Floats:

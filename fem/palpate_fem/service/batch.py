@@ -18,11 +18,12 @@ from typing import Protocol
 
 from palpate.errors import RemoteError, SimulationError
 from palpate.process import Closing
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.runs import SimulatedRun
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import check_path
-from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.jobs import (
     JobEnded,
     JobEvent,

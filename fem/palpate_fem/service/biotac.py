@@ -7,12 +7,13 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 from palpate.errors import ConfigError
+from palpate_fem.arrays import Floats
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.solid import FingertipGeometry
-from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.fingertips import BuildTip, OnFraction
 from palpate_fem.store.content import Setting, StoredFingertip
 

@@ -13,10 +13,11 @@ from dataclasses import replace
 from typing import Protocol, cast
 
 from palpate.errors import ConfigError, SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 OnFraction = Callable[[float], None]

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from palpate.errors import ErrorCode, PalpateError, RemoteError
+from palpate_fem.arrays import Floats
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import Floats, IndentationOutcome, IndentationResult, IndentationStep
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
 
 

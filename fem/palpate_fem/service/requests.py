@@ -27,16 +27,11 @@ from palpate.messages import (
     SimulationRequest,
     SimulationStep,
 )
+from palpate_fem.arrays import Floats
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.path import check_path
-from palpate_fem.result import (
-    Convergence,
-    Floats,
-    IndentationOutcome,
-    IndentationResult,
-    IndentationStep,
-)
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.config import FemConfig
 from palpate_fem.service.fingertips import check_start, without_friction
 from palpate_fem.service.jobs import SimulationJob

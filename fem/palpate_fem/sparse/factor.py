@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from palpate.errors import ConfigError, SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.sparse.fronts import FrontalFactor, FrontAssembly, UnsafePivotError
 
 _log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.integer[Any]]
 
 SOLVERS = ("auto", "fronts", "fronts-double", "superlu")

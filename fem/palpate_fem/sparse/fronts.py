@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.device import DEVICE
 from palpate_fem.sparse import blas
 from palpate_fem.sparse.ordering import plan_elimination
@@ -23,7 +24,6 @@ from palpate_fem.sparse.ordering import plan_elimination
 wp.set_module_options({"enable_backward": False})
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

@@ -11,6 +11,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from palpate_fem.verify import (
@@ -22,7 +24,7 @@ from palpate_fem.verify import (
     public_skin,
     tangents,
 )
-from palpate_fem.verify.check import VerificationCase, VerificationCheck
+from palpate_fem.verify.check import CASES, VerificationCase, VerificationCheck
 
 __all__ = ["VerificationCase", "VerificationCheck", "run", "suite"]
 
@@ -42,15 +44,12 @@ def suite(
         shared_data: Folder that holds the public BioTac meshes; None = beside the project.
     """
     folder = (shared_data or SHARED_DATA) / PUBLIC_SKIN
-    every = (
-        *tangents.CHECKS,
-        *element.CHECKS,
-        *closed_forms.CHECKS,
-        *conservation.CHECKS,
-        *contact.CHECKS,
-        *friction.CHECKS,
-        *public_skin.checks(folder),
-    )
+    modules = (tangents, element, closed_forms, conservation, contact, friction)
+    every = [case for module in modules for case in CASES[module.__name__]]
+    every += [
+        replace(case, measure=partial(case.measure, folder=folder))
+        for case in CASES[public_skin.__name__]
+    ]
     word = only.lower()
     return tuple(case for case in every if word in case.name.lower() and not (quick and case.slow))
 

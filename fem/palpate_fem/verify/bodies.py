@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.load_stepping import SolverSettings
@@ -27,8 +28,6 @@ from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
 from palpate_fem.sparse.factor import make_factor
 from palpate_fem.verify.meshes import hollow_sphere
-
-Floats = NDArray[np.float64]
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 

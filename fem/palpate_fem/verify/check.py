@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
+from itertools import product
+from typing import Any
 
 from palpate.errors import PalpateError
 
@@ -64,7 +68,7 @@ class VerificationCase:
     """
 
     name: str
-    measure: Callable[[], Measurement]
+    measure: Callable[..., Measurement]
     tolerance: float
     unit: str = ""
     slow: bool = False
@@ -99,3 +103,55 @@ class VerificationCase:
         allowed = self.tolerance * (abs(measured.reference) or 1.0)
         miss = measured.reference - measured.value
         return bool(miss <= allowed if self.at_least else abs(miss) <= allowed)
+
+
+CASES: dict[str, list[VerificationCase]] = defaultdict(list)
+"""Registered checks by the module of their function."""
+
+Variants = Mapping[Any, object] | Iterable[object]
+Registrar = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def check(name: str, tolerance: float, unit: str = "", **options: Any) -> Registrar:
+    """Register a function that returns one `Measurement`; see `checks`."""
+    return checks((name, tolerance, unit), **options)
+
+
+def checks(
+    *rows: tuple[str, float, str], slow: bool = False, at_least: bool = False, **variants: Variants
+) -> Registrar:
+    """Register a function as one check for each of its measurements and each variant.
+
+    Args:
+        rows: Name, tolerance and unit of each measurement. If there are several, the function
+            returns a tuple of them and runs only once.
+        slow: See `VerificationCase`.
+        at_least: See `VerificationCase`.
+        variants: Values of the function's arguments, or these by their labels; every combination is
+            a check, and ``{argument}`` in a name stands for the value or label.
+    """
+    labelled = [v if isinstance(v, Mapping) else {x: x for x in v} for v in variants.values()]
+
+    def register(function: Callable[..., Any]) -> Callable[..., Any]:
+        measure = function if len(rows) == 1 else cache(function)
+        for labels in product(*labelled):
+            given = {k: v[x] for k, v, x in zip(variants, labelled, labels, strict=True)}
+            for part, (name, tolerance, unit) in enumerate(rows):
+                CASES[function.__module__].append(
+                    VerificationCase(
+                        name.format(**dict(zip(variants, labels, strict=True))),
+                        partial(_part, measure, part, **given),
+                        tolerance,
+                        unit,
+                        slow=slow,
+                        at_least=at_least,
+                    )
+                )
+        return function
+
+    return register
+
+
+def _part(measure: Callable[..., Any], part: int, **given: Any) -> Measurement:
+    found = measure(**given)
+    return found if isinstance(found, Measurement) else found[part]

@@ -6,13 +6,14 @@ Also Cook's membrane against felupe, and the number of Newton iterations for two
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 
 from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody
-from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.check import Measurement, check
 from palpate_fem.verify.meshes import (
+    KINDS,
     cooks_membrane,
     octant,
     on_planes,
@@ -28,15 +29,23 @@ EVER_FINER = ((2, 1), (4, 2), (8, 4))
 FEWER_DIGITS = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-9)
 
 
-def stretched(stretch: float, power: int, *, wide: bool, plane: bool) -> Measurement:
+@check(
+    "closed/{way} stretch 1.5",
+    1e-8,
+    way={
+        "uniaxial": (-1, False, False),
+        "equibiaxial": (-4, True, False),
+        "pure shear": (-2, False, True),
+    },
+)
+def stretched(way: tuple[int, bool, bool]) -> Measurement:
     """Cauchy stress over mu along x of a cube: l^2 - l^power for J = 1.
 
     Args:
-        stretch: l.
-        power: Of the stretch across, squared: -1 uniaxial, -4 equibiaxial, -2 pure shear.
-        wide: Whether y is stretched as x is.
-        plane: Whether y keeps its length.
+        way: Power of the stretch across, squared; whether y is stretched as x is; whether y keeps
+            its length.
     """
+    stretch, (power, wide, plane) = 1.5, way
     line = np.linspace(0.0, 1e-3, 3)
     mesh = slab(*rectangle(line, line), line)
     held, end = on_planes(mesh), np.abs(mesh.nodes - 1e-3) < 1e-9
@@ -86,8 +95,10 @@ def blown(
 
 
 STRETCHES = (1.1, 1.25, 1.5, 2.0)
+WIDER, SMALLER = (1.1, 1.5, 2.0), (1.05, 1.1, 1.2, 1.3)
 
 
+@check("closed/thick sphere, {wedges}, stretch {stretch}", 1e-2, wedges=KINDS, stretch=STRETCHES)
 def sphere(stretch: float, *, wedges: bool) -> Measurement:
     """Inflation of a thick sphere, B/A = 1.5, with three layers; through its limit point at 1.6."""
     return Measurement(
@@ -95,13 +106,15 @@ def sphere(stretch: float, *, wedges: bool) -> Measurement:
     )
 
 
+@check("closed/sphere of the BioTac's size, stretch {stretch}", 1e-2, "kPa", stretch=SMALLER)
 def sphere_of_biotac(stretch: float) -> Measurement:
     """The same at the BioTac's size."""
     ratio = OUTER_M / INNER_M
-    found = blown(*FINEST, ratio, (1.05, 1.1, 1.2, 1.3))
+    found = blown(*FINEST, ratio, SMALLER)
     return Measurement(MU * found[stretch] * 1e-3, MU * thick_sphere(stretch, ratio) * 1e-3)
 
 
+@check("closed/thick sphere, {wedges}, order", 0.1, at_least=True, wedges=KINDS)
 def sphere_order(*, wedges: bool) -> Measurement:
     """Order of convergence: slope of log error over log edge, from the two finest meshes."""
     exact = thick_sphere(1.1, 1.5)
@@ -110,6 +123,7 @@ def sphere_order(*, wedges: bool) -> Measurement:
     return Measurement(np.log2(error[1] / error[2]), 2.0, note)
 
 
+@check("closed/ideal balloon, stretch {stretch}", 1e-2, stretch=(1.5,))
 def balloon(stretch: float) -> Measurement:
     """Ideal balloon, thickness over radius t -> 0: p / mu = 2 t (1/l - 1/l^7)."""
     thin = 1e-3
@@ -141,9 +155,10 @@ def _tube(stretches: tuple[float, ...], bulk_ratio: float, layers: int) -> dict[
     return found
 
 
+@check("closed/thick tube, plane strain, stretch {stretch}", 1e-2, stretch=WIDER)
 def tube(stretch: float) -> Measurement:
     """Inflation of a thick tube in plane strain, B/A = 1.5, with three layers."""
-    return Measurement(_tube((1.1, 1.5, 2.0), 1e6, 3)[stretch], thick_tube(stretch, 1.5), "p / mu")
+    return Measurement(_tube(WIDER, 1e6, 3)[stretch], thick_tube(stretch, 1.5), "p / mu")
 
 
 SMALL = 1e-4  # strain; terms of second order are far below the tolerance
@@ -172,12 +187,14 @@ def _lame_tube(nu: float) -> Measurement:
     return Measurement(found, 2 * (square - 1) / ((1 - 2 * nu) + square), "p A / (mu u)")
 
 
+@check("closed/Lame {shape}, nu {nu}", 5e-3, shape=("sphere", "tube"), nu=(0.3, 0.4999))
 @cache
 def lame(shape: str, nu: float) -> Measurement:
     """Lame's thick sphere or tube in plane strain: pressure per small displacement of the bore."""
     return (_lame_sphere if shape == "sphere" else _lame_tube)(nu)
 
 
+@check("closed/Lame {shape}, change with nu", 5e-3, shape=("sphere", "tube"))
 def lame_change(shape: str) -> Measurement:
     """Change of the relative error from nu = 0.3 to 0.4999, which would show locking."""
     errors = [m.value / m.reference - 1 for m in (lame(shape, 0.3), lame(shape, 0.4999))]
@@ -211,16 +228,19 @@ def cooks_corner(edges: int) -> float:
     return float((body.state.position - mesh.nodes)[corner, 1].mean())
 
 
+@check("convergence/Cook's membrane, {edges} edges", 2e-4, edges=tuple(COOK))
 def cook(edges: int) -> Measurement:
     """The same element in another code gives the same displacement."""
     return Measurement(cooks_corner(edges), COOK[edges], "felupe, Q1P0")
 
 
+@check("convergence/Cook's membrane, limit", 1e-2)
 def cook_limit() -> Measurement:
     """The element does not lock: the finest mesh is near the limit."""
     return Measurement(cooks_corner(32), COOK_LIMIT, "limit of felupe's series")
 
 
+@check("newton/count does not grow with kappa", 1e-12, "iterations")
 def newton_count() -> Measurement:
     """Newton iterations of an inflation by 10 % at kappa / mu = 1e6, against those at 1e2."""
     counts = []
@@ -231,61 +251,3 @@ def newton_count() -> Measurement:
         body.solve(volume=1.1 * body.system.balance(body.state, None).volume)
         counts.append(body.report.iterations)
     return Measurement(counts[0], counts[1])
-
-
-CHECKS = (
-    VerificationCase(
-        "closed/uniaxial stretch 1.5", partial(stretched, 1.5, -1, wide=False, plane=False), 1e-8
-    ),
-    VerificationCase(
-        "closed/equibiaxial stretch 1.5", partial(stretched, 1.5, -4, wide=True, plane=False), 1e-8
-    ),
-    VerificationCase(
-        "closed/pure shear stretch 1.5", partial(stretched, 1.5, -2, wide=False, plane=True), 1e-8
-    ),
-    *(
-        VerificationCase(
-            f"closed/thick sphere, {kind}, stretch {s}", partial(sphere, s, wedges=wedges), 1e-2
-        )
-        for kind, wedges in (("hexahedra", False), ("wedges", True))
-        for s in STRETCHES
-    ),
-    *(
-        VerificationCase(
-            f"closed/thick sphere, {kind}, order",
-            partial(sphere_order, wedges=wedges),
-            0.1,
-            at_least=True,
-        )
-        for kind, wedges in (("hexahedra", False), ("wedges", True))
-    ),
-    *(
-        VerificationCase(
-            f"closed/sphere of the BioTac's size, stretch {s}",
-            partial(sphere_of_biotac, s),
-            1e-2,
-            unit="kPa",
-        )
-        for s in (1.05, 1.1, 1.2, 1.3)
-    ),
-    VerificationCase("closed/ideal balloon, stretch 1.5", partial(balloon, 1.5), 1e-2),
-    *(
-        VerificationCase(f"closed/thick tube, plane strain, stretch {s}", partial(tube, s), 1e-2)
-        for s in (1.1, 1.5, 2.0)
-    ),
-    *(
-        VerificationCase(f"closed/Lame {shape}, nu {nu}", partial(lame, shape, nu), 5e-3)
-        for shape in ("sphere", "tube")
-        for nu in (0.3, 0.4999)
-    ),
-    *(
-        VerificationCase(f"closed/Lame {shape}, change with nu", partial(lame_change, shape), 5e-3)
-        for shape in ("sphere", "tube")
-    ),
-    *(
-        VerificationCase(f"convergence/Cook's membrane, {edges} edges", partial(cook, edges), 2e-4)
-        for edges in COOK
-    ),
-    VerificationCase("convergence/Cook's membrane, limit", cook_limit, 1e-2),
-    VerificationCase("newton/count does not grow with kappa", newton_count, 1e-12, "iterations"),
-)

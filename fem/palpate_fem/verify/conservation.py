@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.mechanics.contact import PosedIndenter
-from palpate_fem.mechanics.state import ForceBalance
 from palpate_fem.verify.bodies import (
     MU,
     TouchedFingertip,
@@ -25,7 +24,7 @@ from palpate_fem.verify.bodies import (
     pose,
     round_finger,
 )
-from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.check import Measurement, check, checks
 from palpate_fem.verify.element import order_of
 from palpate_fem.verify.meshes import hollow_sphere
 
@@ -40,6 +39,7 @@ def _skin() -> VerificationBody:
     return VerificationBody(mesh, held=held)
 
 
+@check("fluid/sealed volume while pressed", 1e-10)
 def sealed() -> Measurement:
     """Largest deviation from the sealed volume while a finger is pressed, over it."""
     worst = 0.0
@@ -50,34 +50,27 @@ def sealed() -> Measurement:
     return Measurement(worst)
 
 
-@cache
-def _dented() -> tuple[float, float, float]:
+@checks(
+    ("fluid/no pressure at the free volume", 1e-10, ""), ("fluid/no force of it either", 1e-8, "")
+)
+def unsealed() -> tuple[Measurement, ...]:
     """An empty skin that an indenter dents, and the same skin sealed at that volume.
 
-    Returns:
-        Relative loss of volume; p / mu of the sealed skin; relative difference of nodal forces.
+    The sealed one has no fluid pressure, and the nodal forces are those of the empty one.
     """
     press = PosedIndenter(ball(BALL_M), pose((0.0, 0.0, -OUTER_M + DENT_M)), 0.0)
-    empty = _skin()
+    empty, shut = _skin(), _skin()
     rest = empty.system.balance(empty.state, None).volume
     free = empty.solve(press)
-    shut = _skin()
     again = shut.solve(press, volume=free.volume)
-    same = np.abs(again.indenter - free.indenter).max() / np.abs(free.indenter).max()
-    return 1 - free.volume / rest, shut.state.fluid_pressure / MU, float(same)
+    note = f"p / mu; the dent takes {1 - free.volume / rest:.2%} of the volume"
+    return (
+        Measurement(shut.state.fluid_pressure / MU, note=note),
+        Measurement(np.abs(again.indenter - free.indenter).max() / np.abs(free.indenter).max()),
+    )
 
 
-def unsealed() -> Measurement:
-    """Sealed at the volume that it takes when empty, a dented skin has no fluid pressure."""
-    lost, pressure, _ = _dented()
-    return Measurement(pressure, note=f"p / mu; the dent takes {lost:.2%} of the volume")
-
-
-def unsealed_force() -> Measurement:
-    """Nodal forces of that sealed skin against those of the empty one."""
-    return Measurement(_dented()[2])
-
-
+@check("fluid/pressure and volume control agree", 1e-10)
 def two_controls() -> Measurement:
     """The pressure found by volume control leads to the same volume by pressure control."""
     by_volume = _skin()
@@ -89,63 +82,44 @@ def two_controls() -> Measurement:
     return Measurement(by_pressure.solve().volume / volume, 1.0, note)
 
 
-Floats = NDArray[np.float64]
-
 FRICTION = 0.186
 ASIDE_M = (-6e-3, 1e-3)  # under the BioTac's pad, off its middle
 RUB_M, DEEP_M = 0.6e-3, 3.6e-3
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def _forces(finger: TouchedFingertip, balance: ForceBalance) -> dict[str, Floats]:
-    """Nodal forces on the skin by their source [N], (V, 3)."""
-    return {
-        "indenter": -balance.indenter,
-        "core": -balance.core,
-        "fluid": finger.body.state.fluid_pressure * balance.volume_gradient,
-        "supports": finger.body.reactions(balance),
-    }
-
-
-@cache
-def _pressed_biotac() -> tuple[float, float, float, str]:
+@checks(
+    ("balance/forces on a pressed BioTac", 1e-8, ""),
+    ("balance/moments on a pressed BioTac", 1e-8, ""),
+    ("contact/penetration on a pressed BioTac", 5.0, "um"),
+)
+def pressed_biotac() -> tuple[Measurement, ...]:
     """A fingertip that is rubbed and pinched on its core.
 
-    Returns:
-        Imbalance of force and of moment over the indenter's, deepest penetration [m], and the
-        sizes of the forces in words.
+    The forces of indenter, core, fluid and supports on the skin add up to zero, and so do their
+    moments about the origin, because the stress is symmetric. Last, the deepest penetration of a
+    point into indenter or core.
     """
     finger = biotac_finger(friction=FRICTION, aside=ASIDE_M)
     for share in np.linspace(0.0, 1.0, 13)[1:]:
         balance = finger.at(share * np.array([RUB_M, 0.0, DEEP_M]))
-    forces = _forces(finger, balance)
-    position = finger.body.state.position
+    body, position = finger.body, finger.body.state.position
+    forces = {  # nodal forces on the skin by their source [N], (V, 3)
+        "indenter": -balance.indenter,
+        "core": -balance.core,
+        "fluid": body.state.fluid_pressure * balance.volume_gradient,
+        "supports": body.reactions(balance),
+    }
     push = {who: float(np.linalg.norm(force.sum(axis=0))) for who, force in forces.items()}
     force = sum(forces.values(), np.zeros((1, 3)))
     turn = np.linalg.norm(np.cross(position, forces["indenter"]).sum(axis=0))
     note = ", ".join(f"{who} {size:.3g} N" for who, size in push.items())
-    system = finger.body.system
+    deepest = -float(min(body.system.outer.gap.min(), body.system.inner.gap.min()))
     return (
-        float(np.linalg.norm(force.sum(axis=0))) / push["indenter"],
-        float(np.linalg.norm(np.cross(position, force).sum(axis=0)) / turn),
-        -float(min(system.outer.gap.min(), system.inner.gap.min())),
-        note,
+        Measurement(float(np.linalg.norm(force.sum(axis=0))) / push["indenter"], note=note),
+        Measurement(float(np.linalg.norm(np.cross(position, force).sum(axis=0)) / turn)),
+        Measurement(deepest * 1e6),
     )
-
-
-def force_balance() -> Measurement:
-    """The forces of indenter, core, fluid and supports on the skin add up to zero."""
-    return Measurement(_pressed_biotac()[0], note=_pressed_biotac()[3])
-
-
-def moment_balance() -> Measurement:
-    """So do their moments about the origin, because the stress is symmetric."""
-    return Measurement(_pressed_biotac()[1])
-
-
-def penetration() -> Measurement:
-    """Deepest penetration of a point into indenter or core."""
-    return Measurement(_pressed_biotac()[2] * 1e6)
 
 
 def potential(finger: TouchedFingertip, move: Floats) -> float:
@@ -168,6 +142,7 @@ def potential(finger: TouchedFingertip, move: Floats) -> float:
     return body.strain_energy() - fluid + contact
 
 
+@check("balance/force is the energy's derivative", 1e-8)
 def energy_derivative() -> Measurement:
     """Without friction the force is the derivative of the energy by the indenter's position."""
     finger, depth, step = round_finger(friction=0.0), 0.75e-3, 1e-7
@@ -178,6 +153,7 @@ def energy_derivative() -> Measurement:
     return Measurement(force / slope - 1, note=f"{force:.4g} N")
 
 
+@check("symmetry/mesh", 1e-10)
 def mirror_mesh() -> Measurement:
     """Nodes of the parametric mesh against their mirror images, over the finger's size."""
     mesh = biotac_finger(friction=0.0, aside=ASIDE_M).body.mesh
@@ -185,8 +161,12 @@ def mirror_mesh() -> Measurement:
     return Measurement(np.abs(off).max() / np.ptp(mesh.nodes))
 
 
-@cache
-def _pressed_in_the_middle() -> tuple[float, float]:
+@checks(("symmetry/displacements", 1e-10, ""), ("symmetry/force across", 1e-10, ""))
+def mirror_displacement() -> tuple[Measurement, ...]:
+    """Pressed and rubbed in its plane of symmetry, the skin deforms symmetrically.
+
+    The force has no component across the plane.
+    """
     finger = biotac_finger(friction=FRICTION, aside=(ASIDE_M[0], 0.0))
     start = finger.body.state.position.copy()
     for k in range(1, 5):
@@ -194,17 +174,10 @@ def _pressed_in_the_middle() -> tuple[float, float]:
     moved = finger.body.state.position - start
     off = moved[finger.body.mesh.mirror] * [1.0, -1.0, 1.0] - moved
     force = balance.indenter.sum(axis=0)
-    return float(np.abs(off).max() / np.abs(moved).max()), abs(force[1] / force[2])
-
-
-def mirror_displacement() -> Measurement:
-    """Pressed and rubbed in its plane of symmetry, the skin deforms symmetrically."""
-    return Measurement(_pressed_in_the_middle()[0])
-
-
-def mirror_force() -> Measurement:
-    """The force has no component across the plane of symmetry."""
-    return Measurement(_pressed_in_the_middle()[1])
+    return (
+        Measurement(np.abs(off).max() / np.abs(moved).max()),
+        Measurement(abs(force[1] / force[2])),
+    )
 
 
 def _answer(scale: float, mu: float, stiffness: float) -> tuple[Floats, Floats]:
@@ -219,13 +192,21 @@ def _answer(scale: float, mu: float, stiffness: float) -> tuple[Floats, Floats]:
     return moved, np.array([*force, *core, pressure]) / scale**2 / (mu / MU)
 
 
-@cache
-def scaling(scale: float, modulus: float, stiffness: float) -> Measurement:
+@check(
+    "scaling/{by}",
+    1e-8,
+    by={"modulus x 3": (1.0, 3.0, 3.0), "lengths x 1.7": (1.7, 1.0, 1 / 1.7)},
+)
+def scaling(by: tuple[float, float, float]) -> Measurement:
     """Largest relative deviation of displacements and of forces from those of the original.
 
     Forces are proportional to the modulus and to the square of lengths; the constants of contact,
     which are pressures per length, are scaled accordingly.
+
+    Args:
+        by: Factors of lengths, modulus and contact constants.
     """
+    scale, modulus, stiffness = by
     moved, force = _answer(1.0, MU, 1.0)
     other, other_force = _answer(scale, modulus * MU, stiffness)
     # Each force over the size of its own kind: indenter, core, fluid.
@@ -235,6 +216,7 @@ def scaling(scale: float, modulus: float, stiffness: float) -> Measurement:
     return Measurement(np.max([shape, off]), note=f"shape {shape:.1e}, forces {off:.1e}")
 
 
+@check("newton/order in contact", 0.1, at_least=True)
 def newton_in_contact() -> Measurement:
     """Order of Newton's method without friction, once the set of touching points is found."""
     finger = round_finger(friction=0.0)
@@ -308,19 +290,16 @@ def cycle(friction: float, steps: int) -> LoadCycle:
     return LoadCycle(work, stored, lost, most, least, apart)
 
 
-def closed_cycle() -> Measurement:
-    """Without friction the work of a cycle is zero."""
+@checks(("work/closed cycle without friction", 1e-8, ""), ("work/shape after it", 1.0, "nm"))
+def closed_cycle() -> tuple[Measurement, ...]:
+    """Without friction the work of a cycle is zero, and every node returns to its place."""
     around = cycle(0.0, COARSE)
-    return Measurement(
-        max(abs(around.work), abs(around.stored)) / around.most, note="over the most"
-    )
+    work = max(abs(around.work), abs(around.stored)) / around.most
+    return Measurement(work, note="over the most"), Measurement(around.apart_m * 1e9)
 
 
-def same_shape() -> Measurement:
-    """Without friction every node returns to its place."""
-    return Measurement(cycle(0.0, COARSE).apart_m * 1e9)
-
-
+@check("work/stored and lost, {steps} steps a leg", 3e-4, slow=True, steps=(FINEST,))
+@check("work/stored and lost, {steps} steps a leg", 1e-3, steps=(FINE,))
 def work_balance(steps: int) -> Measurement:
     """Work = stored energy + loss by friction."""
     around = cycle(FRICTION, steps)
@@ -328,6 +307,7 @@ def work_balance(steps: int) -> Measurement:
     return Measurement(around.miss, note=note)
 
 
+@check("work/order in the step", 1e-12, at_least=True)
 def work_order() -> Measurement:
     """Order of convergence of the work balance; lower than 2 by the kinks at stick and slip."""
     misses = [abs(cycle(FRICTION, steps).miss) for steps in (COARSE, FINE)]
@@ -335,38 +315,8 @@ def work_order() -> Measurement:
     return Measurement(order, 1.0, ", ".join(f"{miss:.1e}" for miss in misses))
 
 
+@check("work/friction gives nothing back", 1e-12, at_least=True)
 def dissipation() -> Measurement:
     """Friction never gives energy: smallest loss of an increment over the largest stored energy."""
     around = cycle(FRICTION, FINE)
     return Measurement(around.least_lost / around.most)
-
-
-CHECKS = (
-    VerificationCase("fluid/sealed volume while pressed", sealed, 1e-10),
-    VerificationCase("fluid/no pressure at the free volume", unsealed, 1e-10),
-    VerificationCase("fluid/no force of it either", unsealed_force, 1e-8),
-    VerificationCase("fluid/pressure and volume control agree", two_controls, 1e-10),
-    VerificationCase("balance/forces on a pressed BioTac", force_balance, 1e-8),
-    VerificationCase("balance/moments on a pressed BioTac", moment_balance, 1e-8),
-    VerificationCase("contact/penetration on a pressed BioTac", penetration, 5.0, "um"),
-    VerificationCase("balance/force is the energy's derivative", energy_derivative, 1e-8),
-    VerificationCase("symmetry/mesh", mirror_mesh, 1e-10),
-    VerificationCase("symmetry/displacements", mirror_displacement, 1e-10),
-    VerificationCase("symmetry/force across", mirror_force, 1e-10),
-    VerificationCase("scaling/modulus x 3", partial(scaling, 1.0, 3.0, 3.0), 1e-8),
-    VerificationCase("scaling/lengths x 1.7", partial(scaling, 1.7, 1.0, 1 / 1.7), 1e-8),
-    VerificationCase("newton/order in contact", newton_in_contact, 0.1, at_least=True),
-    VerificationCase("work/closed cycle without friction", closed_cycle, 1e-8),
-    VerificationCase("work/shape after it", same_shape, 1.0, "nm"),
-    VerificationCase(
-        f"work/stored and lost, {FINE} steps a leg", partial(work_balance, FINE), 1e-3
-    ),
-    VerificationCase(
-        f"work/stored and lost, {FINEST} steps a leg",
-        partial(work_balance, FINEST),
-        3e-4,
-        slow=True,
-    ),
-    VerificationCase("work/order in the step", work_order, 1e-12, at_least=True),
-    VerificationCase("work/friction gives nothing back", dissipation, 1e-12, at_least=True),
-)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.state import ForceBalance
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody, ball, plane, pose, punch, roll
-from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.check import Measurement, check, checks
 from palpate_fem.verify.meshes import (
     graded,
     hollow_sphere,
@@ -22,8 +22,6 @@ from palpate_fem.verify.meshes import (
     rectangle,
     slab,
 )
-
-Floats = NDArray[np.float64]
 
 FAR = 60.0  # size of the body over the contact's: a half-space to 1 %
 GROWTH = 1.5
@@ -60,13 +58,20 @@ def _mean_square(balance: ForceBalance, distance: Floats) -> float:
     return float((force * distance**2).sum() / force.sum())
 
 
-@cache
-def hertz(radius: float, depth: float) -> tuple[float, float, float]:
-    """Force [N], contact radius [m] and pressure in the middle [Pa] of a ball on a half-space.
+@checks(
+    ("contact/Hertz force, R {radius} mm", 3e-2, "N"),
+    ("contact/Hertz contact radius, R {radius} mm", 5e-2, "mm"),
+    ("contact/Hertz pressure, R {radius} mm", 5e-2, "kPa"),
+    radius={"3.5": 3.5e-3, "1.75": 1.75e-3},
+)
+def hertz(radius: float) -> tuple[Measurement, ...]:
+    """A ball on a half-space, of which a quarter is meshed.
 
-    A quarter is meshed. The contact radius is that of Hertz' pressure with the same mean square
-    distance, a^2 = 5/2 <r^2>, which is not restricted to nodes.
+    Hertz: force F = 16/3 mu sqrt(R) d^1.5, contact radius a = sqrt(R d), and pressure in the middle
+    p0 = 3 F / (2 pi a^2), F and a by their formulas. The measured radius is that of Hertz' pressure
+    with the same mean square distance, a^2 = 5/2 <r^2>, which is not restricted to nodes.
     """
+    depth = 1e-4
     a = np.sqrt(radius * depth)
     radii = graded(a / ACROSS, 1.3 * a, FAR * a, GROWTH)[2:]
     depths = graded(a / ACROSS, 0.5 * a, FAR * a, GROWTH)
@@ -74,26 +79,16 @@ def hertz(radius: float, depth: float) -> tuple[float, float, float]:
     body, balance = _pressed(mesh, _quarter(mesh), ball(radius), depth)
     contact = np.sqrt(2.5 * _mean_square(balance, np.hypot(*mesh.nodes[:, :2].T)))
     middle = np.hypot(*mesh.nodes[mesh.outer_faces, :2].transpose(2, 0, 1)) == 0
-    force = -4 * balance.indenter[:, 2].sum()
-    return float(force), float(contact), float(body.state.indenter_pressure[middle].max())
+    pressure = body.state.indenter_pressure[middle].max()
+    force = 16 / 3 * MU * np.sqrt(radius) * depth**1.5
+    return (
+        Measurement(-4 * balance.indenter[:, 2].sum(), force),
+        Measurement(contact * 1e3, a * 1e3),
+        Measurement(pressure * 1e-3, 1.5e-3 * force / (np.pi * radius * depth)),
+    )
 
 
-def hertz_force(radius: float, depth: float) -> Measurement:
-    """Hertz: F = 16/3 mu sqrt(R) d^1.5."""
-    return Measurement(hertz(radius, depth)[0], 16 / 3 * MU * np.sqrt(radius) * depth**1.5)
-
-
-def hertz_radius(radius: float, depth: float) -> Measurement:
-    """Hertz: a = sqrt(R d)."""
-    return Measurement(hertz(radius, depth)[1] * 1e3, np.sqrt(radius * depth) * 1e3)
-
-
-def hertz_pressure(radius: float, depth: float) -> Measurement:
-    """Hertz: p0 = 3 F / (2 pi a^2), F and a by their formulas."""
-    force, area = 16 / 3 * MU * np.sqrt(radius) * depth**1.5, np.pi * radius * depth
-    return Measurement(hertz(radius, depth)[2] * 1e-3, 1.5e-3 * force / area)
-
-
+@check("contact/flat punch, force", 5e-2, "N")
 def flat_punch() -> Measurement:
     """Sneddon: F = 8 mu a d under a flat-ended cylinder."""
     a, depth = 1e-3, 1e-5
@@ -104,11 +99,15 @@ def flat_punch() -> Measurement:
     return Measurement(-4 * balance.indenter[:, 2].sum(), 8 * MU * a * depth)
 
 
-@cache
-def line_contact() -> tuple[float, float, float, float]:
-    """Roll on a half-space in plane strain: force a length [N/m], a [m], p0 [Pa], radius [m].
+@checks(
+    ("contact/line contact, half width", 5e-2, "mm"),
+    ("contact/line contact, pressure", 5e-2, "kPa"),
+)
+def line_contact() -> tuple[Measurement, ...]:
+    """Roll on a half-space in plane strain, at the measured force F for each length.
 
-    a^2 = 4 <x^2> of Johnson's pressure p0 sqrt(1 - x^2 / a^2).
+    Johnson: half width a = sqrt(F R / (pi mu)), and p0 = 2 F / (pi a), a by its formula. The
+    measured a^2 = 4 <x^2> is that of Johnson's pressure p0 sqrt(1 - x^2 / a^2).
     """
     radius, depth, width = 3.5e-3, 5e-5, 1e-4
     a = 2.0e-4
@@ -123,23 +122,14 @@ def line_contact() -> tuple[float, float, float, float]:
     body, balance = _pressed(mesh, held, roll(radius, 1e-2), depth)
     force = -2 * float(balance.indenter[:, 2].sum()) / width
     contact = 2 * np.sqrt(_mean_square(balance, mesh.nodes[:, 0]))
-    return force, float(contact), float(body.state.indenter_pressure.max()), radius
-
-
-def line_contact_width() -> Measurement:
-    """Johnson: a = sqrt(F R / (pi mu)) at the measured force."""
-    force, contact, _, radius = line_contact()
-    return Measurement(
-        contact * 1e3, np.sqrt(force * radius / np.pi / MU) * 1e3, f"{force:.2f} N/m"
+    expected = np.sqrt(force * radius / np.pi / MU)
+    return (
+        Measurement(contact * 1e3, expected * 1e3, f"{force:.2f} N/m"),
+        Measurement(body.state.indenter_pressure.max() * 1e-3, 2e-3 * force / np.pi / expected),
     )
 
 
-def line_contact_pressure() -> Measurement:
-    """Johnson: p0 = 2 F / (pi a), a by its formula."""
-    force, _, pressure, radius = line_contact()
-    return Measurement(pressure * 1e-3, 2e-3 * force / np.pi / np.sqrt(force * radius / np.pi / MU))
-
-
+@check("contact/patch test, {shake}", 1e-6, shake={"even quads": 0.0, "distorted quads": 0.2})
 def contact_patch(shake: float) -> Measurement:
     """A block that a plane compresses: the pressure is uniform.
 
@@ -161,6 +151,7 @@ def contact_patch(shake: float) -> Measurement:
     return Measurement(spread, note=f"mean {pressure.mean() * 1e-3:.3f} kPa")
 
 
+@check("contact/free slide of facets on a plane", 1e-6)
 def free_slide() -> Measurement:
     """A coarse ball dragged over a frictionless plane: tangential over normal force.
 
@@ -176,26 +167,3 @@ def free_slide() -> Measurement:
         x, y, z = -balance.indenter.sum(axis=0)
         worst = max(worst, float(np.hypot(x, y) / z))
     return Measurement(worst, note=f"{z:.3f} N")
-
-
-SPHERES = ((3.5e-3, "3.5"), (1.75e-3, "1.75"))
-DEPTH_M = 1e-4
-CHECKS = (
-    *(
-        VerificationCase(
-            f"contact/Hertz {what}, R {name} mm", partial(law, radius, DEPTH_M), tolerance, unit
-        )
-        for radius, name in SPHERES
-        for what, law, tolerance, unit in (
-            ("force", hertz_force, 3e-2, "N"),
-            ("contact radius", hertz_radius, 5e-2, "mm"),
-            ("pressure", hertz_pressure, 5e-2, "kPa"),
-        )
-    ),
-    VerificationCase("contact/flat punch, force", flat_punch, 5e-2, "N"),
-    VerificationCase("contact/line contact, half width", line_contact_width, 5e-2, "mm"),
-    VerificationCase("contact/line contact, pressure", line_contact_pressure, 5e-2, "kPa"),
-    VerificationCase("contact/patch test, even quads", partial(contact_patch, 0.0), 1e-6),
-    VerificationCase("contact/patch test, distorted quads", partial(contact_patch, 0.2), 1e-6),
-    VerificationCase("contact/free slide of facets on a plane", free_slide, 1e-6),
-)

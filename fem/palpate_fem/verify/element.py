@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.rigid import rotation_matrices
+from palpate_fem.arrays import Floats
 from palpate_fem.mechanics.contact import PosedIndenter
-from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.verify.bodies import MU, TIGHT, VerificationBody, ball, pose
-from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.check import Measurement, check
 from palpate_fem.verify.closed_forms import INNER_M, OUTER_M
 from palpate_fem.verify.meshes import (
+    KINDS,
     distorted,
     hollow_sphere,
     octant,
@@ -25,50 +24,45 @@ from palpate_fem.verify.meshes import (
     triangles,
 )
 
-Floats = NDArray[np.float64]
-
 SIDE_M = 1e-3
 STRAIN = np.array([[0.10, 0.05, -0.02], [0.03, -0.08, 0.04], [0.01, 0.06, 0.05]])
 QUATERNION = np.array([0.6, -0.4, 0.5, 0.48]) / np.linalg.norm([0.6, -0.4, 0.5, 0.48])
 
 
-def _cube(*, wedges: bool) -> SolidMesh:
+def _patch(
+    gradient: Floats, *, wedges: bool, tolerance: float = TIGHT.tolerance
+) -> tuple[VerificationBody, Floats]:
+    """A distorted cube whose boundary moves by a deformation gradient, and all nodes' positions."""
     line = np.linspace(0.0, SIDE_M, 5)
     points, quads = rectangle(line, line)
     mesh = slab(points, triangles(quads) if wedges else quads, line)
-    return distorted(mesh, 0.25 * line[1], seed=3)
-
-
-def _on_edge(mesh: SolidMesh) -> NDArray[np.bool_]:
-    inside = (mesh.nodes > 1e-9) & (mesh.nodes < SIDE_M - 1e-9)
-    return np.asarray(~inside.all(axis=1))
-
-
-def patch(strain: Floats, *, wedges: bool) -> Measurement:
-    """Linear displacement of the boundary of a distorted cube: the inside follows exactly."""
-    mesh = _cube(wedges=wedges)
-    held = np.zeros(mesh.nodes.shape, bool)
-    held[_on_edge(mesh)] = True
+    mesh = distorted(mesh, 0.25 * line[1], seed=3)
+    inside = np.all((mesh.nodes > 1e-9) & (mesh.nodes < SIDE_M - 1e-9), axis=1, keepdims=True)
+    held = np.broadcast_to(~inside, mesh.nodes.shape)
     body = VerificationBody(
-        mesh, held=held, bulk_ratio=10.0, settings=replace(TIGHT, tolerance=1e-13)
+        mesh, held=held, bulk_ratio=10.0, settings=replace(TIGHT, tolerance=tolerance)
     )
-    exact = mesh.nodes @ (np.eye(3) + strain).T
+    exact = mesh.nodes @ gradient.T
     body.state.position[held] = exact[held]
     body.solve()
+    return body, exact
+
+
+@check("element/patch test, {wedges}", 1e-12, wedges=KINDS)
+def patch(*, wedges: bool) -> Measurement:
+    """Linear displacement of the boundary of a distorted cube: the inside follows exactly."""
+    body, exact = _patch(np.eye(3) + STRAIN, wedges=wedges, tolerance=1e-13)
     return Measurement(np.abs(body.state.position - exact).max() / SIDE_M)
 
 
+@check("element/patch test, pressure, {wedges}", 1e-12, wedges=KINDS)
 def patch_pressure(*, wedges: bool) -> Measurement:
     """The same under uniform swelling: all elements have the same pressure."""
-    mesh = _cube(wedges=wedges)
-    held = np.zeros(mesh.nodes.shape, bool)
-    held[_on_edge(mesh)] = True
-    body = VerificationBody(mesh, held=held, bulk_ratio=10.0)
-    body.state.position[held] = 1.05 * mesh.nodes[held]
-    body.solve()
+    body, _ = _patch(1.05 * np.eye(3), wedges=wedges)
     return Measurement(np.abs(body.state.pressure / (body.bulk * (1.05**3 - 1)) - 1).max())
 
 
+@check("element/rigid motion, {wedges}", 1e-10, wedges=KINDS)
 def rigid_motion(*, wedges: bool) -> Measurement:
     """A body at rest that is turned and moved has no energy, force or change of volume."""
     mesh = octant(3, INNER_M, OUTER_M, 2, wedges=wedges)
@@ -81,6 +75,7 @@ def rigid_motion(*, wedges: bool) -> Measurement:
     return Measurement(max(force, energy, moved.strain_error), note=f"volume {rest.volume:.3g} m^3")
 
 
+@check("element/objectivity of a loaded state", 1e-10)
 def objectivity() -> Measurement:
     """A loaded state turned with its indenter: forces turn, energy and volume do not change."""
     mesh = hollow_sphere(4, INNER_M, OUTER_M, 2)
@@ -116,6 +111,7 @@ def order_of(residuals: Sequence[float]) -> float:
     return float(np.log(c / b) / np.log(b / a))
 
 
+@check("newton/order, inflation, {wedges}", 0.1, at_least=True, wedges=KINDS)
 def newton_order(*, wedges: bool) -> Measurement:
     """The last three residuals of an inflation decrease quadratically."""
     mesh = octant(4, INNER_M, 1.5 * INNER_M, 2, wedges=wedges)
@@ -124,36 +120,3 @@ def newton_order(*, wedges: bool) -> Measurement:
     body.solve(volume=1.1 * rest)
     note = " ".join(f"{r:.0e}" for r in body.report.residuals)
     return Measurement(order_of(body.report.residuals), 2.0, note)
-
-
-KINDS = (("hexahedra", False), ("wedges", True))
-CHECKS = (
-    *(
-        VerificationCase(
-            f"element/patch test, {kind}", partial(patch, STRAIN, wedges=wedges), 1e-12
-        )
-        for kind, wedges in KINDS
-    ),
-    *(
-        VerificationCase(
-            f"element/patch test, pressure, {kind}", partial(patch_pressure, wedges=wedges), 1e-12
-        )
-        for kind, wedges in KINDS
-    ),
-    *(
-        VerificationCase(
-            f"element/rigid motion, {kind}", partial(rigid_motion, wedges=wedges), 1e-10
-        )
-        for kind, wedges in KINDS
-    ),
-    VerificationCase("element/objectivity of a loaded state", objectivity, 1e-10),
-    *(
-        VerificationCase(
-            f"newton/order, inflation, {kind}",
-            partial(newton_order, wedges=wedges),
-            0.1,
-            at_least=True,
-        )
-        for kind, wedges in KINDS
-    ),
-)

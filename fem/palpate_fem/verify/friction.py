@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
 from palpate.rigid import rotation_matrices
+from palpate_fem.arrays import Floats
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.verify.bodies import BULK_RATIO, TIGHT, VerificationBody, about_y, plane, pose
-from palpate_fem.verify.check import Measurement, VerificationCase
+from palpate_fem.verify.check import Measurement, check, checks
 from palpate_fem.verify.meshes import rectangle, slab
-
-Floats = NDArray[np.float64]
 
 FRICTION = 0.186
 SIDE_M, HEIGHT_M = 4e-3, 1e-3
@@ -74,24 +71,7 @@ class SlidingBlock:
         self.body.system.load[:] = WEIGHT_N * share[:, None] * down
 
 
-@cache
-def dragged(angle: float) -> tuple[float, float]:
-    """A clamped block that is pressed and dragged along and back on a plane turned by an angle.
-
-    Returns:
-        Tangential over normal force while it slides along, and back.
-    """
-    block = SlidingBlock(clamped=True, angle=angle)
-    for along, up in ((0.0, 1e-5), (0.0, PRESS_M), (1e-5, PRESS_M)):
-        block.slide(along, up)
-    for k in range(1, 8):
-        along, across = block.slide(SLIDE_M * k / 7, PRESS_M)
-    forth = along / across
-    for share in (0.99, 0.95, 0.9, 0.75, 0.6, 0.45, 0.3, 0.15, 0.0):
-        along, across = block.slide(share * SLIDE_M, PRESS_M)
-    return forth, along / across
-
-
+@check("friction/stick below the limit", 1e-6, "nm")
 def stick() -> Measurement:
     """Half way to its slip angle a block is held by the springs of sticking: u = T / (k area).
 
@@ -109,16 +89,31 @@ def stick() -> Measurement:
     return Measurement(way * 1e9, expected * 1e9, "mean of the sole")
 
 
-def slip_at(angle: float) -> Measurement:
-    """Steady sliding: T = mu N."""
-    return Measurement(dragged(angle)[0], FRICTION, "T / N")
+@checks(
+    ("friction/slip at T = mu N, plane at {angle} degrees", 1e-6, ""),
+    ("friction/reversal, plane at {angle} degrees", 1e-6, ""),
+    angle={0: 0.0, 30: np.radians(30)},
+)
+def dragged(angle: float) -> tuple[Measurement, ...]:
+    """A clamped block that is pressed and dragged along and back on a plane turned by an angle.
+
+    Steady sliding: T = mu N. Dragged back the force turns round: T = -mu N.
+    """
+    block = SlidingBlock(clamped=True, angle=angle)
+    for along, up in ((0.0, 1e-5), (0.0, PRESS_M), (1e-5, PRESS_M)):
+        block.slide(along, up)
+    for k in range(1, 8):
+        along, across = block.slide(SLIDE_M * k / 7, PRESS_M)
+    forth = along / across
+    for share in (0.99, 0.95, 0.9, 0.75, 0.6, 0.45, 0.3, 0.15, 0.0):
+        along, across = block.slide(share * SLIDE_M, PRESS_M)
+    return (
+        Measurement(forth, FRICTION, "T / N"),
+        Measurement(along / across, -FRICTION, "T / N"),
+    )
 
 
-def reversal(angle: float) -> Measurement:
-    """Dragged back the force turns round: T = -mu N."""
-    return Measurement(dragged(angle)[1], -FRICTION, "T / N")
-
-
+@check("friction/slip angle of a ramp", 1e-6, "degrees")
 def slip_angle() -> Measurement:
     """The steepest ramp on which a free block sticks: atan(mu); found by bisection."""
     block = SlidingBlock(settings=NEAR_SLIP)
@@ -137,6 +132,7 @@ def slip_angle() -> Measurement:
     return Measurement(np.degrees(still), np.degrees(np.arctan(FRICTION)))
 
 
+@check("friction/tether on a ramp of 30 degrees", 1e-6, "N")
 def tether() -> Measurement:
     """Force that holds a tied block on a slipping ramp of 30 degrees: W (sin - mu cos)."""
     slope = np.radians(30.0)
@@ -150,30 +146,17 @@ def tether() -> Measurement:
     return Measurement(pull, WEIGHT_N * (np.sin(slope) - FRICTION * np.cos(slope)))
 
 
-def no_drift(increments: int) -> Measurement:
+@check("friction/no creep under load", 1.0, "nm")
+def no_drift() -> Measurement:
     """A block at 95 % of its slip angle, solved again and again from a disturbed state."""
     block = SlidingBlock(edges=2, settings=replace(TIGHT, tolerance=1e-10, gap_tolerance_m=1e-13))
     for share in (0.0, 0.5, 0.95):
         block.weigh(np.arctan(FRICTION) * share)
         block.slide(0.0, 1e-6)
     random, start = np.random.default_rng(7), block.body.state.position.copy()
+    increments = 1000
     for _ in range(increments):
         block.body.state.position += random.normal(scale=1e-8, size=start.shape)
         block.slide(0.0, 1e-6)
     way = float(np.abs(block.body.state.position - start).max())
     return Measurement(way * 1e9, 0.0, f"{increments} increments")
-
-
-CHECKS = (
-    VerificationCase("friction/stick below the limit", stick, 1e-6, "nm"),
-    *(
-        VerificationCase(
-            f"friction/{what}, plane at {degrees} degrees", partial(law, np.radians(degrees)), 1e-6
-        )
-        for degrees in (0, 30)
-        for what, law in (("slip at T = mu N", slip_at), ("reversal", reversal))
-    ),
-    VerificationCase("friction/slip angle of a ramp", slip_angle, 1e-6, "degrees"),
-    VerificationCase("friction/tether on a ramp of 30 degrees", tether, 1e-6, "N"),
-    VerificationCase("friction/no creep under load", partial(no_drift, 1000), 1.0, "nm"),
-)

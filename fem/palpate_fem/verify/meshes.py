@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.solid import SolidMesh, extrude
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
+KINDS = {"hexahedra": False, "wedges": True}  # whether elements are wedges, by their name
 
 
 def rectangle(x: Floats, y: Floats) -> tuple[Floats, Ints]:

@@ -8,14 +8,14 @@ same inner surface (the project's reference notes on finite elements, section 0.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from palpate_fem.mesh.nvlabs import SKIN, read_nvlabs
 from palpate_fem.verify.bodies import TIGHT, VerificationBody
-from palpate_fem.verify.check import Measurement, MissingDataError, VerificationCase
+from palpate_fem.verify.check import Measurement, MissingDataError, check
 
 FILLED_M3 = (60e-9, 150e-9, 250e-9, 350e-9, 430e-9)
 QUADRATIC_KPA = 26.58  # P2-P0 on the public tetrahedra
@@ -50,17 +50,21 @@ def filled(folder: Path, layers: int, bulk_ratio: float) -> tuple[float, float]:
     return body.state.fluid_pressure * 1e-3, thickness
 
 
+@check("skin/filled by 430 mm^3, {layers} layers", 1e-2, "kPa", slow=True, layers=(1, 3))
+@check("skin/filled by 430 mm^3, {layers} layers", 1e-2, "kPa", layers=(2,))
 def pressure(folder: Path, layers: int) -> Measurement:
     """Fluid pressure by layers, against wedges of another program."""
     found, thickness = filled(folder, layers, 1e3)
     return Measurement(found, WEDGES_KPA[layers], f"{thickness:.2f} mm thick")
 
 
+@check("skin/against quadratic tetrahedra", 1e-2, "kPa")
 def against_quadratic(folder: Path) -> Measurement:
     """Fluid pressure against quadratic tetrahedra, which do not lock, on the public mesh itself."""
     return Measurement(filled(folder, 2, 1e3)[0], QUADRATIC_KPA, "P2-P0")
 
 
+@check("skin/layers agree", 8e-3, slow=True)
 def layers_agree(folder: Path) -> Measurement:
     """Largest deviation of one or two layers from three."""
     found = [filled(folder, layers, 1e3)[0] for layers in WEDGES_KPA]
@@ -68,43 +72,8 @@ def layers_agree(folder: Path) -> Measurement:
     return Measurement(max(abs(p / found[-1] - 1) for p in found), 0.0, note)
 
 
+@check("skin/kappa / mu = {ratio:g} over 1000", 1e-3, slow=True, ratio=tuple(SOFTER))
 def bulk_modulus(folder: Path, ratio: float) -> Measurement:
     """Pressure at another kappa over that at 1e3 mu: an element that locks would show more."""
     found = filled(folder, 2, ratio)[0]
     return Measurement(found / filled(folder, 2, 1e3)[0], SOFTER[ratio], f"{found:.2f} kPa")
-
-
-def checks(folder: Path) -> tuple[VerificationCase, ...]:
-    """All of them.
-
-    Args:
-        folder: Holds ``meshes/biotac``; where it is absent they are skipped.
-    """
-    return (
-        VerificationCase(
-            "skin/filled by 430 mm^3, 2 layers", partial(pressure, folder, 2), 1e-2, "kPa"
-        ),
-        VerificationCase(
-            "skin/against quadratic tetrahedra", partial(against_quadratic, folder), 1e-2, "kPa"
-        ),
-        *(
-            VerificationCase(
-                f"skin/filled by 430 mm^3, {layers} layers",
-                partial(pressure, folder, layers),
-                1e-2,
-                "kPa",
-                slow=True,
-            )
-            for layers in (1, 3)
-        ),
-        VerificationCase("skin/layers agree", partial(layers_agree, folder), 8e-3, slow=True),
-        *(
-            VerificationCase(
-                f"skin/kappa / mu = {ratio:g} over 1000",
-                partial(bulk_modulus, folder, ratio),
-                1e-3,
-                slow=True,
-            )
-            for ratio in SOFTER
-        ),
-    )

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import distance
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.state import ForceBalance
 from palpate_fem.verify.bodies import MU, VerificationBody, ball, pose, round_core
-from palpate_fem.verify.check import Measurement, VerificationCase
-from palpate_fem.verify.meshes import hollow_sphere, octant
-
-Floats = NDArray[np.float64]
+from palpate_fem.verify.check import Measurement, check
+from palpate_fem.verify.meshes import KINDS, hollow_sphere, octant
 
 INNER_M, OUTER_M = 5.5e-3, 7.07e-3
 CORE_M = 5.49e-3
@@ -107,6 +104,7 @@ def _off(found: Floats, expected: Floats) -> Measurement:
     return Measurement(float(np.abs(found - expected).max() / np.abs(expected).max()))
 
 
+@check("element/force is the energy's gradient, {wedges}", TOLERANCE, wedges=KINDS)
 def element_force(*, wedges: bool) -> Measurement:
     """Nodal forces are the derivative of the mixed energy by the nodes."""
     body, direction = _shaken(wedges=wedges)
@@ -120,6 +118,7 @@ def element_force(*, wedges: bool) -> Measurement:
     return Measurement(abs(float((force * direction).sum()) / slope - 1))
 
 
+@check("element/tangent by differences, {wedges}", TOLERANCE, wedges=KINDS)
 def element_tangent(*, wedges: bool) -> Measurement:
     """The condensed tangent is the derivative of the nodal forces with pressures eliminated."""
     body, direction = _shaken(wedges=wedges)
@@ -127,6 +126,7 @@ def element_tangent(*, wedges: bool) -> Measurement:
     return _off(_product(body, None, direction), expected)
 
 
+@check("fluid/volume gradient by differences", TOLERANCE)
 def fluid_gradient() -> Measurement:
     """Gradient dV/dx against differences of the cavity's volume."""
     body, direction = _shaken()
@@ -139,6 +139,7 @@ def fluid_gradient() -> Measurement:
     return Measurement(abs(float((gradient * direction).sum()) / slope - 1))
 
 
+@check("fluid/tangent by differences", TOLERANCE)
 def fluid_tangent() -> Measurement:
     """Tangent of the follower pressure, -p d2V/dx2, against differences of dV/dx."""
     body, direction = _shaken()
@@ -149,6 +150,7 @@ def fluid_tangent() -> Measurement:
     return _off(found, expected)
 
 
+@check("contact/tangent by differences, core", TOLERANCE)
 def core_tangent() -> Measurement:
     """Contact with the tabulated core, its curvature included."""
     body, direction = _shaken(core=True)
@@ -158,7 +160,11 @@ def core_tangent() -> Measurement:
     return _off(with_core - _product(body, None, direction), expected)
 
 
-def contact_tangent(friction: float, slip_m: float) -> Measurement:
+@check("friction/tangent by differences, {slip_m}", TOLERANCE, slip_m={"stick": 1e-7, "slip": 3e-3})
+@check(
+    "contact/tangent by differences, {friction}", TOLERANCE, friction={"gap": 0.0}, slip_m=(0.0,)
+)
+def contact_tangent(slip_m: float, friction: float = FRICTION) -> Measurement:
     """Contact with a ball; with friction, points are displaced by ``slip_m`` from their anchors."""
     body, direction = _shaken()
     press = PosedIndenter(ball(3.5e-3), pose((1e-4, 2e-4, -OUTER_M + 3e-4), TURN), friction)
@@ -173,29 +179,3 @@ def contact_tangent(friction: float, slip_m: float) -> Measurement:
     if friction:
         note += f", {slides.sum()} slide"
     return Measurement(_off(found, expected).value, note=note)
-
-
-CHECKS = (
-    *(
-        VerificationCase(f"element/{what}, {kind}", partial(law, wedges=wedges), TOLERANCE)
-        for kind, wedges in (("hexahedra", False), ("wedges", True))
-        for what, law in (
-            ("force is the energy's gradient", element_force),
-            ("tangent by differences", element_tangent),
-        )
-    ),
-    VerificationCase("fluid/volume gradient by differences", fluid_gradient, TOLERANCE),
-    VerificationCase("fluid/tangent by differences", fluid_tangent, TOLERANCE),
-    VerificationCase("contact/tangent by differences, core", core_tangent, TOLERANCE),
-    VerificationCase(
-        "contact/tangent by differences, gap", partial(contact_tangent, 0.0, 0.0), TOLERANCE
-    ),
-    VerificationCase(
-        "friction/tangent by differences, stick",
-        partial(contact_tangent, FRICTION, 1e-7),
-        TOLERANCE,
-    ),
-    VerificationCase(
-        "friction/tangent by differences, slip", partial(contact_tangent, FRICTION, 3e-3), TOLERANCE
-    ),
-)
