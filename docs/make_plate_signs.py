@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.rigid import rotation_matrices
 from palpate_deploy.experiment import parameters_of
+from palpate_fem.electrodes.electronics import PDC_PA
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
@@ -22,7 +23,6 @@ from palpate_fem.mesh.parametric import biotac
 from palpate_fem.population.members import read_population
 from palpate_fem.population.responses import Population
 from palpate_fem.service.biotac import BiotacTip
-from palpate_gateway.biotac.conversions import BIOTAC
 from palpate_training.experiment.generate.simulator import ExperimentSpec
 from palpate_training.figures.plate import (
     TOUCHED_COUNTS,
@@ -67,7 +67,7 @@ def tilts(folder: Path) -> tuple[Floats, float, Floats]:
         normal = log.normal[there]
         leans.append(np.arctan2(normal[:, 0], normal[:, 2]))
         sides.append(np.arctan2(normal[:, 1], normal[:, 2]))
-        rises.append(above[there] * BIOTAC.pdc_pa)
+        rises.append(above[there] * PDC_PA)
     lean = np.percentile(np.concatenate(leans), [25, 50, 75])
     rise = np.percentile(np.concatenate(rises), [0, 100])
     return lean, float(np.median(np.concatenate(sides))), rise

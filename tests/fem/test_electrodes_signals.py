@@ -186,6 +186,14 @@ def test_static_channels_are_inverse(pressure: float, temperature: float) -> Non
     assert channels.temperature_of_tdc(tdc) == pytest.approx(temperature, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("counts", "degrees_c"), [(1000, 29.8), (1500, 40.3), (2000, 48.6), (2500, 55.6), (3100, 63.0)]
+)
+def test_temperatures_of_the_hardware_reference(counts: int, degrees_c: float) -> None:
+    found = channels.temperature_of_tdc(np.array(float(counts)))
+    assert found == pytest.approx(degrees_c, abs=0.05)
+
+
 def test_channels_say_what_was_measured() -> None:
     """Section 4.5: 46-49 C at 1825-2045 counts; section 4.6: a plate of 21-25 kPa, 590-670."""
     low, high = channels.temperature_of_tdc(np.array([1825.0, 2045.0]))

@@ -127,7 +127,7 @@ class BiotacPic32(Device):
 
     def _start(self) -> None:
         """Stop the stream, drain the line, start the stream."""
-        self._port.write(ask.stop_request())
+        self._port.write(ask.STOP_REQUEST)
         began_s = time.monotonic()
         settle(self._port, _QUIET_S, _DRAIN_S)
         if time.monotonic() - began_s >= _DRAIN_S:
@@ -138,7 +138,7 @@ class BiotacPic32(Device):
         self._decoder.reset()
         self._held = None
         self._clock.pause()
-        self._port.write(ask.start_request())
+        self._port.write(ask.START_REQUEST)
         self._arrived_s = time.monotonic()
 
     def _wait_for_record(self) -> None:
@@ -166,7 +166,7 @@ class BiotacPic32(Device):
 
     def _close(self) -> None:
         with contextlib.suppress(DeviceError):  # it may be gone
-            self._port.write(ask.stop_request())
+            self._port.write(ask.STOP_REQUEST)
         self._port.close()
 
     def _read(self, timeout_s: float) -> list[Reading]:

@@ -2,7 +2,7 @@
 
 The sensor answers in text until the run command, then it sends frames of 37 bytes. Commands have no
 line end. Letters, lists and defaults come from the hardware reference; the number format of offsets
-and matrix rows from the maker's ROS 2 driver (one source).
+from the maker's ROS 2 driver (one source).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
 
 from palpate_gateway.protocols.framing import FrameFinder, crc16_x25
 
@@ -72,24 +71,9 @@ class BotaDecoder(FrameFinder[BotaFrame]):
         return BotaFrame(status, tuple(wrench), time_us, temperature_c)
 
 
-class BotaFormat(IntEnum):
-    """What the sensor sends while it runs; ``BotaDecoder`` reads the binary one."""
-
-    BINARY = 0
-    CSV = 1
-
-
-class BotaCommand(StrEnum):
-    """Commands without parameters."""
-
-    CONFIG = "C"
-    RUN = "R"
-    SAVE = "s"
-    LOAD = "l"
-    PRINT = "w"
-    SOFT_RESET = "I"
-    HARD_RESET = "#"
-
+CONFIG_REQUEST = b"C"
+RUN_REQUEST = b"R"
+"""Leave the configuration mode and send frames."""
 
 BOOT_TEXT = b"App Init"
 """What the sensor writes when it has started."""
@@ -105,7 +89,6 @@ SINC_LENGTHS = (51, 64, 128, 205, 256, 512)
 SINC_STEP_S = 19.53125e-6
 """Period of the frames per unit of sinc length [s]."""
 
-_WITH_REPLY = frozenset(b"CRcfbm")
 _ACK = re.compile(rb"r,(\d{1,9}),([ -~]),(\d{1,9})")
 _REMEMBERED_BYTES = 256
 
@@ -115,29 +98,15 @@ def period_s(sinc: int) -> float:
     return SINC_STEP_S * _one_of(SINC_LENGTHS, sinc, "sinc length")
 
 
-def bare_request(command: BotaCommand) -> bytes:
-    """A command without parameters."""
-    return command.value.encode("ascii")
-
-
-def communication_request(
-    *,
-    baud: int,
-    temperature_compensation: bool = False,
-    calibrated: bool = True,
-    data_format: BotaFormat = BotaFormat.BINARY,
-) -> bytes:
-    """Set what is sent and how fast.
+def communication_request(*, baud: int, temperature_compensation: bool = False) -> bytes:
+    """Send calibrated values in binary frames.
 
     Args:
         baud: One of ``BAUD_CODES``.
         temperature_compensation: Correct for temperature in the sensor.
-        calibrated: Send newtons, not raw gauges.
-        data_format: Binary frames or text.
     """
     code = BAUD_CODES[_one_of(BAUD_CODES, baud, "baud")]
-    values = (int(temperature_compensation), int(calibrated), int(data_format), code)
-    return b"c,%d,%d,%d,%d" % values
+    return b"c,%d,1,0,%d" % (temperature_compensation, code)
 
 
 def filter_request(
@@ -150,19 +119,14 @@ def filter_request(
 
 def offsets_request(offsets: Sequence[float]) -> bytes:
     """Set the six offsets Fx Fy Fz [N] Tx Ty Tz [N m]."""
-    return ("b," + _six(offsets, "offsets", 3)).encode("ascii")
+    if len(offsets) != 6 or not all(map(math.isfinite, offsets)):
+        raise ValueError(f"offsets {tuple(offsets)} are not six finite numbers")
+    return b"b," + ",".join(f"{offset:.3f}" for offset in offsets).encode("ascii")
 
 
-def matrix_row_request(row: int, values: Sequence[float]) -> bytes:
-    """Set row 0..5 of the calibration matrix, six values."""
-    _one_of(range(6), row, "matrix row")
-    return (f"m{row}," + _six(values, "values", 6)).encode("ascii")
-
-
-def expected_reply(request: bytes) -> bytes | None:
-    """Reply that confirms the request; None where the reference names none."""
-    letter = request[:1]
-    return b"r,0,%b,0" % letter if letter and letter[0] in _WITH_REPLY else None
+def expected_reply(request: bytes) -> bytes:
+    """Reply that confirms the request."""
+    return b"r,0,%b,0" % request[:1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,12 +152,10 @@ class BotaTextWait:
     """Waits for a text, and returns the bytes that follow it: after ``R`` those are frames.
 
     Args:
-        text: The text to wait for; not empty, at most 64 bytes.
+        text: The text to wait for, not empty.
     """
 
     def __init__(self, text: bytes) -> None:
-        if not 1 <= len(text) <= 64:
-            raise ValueError(f"a text of {len(text)} bytes is not in 1..64")
         self._text = text
         self._done = False
         self.before = b""
@@ -209,13 +171,7 @@ class BotaTextWait:
         return after if found else None
 
 
-def _one_of(known: Sequence[int] | dict[int, int] | range, value: int, name: str) -> int:
+def _one_of(known: Sequence[int] | dict[int, int], value: int, name: str) -> int:
     if value not in known:
         raise ValueError(f"{name} {value} is not one of {', '.join(map(str, known))}")
     return value
-
-
-def _six(values: Sequence[float], name: str, digits: int) -> str:
-    if len(values) != 6 or not all(map(math.isfinite, values)):
-        raise ValueError(f"{name} {tuple(values)} are not six finite numbers")
-    return ",".join(f"{value:.{digits}f}" for value in values)

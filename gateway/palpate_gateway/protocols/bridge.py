@@ -180,11 +180,6 @@ class BridgeDecoder:
         """Bytes of the packet that has begun."""
         return self._splitter.pending
 
-    def reset(self) -> None:
-        """The connection is new: forget the bridges of the old one."""
-        self._splitter.reset()
-        self._tracks.clear()
-
     def feed(self, data: bytes) -> list[BridgeRecord]:
         """Take bytes as they come; return the packets that are now whole."""
         records = []

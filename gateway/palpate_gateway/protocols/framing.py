@@ -87,13 +87,6 @@ class PacketSplitter:
         self._hold(rest)
         return packets
 
-    def reset(self) -> None:
-        """A new connection: the packet that has begun will not go on, its bytes are junk."""
-        self.counters["junk_bytes"] += len(self._block)
-        self._block.clear()
-        self._dropping = False
-        self._first = True
-
     def _hold(self, part: bytes) -> None:
         if not self._dropping:
             self._block += part
@@ -218,8 +211,3 @@ def crc16_x25(data: bytes) -> int:
 def sum8(data: bytes) -> int:
     """Sum of all bytes modulo 256."""
     return sum(data) & 0xFF
-
-
-def sum16(data: bytes) -> int:
-    """Sum of all bytes modulo 65536."""
-    return sum(data) & 0xFFFF

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 
@@ -162,12 +161,6 @@ class KmsDecoder:
         self._append(rest)
         return records
 
-    def reset(self) -> None:
-        """A new connection: the line that has begun becomes junk."""
-        self.counters["junk_bytes"] += len(self._line)
-        self._line.clear()
-        self._skipping = False
-
     def _append(self, piece: bytes) -> None:
         if not self._skipping and len(self._line) + len(piece) <= LINE_MAX:
             self._line += piece
@@ -302,12 +295,7 @@ class KmsQuery(StrEnum):
 
     IDENTITY = "ID"
     SERIAL_NUMBER = "SN"
-    VERSION = "V"
-    CALIBRATION_DATE = "CALDATE"
-    TEMPERATURE = "T"
     FLAGS = "FLAGS"
-    SAMPLE = "F"
-    """One sample; the answer is a data line."""
 
 
 def query_request(query: KmsQuery) -> bytes:
@@ -315,82 +303,36 @@ def query_request(query: KmsQuery) -> bytes:
     return f"{query}()\n".encode("ascii")
 
 
-def identify_requests() -> tuple[bytes, ...]:
-    """Ask for identity, serial number and version, one request each."""
-    return tuple(map(query_request, (KmsQuery.IDENTITY, KmsQuery.SERIAL_NUMBER, KmsQuery.VERSION)))
+START_REQUEST = b"L1()\n"
+"""Start the stream; the device echoes ``L1``."""
 
+STOP_REQUEST = b"L0()\n"
+"""Stop the stream; the device echoes ``L0``, perhaps after more samples."""
 
-def start_request() -> bytes:
-    """Start the stream; the device echoes ``L1``."""
-    return b"L1()\n"
+TARE_REQUEST = b"TARE(1)\n"
+"""Take the present load as zero; the reply is ``TARE=1``."""
 
+QUIET_REQUEST = b"VL(0)\n"
+"""Choose the shortest replies."""
 
-def stop_request() -> bytes:
-    """Stop the stream; the device echoes ``L0``, perhaps after more samples."""
-    return b"L0()\n"
-
-
-def tare_request() -> bytes:
-    """Take the present load as zero; the reply is ``TARE=1``."""
-    return b"TARE(1)\n"
-
-
-def clear_tare_request() -> bytes:
-    """Forget the tare; the reply is ``TARE=0``."""
-    return b"TARE(0)\n"
-
-
-def quiet_request() -> bytes:
-    """Choose the shortest replies."""
-    return b"VL(0)\n"
-
-
-def mask_request(axes: Sequence[bool] = (True,) * 6) -> bytes:
-    """Choose the axes to be sent; ``kms40.parse_line`` takes only samples of all six.
-
-    Args:
-        axes: Whether to send fx fy fz mx my mz.
-
-    Raises:
-        ValueError: There are not six, or none is chosen.
-    """
-    if len(axes) != 6 or not any(axes):
-        raise ValueError(f"mask {list(axes)} is not six truth values with one true at least")
-    return f"LMASK({{{','.join('1' if axis else '0' for axis in axes)}}})\n".encode("ascii")
+ALL_AXES_REQUEST = b"LMASK({1,1,1,1,1,1})\n"
+"""Send all six axes: ``parse_line`` takes only such samples."""
 
 
 def divider_request(divider: int) -> bytes:
-    """Send only every n-th sample.
-
-    Args:
-        divider: The n, 1..500.
-
-    Raises:
-        ValueError: The divider is out of range.
-    """
+    """Send only every n-th sample, n in 1..500; otherwise raises ValueError."""
     _check("divider", divider, 1, DIVIDER_MAX)
     return f"LDIV({divider})\n".encode("ascii")
 
 
 def filter_request(number: int) -> bytes:
-    """Choose a filter.
-
-    Args:
-        number: Number in the device's table of filters, 0..255.
-
-    Raises:
-        ValueError: The number is out of range.
-    """
+    """Choose a filter of the device's table, 0..255; otherwise raises ValueError."""
     _check("filter number", number, 0, FILTER_MAX)
     return f"FLT({number})\n".encode("ascii")
 
 
 def rate_of_divider(divider: int) -> float:
-    """Lines per second at a divider [Hz].
-
-    Raises:
-        ValueError: The divider is out of range.
-    """
+    """Lines per second at a divider [Hz]; raises ValueError for one out of range."""
     _check("divider", divider, 1, DIVIDER_MAX)
     return BASE_RATE_HZ / divider
 

@@ -25,12 +25,8 @@ RATE_HZ = 100.0
 LARGEST_LOAD_G = 1_000_000
 """A larger load means a misaligned stream: no such cell carries a tonne [g]."""
 
-_NEWTON_PER_GRAM = 9.80665e-3
-_COUNTS = struct.Struct(f"<{ELECTRODES + 4}H")
 _RECORD = struct.Struct(f"<I{ELECTRODES + 4}Hii")
-_LOAD = struct.Struct("<i")
 
-SAMPLE_BYTES = _COUNTS.size
 RECORD_BYTES = _RECORD.size
 
 
@@ -76,48 +72,12 @@ class Pic32Record:
     load_g: int
     reference_g: int
 
-    @property
-    def time_s(self) -> float:
-        """Device time [s]."""
-        return self.tick * TICK_S
 
+START_REQUEST = b"r\n"
+"""Ask for the stream of records."""
 
-def start_request() -> bytes:
-    """Ask for the stream of records."""
-    return b"r\n"
-
-
-def stop_request() -> bytes:
-    """End the stream."""
-    return b"q\n"
-
-
-def sample_request() -> bytes:
-    """Ask for one sample, 46 bytes."""
-    return b"b\n"
-
-
-def load_request() -> bytes:
-    """Ask for the load cell, 4 bytes."""
-    return b"l\n"
-
-
-def newtons(grams: int) -> float:
-    """Force under which the cell shows this mass [N]."""
-    return grams * _NEWTON_PER_GRAM
-
-
-def decode_sample(reply: bytes, layout: Pic32Layout = Pic32Layout.PAC_FIRST) -> Pic32Sample | None:
-    """The reply to ``sample_request``; None if it has another length or is misaligned."""
-    return _sample(_COUNTS.unpack(reply), layout) if len(reply) == SAMPLE_BYTES else None
-
-
-def decode_load(reply: bytes) -> int | None:
-    """The reply to ``load_request`` [g]; None if it has another length or is misaligned."""
-    if len(reply) != _LOAD.size:
-        return None
-    (load_g,) = _LOAD.unpack(reply)
-    return int(load_g) if abs(load_g) <= LARGEST_LOAD_G else None
+STOP_REQUEST = b"q\n"
+"""End the stream."""
 
 
 def _sample(values: tuple[int, ...], layout: Pic32Layout) -> Pic32Sample | None:

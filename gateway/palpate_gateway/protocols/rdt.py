@@ -15,7 +15,6 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -34,14 +33,7 @@ LATE_COUNTS = 8000
 BELIEVABLE_LOSS = 1_000_000
 """A larger gap is taken for a restart where both are possible [records]."""
 
-_REQUEST = struct.Struct(">HHI")
-_REQUEST_HEADER = 0x1234
 _RECORD = struct.Struct(">3I6i")
-
-RECORD_TYPE = np.dtype(
-    [("rdt_sequence", ">u4"), ("ft_sequence", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)]
-)
-"""A record in a datagram, for NumPy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +66,8 @@ class RdtScale:
     counts_per_n_m: float
 
     def __post_init__(self) -> None:
-        for name, value in (
-            ("counts_per_n", self.counts_per_n),
-            ("counts_per_n_m", self.counts_per_n_m),
-        ):
+        for name in self.__slots__:
+            value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} {value} is not a positive finite number")
 
@@ -109,19 +99,14 @@ class RdtDecoder:
             self.counters["bad_lengths"] += 1
             self.counters["junk_bytes"] += len(datagram)
             return []
-        if len(datagram) == RECORD_BYTES:
-            rdt_sequence, ft_sequence, status, *axes = _RECORD.unpack(datagram)
-            fields = [(rdt_sequence, ft_sequence, status, axes)]
-        else:
-            fields = decode_records(datagram).tolist()
-        self.counters["records"] += len(fields)
-        return [
-            RdtRecord(rdt_sequence, ft_sequence, status, tuple(counts))
-            for rdt_sequence, ft_sequence, status, counts in fields
+        records = [
+            RdtRecord(rdt_sequence, ft_sequence, status, (fx, fy, fz, tx, ty, tz))
+            for rdt_sequence, ft_sequence, status, fx, fy, fz, tx, ty, tz in _RECORD.iter_unpack(
+                datagram
+            )
         ]
-
-    def reset(self) -> None:
-        """Nothing is kept from one datagram to the next."""
+        self.counters["records"] += len(records)
+        return records
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,10 +168,6 @@ class RdtSequence:
         lost = lost if lost <= BELIEVABLE_LOSS else 0
         return self._accept(rdt_sequence, ft_sequence, lost=lost, new_epoch=True)
 
-    def reset(self) -> None:
-        """A new connection: ticks run on, counters are kept."""
-        self._last = None
-
     def _accept(
         self, rdt_sequence: int, ft_sequence: int, *, lost: int, new_epoch: bool
     ) -> RdtStep:
@@ -210,44 +191,17 @@ def unwrap(raw: int, previous: int) -> int:
     return previous + (raw - previous + U32 // 2) % U32 - U32 // 2
 
 
-def decode_records(datagram: bytes) -> npt.NDArray[np.void]:
-    """Read many records at once, shape ``(N,)``, fields of ``RECORD_TYPE``.
-
-    Raises:
-        ValueError: The length is no multiple of 36 bytes.
-    """
-    if len(datagram) % RECORD_BYTES:
-        raise ValueError(f"{len(datagram)} bytes are not a multiple of {RECORD_BYTES}")
-    return np.frombuffer(datagram, RECORD_TYPE)
+_BIAS, _HEX_FILTER, _HEX_PERIOD = 0x42, 0x81, 0x82
 
 
-def encode_request(command: int, count: int = 0) -> bytes:
-    """The 8 bytes of a request.
-
-    Args:
-        command: Command 0..65535.
-        count: Samples to send, 0 = endless; some commands take another number here.
-
-    Raises:
-        ValueError: A number does not fit its field.
-    """
-    if not 0 <= command <= 0xFFFF:
-        raise ValueError(f"command {command} is not in 0..65535")
-    if not 0 <= count < U32:
-        raise ValueError(f"count {count} is not in 0..{U32 - 1}")
-    return _REQUEST.pack(_REQUEST_HEADER, command, count)
+def _request(command: int, count: int = 0) -> bytes:
+    return struct.pack(">HHI", 0x1234, command, count)
 
 
-class RdtCommand(IntEnum):
-    """Commands that palpate sends; those from 0x81 exist on OnRobot's converter only."""
+START_REQUEST = _request(0x02)
+"""Start sending without end; a repeated start begins to count from 1 again."""
 
-    STOP = 0x0000
-    START_REALTIME = 0x0002
-    RESET_THRESHOLD_LATCH = 0x0041
-    BIAS = 0x0042
-    HEX_FILTER = 0x0081
-    HEX_PERIOD = 0x0082
-
+STOP_REQUEST = _request(0x00)
 
 HEX_FILTERS_HZ: dict[int, float | None] = {
     0: None, 1: 500.0, 2: 150.0, 3: 50.0, 4: 15.0, 5: 5.0, 6: 1.5,
@@ -255,8 +209,6 @@ HEX_FILTERS_HZ: dict[int, float | None] = {
 """Cut-off of each filter code [Hz]; None = no filter, 4 is the factory setting."""
 
 HEX_PERIOD_MAX_MS = 255
-HEX_CLEAR_BIAS = 0
-_HEX_SET_BIAS = 0xFF
 
 _SUMMARY = 1 << 31
 _LATCHED = 1 << 16
@@ -278,9 +230,7 @@ class RdtProfile:
         harmless: Bits that leave the data good.
         overload: Bits that report an exceeded range.
         latch_sets_summary: A latched threshold sets the summary bit as an error does.
-        bias_count: Count field of the request that takes the present load as zero.
-        clear_bias_count: The same for undoing it; None = the product cannot.
-        has_threshold_latch: Whether a latched threshold can be reset.
+        bias_request: Request that takes the present load as zero, in the device.
     """
 
     name: str
@@ -291,48 +241,7 @@ class RdtProfile:
     harmless: int = _LATCHED
     overload: int = 0
     latch_sets_summary: bool = False
-    bias_count: int = 0
-    clear_bias_count: int | None = None
-    has_threshold_latch: bool = True
-
-    def start_request(self, count: int = 0) -> bytes:
-        """Start sending; a repeated start begins to count from 1 again.
-
-        Args:
-            count: Records to send, 0 = without end.
-
-        Raises:
-            ValueError: The count does not fit 32 bits.
-        """
-        return encode_request(RdtCommand.START_REALTIME, count)
-
-    def stop_request(self) -> bytes:
-        """Stop sending."""
-        return encode_request(RdtCommand.STOP)
-
-    def bias_request(self) -> bytes:
-        """Take the present load as zero, in the device."""
-        return encode_request(RdtCommand.BIAS, self.bias_count)
-
-    def clear_bias_request(self) -> bytes:
-        """Undo the bias.
-
-        Raises:
-            ValueError: The product has no such command.
-        """
-        if self.clear_bias_count is None:
-            raise ValueError(f"{self.name} cannot clear its bias by RDT")
-        return encode_request(RdtCommand.BIAS, self.clear_bias_count)
-
-    def reset_latch_request(self) -> bytes:
-        """Release a latched threshold.
-
-        Raises:
-            ValueError: The product has no such command.
-        """
-        if not self.has_threshold_latch:
-            raise ValueError(f"{self.name} has no thresholds that latch")
-        return encode_request(RdtCommand.RESET_THRESHOLD_LATCH)
+    bias_request: bytes = _request(_BIAS)
 
     def status_names(self, status: int) -> tuple[str, ...]:
         """What the set bits mean, highest first; ``bit 9`` where the reference has no name."""
@@ -427,9 +336,7 @@ HEX = RdtProfile(
     },
     harmless=1 << 3,
     overload=0x3F << 4,
-    bias_count=_HEX_SET_BIAS,
-    clear_bias_count=HEX_CLEAR_BIAS,
-    has_threshold_latch=False,
+    bias_request=_request(_BIAS, 0xFF),
 )
 """OnRobot HEX or OptoForce with the Ethernet converter; its counter counts milliseconds."""
 
@@ -444,17 +351,10 @@ def hex_sensor_number(status: int) -> int:
 
 
 def hex_filter_request(code: int) -> bytes:
-    """Choose the low-pass filter of a HEX.
-
-    Args:
-        code: Key of ``HEX_FILTERS_HZ``.
-
-    Raises:
-        ValueError: There is no such filter.
-    """
+    """Choose the low-pass filter of a HEX, by a key of ``HEX_FILTERS_HZ``, else ValueError."""
     if code not in HEX_FILTERS_HZ:
         raise ValueError(f"filter code {code} is not in 0..{max(HEX_FILTERS_HZ)}")
-    return encode_request(RdtCommand.HEX_FILTER, code)
+    return _request(_HEX_FILTER, code)
 
 
 def hex_period_request(period_ms: int) -> bytes:
@@ -468,4 +368,4 @@ def hex_period_request(period_ms: int) -> bytes:
     """
     if not 1 <= period_ms <= HEX_PERIOD_MAX_MS:
         raise ValueError(f"period {period_ms} ms is not in 1..{HEX_PERIOD_MAX_MS} ms")
-    return encode_request(RdtCommand.HEX_PERIOD, period_ms)
+    return _request(_HEX_PERIOD, period_ms)

@@ -227,49 +227,29 @@ def scale_of(model: str, *, torque_divisor: float | None = None) -> RobotousScal
     return RobotousScale(FORCE_DIVISOR, torque_divisor)
 
 
-def cutoff_hz_of(code: int, order: RobotousFilterOrder = RobotousFilterOrder.MANUALS) -> int | None:
-    """Cutoff [Hz] of a filter code; None if the code names none."""
-    if not 1 <= code <= len(CUTOFFS_HZ):
-        return None
-    return CUTOFFS_HZ[code - 1 if order is RobotousFilterOrder.MANUALS else -code]
+def request(command: RobotousCommand, *parameters: int) -> bytes:
+    """Data bytes of a request."""
+    return bytes((command, *parameters)).ljust(REQUEST_BYTES, b"\0")
 
 
-def start_request() -> bytes:
-    """Start the stream; while it runs, the sensor accepts only stop and bias."""
-    return _request(RobotousCommand.START)
+START_REQUEST = request(RobotousCommand.START)
+"""Start the stream; while it runs, the sensor accepts only stop and bias."""
 
+STOP_REQUEST = request(RobotousCommand.STOP)
+"""Stop the stream; there is no answer."""
 
-def stop_request() -> bytes:
-    """Stop the stream; there is no answer."""
-    return _request(RobotousCommand.STOP)
-
-
-def sample_request() -> bytes:
-    """Send one wrench."""
-    return _request(RobotousCommand.SAMPLE)
-
-
-def bias_request(on: bool = True) -> bytes:
-    """Take the present load as zero, or drop that zero; there is no answer."""
-    return _request(RobotousCommand.BIAS, int(on))
-
-
-def get_request(command: RobotousCommand) -> bytes:
-    """Ask for an identity, a setting or the overload counts."""
-    if command not in _TEXTS and command not in _VALUES:
-        asks = ", ".join(one.name for one in (*_TEXTS, *_VALUES))
-        raise ValueError(f"command {command!r} is none of {asks}")
-    return _request(command)
+BIAS_REQUEST = request(RobotousCommand.BIAS, 1)
+"""Take the present load as zero; there is no answer."""
 
 
 def rate_request(rate_hz: int) -> bytes:
     """Set the stream's rate [Hz], one of ``RATE_CODES``; serial lines: ``HIGHEST_RATE_HZ``."""
-    return _request(RobotousCommand.SET_RATE, _code(RATE_CODES, rate_hz, "rate [Hz]"))
+    return request(RobotousCommand.SET_RATE, _code(RATE_CODES, rate_hz, "rate [Hz]"))
 
 
 def baud_request(baud: int) -> bytes:
     """Set the baud of the serial line, one of ``BAUD_CODES``."""
-    return _request(RobotousCommand.SET_BAUD, _code(BAUD_CODES, baud, "baud"))
+    return request(RobotousCommand.SET_BAUD, _code(BAUD_CODES, baud, "baud"))
 
 
 def filter_request(
@@ -282,21 +262,10 @@ def filter_request(
         order: How the sensor numbers cutoffs. Confirm it by the noise level.
     """
     if cutoff_hz is None:
-        return _request(RobotousCommand.SET_FILTER, 0, 0)
-    codes = {cutoff_hz_of(code, order) or 0: code for code in range(1, len(CUTOFFS_HZ) + 1)}
-    return _request(RobotousCommand.SET_FILTER, 1, _code(codes, cutoff_hz, "cutoff [Hz]"))
-
-
-def can_ids_request(request_id: int, first_id: int, second_id: int) -> bytes:
-    """Set the ids of requests and of both halves of an answer, 1..255; valid after a restart."""
-    ids = (request_id, first_id, second_id)
-    if any(not 1 <= one <= 255 for one in ids) or len(set(ids)) < 3:
-        raise ValueError(f"CAN ids {ids} are not three different ones in 1..255")
-    return _request(RobotousCommand.SET_CAN_IDS, *ids)
-
-
-def _request(command: RobotousCommand, *parameters: int) -> bytes:
-    return bytes((command, *parameters)).ljust(REQUEST_BYTES, b"\0")
+        return request(RobotousCommand.SET_FILTER, 0, 0)
+    cutoffs_hz = CUTOFFS_HZ if order is RobotousFilterOrder.MANUALS else CUTOFFS_HZ[::-1]
+    codes = {one_hz: code for code, one_hz in enumerate(cutoffs_hz, 1)}
+    return request(RobotousCommand.SET_FILTER, 1, _code(codes, cutoff_hz, "cutoff [Hz]"))
 
 
 def _code(codes: dict[int, int], value: int, name: str) -> int:

@@ -137,10 +137,9 @@ class SlotClock:
 
     Args:
         slot_rate_hz: Slots per second of the sender's clock; if it is wrong by many percent, a
-            silence is misjudged: compare ``measured_rate_hz``.
+            silence is misjudged.
         sequence: Channels of a frame in order; None learns them from the stream, E1 first.
-        exact: The stamps are the sender's own times of sampling, so that each loss shows at once;
-            call ``reset`` when that clock starts again.
+        exact: The stamps are the sender's own times of sampling, so that each loss shows at once.
     """
 
     def __init__(
@@ -163,7 +162,6 @@ class SlotClock:
         self._resume_s: float | None = None  # end of the last frame of the previous run
         self._silences: Silences | None = None  # None between two runs
         self._origin_s = 0.0  # time of index 0, the first slot of the first frame
-        self._begun = (0, 0.0)  # index and stamp
         self._index = 0  # of the last slot, lost slots counted
         self._last_s = 0.0
         self._sure = (0, 0.0)  # index and stamp of the last slot whose channel occurs once
@@ -177,14 +175,6 @@ class SlotClock:
     def sequence(self) -> tuple[int, ...]:
         """Channels of a frame in order; empty while they are being learnt."""
         return () if self._order is None else self._order.channels
-
-    @property
-    def measured_rate_hz(self) -> float | None:
-        """Slots per second of the stamps in this run; None in its first second."""
-        index, stamp_s = self._begun
-        if self._silences is None or self._last_s - stamp_s < 1.0:
-            return None
-        return (self._index - index) / (self._last_s - stamp_s)
 
     def place(self, channel: int, stamp_s: float) -> SlotPlace | None:
         """Place the next slot; None if it gets no place.
@@ -281,14 +271,6 @@ class SlotClock:
         run = np.full(number, self._run)
         return SlotPlaces(np.arange(number), run, self._base + frame, position, times_s)
 
-    def reset(self) -> None:
-        """The connection is new: a new run begins, and a learnt sequence is learnt again."""
-        self._end_run()
-        if self._learns:
-            self._order = None
-            self._doubt = True
-            self._seen.clear()
-
     def _time_s(self, index: int) -> float:
         return self._origin_s + index * self._period_s
 
@@ -318,7 +300,7 @@ class SlotClock:
         # The rest of the frame that has begun lies before index 0 and gets no place.
         self._index = position - order.size if position else 0
         self._origin_s = stamp_s - self._index * self._period_s
-        self._begun = self._sure = (self._index, stamp_s)
+        self._sure = (self._index, stamp_s)
         self._last_s = stamp_s
         self._since = 0
         self._frame = 0

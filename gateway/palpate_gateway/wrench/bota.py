@@ -18,7 +18,7 @@ from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
 from palpate_gateway.ports.serial_port import SerialPort, settle
 from palpate_gateway.protocols import bota as wire
-from palpate_gateway.protocols.bota import BotaCommand, BotaDecoder, BotaFrame
+from palpate_gateway.protocols.bota import BotaDecoder, BotaFrame
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
@@ -170,12 +170,12 @@ class WrenchBota(WrenchDevice):
                 )
 
     def _configure(self, within_s: float = _ANSWER_S) -> None:
-        self._ask(wire.bare_request(BotaCommand.CONFIG), within_s)
+        self._ask(wire.CONFIG_REQUEST, within_s)
         # Discard answers to earlier requests and the rest of the stream.
         settle(self._port, _QUIET_S, _ANSWER_S)
 
     def _run(self) -> None:
-        self._early = self._ask(wire.bare_request(BotaCommand.RUN))
+        self._early = self._ask(wire.RUN_REQUEST)
         self._decoder.reset()
         self._boot = wire.BotaTextWait(wire.BOOT_TEXT)
         self._clock.pause()
@@ -252,7 +252,7 @@ class WrenchBota(WrenchDevice):
         """
         self._port.write(request)
         what = f"{self.info.model}: command {request.decode('ascii')!r}"
-        wait = wire.BotaTextWait(wire.expected_reply(request) or b"\n")
+        wait = wire.BotaTextWait(wire.expected_reply(request))
         until = time.monotonic() + within_s
         while (left_s := until - time.monotonic()) > 0.0:
             with contextlib.suppress(DeviceTimeout):

@@ -110,11 +110,11 @@ class WrenchKms40(WrenchDevice):
 
     def zero(self) -> None:
         """See ``WrenchDevice``; the stream pauses, and the samples before it are discarded."""
-        self._ask(wire.stop_request(), "L0")
+        self._ask(wire.STOP_REQUEST, "L0")
         try:
-            self._ask(wire.tare_request(), "TARE", "1")
+            self._ask(wire.TARE_REQUEST, "TARE", "1")
         finally:
-            self._ask(wire.start_request(), "L1")
+            self._ask(wire.START_REQUEST, "L1")
             self._arrivals.begin()
 
     def _keeps_zero(self) -> bool:
@@ -131,14 +131,14 @@ class WrenchKms40(WrenchDevice):
                 f"{self.info.model}: it gives no serial number",
                 remedy="check that this is a KMS 40",
             )
-        self._ask(wire.mask_request(), "LMASK", "{1,1,1,1,1,1}")
+        self._ask(wire.ALL_AXES_REQUEST, "LMASK", "{1,1,1,1,1,1}")
         if self._filter is not None:
             self._ask(wire.filter_request(self._filter), "FLT", str(self._filter))
         self._ask(wire.divider_request(self._divider), "LDIV", str(self._divider))
-        self._ask(wire.quiet_request(), "VL", "0")
+        self._ask(wire.QUIET_REQUEST, "VL", "0")
         if self._flags_every_s:
             self._check_flags()
-        self._ask(wire.start_request(), "L1")
+        self._ask(wire.START_REQUEST, "L1")
         return serial
 
     def _greet(self) -> None:
@@ -147,7 +147,7 @@ class WrenchKms40(WrenchDevice):
         while True:
             left_s = until - time.monotonic()
             try:
-                self._ask(wire.stop_request(), "L0", within_s=min(_GREET_S, left_s))
+                self._ask(wire.STOP_REQUEST, "L0", within_s=min(_GREET_S, left_s))
                 return
             except DeviceTimeout:
                 if left_s <= _GREET_S:
@@ -166,7 +166,7 @@ class WrenchKms40(WrenchDevice):
     def _close(self) -> None:
         # Wait for the echo: a socket that is closed with unread input cancels the request.
         with contextlib.suppress(DeviceError):
-            self._ask(wire.stop_request(), "L0", within_s=_GOODBYE_S)
+            self._ask(wire.STOP_REQUEST, "L0", within_s=_GOODBYE_S)
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -215,7 +215,7 @@ class WrenchKms40(WrenchDevice):
         if now_s - self._heard_s >= self._patience_s:
             self._heard_s = now_s
             self._counts["streams_restarted"] += 1
-            self._port.write(wire.start_request())
+            self._port.write(wire.START_REQUEST)
         if self._flags_every_s and now_s >= self._flags_due_s:
             self._flags_due_s = now_s + self._flags_every_s
             self._counts["flags_unanswered"] += self._flags_asked

@@ -27,6 +27,8 @@ from palpate_gateway.protocols.rdt import (
     HEX_PERIOD_MAX_MS,
     PORT,
     PROFILES,
+    START_REQUEST,
+    STOP_REQUEST,
     RdtDecoder,
     RdtRecord,
     RdtScale,
@@ -235,7 +237,7 @@ class WrenchRdt(WrenchDevice):
         """See ``WrenchDevice``; the request is repeated until the records show its effect."""
         before, spread_before = self._load()
         for _ in range(_ZEROS):
-            self._port.write(self._profile.bias_request())
+            self._port.write(self._profile.bias_request)
             after, spread = self._load()
             # Only a lost request leaves the load unchanged.
             if np.all(abs(after) <= 0.5 * abs(before) + spread_before + spread + 2.0):
@@ -269,7 +271,7 @@ class WrenchRdt(WrenchDevice):
         self._begin()
         serial = self._learn()
         self._port.open()
-        self._port.write(self._profile.stop_request())
+        self._port.write(STOP_REQUEST)
         self._port.discard_input()
         if self._is_hex:
             if self._options.filter_code is not None:
@@ -315,7 +317,7 @@ class WrenchRdt(WrenchDevice):
 
     def _start(self) -> None:
         for _ in range(_STARTS):
-            self._port.write(self._profile.start_request())
+            self._port.write(START_REQUEST)
             with contextlib.suppress(DeviceTimeout):
                 self._early = self._fresh(self._port.receive(self._patience_s))
             if self._early:
@@ -328,7 +330,7 @@ class WrenchRdt(WrenchDevice):
 
     def _close(self) -> None:
         with contextlib.suppress(DeviceError):
-            self._port.write(self._profile.stop_request())
+            self._port.write(STOP_REQUEST)
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -374,7 +376,7 @@ class WrenchRdt(WrenchDevice):
         if now_s - self._heard_s >= self._patience_s:
             self._heard_s = now_s
             self._counts["starts_repeated"] += 1
-            self._port.write(self._profile.start_request())
+            self._port.write(START_REQUEST)
 
     def _fresh(self, datagram: ReceivedBytes) -> list[_Record]:
         """Records of a datagram, without repeated and late ones."""

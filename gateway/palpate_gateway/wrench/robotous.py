@@ -226,7 +226,7 @@ class WrenchRobotous(WrenchDevice):
         """
         before = self._mean()
         for _ in range(_ATTEMPTS):
-            self._line.send(wire.bias_request())
+            self._line.send(wire.BIAS_REQUEST)
             self._mean()  # some of these may have been on their way
             after = self._mean()
             pairs = zip(before, after, strict=True)
@@ -239,7 +239,7 @@ class WrenchRobotous(WrenchDevice):
 
     def _connect(self) -> str:
         self._line.open()
-        self._line.send(wire.stop_request())
+        self._line.send(wire.STOP_REQUEST)
         until = time.monotonic() + _DRAIN_S
         with contextlib.suppress(DeviceTimeout):
             while time.monotonic() < until:
@@ -250,7 +250,7 @@ class WrenchRobotous(WrenchDevice):
         cutoff_hz = self._options.cutoff_hz or None
         self._set(wire.filter_request(cutoff_hz, order=self._options.filter_order))
         self._set(wire.rate_request(self._options.rate_hz))
-        self._answer(wire.start_request(), RobotousCommand.START)
+        self._answer(wire.START_REQUEST, RobotousCommand.START)
         self._arrivals.begin()
         return serial or self._line.name
 
@@ -272,7 +272,7 @@ class WrenchRobotous(WrenchDevice):
 
     def _close(self) -> None:
         with contextlib.suppress(DeviceError):
-            self._line.send(wire.stop_request())
+            self._line.send(wire.STOP_REQUEST)
         self._line.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -311,7 +311,7 @@ class WrenchRobotous(WrenchDevice):
         return [sum(axis) / len(samples) for axis in zip(*(s.counts for s in samples), strict=True)]
 
     def _text(self, command: RobotousCommand) -> str:
-        record = self._answer(wire.get_request(command), command)
+        record = self._answer(wire.request(command), command)
         return record.text if isinstance(record, wire.RobotousText) else ""
 
     def _set(self, request: bytes) -> None:
@@ -332,7 +332,7 @@ class WrenchRobotous(WrenchDevice):
         patience_s = _ANSWER_S + 2.0 / self.info.rate_hz
         for attempt in range(_ATTEMPTS):
             if attempt:  # while it streams it ignores most requests
-                self._line.send(wire.stop_request())
+                self._line.send(wire.STOP_REQUEST)
             self._line.send(request)
             until = time.monotonic() + patience_s
             with contextlib.suppress(DeviceTimeout):

@@ -31,6 +31,7 @@ def check(data: bytes) -> None:
             expected.append((packet, len(one) + 1, number == 0))
     assert [(p.data, p.wire_bytes, p.first) for p in packets] == expected
     all_counted(decoder, sum(packet.wire_bytes for packet in packets), stream)
+    decoder.feed(DELIMITER)
     (good,) = decoder.feed(encode_packet(stream[:LONGEST]))
     assert good.data == stream[:LONGEST]
 

@@ -37,6 +37,7 @@ def check(data: bytes) -> None:
     again = cast(KmsDecoder, decoder)
     taken = counters["record_bytes"]
     all_counted(decoder, taken, stream)
+    again.feed(b"\n")
     assert again.feed(_GOOD) == [_SAMPLE]
 
 

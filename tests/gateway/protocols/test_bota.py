@@ -128,27 +128,12 @@ def test_any_bytes_are_accepted(chunks: list[bytes]) -> None:
 
 
 def test_requests() -> None:
-    assert bota.bare_request(bota.BotaCommand.CONFIG) == b"C"
-    assert bota.bare_request(bota.BotaCommand.RUN) == b"R"
-    letters = {command.name: bota.bare_request(command) for command in bota.BotaCommand}
-    assert letters == {
-        "CONFIG": b"C", "RUN": b"R", "SAVE": b"s", "LOAD": b"l", "PRINT": b"w",
-        "SOFT_RESET": b"I", "HARD_RESET": b"#",
-    }  # fmt: skip
     assert bota.communication_request(baud=460800) == b"c,0,1,0,4"
-    assert bota.communication_request(
-        baud=230400,
-        temperature_compensation=True,
-        calibrated=False,
-        data_format=bota.BotaFormat.CSV,
-    ) == b"c,1,0,1,3"  # fmt: skip
+    assert bota.communication_request(baud=230400, temperature_compensation=True) == b"c,1,1,0,3"
     assert bota.filter_request(512) == b"f,512,0,0,1"
     assert bota.filter_request(51, chop=True, fast=True, fir=True) == b"f,51,1,1,0"
     assert bota.offsets_request([1, -2, 0.5, 0, 0, -0.0625]) == (
         b"b,1.000,-2.000,0.500,0.000,0.000,-0.062"
-    )
-    assert bota.matrix_row_request(5, [1, 0, 0, 0, 0, 0.25]) == (
-        b"m5,1.000000,0.000000,0.000000,0.000000,0.000000,0.250000"
     )
 
 
@@ -160,9 +145,6 @@ def test_requests_out_of_range() -> None:
             bota.filter_request(sinc)
         with pytest.raises(ValueError, match="not one of 51"):
             bota.period_s(sinc)
-    for row in (-1, 6):
-        with pytest.raises(ValueError, match="matrix row"):
-            bota.matrix_row_request(row, [0] * 6)
     for values in ([0] * 5, [0] * 5 + [math.nan]):
         with pytest.raises(ValueError, match="six finite"):
             bota.offsets_request(values)
@@ -185,9 +167,7 @@ def test_expected_replies() -> None:
     assert bota.expected_reply(bota.communication_request(baud=460800)) == b"r,0,c,0"
     assert bota.expected_reply(bota.filter_request(64)) == b"r,0,f,0"
     assert bota.expected_reply(bota.offsets_request([0] * 6)) == b"r,0,b,0"
-    assert bota.expected_reply(bota.matrix_row_request(1, [0] * 6)) == b"r,0,m,0"
     assert bota.expected_reply(b"R") == b"r,0,R,0"
-    assert [bota.expected_reply(request) for request in (b"#", b"I", b"")] == [None] * 3
 
 
 def test_refusal_is_told() -> None:
@@ -223,9 +203,3 @@ def test_wait_is_bounded(chunks: list[bytes]) -> None:
         wait.feed(chunk)
         assert len(wait.before) <= 256
     bota.find_ack(b"".join(chunks))
-
-
-@pytest.mark.parametrize("text", [b"", bytes(65)])
-def test_wait_wants_a_short_text(text: bytes) -> None:
-    with pytest.raises(ValueError, match=r"1\.\.64"):
-        bota.BotaTextWait(text)

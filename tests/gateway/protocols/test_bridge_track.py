@@ -88,13 +88,3 @@ def test_a_hello_at_the_wrap_is_no_restart() -> None:
     (record,) = decoder.feed(packet(0, 9_995, HELLO))
     assert (record.epoch, record.time_us) == (0, 2**32 + 9_995)
     assert counted(decoder) == {}
-
-
-def test_a_new_connection_is_a_new_epoch() -> None:
-    decoder = BridgeDecoder()
-    decoder.feed(packet(7, 100) + packet(8, 200)[:5])
-    assert decoder.pending == 5
-    decoder.reset()
-    (record,) = decoder.feed(packet(3, 50))
-    assert (record.epoch, record.lost_before, record.time_us) == (1, 0, 50)
-    assert counted(decoder) == {"junk_bytes": 5}

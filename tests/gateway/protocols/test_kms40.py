@@ -152,17 +152,6 @@ def test_longest_line() -> None:
     assert KmsDecoder().feed(line + b"\n") == [KmsReply("PRINT", "7" * (LINE_MAX - 6))]
 
 
-def test_reset_forgets_the_line_that_has_begun() -> None:
-    decoder = KmsDecoder()
-    decoder.feed(GOOD[:10])
-    assert decoder.pending == 10
-    decoder.reset()
-    assert (decoder.pending, decoder.counters["junk_bytes"]) == (0, 10)
-    decoder.feed(b"x" * 5000)
-    decoder.reset()
-    assert decoder.feed(GOOD + b"\n") == [SAMPLE]
-
-
 def test_stopping_drains_samples_before_the_echo() -> None:
     decoder = KmsDecoder()
     records = decoder.feed(GOOD + b"\n" + GOOD + b"\nL0\nTARE=1\n")
@@ -260,23 +249,9 @@ def test_over_range_is_told_per_axis() -> None:
 
 
 def test_requests() -> None:
-    assert ask.start_request() == b"L1()\n"
-    assert ask.stop_request() == b"L0()\n"
-    assert ask.tare_request() == b"TARE(1)\n"
-    assert ask.clear_tare_request() == b"TARE(0)\n"
-    assert ask.quiet_request() == b"VL(0)\n"
-    assert ask.mask_request() == b"LMASK({1,1,1,1,1,1})\n"
-    assert ask.mask_request([False, False, True, False, False, False]) == b"LMASK({0,0,1,0,0,0})\n"
     assert ask.divider_request(5) == b"LDIV(5)\n"
     assert ask.filter_request(0) == b"FLT(0)\n"
     assert ask.query_request(ask.KmsQuery.FLAGS) == b"FLAGS()\n"
-    assert ask.identify_requests() == (b"ID()\n", b"SN()\n", b"V()\n")
-
-
-@pytest.mark.parametrize("axes", [[True] * 5, [True] * 7, [False] * 6])
-def test_mask_of_wrong_shape(axes: list[bool]) -> None:
-    with pytest.raises(ValueError, match="mask"):
-        ask.mask_request(axes)
 
 
 def test_arguments_out_of_range() -> None:

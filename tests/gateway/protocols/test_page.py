@@ -1,7 +1,7 @@
 """Every vector of the hardware reference, section by section: bytes, and what they mean.
 
-The tables of single bytes (commands 1.3, words 1.4, error words 1.6) are in ``test_spi``; values of
-conversions (1.9) in ``biotac/test_conversions``; logs (1.8, 4.2) in ``recordings``.
+The tables of single bytes (commands 1.3, words 1.4, error words 1.6) are in ``test_spi``; logs
+(1.8, 4.2) in ``recordings``.
 """
 
 from __future__ import annotations
@@ -15,69 +15,51 @@ import numpy as np
 import pytest
 from tests.gateway.spi_words import decode_word
 
-from palpate_gateway.protocols import bota, kms40, optoforce, pic32, robotous
+from palpate_gateway.protocols import bota, kms40, pic32, robotous
 from palpate_gateway.protocols.framing import crc16_x25
-from palpate_gateway.protocols.rdt import HEX, NET_FT, RdtDecoder, RdtScale, hex_filter_request
+from palpate_gateway.protocols.rdt import (
+    HEX,
+    NET_FT,
+    START_REQUEST,
+    STOP_REQUEST,
+    RdtDecoder,
+    RdtScale,
+    hex_filter_request,
+)
 from palpate_gateway.protocols.robotous import RobotousSerialDecoder, serial_frame
 from palpate_gateway.protocols.spi import WordKind, channel_of_command
 
-SENT: dict[str, tuple[Callable[[], bytes], str]] = {
-    "3.1 identity": (
-        lambda: kms40.query_request(kms40.KmsQuery.IDENTITY),
-        b"ID()\n".hex(),
-    ),
-    "3.1 start": (kms40.start_request, b"L1()\n".hex()),
-    "3.1 stop": (kms40.stop_request, b"L0()\n".hex()),
-    "3.1 all axes": (kms40.mask_request, b"LMASK({1,1,1,1,1,1})\n".hex()),
-    "3.1 every sample": (lambda: kms40.divider_request(1), b"LDIV(1)\n".hex()),
-    "3.1 tare": (kms40.tare_request, b"TARE(1)\n".hex()),
-    "3.1 clear tare": (kms40.clear_tare_request, b"TARE(0)\n".hex()),
-    "3.1 quiet": (kms40.quiet_request, b"VL(0)\n".hex()),
-    "3.2 start": (NET_FT.start_request, "12 34 00 02 00 00 00 00"),
+SENT: dict[str, tuple[bytes, str]] = {
+    "3.1 identity": (kms40.query_request(kms40.KmsQuery.IDENTITY), b"ID()\n".hex()),
+    "3.1 start": (kms40.START_REQUEST, b"L1()\n".hex()),
+    "3.1 stop": (kms40.STOP_REQUEST, b"L0()\n".hex()),
+    "3.1 all axes": (kms40.ALL_AXES_REQUEST, b"LMASK({1,1,1,1,1,1})\n".hex()),
+    "3.1 every sample": (kms40.divider_request(1), b"LDIV(1)\n".hex()),
+    "3.1 tare": (kms40.TARE_REQUEST, b"TARE(1)\n".hex()),
+    "3.1 quiet": (kms40.QUIET_REQUEST, b"VL(0)\n".hex()),
+    "3.2 start": (START_REQUEST, "12 34 00 02 00 00 00 00"),
     "3.2 bias": (NET_FT.bias_request, "12 34 00 42 00 00 00 00"),
-    "3.2 stop": (NET_FT.stop_request, "12 34 00 00 00 00 00 00"),
+    "3.2 stop": (STOP_REQUEST, "12 34 00 00 00 00 00 00"),
     "3.3 zero": (HEX.bias_request, "12 34 00 42 00 00 00 FF"),
-    "3.3 clear": (HEX.clear_bias_request, "12 34 00 42 00 00 00 00"),
-    "3.3 filter": (lambda: hex_filter_request(4), "12 34 00 81 00 00 00 04"),
-    "3.4 configure": (
-        lambda: optoforce.configure_request(rate_hz=100, cutoff_hz=15, zero=True),
-        "AA 00 32 03 0A 04 FF 01 EC",
-    ),
-    "3.5 start": (
-        lambda: serial_frame(robotous.start_request()),
-        "55 0B 00 00 00 00 00 00 00 0B AA",
-    ),
-    "3.5 stop": (
-        lambda: serial_frame(robotous.stop_request()),
-        "55 0C 00 00 00 00 00 00 00 0C AA",
-    ),
-    "3.5 bias": (
-        lambda: serial_frame(robotous.bias_request()),
-        "55 11 01 00 00 00 00 00 00 12 AA",
-    ),
-    "3.5 rate": (
-        lambda: serial_frame(robotous.rate_request(200)),
-        "55 0F 05 00 00 00 00 00 00 14 AA",
-    ),
-    "3.6 configuration": (lambda: bota.bare_request(bota.BotaCommand.CONFIG), b"C".hex()),
-    "3.6 communication": (
-        lambda: bota.communication_request(baud=460800),
-        b"c,0,1,0,4".hex(),
-    ),
-    "3.6 filter": (lambda: bota.filter_request(512), b"f,512,0,0,1".hex()),
-    "3.6 run": (lambda: bota.bare_request(bota.BotaCommand.RUN), b"R".hex()),
-    "2.2 stream": (pic32.start_request, b"r\n".hex()),
-    "2.2 sample": (pic32.sample_request, b"b\n".hex()),
-    "2.2 load": (pic32.load_request, b"l\n".hex()),
-    "2.2 stop": (pic32.stop_request, b"q\n".hex()),
+    "3.3 filter": (hex_filter_request(4), "12 34 00 81 00 00 00 04"),
+    "3.5 start": (serial_frame(robotous.START_REQUEST), "55 0B 00 00 00 00 00 00 00 0B AA"),
+    "3.5 stop": (serial_frame(robotous.STOP_REQUEST), "55 0C 00 00 00 00 00 00 00 0C AA"),
+    "3.5 bias": (serial_frame(robotous.BIAS_REQUEST), "55 11 01 00 00 00 00 00 00 12 AA"),
+    "3.5 rate": (serial_frame(robotous.rate_request(200)), "55 0F 05 00 00 00 00 00 00 14 AA"),
+    "3.6 configuration": (bota.CONFIG_REQUEST, b"C".hex()),
+    "3.6 communication": (bota.communication_request(baud=460800), b"c,0,1,0,4".hex()),
+    "3.6 filter": (bota.filter_request(512), b"f,512,0,0,1".hex()),
+    "3.6 run": (bota.RUN_REQUEST, b"R".hex()),
+    "2.2 stream": (pic32.START_REQUEST, b"r\n".hex()),
+    "2.2 stop": (pic32.STOP_REQUEST, b"q\n".hex()),
 }
-"""Section and name: what makes the request, and its bytes."""
+"""Section and name: the request, and its bytes."""
 
 
 @pytest.mark.parametrize("name", SENT)
 def test_what_is_sent(name: str) -> None:
-    make, told = SENT[name]
-    assert make() == bytes.fromhex(told)
+    request, told = SENT[name]
+    assert request == bytes.fromhex(told)
 
 
 def slot(told: str) -> Any:
@@ -90,11 +72,6 @@ def rdt(told: str) -> Any:
     (record,) = RdtDecoder().feed(bytes.fromhex(told))
     wrench = RdtScale(1e6, 1e6).wrench(record.counts)
     return record.rdt_sequence, record.ft_sequence, record.status, *np.round(wrench, 9).tolist()
-
-
-def opto(told: str) -> Any:
-    (record,) = optoforce.OptoForceDecoder().feed(bytes.fromhex(told))
-    return record
 
 
 def rft(told: str) -> Any:
@@ -133,12 +110,6 @@ RECEIVED: dict[str, tuple[Callable[[str], Any], str, Any]] = {
         "00000001 00001B58 00000000 0016E360 FFFC2F70 000F4240 00004E20 FFFFD8F0 00001388",
         (1, 7000, 0, 1.5, -0.25, 1.0, 0.02, -0.01, 0.005),
     ),
-    "3.4 reply": (opto, "AA 00 50 01 00 00 FB", optoforce.OptoForceReply(0)),
-    "3.4 real frame": (
-        opto,
-        "AA 07 08 0A 2D 6A 00 00 FF F7 FF FB 00 07 05 51",
-        optoforce.OptoForceData(11626, 0, (-9, -5, 7)),
-    ),
     "3.5 data": (
         rft,
         "55 0B 01F4 FF06 03E8 00C8 FF9C 0032 00 00 00 85 AA",
@@ -165,7 +136,8 @@ def test_checksum_of_the_bridge() -> None:
 
 def _hex_of_page(page: str) -> Iterable[str]:
     """Byte strings in the chapters on what is implemented, at least six bytes long."""
-    chapters = page[page.index("### 2.1") : page.index("### 3.7")]
+    chapters = page[page.index("### 2.1") : page.index("### 3.4")]
+    chapters += page[page.index("### 3.5") : page.index("### 3.7")]
     for code in re.findall(r"`([^`]+)`", chapters):
         digits = re.sub(r"\s", "", code)
         if re.fullmatch(r"(?:[0-9A-F]{2}){6,}", digits):

@@ -12,9 +12,9 @@ from palpate_gateway.protocols import robotous as rft
 
 # Every vector of the hardware reference, section 3.5.
 REQUESTS = {
-    "55 0B 00 00 00 00 00 00 00 0B AA": rft.start_request(),
-    "55 0C 00 00 00 00 00 00 00 0C AA": rft.stop_request(),
-    "55 11 01 00 00 00 00 00 00 12 AA": rft.bias_request(),
+    "55 0B 00 00 00 00 00 00 00 0B AA": rft.START_REQUEST,
+    "55 0C 00 00 00 00 00 00 00 0C AA": rft.STOP_REQUEST,
+    "55 11 01 00 00 00 00 00 00 12 AA": rft.BIAS_REQUEST,
     "55 0F 05 00 00 00 00 00 00 14 AA": rft.rate_request(200),
 }
 DATA_FRAME = bytes.fromhex("55 0B 01F4 FF06 03E8 00C8 FF9C 0032 00 00 00 85 AA")
@@ -133,19 +133,14 @@ def test_filter_codes_follow_the_manuals_unless_told() -> None:
     assert rft.filter_request(500, order=header)[:3] == bytes((8, 1, 14))
     assert rft.filter_request(1, order=header)[:3] == bytes((8, 1, 1))
     assert rft.filter_request(None) == reply(8)[:8]
-    assert [rft.cutoff_hz_of(code) for code in (0, 1, 14, 15)] == [None, 500, 1, None]
-    assert [rft.cutoff_hz_of(code, header) for code in (0, 1, 14, 15)] == [None, 1, 500, None]
     with pytest.raises(ValueError, match=r"cutoff \[Hz\] 7 is not one of 1, 2, 3"):
         rft.filter_request(7)
 
 
 def test_requests() -> None:
-    assert rft.sample_request() == reply(10)[:8]
-    assert rft.bias_request(on=False) == reply(17)[:8]
-    assert rft.get_request(rft.RobotousCommand.MODEL) == reply(1)[:8]
-    assert rft.get_request(rft.RobotousCommand.OVERLOADS) == reply(18)[:8]
+    assert rft.request(rft.RobotousCommand.MODEL) == reply(1)[:8]
+    assert rft.request(rft.RobotousCommand.OVERLOADS) == reply(18)[:8]
     assert rft.baud_request(921600) == reply(6, 1)[:8]
-    assert rft.can_ids_request(0x64, 1, 2) == reply(4, 0x64, 1, 2)[:8]
     rates = {rate: rft.rate_request(rate)[1] for rate in (10, 20, 50, 100, 200, 333, 500, 1000)}
     assert rates == {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
 
@@ -155,12 +150,6 @@ def test_requests_out_of_range() -> None:
         rft.rate_request(300)
     with pytest.raises(ValueError, match="baud 9600 is not one of 57600"):
         rft.baud_request(9600)
-    for ids in ((0, 1, 2), (1, 2, 256), (5, 5, 6)):
-        with pytest.raises(ValueError, match=r"1\.\.255"):
-            rft.can_ids_request(*ids)
-    for command in (rft.RobotousCommand.START, rft.RobotousCommand.SET_RATE):
-        with pytest.raises(ValueError, match="none of MODEL"):
-            rft.get_request(command)
 
 
 def test_rates_fit_the_line() -> None:
