@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +17,17 @@ pytest.importorskip("h5py", reason="palpate[fem] is not installed")
 
 from palpate_deploy.cli import files as cli_files
 from palpate_deploy.cli.options import PalpateGroup
+from palpate_fem.result import IndentationResult
+from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter, export
 from palpate_services.viewer.simulation import DrawnSimulations
+
+sys.path.append(str(Path(__file__).parents[1] / "fem"))
+sample: Any = importlib.import_module("stored_sample")
+indenter_outline: Callable[[str], Outline] = sample.indenter_outline
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 NAMES = ["sphere_medium/00/angled", "sphere_medium/00/normal"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from palpate_deploy.cli.app import app
+from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, read_experiment, read_mixed
@@ -39,6 +39,11 @@ from palpate_training.experiment.plan import (
 )
 from palpate_training.experiment.trajectory_file import write_trajectories
 from palpate_training.experiment.virtual_testbed import perform
+
+sys.path.append(str(Path(__file__).parents[1] / "fem"))
+sample: Any = importlib.import_module("stored_sample")
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 sys.path.append(str(Path(__file__).parents[1] / "training"))
 fakes: Any = importlib.import_module("testbed_fakes")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +18,20 @@ from typer.testing import CliRunner, Result
 from palpate_deploy.cli.app import app
 from palpate_fem.indenter.approach import first_contact
 from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.result import IndentationResult
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.store.content import StoredFingertip
-from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.trajectory import Campaign
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.plan import APPROACH_M
 from palpate_training.experiment.registration import ArmRegistration, write_registrations
 from palpate_training.experiment.trajectory_file import read_trajectories
+
+sys.path.append(str(Path(__file__).parents[1] / "fem"))
+sample: Any = importlib.import_module("stored_sample")
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 
 def run(*words: object) -> Result:

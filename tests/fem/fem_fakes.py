@@ -5,6 +5,7 @@ The friction coefficient of a job says how its run behaves.
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
@@ -22,10 +23,13 @@ from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.fingertips import OnFraction
 from palpate_fem.store.content import StoredFingertip
-from palpate_fem.store.sample import sample_fingertip
 
 if TYPE_CHECKING:
     from palpate.messages import SimulationRequest
+
+sample_fingertip: Callable[[], StoredFingertip] = importlib.import_module(
+    "stored_sample"
+).sample_fingertip
 
 QUICK, SLOW, STUBBORN, DIES, SEGFAULTS, DIVERGES, REFUSES, DEFECTIVE, PINCHES, NAN = (
     round(0.01 * k, 2) for k in range(10, 20)

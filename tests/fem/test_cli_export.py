@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +13,15 @@ from typer.testing import CliRunner, Result
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.cli.app import fem_app
+from palpate_fem.result import IndentationResult
+from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
+
+sample: Any = importlib.import_module("stored_sample")
+indenter_outline: Callable[[str], Outline] = sample.indenter_outline
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 NAMES = ["cube/00/normal", "sphere_medium/00/normal"]
 

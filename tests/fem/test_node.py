@@ -31,7 +31,7 @@ from palpate.v1 import simulation_pb2
 from palpate_fem.config import FingertipParameters
 from palpate_fem.service import node
 from palpate_fem.service.config import FemConfig
-from palpate_fem.service.requests import as_reply, path_of
+from palpate_fem.service.requests import OUTCOMES, as_step, path_of
 
 fakes: Any = importlib.import_module("fem_fakes")
 
@@ -58,10 +58,16 @@ def test_the_wire_changes_no_bit(service: Any) -> None:
         asked, on_progress=told.append, on_step=lambda index, _: seen.append(index)
     )
     tip = fakes.FakeTip(FingertipParameters(), 40)
-    here = as_reply(
-        tip.indent("sphere_medium", path_of(asked, max_steps=9), friction_coefficient=fakes.QUICK),
-        asked,
+    done = tip.indent(
+        "sphere_medium", path_of(asked, max_steps=9), friction_coefficient=fakes.QUICK
+    )
+    here = SimulationReply(
+        asked.request_id,
         tip.mesh.sha256,
+        tuple(as_step(step, asked) for step in done.steps),
+        done.reason,
+        outcome=OUTCOMES[done.outcome],
+        travel_m=done.travel_m,
     )
     assert over_the_wire.outcome is SimulationOutcome.COMPLETE
     assert over_the_wire.steps[-1].displacement is not None

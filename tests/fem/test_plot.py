@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,18 +15,18 @@ import pytest
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.step import plot_step, von_mises
-from palpate_fem.plot.trajectories import plot_curves, plot_overview, travel_m
+from palpate_fem.plot.trajectories import plot_overview, travel_m
 from palpate_fem.result import IndentationOutcome, IndentationResult
-from palpate_fem.store.content import StoredFingertip, TrajectorySummary
+from palpate_fem.store.content import Outline, StoredFingertip, TrajectorySummary
 from palpate_fem.store.files import StoreDiskError
-from palpate_fem.store.sample import (
-    INNER_M,
-    OUTER_M,
-    indenter_outline,
-    sample_fingertip,
-    sample_trajectory,
-    sphere_outline,
-)
+
+sample: Any = importlib.import_module("stored_sample")
+INNER_M: float = sample.INNER_M
+OUTER_M: float = sample.OUTER_M
+indenter_outline: Callable[[str], Outline] = sample.indenter_outline
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
+sphere_outline: Callable[..., Outline] = sample.sphere_outline
 
 FACETS = 0.03
 """A ball of 24 facets around has 1.1 % less section than a round one, off its centre up to 3 %."""
@@ -149,14 +152,6 @@ def test_wedges_and_no_contact_are_drawn(tip: StoredFingertip, tmp_path: Path) -
     assert _is_picture(path)
 
 
-def test_curves_are_drawn(press: IndentationResult, tmp_path: Path) -> None:
-    plot_curves(press, tmp_path / "whole.png", title="normal")
-    cut = replace(press, steps=(), outcome=IndentationOutcome.DIVERGED, reason="at once")
-    plot_curves(cut, tmp_path / "nothing.png")
-    assert _is_picture(tmp_path / "whole.png")
-    assert _is_picture(tmp_path / "nothing.png")
-
-
 def test_what_cannot_be_drawn_is_refused(
     tip: StoredFingertip, press: IndentationResult, tmp_path: Path
 ) -> None:
@@ -172,7 +167,7 @@ def test_what_cannot_be_drawn_is_refused(
         plot_overview([], path)
     path.mkdir()
     with pytest.raises(StoreDiskError, match="cannot write"):
-        plot_curves(press, path)
+        plot_step(tip, press, path)
 
 
 def test_overview_counts_outcomes(press: IndentationResult, tmp_path: Path) -> None:

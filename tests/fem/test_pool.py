@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -22,7 +23,10 @@ from palpate_fem.service.jobs import (
     WorkerSetup,
 )
 from palpate_fem.service.pool import WorkerPool, WorkerState
-from palpate_fem.store.sample import sample_fingertip
+from palpate_fem.store.content import StoredFingertip
+
+sample: Any = importlib.import_module("stored_sample")
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
 
 PATIENCE_S = 10.0
 WARM, THIN, THICK = (FingertipParameters(skin_thickness_m=m) for m in (1.57e-3, 1.2e-3, 1.9e-3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import subprocess
 import sys
@@ -18,11 +19,15 @@ from palpate.errors import ConfigError, DatasetError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.service.biotac import biotac
-from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.files import StoreMismatchError, StoreTakenError
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter, export
+
+sample: Any = importlib.import_module("stored_sample")
+indenter_outline: Callable[[str], Outline] = sample.indenter_outline
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 ID = "sphere_medium/03/normal"
 FLOAT32 = 6e-8

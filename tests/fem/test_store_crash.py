@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,16 +18,20 @@ from palpate_fem.result import IndentationResult
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreDiskError, StoreTakenError
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
 
-PRELUDE = """
+sample: Any = importlib.import_module("stored_sample")
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
+
+PRELUDE = f"""
 import json, os, random, select, signal, sys, time
+sys.path.append({str(Path(__file__).parent)!r})
 from pathlib import Path
 from palpate.files.simulation_store import FINGERTIP
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.files import StoreTakenError, StoreDiskError
-from palpate_fem.store.sample import sample_fingertip, sample_trajectory
+from stored_sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
 path = Path(sys.argv[1])
 tip = sample_fingertip(divisions=4)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,11 +16,15 @@ import pytest
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.simulation_store import FINGERTIP
 from palpate_fem.result import IndentationResult
-from palpate_fem.store.content import StoredFingertip
+from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.files import StoreDiskError
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter
+
+sample: Any = importlib.import_module("stored_sample")
+indenter_outline: Callable[[str], Outline] = sample.indenter_outline
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 ID = "sphere_medium/03/normal"
 

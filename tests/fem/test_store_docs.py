@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
 
-from palpate_fem.store.sample import indenter_outline, sample_fingertip, sample_trajectory
+from palpate_fem.result import IndentationResult
+from palpate_fem.store.content import Outline, StoredFingertip
 from palpate_fem.store.schema import CONVERGENCE
 from palpate_fem.store.writer import StoreWriter
+
+sample: Any = importlib.import_module("stored_sample")
+indenter_outline: Callable[[str], Outline] = sample.indenter_outline
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +29,9 @@ def page(root: Path) -> str:
 
 def test_example_runs(page: str) -> None:
     (example,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    exec(compile(example, "simulation-store.md", "exec"), {})
+    tip = sample_fingertip()
+    given = {"tip": tip, "simulate": lambda name: sample_trajectory(tip)}
+    exec(compile(example, "simulation-store.md", "exec"), given)
 
 
 def _documented(page: str, heading: str) -> dict[str, tuple[str, str]]:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +20,9 @@ from palpate_fem.calibration.runs import SimulatedRun, simulate_all
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
-from palpate_fem.result import IndentationOutcome
+from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.sample import sample_fingertip, sample_trajectory
 from palpate_fem.store.writer import StoreWriter, export
 from palpate_fem.validation.sources import measured_from, simulated_from
 from palpate_fem.validation.validate import (
@@ -32,6 +35,10 @@ from palpate_fem.validation.validate import (
     validate,
     write_report,
 )
+
+sample: Any = importlib.import_module("stored_sample")
+sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
+sample_trajectory: Callable[..., IndentationResult] = sample.sample_trajectory
 
 TOUCH_M = 1e-3
 STIFFNESS = np.array([200.0, 0.0, 1000.0])

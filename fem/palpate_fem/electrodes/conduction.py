@@ -96,11 +96,6 @@ class FilmSolution:
         terminals = np.concatenate([np.zeros((1, free)), answer[count:]])
         return answer[self.solver.position], terminals
 
-    @property
-    def potential(self) -> Floats:
-        """Potential of the film for a unit current from E_i to the excitation [V / A], (N, 19)."""
-        return self._potentials[0]
-
     @cached_property
     def _field(self) -> tuple[Floats, Floats]:
         """Squared gradients [V^2 / (m A)^2] (F, 19) and squared jumps under discs (C, 19)."""
@@ -118,18 +113,6 @@ class FilmSolution:
         steepness = (self._access[1] / self.sigma_s_m)[:, None]
         vertical = share * self._transfer[:, None] ** 2 * steepness
         return np.asarray(mesh.to_nodes @ per_face + mesh.share_to_nodes @ vertical).T
-
-    def gradient_log_sigma(self) -> Floats:
-        """dZ_i / d ln sigma [Ohm], shape (19,); equals -Z_i without contact impedance."""
-        mesh, (steep, jump) = self.solver, self._field
-        thick = self.film[mesh.mesh.faces].mean(axis=1)
-        bulk = self.sigma_s_m * (mesh.areas * thick) @ steep
-        access = self._access[0] / self.sigma_s_m
-        return np.asarray(-bulk - (mesh.share_area * self._transfer**2 * access) @ jump)
-
-    def gradient_contact(self) -> Floats:
-        """dZ_i / dz_c [1 / m^2], shape (19,)."""
-        return np.asarray((self.solver.share_area * self._transfer**2) @ self._field[1])
 
     @property
     def _access(self) -> tuple[Floats, Floats]:
@@ -255,15 +238,6 @@ class FilmConduction:
             contact_ohm_m2=contact_ohm_m2,
             solver=self,
             factor=factor,
-        )
-
-    def impedances(self, films: Floats, *, sigma_s_m: float, contact_ohm_m2: float = 0.0) -> Floats:
-        """Z of many films (B, N) [m], shape (B, 19) [Ohm]; the same as `solve` one by one."""
-        return np.stack(
-            [
-                self.solve(film, sigma_s_m=sigma_s_m, contact_ohm_m2=contact_ohm_m2).impedance
-                for film in films
-            ]
         )
 
 

@@ -71,10 +71,6 @@ class FilmMesh:
         """Areas of the triangles [m^2], shape (F,)."""
         return np.asarray(np.linalg.norm(face_vectors(self.nodes, self.faces), axis=1))
 
-    def volume(self, film: Floats) -> float:
-        """Volume of a film of thickness (N,) [m^3]; ignores the core's curvature."""
-        return float((self.areas * film[self.faces].mean(axis=1)).sum())
-
 
 def film_mesh(
     core: RigidCore,

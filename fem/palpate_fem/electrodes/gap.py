@@ -65,11 +65,6 @@ class Gap:
             total[:, i] = np.bincount(self.nodes.ravel(), parts[:, :, i].ravel(), count)
         return total
 
-    def along(self, motion: Floats) -> Floats:
-        """Change of the gap [m], shape (N,), with small nodal displacements (V, 3) [m]."""
-        moved = np.einsum("nk,nki->ni", self.weights, motion[self.nodes])
-        return np.asarray(np.einsum("ni,ni->n", moved, self.slope))
-
 
 class GapFinder:
     """Measures gaps of a skin at the nodes of a film.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -15,7 +14,6 @@ from palpate_fem.electrodes.film import EDGE_M, film_mesh
 from palpate_fem.electrodes.gap import Gap, GapFinder, gap_adjustment, thickness
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.solid import FingertipGeometry
-from palpate_fem.result import IndentationStep
 
 Floats = NDArray[np.float64]
 
@@ -111,12 +109,6 @@ class ElectrodeModel:
         """
         return self.of_gap(self.finder.measure(position, core_force), log_sigma=log_sigma)
 
-    def of_step(
-        self, rest: Floats, step: IndentationStep, *, log_sigma: float = 0.0
-    ) -> ElectrodeResponse:
-        """Response to a simulated step; `rest` are the untouched nodes [m], shape (V, 3)."""
-        return self.respond(rest + step.displacement, step.core_force, log_sigma=log_sigma)
-
     def of_gap(self, gap: Gap, *, log_sigma: float = 0.0) -> ElectrodeResponse:
         """Response to known gaps."""
         specimen = self.specimen
@@ -135,25 +127,3 @@ class ElectrodeModel:
             _slope=counts_slope(solved.impedance, specimen),
             _by_gap=by_gap * self._adjustment.share,
         )
-
-    def counts(
-        self,
-        positions: Floats | Sequence[Floats],
-        core_forces: Floats | Sequence[Floats] | None = None,
-        *,
-        log_sigma: float = 0.0,
-    ) -> Floats:
-        """Ideal counts of many states, shape (B, 19); the same numbers as `respond` one by one.
-
-        Args:
-            positions: Nodal positions [m], shape (B, V, 3).
-            core_forces: Nodal forces of the core on the skin [N], shape (B, V, 3), or None.
-            log_sigma: As in `respond`.
-        """
-        forces = core_forces if core_forces is not None else [None] * len(positions)
-        return np.array(
-            [
-                self.respond(position, force, log_sigma=log_sigma).counts
-                for position, force in zip(positions, forces, strict=True)
-            ]
-        ).reshape(-1, self.conduction.terminals - 1)

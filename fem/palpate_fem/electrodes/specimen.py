@@ -132,7 +132,7 @@ class SpecimenParameters:
         pdc_strain_pa_n: Error of PDC for each newton, as the core bends [Pa/N].
         pdc_warmth_pa_k: Error of PDC for each kelvin above the reference temperature [Pa/K].
         cooling_share: Final cooling of the thermistor by an indenter, divided by the difference of
-            temperature and by the share of the pad that it touches [1]; see `ContactCooling`.
+            temperature and by the share of the pad that it touches [1].
         cooling_tau_s: Time constant of that cooling [s].
         pac_offset: Reading at constant pressure [counts].
         tac_offset: Reading at constant temperature [counts].
@@ -199,21 +199,6 @@ class SpecimenParameters:
                 f"floor_m = {self.floor_m} exceeds asperity_m = {self.asperity_m}",
                 remedy="give a smaller floor_m: a pressed contact has the thinner film",
             )
-
-    @property
-    def asymmetry_array(self) -> Floats:
-        """`asymmetry`, shape (19,)."""
-        return np.array(self.asymmetry)
-
-    @property
-    def gain_array(self) -> Floats:
-        """`gain`, shape (19,)."""
-        return np.array(self.gain)
-
-    @property
-    def offset_array(self) -> Floats:
-        """`offset` [counts], shape (19,)."""
-        return np.array(self.offset)
 
     def to_json(self) -> str:
         """JSON text; `from_json` restores every value to the last bit."""

@@ -15,7 +15,6 @@ from palpate_fem.plot.style import (
     AXES,
     AXIS_COLOURS,
     INK,
-    KPA,
     MM,
     OUTCOME_COLOURS,
     grid,
@@ -42,43 +41,6 @@ def travel_m(path: Floats, pose: Floats) -> Floats:
     return found
 
 
-def plot_curves(trajectory: IndentationResult, path: Path, *, title: str = "") -> None:
-    """Draw one indentation step by step: force, pressure, contact area, Newton iterations.
-
-    Args:
-        trajectory: The indentation; without steps the curves are empty.
-        path: The PNG to write.
-        title: Title; empty = the indenter.
-
-    Raises:
-        StoreDiskError: The disk is full or refuses.
-        MissingExtraError: matplotlib is not installed.
-    """
-    figure = new_figure(11, 7.5)
-    panels = figure.subplots(2, 2)
-    steps = trajectory.steps
-    travel = travel_mm(trajectory)
-    draw_force(panels[0, 0], travel, trajectory.forces)
-    pressure = KPA * np.array([step.fluid_pressure_pa for step in steps])
-    area = MM**2 * np.array([step.contact_area_m2 for step in steps])
-    for axes, values, name in (
-        (panels[0, 1], pressure, "fluid pressure [kPa]"),
-        (panels[1, 0], area, "contact area [mm²]"),
-    ):
-        axes.plot(travel, values, "o-", color=INK, lw=1.4, ms=3)
-        label(axes, "indenter travel [mm]", name)
-        grid(axes)
-    _draw_newton(panels[1, 1], trajectory)
-    ending = trajectory.outcome.value + (f": {trajectory.reason}" if trajectory.reason else "")
-    figure.suptitle(
-        f"{title or trajectory.indenter}\n{ending}, "
-        f"{len(steps)} of {len(trajectory.path) - 1} steps, {trajectory.seconds:.1f} s",
-        color=INK,
-        fontsize=11,
-    )
-    save(figure, path)
-
-
 def travel_mm(trajectory: IndentationResult) -> Floats:
     """Travel of the indenter at each step [mm], shape (K,)."""
     pose = np.array([step.pose for step in trajectory.steps]).reshape(-1, 7)
@@ -99,33 +61,6 @@ def draw_force(axes: Any, travel_mm: Floats, force: Floats, *, mark: int | None 
     label(axes, "indenter travel [mm]", "force on the BioTac [N]")
     grid(axes)
     axes.legend(fontsize=8, frameon=False)
-
-
-def _draw_newton(axes: Any, trajectory: IndentationResult) -> None:
-    """Draw iterations and factorisations as bars, and seconds as a line on its own scale."""
-    table = [step.convergence for step in trajectory.steps]
-    number = 1 + np.arange(len(table))
-    axes.bar(
-        number - 0.2, [row.iterations for row in table], 0.4, color="#7aa6c2", label="iterations"
-    )
-    axes.bar(
-        number + 0.2,
-        [row.factorisations for row in table],
-        0.4,
-        color="#c9b26d",
-        label="factorisations",
-    )
-    cut = [at for at, row in zip(number, table, strict=True) if row.increments > 1]
-    if cut:
-        axes.plot(cut, [0] * len(cut), "v", color="#d1495b", ms=6, clip_on=False, label="cut back")
-    label(axes, "step", "Newton")
-    seconds = axes.twinx()
-    seconds.plot(number, [row.seconds for row in table], color=INK, lw=1.0)
-    seconds.set_ylabel("time [s] (line)", color=INK, fontsize=9)
-    seconds.set_ylim(bottom=0)
-    seconds.tick_params(colors=INK, labelsize=8)
-    seconds.spines["top"].set_visible(False)
-    axes.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
 
 
 COLUMNS = 5

@@ -23,7 +23,6 @@ from palpate.messages import (
     SimulationConvergence,
     SimulationOutcome,
     SimulationParameters,
-    SimulationReply,
     SimulationRequest,
     SimulationStep,
 )
@@ -31,7 +30,7 @@ from palpate_fem.arrays import Floats
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.path import check_path
-from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationStep
 from palpate_fem.service.config import FemConfig
 from palpate_fem.service.fingertips import check_start, without_friction
 from palpate_fem.service.jobs import SimulationJob
@@ -152,21 +151,6 @@ def as_step(step: IndentationStep, request: SimulationRequest) -> SimulationStep
         float(step.contact_area_m2),
         np.array(step.centre_of_pressure, np.float64) if touching else None,
         _convergence(step.convergence),
-    )
-
-
-def as_reply(
-    trajectory: IndentationResult, request: SimulationRequest, mesh_sha256: bytes
-) -> SimulationReply:
-    """The reply of ``Client.simulate`` for this trajectory; only ``elapsed_s`` differs."""
-    return SimulationReply(
-        request.request_id,
-        mesh_sha256,
-        tuple(as_step(step, request) for step in trajectory.steps),
-        trajectory.reason,
-        trajectory.seconds,
-        outcome=OUTCOMES[trajectory.outcome],
-        travel_m=trajectory.travel_m,
     )
 
 

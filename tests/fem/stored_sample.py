@@ -1,4 +1,4 @@
-"""An invented fingertip and indentation, to try stores and pictures without any mechanics.
+"""An invented fingertip and indentation, for stores and pictures without any mechanics.
 
 The finger is a thick spherical shell of hexahedra, fixed on its back, around a ball; the
 indentation is a dent where a sphere would be. Only the order of magnitude of the numbers is right.
