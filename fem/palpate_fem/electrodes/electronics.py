@@ -7,7 +7,8 @@ load, whose voltage is converted with 12 bits (SP manual; learning notes, sectio
 
 Warmth, a slow response (creep) and noise change the electrodes over time, and each electrode is
 read at its own time in a frame. All states are updated exactly for any time between two readings.
-PDC, PAC, TDC and TAC are computed by the gateway's virtual finger, from the pressure on a tape.
+Pressures and temperatures follow from PDC, PAC and TDC as the SP manual says (learning notes,
+section 4.6); the gateway's virtual finger goes the other way.
 """
 
 from __future__ import annotations
@@ -193,3 +194,31 @@ def _followed(goal: Floats, ways: Floats, start: Floats) -> Floats:
         out[begin : begin + _BLOCK] = (start + np.cumsum(gain * piece, axis=0)) / grown
         start = out[min(begin + _BLOCK, len(goal)) - 1]
     return out
+
+
+PDC_PA = 36.5
+"""Pressure of one count of PDC [Pa]."""
+
+PAC_PA = 0.37
+"""Pressure of one count of PAC [Pa]."""
+
+KELVIN = 273.15
+# A thermistor of 0.6444 exp(4025 / T) Ohm against 30 kOhm; the maker states the result in this
+# form.
+BETA_K, UPPER, LOWER = 4025.0, 155183.0, 46555.0
+
+
+def pressure_of_pdc(counts: Floats, specimen: SpecimenParameters) -> Floats:
+    """Fluid pressure above ambient [Pa] for PDC [counts], any shape."""
+    return np.asarray((np.asarray(counts, np.float64) - specimen.pdc_offset) * PDC_PA)
+
+
+def pressure_of_pac(counts: Floats, specimen: SpecimenParameters) -> Floats:
+    """Vibration of the fluid pressure above 10 Hz [Pa] for PAC [counts], any shape."""
+    return np.asarray((np.asarray(counts, np.float64) - specimen.pac_offset) * PAC_PA)
+
+
+def temperature_of_tdc(counts: Floats) -> Floats:
+    """Core temperature [degrees C] for TDC [counts] in 1..4095, any shape."""
+    x = np.asarray(counts, np.float64) / FULL_SCALE
+    return np.asarray(BETA_K / np.log((UPPER - LOWER * x) / x) - KELVIN)
