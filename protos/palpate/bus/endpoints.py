@@ -7,27 +7,10 @@ A node serves an endpoint with ``Session.queryable`` (one reply) or ``Session.st
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from palpate import codec
 from palpate.codec import Codec
-from palpate.messages import (
-    FieldEstimate,
-    FieldFrame,
-    FieldRequest,
-    ModelMetadata,
-    ServiceRequest,
-    SimulationCancelReply,
-    SimulationCancelRequest,
-    SimulationReply,
-    SimulationRequest,
-    Status,
-    SynthesisEstimate,
-    Tare,
-    TareRequest,
-    WrenchZero,
-    WrenchZeroRequest,
-)
 
 Q = TypeVar("Q")
 R = TypeVar("R")
@@ -52,45 +35,31 @@ class Endpoint(Generic[Q, R]):
     per_service: bool = False
 
 
-TARE: Endpoint[TareRequest, Tare] = Endpoint(
+TARE = Endpoint(
     "tare", codec.TARE_REQUEST, codec.TARE, "tare a BioTac, or look up a tare by its id"
 )
-ZERO: Endpoint[WrenchZeroRequest, WrenchZero] = Endpoint(
-    "zero", codec.WRENCH_ZERO_REQUEST, codec.WRENCH_ZERO, "zero a force/torque sensor"
-)
-SIMULATE: Endpoint[SimulationRequest, SimulationReply] = Endpoint(
+ZERO = Endpoint("zero", codec.WRENCH_ZERO_REQUEST, codec.WRENCH_ZERO, "zero a force/torque sensor")
+SIMULATE = Endpoint(
     "simulate",
     codec.SIMULATION_REQUEST,
     codec.SIMULATION_REPLY,
     "indent the finite-element fingertip; several replies",
 )
-CANCEL_SIMULATION: Endpoint[SimulationCancelRequest, SimulationCancelReply] = Endpoint(
+CANCEL_SIMULATION = Endpoint(
     "simulate_cancel",
     codec.SIMULATION_CANCEL_REQUEST,
     codec.SIMULATION_CANCEL_REPLY,
     "stop a simulation that waits or runs",
 )
-STATUS: Endpoint[ServiceRequest, Status] = Endpoint(
+STATUS = Endpoint(
     "status", codec.SERVICE_REQUEST, codec.STATUS, "state and counters of a process", True
 )
-MODEL: Endpoint[ServiceRequest, ModelMetadata] = Endpoint(
+MODEL = Endpoint(
     "model", codec.SERVICE_REQUEST, codec.MODEL_METADATA, "metadata of the served bundle", True
 )
-ESTIMATE_FIELD: Endpoint[FieldRequest, FieldEstimate] = Endpoint(
+ESTIMATE_FIELD = Endpoint(
     "estimate", codec.FIELD_REQUEST, codec.FIELD_ESTIMATE, "field of one electrode frame", True
 )
-SYNTHESISE: Endpoint[FieldFrame, SynthesisEstimate] = Endpoint(
+SYNTHESISE = Endpoint(
     "synthesise", codec.FIELD_FRAME, codec.SYNTHESIS_ESTIMATE, "tared counts of one field", True
 )
-
-ENDPOINTS: tuple[Endpoint[Any, Any], ...] = (
-    TARE,
-    ZERO,
-    SIMULATE,
-    CANCEL_SIMULATION,
-    STATUS,
-    MODEL,
-    ESTIMATE_FIELD,
-    SYNTHESISE,
-)
-"""All questions."""

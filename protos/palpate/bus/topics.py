@@ -22,20 +22,7 @@ from palpate import codec
 from palpate.codec import Codec
 from palpate.config import check_name
 from palpate.errors import WireError
-from palpate.messages import (
-    ElectrodeFrame,
-    FeatureEstimate,
-    FieldEstimate,
-    FieldFrame,
-    IndenterPoseFrame,
-    RobotPoseFrame,
-    SimulationProgress,
-    Stamp,
-    Status,
-    SynthesisEstimate,
-    Tare,
-    WrenchFrame,
-)
+from palpate.messages import Stamp
 
 M = TypeVar("M")
 
@@ -69,19 +56,19 @@ class Topic(Generic[M]):
         codec: Its message.
         rate_hz: Usual rate [Hz]; 0 = on events.
         priority: Zenoh priority.
+        doc: One line for people.
         recorded: Whether the recorder keeps it.
         contiguous: Whether its stamps' sequences have no holes unless the bus lost something.
         per_service: Whether its key names a service instead of a sensor.
-        doc: One line for people.
     """
 
     name: str
     codec: Codec[M]
     rate_hz: float
     priority: Priority
-    recorded: bool
-    contiguous: bool
     doc: str
+    recorded: bool = True
+    contiguous: bool = False
     per_service: bool = False
 
     @property
@@ -91,95 +78,59 @@ class Topic(Generic[M]):
 
     def stamp_of(self, message: M) -> Stamp | None:
         """Stamp of a message; an estimate's is its source's. None where it has none."""
-        stamp = getattr(message, "stamp", None)
-        if stamp is None:
-            stamp = getattr(message, "source", None)
+        stamp = getattr(message, "stamp", None) or getattr(message, "source", None)
         return stamp if isinstance(stamp, Stamp) else None
 
 
 _RT = Priority.REAL_TIME
-ELECTRODES: Topic[ElectrodeFrame] = Topic(
-    "electrodes", codec.ELECTRODE_FRAME, 100, _RT, True, True, "raw counts of one BioTac"
+ELECTRODES = Topic(
+    "electrodes", codec.ELECTRODE_FRAME, 100, _RT, "raw counts of one BioTac", contiguous=True
 )
-WRENCH: Topic[WrenchFrame] = Topic(
-    "wrench", codec.WRENCH_FRAME, 100, _RT, True, True, "force and torque on the BioTac"
+WRENCH = Topic(
+    "wrench", codec.WRENCH_FRAME, 100, _RT, "force and torque on the BioTac", contiguous=True
 )
-POSE: Topic[IndenterPoseFrame] = Topic(
-    "pose", codec.INDENTER_POSE_FRAME, 100, _RT, True, True, "where the indenter is"
-)
-ROBOT_POSE: Topic[RobotPoseFrame] = Topic(
+POSE = Topic("pose", codec.INDENTER_POSE_FRAME, 100, _RT, "where the indenter is", contiguous=True)
+ROBOT_POSE = Topic(
     "robot_pose",
     codec.ROBOT_POSE_FRAME,
     250,
     _RT,
-    True,
-    False,
     "pose of a robot's flange, published by its program",
 )
-FIELD_TRUTH: Topic[FieldFrame] = Topic(
+FIELD_TRUTH = Topic(
     "field_truth",
     codec.FIELD_FRAME,
     20,
     Priority.DATA_HIGH,
-    True,
-    False,
     "known displacement of each skin node",
 )
-TARE: Topic[Tare] = Topic(
-    "tare", codec.TARE, 0, Priority.DATA_HIGH, True, False, "a new baseline of one sensor"
+TARE = Topic("tare", codec.TARE, 0, Priority.DATA_HIGH, "a new baseline of one sensor")
+FEATURES = Topic("features", codec.FEATURE_ESTIMATE, 100, _RT, "contact location and net force")
+FIELD = Topic(
+    "field", codec.FIELD_ESTIMATE, 20, Priority.DATA_HIGH, "displacement of each skin node"
 )
-FEATURES: Topic[FeatureEstimate] = Topic(
-    "features", codec.FEATURE_ESTIMATE, 100, _RT, True, False, "contact location and net force"
-)
-FIELD: Topic[FieldEstimate] = Topic(
-    "field",
-    codec.FIELD_ESTIMATE,
-    20,
-    Priority.DATA_HIGH,
-    True,
-    False,
-    "displacement of each skin node",
-)
-SYNTHESIS: Topic[SynthesisEstimate] = Topic(
-    "synthesis", codec.SYNTHESIS_ESTIMATE, 100, _RT, True, False, "tared counts from a field"
-)
-SIMULATION_PROGRESS: Topic[SimulationProgress] = Topic(
+SYNTHESIS = Topic("synthesis", codec.SYNTHESIS_ESTIMATE, 100, _RT, "tared counts from a field")
+SIMULATION_PROGRESS = Topic(
     "simulation_progress",
     codec.SIMULATION_PROGRESS,
     0,
     Priority.DATA,
-    False,
-    False,
     "how far a finite-element simulation is",
+    recorded=False,
 )
-STATUS: Topic[Status] = Topic(
+STATUS = Topic(
     "status",
     codec.STATUS,
     1,
     Priority.BACKGROUND,
-    True,
-    False,
     "state and counters of a process",
     per_service=True,
 )
 
 TOPICS: dict[str, Topic[Any]] = {
-    topic.name: topic
-    for topic in (
-        ELECTRODES,
-        WRENCH,
-        POSE,
-        ROBOT_POSE,
-        FIELD_TRUTH,
-        TARE,
-        FEATURES,
-        FIELD,
-        SYNTHESIS,
-        SIMULATION_PROGRESS,
-        STATUS,
-    )
+    value.name: value for value in tuple(globals().values()) if isinstance(value, Topic)
 }
-"""All streams by name."""
+"""All streams above by name."""
 
 SCHEMAS: dict[str, Codec[Any]] = {item.schema: item for item in codec.CODECS}
 """All codecs by the full name of their message."""

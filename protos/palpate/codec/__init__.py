@@ -1,5 +1,7 @@
 """Values to bytes and back, checked both ways. One ``Codec`` for each message of ``palpate.v1``."""
 
+from typing import Any
+
 from palpate.codec.base import Codec
 from palpate.codec.estimates import FEATURE_ESTIMATE, FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
 from palpate.codec.frames import (
@@ -28,31 +30,10 @@ from palpate.codec.simulation import (
     SIMULATION_REQUEST,
 )
 
-CODECS = (
-    ELECTRODE_FRAME,
-    WRENCH_FRAME,
-    INDENTER_POSE_FRAME,
-    ROBOT_POSE_FRAME,
-    FIELD_FRAME,
-    FEATURE_ESTIMATE,
-    FIELD_ESTIMATE,
-    SYNTHESIS_ESTIMATE,
-    TARE,
-    TARE_REQUEST,
-    WRENCH_ZERO,
-    WRENCH_ZERO_REQUEST,
-    FIELD_REQUEST,
-    SERVICE_REQUEST,
-    STATUS,
-    MODEL_METADATA,
-    ERROR,
-    SIMULATION_REQUEST,
-    SIMULATION_PROGRESS,
-    SIMULATION_REPLY,
-    SIMULATION_CANCEL_REQUEST,
-    SIMULATION_CANCEL_REPLY,
+CODECS: tuple[Codec[Any], ...] = tuple(
+    value for value in globals().values() if isinstance(value, Codec)
 )
-"""All codecs of the contract."""
+"""All codecs of the contract: what is imported above."""
 
 __all__ = [
     "CODECS",

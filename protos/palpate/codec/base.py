@@ -180,21 +180,21 @@ def pose_to_wire(pose: Pose, what: str) -> common_pb2.Pose:
 
 
 def field_from_wire(
-    values: object, width: int, what: str, *, rows: int | None = None
+    values: object, width: int, what: str, *, rows: int | None = None, deviation: bool = False
 ) -> FloatArray:
     """Check and convert a packed float field to ``(V, width)`` or, with width 1, ``(V,)``."""
     array = np.asarray(values, dtype=np.float32)
-    return check_field(array if width == 1 else _rows(array, width, what), width, what, rows=rows)
+    if width > 1:
+        if array.size % width:
+            reject("shape", f"{what} has {array.size} values, not a multiple of {width}")
+        array = array.reshape(-1, width)
+    return check_field(array, width, what, rows=rows, deviation=deviation)
 
 
-def _rows(array: FloatArray, width: int, what: str) -> FloatArray:
-    if array.size % width:
-        reject("shape", f"{what} has {array.size} values, not a multiple of {width}")
-    return array.reshape(-1, width)
-
-
-def check_field(array: FloatArray, width: int, what: str, *, rows: int | None = None) -> FloatArray:
-    """Check shape, type and finiteness of a field."""
+def check_field(
+    array: FloatArray, width: int, what: str, *, rows: int | None = None, deviation: bool = False
+) -> FloatArray:
+    """Check shape, type and finiteness of a field; a standard deviation is not negative."""
     shape_good = array.ndim == 1 if width == 1 else array.ndim == 2 and array.shape[1] == width
     if not shape_good or array.shape[0] == 0 or (rows is not None and array.shape[0] != rows):
         wanted = f"({rows or 'V'},)" if width == 1 else f"({rows or 'V'}, {width})"
@@ -204,6 +204,8 @@ def check_field(array: FloatArray, width: int, what: str, *, rows: int | None = 
     if not np.isfinite(array).all():
         bad = int(np.argwhere(~np.isfinite(array))[0][0])
         reject("non_finite", f"{what} is not finite at row {bad}")
+    if deviation and array.min() < 0:
+        reject("negative_sd", f"{what} is negative")
     return array
 
 

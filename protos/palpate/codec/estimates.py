@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from palpate.codec.base import (
-    Codec,
     check_digest,
     check_electrodes,
     check_field,
@@ -19,13 +16,8 @@ from palpate.codec.base import (
     vector3_from_wire,
     vector3_to_wire,
 )
-from palpate.messages import FeatureEstimate, FieldEstimate, FloatArray, SynthesisEstimate
+from palpate.messages import FeatureEstimate, FieldEstimate, SynthesisEstimate
 from palpate.v1 import estimates_pb2
-
-
-def _check_sd(sd: FloatArray, what: str) -> None:
-    if np.min(sd) < 0:
-        reject("negative_sd", f"{what} is negative")
 
 
 def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
@@ -83,8 +75,7 @@ def _field_from_wire(msg: estimates_pb2.FieldEstimate) -> FieldEstimate:
     nodes = displacement.shape[0]
     sd = contact_force = None
     if msg.displacement_sd:
-        sd = field_from_wire(msg.displacement_sd, 1, "displacement_sd", rows=nodes)
-        _check_sd(sd, "displacement_sd")
+        sd = field_from_wire(msg.displacement_sd, 1, "displacement_sd", rows=nodes, deviation=True)
     if msg.contact_force:
         contact_force = field_from_wire(msg.contact_force, 3, "contact_force", rows=nodes)
     return FieldEstimate(
@@ -111,8 +102,7 @@ def _field_encode(estimate: FieldEstimate) -> bytes:
     stamp_to_wire(estimate.source, msg.source)
     payload = msg.SerializeToString() + splice(6, displacement)
     if estimate.displacement_sd is not None:
-        sd = check_field(estimate.displacement_sd, 1, "displacement_sd", rows=nodes)
-        _check_sd(sd, "displacement_sd")
+        sd = check_field(estimate.displacement_sd, 1, "displacement_sd", rows=nodes, deviation=True)
         payload += splice(7, sd)
     if estimate.contact_force is not None:
         payload += splice(8, check_field(estimate.contact_force, 3, "contact_force", rows=nodes))
@@ -123,8 +113,9 @@ def _synthesis_from_wire(msg: estimates_pb2.SynthesisEstimate) -> SynthesisEstim
     counts = check_electrodes(field_from_wire(msg.tared_counts, 1, "tared_counts"), "tared_counts")
     sd = None
     if msg.tared_counts_sd:
-        sd = field_from_wire(msg.tared_counts_sd, 1, "tared_counts_sd", rows=counts.shape[0])
-        _check_sd(sd, "tared_counts_sd")
+        sd = field_from_wire(
+            msg.tared_counts_sd, 1, "tared_counts_sd", rows=counts.shape[0], deviation=True
+        )
     return SynthesisEstimate(
         stamp_from_wire(msg.source),
         check_serial(msg.sensor_serial),
@@ -145,18 +136,15 @@ def _synthesis_encode(estimate: SynthesisEstimate) -> bytes:
     stamp_to_wire(estimate.source, msg.source)
     payload = msg.SerializeToString() + splice(5, counts)
     if estimate.tared_counts_sd is not None:
-        sd = check_field(estimate.tared_counts_sd, 1, "tared_counts_sd", rows=counts.shape[0])
-        _check_sd(sd, "tared_counts_sd")
+        sd = check_field(
+            estimate.tared_counts_sd, 1, "tared_counts_sd", rows=counts.shape[0], deviation=True
+        )
         payload += splice(6, sd)
     return payload
 
 
-FEATURE_ESTIMATE: Codec[FeatureEstimate] = codec_of(
-    estimates_pb2.FeatureEstimate, _features_encode, _features_from_wire
-)
-FIELD_ESTIMATE: Codec[FieldEstimate] = codec_of(
-    estimates_pb2.FieldEstimate, _field_encode, _field_from_wire
-)
-SYNTHESIS_ESTIMATE: Codec[SynthesisEstimate] = codec_of(
+FEATURE_ESTIMATE = codec_of(estimates_pb2.FeatureEstimate, _features_encode, _features_from_wire)
+FIELD_ESTIMATE = codec_of(estimates_pb2.FieldEstimate, _field_encode, _field_from_wire)
+SYNTHESIS_ESTIMATE = codec_of(
     estimates_pb2.SynthesisEstimate, _synthesis_encode, _synthesis_from_wire
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from palpate.codec.base import (
-    Codec,
     check_digest,
     check_field,
     check_serial,
@@ -187,16 +186,10 @@ def _field_encode(frame: FieldFrame) -> bytes:
     return msg.SerializeToString() + splice(4, displacement)
 
 
-ELECTRODE_FRAME: Codec[ElectrodeFrame] = codec_of(
-    frames_pb2.ElectrodeFrame, _electrodes_encode, electrodes_from_wire
-)
-WRENCH_FRAME: Codec[WrenchFrame] = codec_of(
-    frames_pb2.WrenchFrame, _wrench_encode, _wrench_from_wire
-)
-INDENTER_POSE_FRAME: Codec[IndenterPoseFrame] = codec_of(
-    frames_pb2.IndenterPoseFrame, _pose_encode, _pose_from_wire
-)
-FIELD_FRAME: Codec[FieldFrame] = codec_of(frames_pb2.FieldFrame, _field_encode, _field_from_wire)
+ELECTRODE_FRAME = codec_of(frames_pb2.ElectrodeFrame, _electrodes_encode, electrodes_from_wire)
+WRENCH_FRAME = codec_of(frames_pb2.WrenchFrame, _wrench_encode, _wrench_from_wire)
+INDENTER_POSE_FRAME = codec_of(frames_pb2.IndenterPoseFrame, _pose_encode, _pose_from_wire)
+FIELD_FRAME = codec_of(frames_pb2.FieldFrame, _field_encode, _field_from_wire)
 
 
 _TIMES = 1 << 63
@@ -243,6 +236,4 @@ def _robot_encode(frame: RobotPoseFrame) -> bytes:
     return msg.SerializeToString()
 
 
-ROBOT_POSE_FRAME: Codec[RobotPoseFrame] = codec_of(
-    robot_pb2.RobotPoseFrame, _robot_encode, _robot_from_wire
-)
+ROBOT_POSE_FRAME = codec_of(robot_pb2.RobotPoseFrame, _robot_encode, _robot_from_wire)

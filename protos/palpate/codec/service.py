@@ -44,10 +44,12 @@ from palpate.messages import (
 )
 from palpate.v1 import service_pb2
 
-# A newer gateway may know more of them.
+# A newer gateway may know more states and faults than this palpate: they become UNKNOWN.
 _SENSOR_STATES = {int(state): state for state in SensorState}
 _FAULT_KINDS = {int(kind): kind for kind in FaultKind}
-_LINE_MAX = 1024
+_STATES = {int(state): state for state in ServiceState}
+_CODES = {int(code): code for code in ErrorCode}
+_LINE_MAX, _TEXT_MAX = 1024, 4096  # [characters]
 _TIME_MAX = (1 << 63) - 1
 
 
@@ -61,7 +63,7 @@ def sensor_status_from_wire(msg: service_pb2.SensorStatus) -> SensorStatus:
             ChannelFault(_FAULT_KINDS.get(fault.kind, FaultKind.UNKNOWN), tuple(fault.channels))
             for fault in msg.faults
         ),
-        _check_line(msg.message, "message of a sensor"),
+        _check_text(msg.message, "message of a sensor", most=_LINE_MAX),
     )
 
 
@@ -87,9 +89,9 @@ def sensor_states_to_wire(
     ]
 
 
-def _check_line(text: str, what: str) -> str:
-    if len(text) > _LINE_MAX:
-        reject("text", f"{what} has {len(text)} characters, at most {_LINE_MAX} are allowed")
+def _check_text(text: str, what: str, *, most: int = _TEXT_MAX) -> str:
+    if len(text) > most:
+        reject("text", f"{what} has {len(text)} characters, at most {most} are allowed")
     return text
 
 
@@ -104,7 +106,7 @@ def _zero_from_wire(msg: service_pb2.WrenchZero) -> WrenchZero:
         reject("readings_averaged", "a zero of no readings")
     return WrenchZero(
         check_serial(msg.sensor_serial),
-        _check_line(msg.device, "device"),
+        _check_text(msg.device, "device", most=_LINE_MAX),
         _check_time(msg.monotonic_ns),
         _check_time(msg.wall_ns),
         vector3_from_wire(msg.force_before, "force_before"),
@@ -131,23 +133,12 @@ def _zero_encode(zero: WrenchZero) -> bytes:
     return msg.SerializeToString()
 
 
-WRENCH_ZERO: Codec[WrenchZero] = codec_of(service_pb2.WrenchZero, _zero_encode, _zero_from_wire)
+WRENCH_ZERO = codec_of(service_pb2.WrenchZero, _zero_encode, _zero_from_wire)
 WRENCH_ZERO_REQUEST: Codec[WrenchZeroRequest] = codec_of(
     service_pb2.WrenchZeroRequest,
     lambda r: service_pb2.WrenchZeroRequest(readings=r.readings).SerializeToString(),
     lambda msg: WrenchZeroRequest(msg.readings),
 )
-
-
-_STATES = {int(state): state for state in ServiceState}
-_CODES = {int(code): code for code in ErrorCode}
-_TEXT_MAX = 4096
-
-
-def _check_text(text: str, what: str) -> str:
-    if len(text) > _TEXT_MAX:
-        reject("text", f"{what} has {len(text)} characters, at most {_TEXT_MAX} are allowed")
-    return text
 
 
 def _tare_from_wire(msg: service_pb2.Tare) -> Tare:
@@ -300,7 +291,7 @@ def _field_request_encode(request: FieldRequest) -> bytes:
     return head.SerializeToString() + delimited(2, ELECTRODE_FRAME.encode(request.frame))
 
 
-TARE: Codec[Tare] = codec_of(service_pb2.Tare, _tare_encode, _tare_from_wire)
+TARE = codec_of(service_pb2.Tare, _tare_encode, _tare_from_wire)
 TARE_REQUEST: Codec[TareRequest] = codec_of(
     service_pb2.TareRequest,
     lambda r: service_pb2.TareRequest(tare_id=r.tare_id, frames=r.frames).SerializeToString(),
@@ -309,13 +300,9 @@ TARE_REQUEST: Codec[TareRequest] = codec_of(
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()
 )
-FIELD_REQUEST: Codec[FieldRequest] = codec_of(
-    service_pb2.FieldRequest, _field_request_encode, _field_request_from_wire
-)
-STATUS: Codec[Status] = codec_of(service_pb2.Status, _status_encode, _status_from_wire)
-MODEL_METADATA: Codec[ModelMetadata] = codec_of(
-    service_pb2.ModelMetadata, _metadata_encode, _metadata_from_wire
-)
+FIELD_REQUEST = codec_of(service_pb2.FieldRequest, _field_request_encode, _field_request_from_wire)
+STATUS = codec_of(service_pb2.Status, _status_encode, _status_from_wire)
+MODEL_METADATA = codec_of(service_pb2.ModelMetadata, _metadata_encode, _metadata_from_wire)
 ERROR: Codec[ErrorReply] = codec_of(
     service_pb2.Error,
     lambda error: _fill_error(error, service_pb2.Error()).SerializeToString(),

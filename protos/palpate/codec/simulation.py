@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,12 +38,9 @@ from palpate.messages import (
 )
 from palpate.v1 import simulation_pb2
 
-_PARAMETERS = (
-    "skin_thickness_m",
-    "shear_modulus_pa",
-    "friction_coefficient",
-    "fluid_volume_m3",
-)
+C = TypeVar("C")
+
+_PARAMETERS = tuple(SimulationParameters.__dataclass_fields__)
 MAX_POSES = 10_000
 """Longest path of a request."""
 
@@ -127,26 +125,18 @@ def progress_to_wire(progress: SimulationProgress) -> simulation_pb2.SimulationP
     )
 
 
-def _cancel_from_wire(msg: simulation_pb2.SimulationCancelRequest) -> SimulationCancelRequest:
-    return SimulationCancelRequest(check_serial(msg.request_id, "request_id"))
-
-
-def _cancel_encode(request: SimulationCancelRequest) -> bytes:
-    return simulation_pb2.SimulationCancelRequest(
-        request_id=check_serial(request.request_id, "request_id")
-    ).SerializeToString()
-
-
-SIMULATION_REQUEST: Codec[SimulationRequest] = codec_of(
-    simulation_pb2.SimulationRequest, _request_encode, _request_from_wire
-)
+SIMULATION_REQUEST = codec_of(simulation_pb2.SimulationRequest, _request_encode, _request_from_wire)
 SIMULATION_PROGRESS: Codec[SimulationProgress] = codec_of(
     simulation_pb2.SimulationProgress,
     lambda progress: progress_to_wire(progress).SerializeToString(),
     progress_from_wire,
 )
 SIMULATION_CANCEL_REQUEST: Codec[SimulationCancelRequest] = codec_of(
-    simulation_pb2.SimulationCancelRequest, _cancel_encode, _cancel_from_wire
+    simulation_pb2.SimulationCancelRequest,
+    lambda request: simulation_pb2.SimulationCancelRequest(
+        request_id=check_serial(request.request_id, "request_id")
+    ).SerializeToString(),
+    lambda msg: SimulationCancelRequest(check_serial(msg.request_id, "request_id")),
 )
 SIMULATION_CANCEL_REPLY: Codec[SimulationCancelReply] = codec_of(
     simulation_pb2.SimulationCancelReply,
@@ -167,32 +157,16 @@ def _doubles(values: Sequence[float], count: int, what: str) -> DoubleArray:
     return array
 
 
-def _convergence_from_wire(
-    msg: simulation_pb2.SimulationConvergence, what: str
-) -> SimulationConvergence:
-    return SimulationConvergence(
-        msg.increments,
-        msg.iterations,
-        msg.factorisations,
-        check_positive(msg.residual, f"{what}.residual"),
-        check_positive(msg.volume_error, f"{what}.volume_error"),
-        check_positive(msg.penetration_m, f"{what}.penetration_m"),
-        check_positive(msg.seconds, f"{what}.seconds"),
-    )
-
-
-def _convergence_to_wire(
-    value: SimulationConvergence, what: str
-) -> simulation_pb2.SimulationConvergence:
-    return simulation_pb2.SimulationConvergence(
-        increments=value.increments,
-        iterations=value.iterations,
-        factorisations=value.factorisations,
-        residual=check_positive(value.residual, f"{what}.residual"),
-        volume_error=check_positive(value.volume_error, f"{what}.volume_error"),
-        penetration_m=check_positive(value.penetration_m, f"{what}.penetration_m"),
-        seconds=check_positive(value.seconds, f"{what}.seconds"),
-    )
+def _convergence(source: Any, target: Callable[..., C], what: str) -> C:
+    """Check and convert to or from the wire: both sides name the numbers alike."""
+    counts = {
+        name: getattr(source, name) for name in ("increments", "iterations", "factorisations")
+    }
+    sizes = {
+        name: check_positive(getattr(source, name), f"{what}.{name}")
+        for name in ("residual", "volume_error", "penetration_m", "seconds")
+    }
+    return target(**counts, **sizes)
 
 
 def _step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> SimulationStep:
@@ -213,7 +187,7 @@ def _step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> Simulation
     if msg.centre_of_pressure:
         centre = _doubles(msg.centre_of_pressure, 3, f"{what}.centre_of_pressure")
     if msg.HasField("convergence"):
-        convergence = _convergence_from_wire(msg.convergence, f"{what}.convergence")
+        convergence = _convergence(msg.convergence, SimulationConvergence, f"{what}.convergence")
     return SimulationStep(
         pose_from_wire(msg.pose_sensor_indenter, f"{what}.pose_sensor_indenter"),
         force,
@@ -251,7 +225,11 @@ def _step_encode(step: SimulationStep, what: str) -> bytes:
         centre = _doubles(step.centre_of_pressure, 3, f"{what}.centre_of_pressure")  # type: ignore[arg-type]
         tail.centre_of_pressure.extend(centre.tolist())
     if step.convergence is not None:
-        tail.convergence.CopyFrom(_convergence_to_wire(step.convergence, f"{what}.convergence"))
+        tail.convergence.CopyFrom(
+            _convergence(
+                step.convergence, simulation_pb2.SimulationConvergence, f"{what}.convergence"
+            )
+        )
     return payload + tail.SerializeToString()
 
 
@@ -296,6 +274,4 @@ def _reply_encode(reply: SimulationReply) -> bytes:
     return head.SerializeToString() + b"".join(steps) + tail.SerializeToString()
 
 
-SIMULATION_REPLY: Codec[SimulationReply] = codec_of(
-    simulation_pb2.SimulationReply, _reply_encode, _reply_from_wire
-)
+SIMULATION_REPLY = codec_of(simulation_pb2.SimulationReply, _reply_encode, _reply_from_wire)
