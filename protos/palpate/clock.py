@@ -34,10 +34,7 @@ def now() -> tuple[int, int]:
 def age_s(stamp: Stamp, *, monotonic_ns: int | None = None, wall_ns: int | None = None) -> float:
     """Age of a reading [s]: by the monotonic clock on the same host and boot, else by wall clocks.
 
-    Args:
-        stamp: The reading's stamp.
-        monotonic_ns: This host's monotonic clock [ns]; None = now.
-        wall_ns: This host's wall clock [ns]; None = now.
+    The times are this host's clocks [ns]; None = now.
     """
     if stamp.clock_id == CLOCK_ID:
         now_ns = time.monotonic_ns() if monotonic_ns is None else monotonic_ns

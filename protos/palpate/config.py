@@ -25,11 +25,7 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 
 
 def check_name(name: str, what: str = "name") -> str:
-    """Check that a name may be part of a key, and return it.
-
-    Args:
-        name: The name.
-        what: What it names, for the error.
+    """Check that a name may be part of a key, and return it; ``what`` says what it names.
 
     Raises:
         ConfigError: It may not be; the error names it and the rule.
@@ -129,12 +125,7 @@ def is_loopback(host: str) -> bool:
 
 
 def parse_config(model: type[C], values: Mapping[str, Any], *, where: str) -> C:
-    """Build a configuration and translate what is wrong with it.
-
-    Args:
-        model: The configuration's class.
-        values: Its keys and values, e.g. a TOML table.
-        where: File or table the values come from, for the error.
+    """Build a configuration from e.g. a TOML table, and translate what is wrong with it.
 
     Raises:
         ConfigError: Names ``where``, the key, and for an unknown key the nearest known one.

@@ -1,23 +1,6 @@
 """Errors of palpate: what was wrong, by name, and what to do about it.
 
-::
-
-    PalpateError
-    ├── ConfigError(ValueError)          a file, key or flag is wrong; names key and file
-    ├── MissingExtraError(ImportError)   an optional dependency is not installed; gives install line
-    ├── DeviceError(OSError)             a sensor or its recording
-    │   ├── DeviceLost                   it was there and is gone
-    │   ├── DeviceTimeout(TimeoutError)  it did not answer in time
-    │   └── RecordingError               a log or record is truncated or damaged
-    ├── WireError(ValueError)            bytes that do not decode or break the contract
-    ├── LinkError(OSError)               no router, port in use, session lost
-    ├── StreamTimeout(TimeoutError)      nothing arrived in time
-    ├── StaleError(TimeoutError)         the newest that arrived is too old to be used
-    ├── BundleError(ValueError)          a model bundle breaks its contract
-    ├── DatasetError(ValueError)         a data set breaks its schema
-    ├── SimulationError(RuntimeError)    a simulation cannot be run or did not converge
-    └── RemoteError                      a service answered with a typed error
-
+All are ``PalpateError`` and a built-in error as well; docs/conventions.md shows the tree.
 Each carries ``remedy``: one sentence that says what to do. ``str(error)`` holds both.
 """
 
@@ -45,12 +28,15 @@ class ErrorCode(IntEnum):
 class PalpateError(Exception):
     """Base of all errors that palpate raises on purpose.
 
-    Args:
+    Attributes:
+        code: Its code on the wire.
         problem: What was wrong, naming the file, key, channel or message.
         remedy: What to do about it.
+        retry_after_s: Ask again after this time [s]; 0 = do not.
     """
 
     code = ErrorCode.INTERNAL
+    retry_after_s = 0.0
 
     def __init__(self, problem: str, *, remedy: str) -> None:
         super().__init__(f"{problem} -> {remedy}")
@@ -59,7 +45,7 @@ class PalpateError(Exception):
 
 
 class ConfigError(PalpateError, ValueError):
-    """A configuration file, key or flag is wrong."""
+    """A configuration file, key or flag is wrong; names key and file."""
 
     code = ErrorCode.INVALID_REQUEST
 
@@ -98,10 +84,7 @@ class RecordingError(DeviceError):
 class WireError(PalpateError, ValueError):
     """Bytes do not decode, break the contract, or speak another version of it.
 
-    Args:
-        problem: What was wrong.
-        remedy: What to do.
-        reason: Short name to count rejects by, e.g. ``"electrode_count"``.
+    Rejects are counted by ``reason``, a short name, e.g. ``"electrode_count"``.
     """
 
     code = ErrorCode.WRONG_CONTRACT
@@ -148,14 +131,7 @@ class SimulationError(PalpateError, RuntimeError):
 
 
 class RemoteError(PalpateError):
-    """A service answered a query with a typed error.
-
-    Args:
-        problem: The service's message.
-        remedy: The service's remedy.
-        code: The service's code.
-        retry_after_s: Ask again after this time [s]; 0 = do not.
-    """
+    """A service answered a query with a typed error; problem, remedy and code are the service's."""
 
     def __init__(
         self, problem: str, *, remedy: str, code: ErrorCode, retry_after_s: float = 0.0

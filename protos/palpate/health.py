@@ -148,11 +148,7 @@ class Health:
 class HealthReporter(Closing):
     """Publishes ``Status`` once a second and on each change of state, and answers when asked.
 
-    Args:
-        session: The bus.
-        health: What to report.
-        period_s: Time between reports [s].
-        refresh: Called before each report, e.g. to take over a subscriber's counters.
+    ``refresh`` is called before each report, e.g. to take over a subscriber's counters.
     """
 
     def __init__(
@@ -192,6 +188,8 @@ class HealthReporter(Closing):
             except PalpateError as error:
                 if not self._stop.is_set():
                     _log.warning("status not published: %s", error)
+            # States that change faster than this share a report; `changed` is cleared before the
+            # status is read, so that a change during the report is published next.
             self._stop.wait(_APART_S)
             self._health.changed.wait(self._period_s)
 

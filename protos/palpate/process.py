@@ -34,14 +34,10 @@ class Closing(ABC):
 
 
 def require(module: str, *, extra: str) -> ModuleType:
-    """Import an optional dependency.
-
-    Args:
-        module: Name to import, e.g. ``"onnxruntime"``.
-        extra: The extra of the palpate distribution that installs it.
+    """Import an optional dependency, e.g. ``"onnxruntime"``.
 
     Raises:
-        MissingExtraError: It is not installed.
+        MissingExtraError: It is not installed; ``extra`` of palpate installs it.
     """
     try:
         return importlib.import_module(module)

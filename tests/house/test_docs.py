@@ -146,11 +146,23 @@ def test_generated_documents_are_fresh(program: str) -> None:
 
 
 def test_tree_of_errors_is_the_one_in_the_code() -> None:
-    assert errors.__doc__
-    drawn = [line.strip() for line in errors.__doc__.splitlines() if line.startswith("    ")]
     page = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
     (block,) = [block for block in FENCE.findall(page) if block.startswith("PalpateError")]
-    assert [line.strip() for line in block.splitlines()] == drawn
+    drawn: dict[str, tuple[str, ...]] = {}
+    above: list[str] = []
+    for line in block.splitlines():
+        found = re.match(r"([│├└─ ]*)(\w+)(?:\((\w+)\))?", line)
+        assert found, line
+        stem, name, builtin = found.groups()
+        del above[len(stem) // 4 :]
+        drawn[name] = (*above[-1:], *([builtin] if builtin else []))
+        above.append(name)
+    coded = {
+        name: tuple(base.__name__ for base in value.__bases__)
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and issubclass(value, errors.PalpateError)
+    }
+    assert drawn == coded | {"PalpateError": ()}
 
 
 def _electrodes() -> tuple[Any, Any]:

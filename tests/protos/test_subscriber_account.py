@@ -179,7 +179,7 @@ def test_a_tap_skips_and_counts_what_has_no_address(frame_of: FrameOf) -> None:
     session: Any = SimpleNamespace(
         declare_subscriber=lambda key, callback: SimpleNamespace(undeclare=lambda: None)
     )
-    tap = Tap(session, [(ELECTRODES, "any")], delivery=Delivery.QUEUE, capacity=10)
+    tap = Tap(session, ["any"], delivery=Delivery.QUEUE, capacity=10)
     payload = ELECTRODES.codec.encode(frame_of(1))
     for key in ("no/key/of/ours", sensor_key("lab", "finger", "electrodes")):
         tap._on_sample(

@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import zenoh
 
@@ -138,12 +138,9 @@ def open_zenoh(link: LinkConfig, mode: str) -> zenoh.Session:
 def run_router(
     listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
 ) -> None:
-    """Run the router until ``stop`` is set.
+    """Run the router at endpoints, e.g. ``("tcp/127.0.0.1:7447",)``, until ``stop`` is set.
 
-    Args:
-        listen: Endpoints, e.g. ``("tcp/127.0.0.1:7447",)``.
-        stop: Set it to end.
-        link: Lease and certificates; None = defaults.
+    Lease and certificates are those of ``link``; None = defaults.
 
     Raises:
         LinkError: A port is in use.
@@ -162,11 +159,7 @@ Q = TypeVar("Q")
 R = TypeVar("R")
 
 
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-K = TypeVar("K", bound=_Closable)
+K = TypeVar("K", bound=Closing)
 
 
 class Session(Closing):
@@ -174,6 +167,9 @@ class Session(Closing):
 
     A process that ends with an open Zenoh session may hang in its thread shutdown; ``with`` closes
     it on every path.
+
+    Methods take the name of a ``sensor`` for its topics and endpoints; for those of a process, the
+    names of its ``service`` and ``instance``. Where many can be meant, ``"*"`` stands for any.
     """
 
     def __init__(self, raw: zenoh.Session, station: str) -> None:
@@ -183,16 +179,13 @@ class Session(Closing):
 
     @classmethod
     def open(cls, link: LinkConfig, *, station: str = "lab") -> Self:
-        """Join the bus.
-
-        Args:
-            link: Where the router is and how long to wait for it.
-            station: The station whose keys this session uses by default.
+        """Join the bus; the session uses the keys of ``station`` by default.
 
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
         """
         raw = open_zenoh(link, "peer" if link.direct else "client")
+        # Zenoh opens a peer at once and looks for the router in the background.
         if link.wait_for_router_s >= 0 and link.connect:
             deadline = time.monotonic() + link.wait_for_router_s
             while not raw.info.routers_zid() and not raw.info.peers_zid():
@@ -211,14 +204,10 @@ class Session(Closing):
         instance: str = "",
         lossless: bool = False,
     ) -> Publisher[M]:
-        """Publish a topic of a sensor (or, for a service's topic, of a service's instance).
+        """Publish a topic of a sensor or of a process.
 
-        Args:
-            topic: From ``palpate.bus.topics``.
-            sensor: Name of the sensor.
-            service: Name of the service, for a service's topic.
-            instance: Name of its instance.
-            lossless: Wait for slow subscribers instead of dropping. Offline replay only.
+        A ``lossless`` publisher waits for slow subscribers instead of dropping: for offline replay
+        only.
         """
         key = self._key(topic, sensor, service, instance)
         return self._keep(Publisher(self._raw, topic, key, lossless=lossless))
@@ -235,17 +224,10 @@ class Session(Closing):
         capacity: int = 4096,
         depth: int = 1,
     ) -> Subscriber[M]:
-        """Subscribe to a topic; ``"*"`` = any sensor, service, instance or station.
+        """Subscribe to a topic of a station; None = the session's own.
 
-        Args:
-            topic: From ``palpate.bus.topics``.
-            sensor: Name of the sensor.
-            service: Name of the service, for a service's topic.
-            instance: Name of its instance.
-            station: Name of the station; None = the session's own.
-            delivery: What happens to messages that come faster than they are taken.
-            capacity: Messages that may wait, for ``QUEUE`` and ``EVERY``.
-            depth: Messages that may wait per sensor, for ``NEWEST``.
+        ``delivery`` says what happens to messages that come faster than they are taken. With
+        ``QUEUE`` and ``EVERY`` ``capacity`` of them may wait, with ``NEWEST`` ``depth`` per sensor.
         """
         key = self._key(topic, sensor, service, instance, station)
         return self._keep(
@@ -262,7 +244,7 @@ class Session(Closing):
         capacity: int = 65536,
     ) -> Tap:
         """Receive several topics undecoded, in order of arrival."""
-        keys = [(topic, self._key(topic, sensor, "*", "*", station)) for topic in topics]
+        keys = [self._key(topic, sensor, "*", "*", station) for topic in topics]
         return self._keep(Tap(self._raw, keys, delivery=delivery, capacity=capacity))
 
     def queryable(
@@ -276,16 +258,9 @@ class Session(Closing):
         capacity: int = 16,
         workers: int = 1,
     ) -> Queryable:
-        """Answer each question with one reply.
+        """Answer each question with what ``handler`` returns, or with the error it raises.
 
-        Args:
-            endpoint: From ``palpate.bus.endpoints``.
-            handler: Returns the reply; may raise any ``PalpateError``.
-            sensor: Name of the sensor.
-            service: Name of the service, for a service's endpoint.
-            instance: Name of its instance.
-            capacity: Questions that may wait; more are refused.
-            workers: Questions that are handled at the same time.
+        ``capacity`` questions may wait, more are refused; ``workers`` are handled at once.
         """
         key = self._key(endpoint, sensor, service, instance)
         return self._keep(

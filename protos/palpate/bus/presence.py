@@ -89,12 +89,7 @@ class CallerWatch(Closing):
     """Calls ``on_gone``, in a thread of its own, with the key of every token that has vanished.
 
     A token that vanishes and is declared again at once, because its caller asked a second time,
-    does not count as vanished.
-
-    Args:
-        session: The bus.
-        key: Which tokens, with a ``"*"``.
-        on_gone: What to call.
+    does not count as vanished. ``key`` names the tokens, with a ``"*"``.
     """
 
     def __init__(self, session: zenoh.Session, key: str, on_gone: Callable[[str], None]) -> None:

@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import zenoh
 
@@ -40,19 +40,6 @@ class Delivery(Enum):
     EVERY = "every"
 
 
-class DeliveryQueue(Protocol[T]):
-    """A queue between the bus and one consumer."""
-
-    def put(self, key: str, item: T) -> None:
-        """Called by the bus; never raises, and blocks only for ``EVERY``."""
-
-    def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """Next item, and how many items of its key were dropped so far; None = none in time."""
-
-    def close(self) -> None:
-        """Release a blocked sender."""
-
-
 class NewestQueue(Generic[T]):
     """Keeps the newest items of each key; serves keys in the order of their oldest waiting item.
 
@@ -71,22 +58,22 @@ class NewestQueue(Generic[T]):
         self._depth = depth
 
     def put(self, key: str, item: T) -> None:
-        """See ``DeliveryQueue.put``."""
+        """Add an item and drop the oldest of its key if too many wait; never blocks."""
         with self._lock:
-            items = self._waiting.get(key)
-            if items is None:
-                items = self._waiting[key] = deque()
+            items = self._waiting.setdefault(key, deque())
+            # Every waiting item has one turn in `_order`. The turn of a dropped item stays for its
+            # successor, so `get` never finds a key without an item.
             full = len(items) == self._depth
             if full:
                 items.popleft()
                 self._lost[key] += 1
                 self._counters["dropped"] += 1
             items.append(item)
-        if not full:  # else the new item takes the turn of the dropped one
+        if not full:
             self._order.put(key)
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """See ``DeliveryQueue.get``."""
+        """Next item, and how many of its key were dropped so far; None = none in time."""
         try:
             key = self._order.get(timeout=timeout_s)
         except queue.Empty:
@@ -111,7 +98,7 @@ class FifoQueue(Generic[T]):
         self._counters = counters
 
     def put(self, key: str, item: T) -> None:
-        """See ``DeliveryQueue.put``."""
+        """Add an item; blocks while the queue is full only if the sender shall wait."""
         with self._changed:
             while self._sender_waits and len(self._items) >= self._capacity and not self._closed:
                 self._changed.wait(0.5)
@@ -123,11 +110,9 @@ class FifoQueue(Generic[T]):
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """See ``DeliveryQueue.get``."""
+        """Next item, and how many of its key were dropped before it; None = none in time."""
         with self._changed:
-            if not self._items:
-                self._changed.wait_for(lambda: bool(self._items), timeout_s)
-            if not self._items:
+            if not self._changed.wait_for(lambda: bool(self._items), timeout_s):
                 return None
             item = self._items.popleft()
             if self._sender_waits:
@@ -135,10 +120,13 @@ class FifoQueue(Generic[T]):
             return item
 
     def close(self) -> None:
-        """See ``DeliveryQueue.close``."""
+        """Release a sender that waits."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+
+DeliveryQueue = NewestQueue[T] | FifoQueue[T]
 
 
 def queue_for(
@@ -153,7 +141,7 @@ def queue_for(
 M = TypeVar("M")
 
 
-class Publisher(Generic[M]):
+class Publisher(Generic[M], Closing):
     """Publishes one topic of one sensor or service. Made by ``Session.publisher``."""
 
     def __init__(
@@ -378,7 +366,8 @@ class Subscriber(Generic[M], Closing):
             step = stamp.sequence - sequence
             if step <= 0:
                 # A restarted gateway counts from 1 again, with a later clock. A replayed record
-                # starts over with its old clock.
+                # starts over with its old clock. A message that was only overtaken is neither: it
+                # is a little older than the last by both measures.
                 restarted = (
                     stamp.monotonic_ns > monotonic_ns
                     or stamp.origin is Origin.REPLAYED
@@ -389,7 +378,8 @@ class Subscriber(Generic[M], Closing):
                     return False
                 self._counters["restarts"] += 1
             elif self.topic.contiguous and step > 1:
-                # What this queue dropped was not lost on the bus.
+                # A hole in the sequence is what the bus lost and what this process's own queue
+                # dropped since the last delivered message; the queue has counted its part.
                 lost = step - 1 - (lost_here - lost_here_before)
                 if lost > 0:
                     self._counters["lost_on_bus"] += lost
@@ -408,7 +398,7 @@ class Tap(Closing):
     def __init__(
         self,
         session: zenoh.Session,
-        topics: Sequence[tuple[Topic[Any], str]],
+        keys: Sequence[str],
         *,
         delivery: Delivery,
         capacity: int,
@@ -420,7 +410,7 @@ class Tap(Closing):
         # By default each subscriber calls back from a thread of its own, and a frame may overtake
         # the tare that was sent before it. Called from the link's thread, arrival is the order.
         in_order = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        self._subscribers = [session.declare_subscriber(key, in_order) for _, key in topics]
+        self._subscribers = [session.declare_subscriber(key, in_order) for key in keys]
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         monotonic_ns, wall_ns = clock.now()

@@ -33,7 +33,6 @@ R = TypeVar("R")
 
 _log = logging.getLogger(__name__)
 
-_STOP = None
 _FRAMING_BYTES = 4096
 """Upper bound of what key, encoding and Zenoh's headers add to a payload; about 200 in practice."""
 
@@ -43,12 +42,10 @@ MAX_REPLY_BYTES = MAX_MESSAGE_BYTES - _FRAMING_BYTES
 
 def error_reply(error: BaseException) -> ErrorReply:
     """The message that describes an exception to a caller."""
-    if isinstance(error, RemoteError):
-        return ErrorReply(error.code, error.problem, error.remedy, error.retry_after_s)
-    if isinstance(error, WireError):
-        return ErrorReply(ErrorCode.INVALID_REQUEST, error.problem, error.remedy)
     if isinstance(error, PalpateError):
-        return ErrorReply(error.code, error.problem, error.remedy)
+        # What breaks the contract here came with the request.
+        code = ErrorCode.INVALID_REQUEST if isinstance(error, WireError) else error.code
+        return ErrorReply(code, error.problem, error.remedy, error.retry_after_s)
     return ErrorReply(
         ErrorCode.INTERNAL,
         f"{type(error).__name__}: {error}",
@@ -125,14 +122,8 @@ class Queryable(Closing):
     typed error; Zenoh itself would leave the caller without a reply. Made by ``Session.queryable``
     and ``Session.stream_queryable``.
 
-    Args:
-        session: The Zenoh session.
-        key: Key on which the questions come.
-        endpoint: What is asked.
-        handler: What answers.
-        capacity: Questions that may wait.
-        workers: Questions that are handled at the same time. With more than one, a quick question
-            overtakes a slow one.
+    ``capacity`` questions may wait, and ``workers`` are handled at the same time. With more than
+    one worker, a quick question overtakes a slow one.
     """
 
     def __init__(
@@ -171,7 +162,7 @@ class Queryable(Closing):
             )
 
     def _run(self) -> None:
-        while (query := self._queries.get()) is not _STOP:
+        while (query := self._queries.get()) is not None:
             answer = QueryAnswer(query, self.key, self._endpoint.reply)
             try:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
@@ -189,7 +180,7 @@ class Queryable(Closing):
         """Undeclare; questions that were already accepted are still handled."""
         self._queryable.undeclare()
         for _ in self._workers:
-            self._queries.put(_STOP)
+            self._queries.put(None)
         for worker in self._workers:
             worker.join(timeout=5)
 
@@ -215,15 +206,8 @@ def ask(
 ) -> Iterator[R | PalpateError]:
     """Replies to a query as they come; typed errors are yielded as exceptions, not raised.
 
-    Closing the iterator cancels the query.
-
-    Args:
-        session: The Zenoh session.
-        key: Key of the endpoint, perhaps with wildcards.
-        endpoint: What is asked.
-        request: The question.
-        timeout_s: How long all of it may take [s].
-        everyone: Ask every queryable that matches; False = the best matching one does the work.
+    Closing the iterator cancels the query. All of it may take ``timeout_s``. The key may have
+    wildcards: ``everyone`` asks every queryable that matches, else the best matching one answers.
     """
     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
     stopped = zenoh.CancellationToken()
@@ -286,13 +270,12 @@ def first_reply(replies: list[R | PalpateError], key: str) -> R:
         LinkError: There is no reply at all.
         PalpateError: All replies are errors; the first of them.
     """
+    errors: list[PalpateError] = []
     for reply in replies:
         if not isinstance(reply, PalpateError):
             return reply
-    for reply in replies:
-        assert isinstance(reply, PalpateError)
-        raise reply
-    raise no_reply(key)
+        errors.append(reply)
+    raise errors[0] if errors else no_reply(key)
 
 
 def raise_errors(replies: Iterator[R | PalpateError], key: str) -> Iterator[R]:

@@ -13,11 +13,9 @@ _KEPT = 1024
 
 
 class TareBook:
-    """Knows every tare of a station: fed by the tare stream, and by asking the gateway on a miss.
+    """Every tare of a station, from the tare stream; the gateway is asked for one that is missing.
 
-    Args:
-        session: The bus.
-        query_timeout_s: How long a question to the gateway may take [s].
+    Such a question may take ``query_timeout_s`` [s].
     """
 
     def __init__(self, session: Session, *, query_timeout_s: float = 0.2) -> None:
@@ -28,11 +26,7 @@ class TareBook:
         self._stream = session.subscriber(TARE, delivery=Delivery.QUEUE, capacity=_KEPT)
 
     def baseline(self, sensor: str, tare_id: int) -> Tare:
-        """The tare of this id.
-
-        Args:
-            sensor: Name of the sensor in the key.
-            tare_id: From a frame; not ``NO_TARE``.
+        """The tare of a sensor that a frame names; not ``NO_TARE``.
 
         Raises:
             LinkError: It is not known here and no gateway answers.
@@ -40,10 +34,9 @@ class TareBook:
             RemoteError: The gateway does not know it either.
         """
         tare = self._known.get((sensor, tare_id))
-        if tare is not None:
-            return tare
-        self._drain()
-        tare = self._known.get((sensor, tare_id))
+        if tare is None:
+            self._drain()
+            tare = self._known.get((sensor, tare_id))
         if tare is None:
             tare = self._session.query(
                 endpoints.TARE,

@@ -32,11 +32,6 @@ class RobotPosePublisher(Closing):
 
     ``counters``: ``put``, ``published``, and ``dropped`` of poses that waited too long for the bus.
     A dropped pose leaves a hole in the sequence, so the gateway counts it, too.
-
-    Args:
-        session: The bus.
-        robot: Name of the robot in keys.
-        waiting: Poses that may wait.
     """
 
     def __init__(self, session: Session, robot: str, *, waiting: int = WAITING) -> None:

@@ -63,19 +63,9 @@ def ask_simulation(
 ) -> SimulationReply:
     """Ask the finite-element service and join its answer.
 
-    While this call waits, a token on the bus shows it. If this process ends or is interrupted, the
-    token vanishes and the service stops the simulation.
-
-    Args:
-        session: The bus.
-        request: What to simulate; its deadline, if it has one, may shorten ``timeout_s``.
-        sensor: Name under which the service serves.
-        timeout_s: How long it may take, time in the queue included [s].
-        on_progress: Called whenever the service says how far it is.
-        on_step: Called with each step as it converges.
-
-    Returns:
-        All converged steps, and how it ended.
+    ``Client.simulate`` explains the arguments; the request's deadline, if it has one, may shorten
+    ``timeout_s``. While this call waits, a token on the bus shows it. If this process ends or is
+    interrupted, the token vanishes and the service stops the simulation.
 
     Raises:
         LinkError: No finite-element service runs.
