@@ -15,7 +15,8 @@ from matplotlib.axes import Axes
 
 from palpate.rigid import unit
 from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
-from palpate_fem.indenter.shape import Indenter, distance, signed_distance
+from palpate_fem.indenter.distance import distance, signed_distance
+from palpate_fem.indenter.shape import Indenter
 
 PICTURE = Path(__file__).resolve().parent / "pictures" / "indenters.png"
 HALF_M, PIXELS = 16e-3, 420  # of each picture

@@ -28,7 +28,7 @@ from palpate_fem.cli import model as cli_model
 from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
-from palpate_fem.indenter.path import write_path
+from palpate_fem.indenter.path import COLUMNS
 from palpate_fem.store.read import SimulationStore
 
 fakes: Any = importlib.import_module("fem_fakes")
@@ -84,12 +84,12 @@ def test_json_is_json(tmp_path: Path) -> None:
 def test_a_path_from_a_file(tmp_path: Path) -> None:
     path = np.zeros((5, 7))
     path[:, 2], path[:, 3] = np.linspace(-0.010, -0.006, 5), 1.0
-    write_path(tmp_path / "poses.csv", path)
+    np.savetxt(tmp_path / "poses.csv", path, "%.17g", ",", header=",".join(COLUMNS), comments="")
     done = fem("run", "--path", tmp_path / "poses.csv", "--json")
     steps = json.loads(done.stdout)["trajectories"][0]["steps"]
     assert [step["pose"][2] for step in steps] == path[1:, 2].tolist()
     path[:, 2] += 0.005
-    write_path(tmp_path / "inside.csv", path)
+    np.savetxt(tmp_path / "inside.csv", path, "%.17g", ",", header=",".join(COLUMNS), comments="")
     with pytest.raises(ConfigError, match="inside"):
         fem("run", "--path", tmp_path / "inside.csv")
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import warp as wp
 from numpy.typing import NDArray
+from tests.fem.numpy_indenter import distance
 from tests.fem.numpy_mechanics import Contact, ContactLaw, contact, elements, return_map
 
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.shape import distance
 from palpate_fem.mechanics.contact import ContactSettings, ContactSurface, PosedIndenter
 from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.state import SolutionState

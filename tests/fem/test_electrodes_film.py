@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.fem.mesh_measures import node_areas
 
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.errors import ConfigError, SimulationError
@@ -26,7 +27,7 @@ from palpate_fem.electrodes.specimen import (
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
-from palpate_fem.mesh.surface import node_areas, open_edges
+from palpate_fem.mesh.surface import open_edges
 
 Floats = NDArray[np.float64]
 Shell = Callable[..., SolidMesh]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from tests.fem.mesh_measures import node_areas
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_fem.electrodes.electronics import FULL_SCALE
@@ -18,7 +19,6 @@ from palpate_fem.electrodes.model import ElectrodeModel, ElectrodeResponse
 from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 from palpate_fem.mesh.nvlabs import read_nvlabs
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.mesh.surface import node_areas
 
 Floats = NDArray[np.float64]
 

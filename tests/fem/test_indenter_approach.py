@@ -14,7 +14,7 @@ from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import facing, rotation_matrices, to_local, unit
 from palpate_fem.indenter.approach import OuterSurface, check_clear, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.shape import signed_distance
+from palpate_fem.indenter.distance import signed_distance
 
 Floats = NDArray[np.float64]
 Direction = tuple[float, float, float]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
 from palpate_fem.indenter.catalogue import ALIASES, BASE_M, indenter_names, make_indenter
-from palpate_fem.indenter.shape import PrimitiveKind, signed_distance
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.shape import PrimitiveKind
 
 Floats = NDArray[np.float64]
 

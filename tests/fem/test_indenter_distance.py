@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.fem import numpy_indenter
 
 from palpate.rigid import rotation_matrices, to_local
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.kernels import distances
-from palpate_fem.indenter.shape import (
-    Indenter,
-    Primitive,
-    PrimitiveKind,
-    distance,
-    signed_distance,
-    top,
-)
+from palpate_fem.indenter.distance import distance, signed_distance
+from palpate_fem.indenter.kernels import indenter_distance
+from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 
 Floats = NDArray[np.float64]
 
@@ -224,7 +221,27 @@ def test_inside_is_negative_and_outside_positive(name: str) -> None:
 def test_height_over_the_top_bounds_the_gap(name: str) -> None:
     points = cloud(500, seed=3)
     for part in make_indenter(name).primitives:
-        assert (signed_distance(one(part), points) >= points[:, 2] - top(part) - ROUNDING).all()
+        assert (
+            signed_distance(one(part), points) >= points[:, 2] - numpy_indenter.top(part) - ROUNDING
+        ).all()
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check  # Warp's annotations are not types
+def distances(
+    primitives: wp.array2d(dtype=wp.float64),
+    margin: wp.float64,
+    point_in: wp.array(dtype=wp.vec3d),
+    gap_out: wp.array(dtype=wp.float64),
+    normal_out: wp.array(dtype=wp.vec3d),
+    hessian_out: wp.array(dtype=wp.mat33d),
+) -> None:
+    """`indenter_distance` at many points; for comparison with the NumPy twin."""
+    i = wp.tid()
+    near = indenter_distance(primitives, point_in[i], margin)
+    gap_out[i] = near.gap
+    normal_out[i] = near.normal
+    hessian_out[i] = near.hessian
 
 
 def launch(indenter: Indenter, points: Floats, margin_m: float) -> tuple[Floats, Floats, Floats]:
@@ -242,9 +259,18 @@ def launch(indenter: Indenter, points: Floats, margin_m: float) -> tuple[Floats,
 
 
 @EVERY
+def test_gap_and_normal_are_those_of_numpy_to_the_bit(name: str) -> None:
+    indenter, points = make_indenter(name), cloud(50_000, seed=6)
+    gap, normal, _ = distance(indenter, points)
+    same_gap, same_normal, _ = numpy_indenter.distance(indenter, points)
+    np.testing.assert_array_equal(gap, same_gap)
+    np.testing.assert_array_equal(normal, same_normal)
+
+
+@EVERY
 def test_the_kernel_is_the_same_function(name: str) -> None:
     indenter, points = make_indenter(name), cloud(5000, seed=4)
-    gap, normal, hessian = distance(indenter, points)
+    gap, normal, hessian = numpy_indenter.distance(indenter, points)
     kernel_gap, kernel_normal, kernel_hessian = launch(indenter, points, 1.0)
     np.testing.assert_allclose(kernel_gap, gap, atol=1e-13 * 1e-2)
     np.testing.assert_allclose(kernel_normal, normal, atol=1e-13)
@@ -255,7 +281,7 @@ def test_the_kernel_is_the_same_function(name: str) -> None:
 @EVERY
 def test_beyond_the_margin_the_kernel_gives_a_bound_and_within_it_the_same(name: str) -> None:
     indenter, points, margin = make_indenter(name), cloud(5000, seed=5), 0.1e-3
-    gap, normal, _ = distance(indenter, points)
+    gap, normal, _ = numpy_indenter.distance(indenter, points)
     kernel_gap, kernel_normal, kernel_hessian = launch(indenter, points, margin)
     near = gap < margin
     assert near.any()

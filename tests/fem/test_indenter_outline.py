@@ -8,8 +8,8 @@ import pytest
 from palpate.errors import ConfigError
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
+from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.indenter.outline import SPACING_M, outline_of
-from palpate_fem.indenter.shape import signed_distance
 
 ROUNDING_M = 1e-12
 FACETS = 0.03

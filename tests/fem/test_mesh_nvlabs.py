@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
+from tests.fem.mesh_measures import node_areas, solid_volume
 
 from palpate.errors import ConfigError
-from palpate_fem.mesh.check import scaled_jacobians, solid_volume
+from palpate_fem.mesh.check import scaled_jacobians
 from palpate_fem.mesh.core import signed_distance
 from palpate_fem.mesh.nvlabs import (
     PARTS,
@@ -22,7 +23,7 @@ from palpate_fem.mesh.nvlabs import (
 )
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.solid import FingertipGeometry
-from palpate_fem.mesh.surface import components, enclosed_volume, node_areas, node_normals
+from palpate_fem.mesh.surface import components, enclosed_volume, node_normals
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.fem.mesh_measures import solid_volume
 
 from palpate.errors import ConfigError
-from palpate_fem.mesh.check import check_mesh, scaled_jacobians, solid_volume
+from palpate_fem.mesh.check import check_mesh, scaled_jacobians
 from palpate_fem.mesh.parametric import NAIL_X_M, NAIL_Y_M, biotac
 from palpate_fem.mesh.shape import CavityShape, CoreShape
 from palpate_fem.mesh.solid import FingertipGeometry

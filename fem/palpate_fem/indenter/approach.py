@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from palpate.errors import SimulationError
 from palpate.rigid import rotation_matrices, to_local, unit
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.indenter.shape import Indenter, PrimitiveKind, signed_distance
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.shape import Indenter, PrimitiveKind
 
 _TOUCH = 1e-9  # [m]; a smaller gap counts as contact
 _LARGE_M = 1.5e-3  # a face from this size on may be touched far from its corners

@@ -1,4 +1,18 @@
-"""Signed distance to an indenter with two derivatives in Warp; NumPy twin: `shape.distance`.
+"""Signed distance to an indenter with two derivatives; NumPy twin: ``tests/fem/numpy_indenter.py``.
+
+A rounded primitive is a sharp one K grown by rho. With c(x) the point of K closest to x and
+L = |x - c|::
+
+    gap = L - rho,   normal = (x - c) / L,   hessian = (I - n n^T - dc/dx) / L
+
+For a box dc/dx is diagonal, 1 where a coordinate is within. For a solid of revolution the same
+holds in the half plane (r, t) of distance from and position along the axis, and the circumference
+adds (d gap / d r) / r. Inside K, where L = 0, the nearest face of K replaces c, so that the sign is
+right.
+
+The distance to the union is the smallest of its parts': exact outside; inside, where parts overlap,
+it has the right sign and is at least the exact one. At kinks (medial axes) one of the candidates is
+chosen, always the same one, and all values are finite.
 
 ``primitives`` are the rows of `Indenter.packed`: kind, axis, centre (3), sizes (4), rounding.
 """
@@ -10,10 +24,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from palpate_fem.indenter.shape import ON_AXIS, PrimitiveKind
+from palpate_fem.indenter.shape import PrimitiveKind
 
 wp.set_module_options({"enable_backward": False})
 
+# [m]; closer to its axis a solid of revolution has no radial direction: far below any length that
+# matters, far above what rounds to zero.
+ON_AXIS = 1e-12
 BOX = wp.constant(wp.float64(float(PrimitiveKind.BOX)))
 NEAR_AXIS = wp.constant(wp.float64(ON_AXIS))
 
@@ -229,20 +246,3 @@ def indenter_distance(
         near = revolved_derivatives(primitives, nearest, x)
     near.gap = below
     return near
-
-
-@wp.kernel
-def distances(
-    primitives: wp.array2d(dtype=wp.float64),
-    margin: wp.float64,
-    point_in: wp.array(dtype=wp.vec3d),
-    gap_out: wp.array(dtype=wp.float64),
-    normal_out: wp.array(dtype=wp.vec3d),
-    hessian_out: wp.array(dtype=wp.mat33d),
-):
-    """`indenter_distance` at many points; for comparison with the NumPy twin."""
-    i = wp.tid()
-    near = indenter_distance(primitives, point_in[i], margin)
-    gap_out[i] = near.gap
-    normal_out[i] = near.normal
-    hessian_out[i] = near.hessian

@@ -9,7 +9,8 @@ from warp.geometry import IsoSurfaceMarchingCubes
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.shape import Indenter, PrimitiveKind, distance, signed_distance
+from palpate_fem.indenter.distance import distance, signed_distance
+from palpate_fem.indenter.shape import Indenter, PrimitiveKind
 
 SPACING_M = 0.4e-3
 """Spacing of the grid: the smallest tip, 3.5 mm wide, looks round, and the largest indenter has

@@ -73,17 +73,6 @@ def check_path(path: ArrayLike, *, source: str = "path", first_line: int | None 
     return poses
 
 
-def write_path(file: Path, path: ArrayLike) -> None:
-    """Write a path as CSV with a header; `read_path` gives back the same bits.
-
-    Raises:
-        ConfigError: It is not a valid path.
-    """
-    poses = check_path(path)
-    lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in poses.tolist())]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def read_path(file: Path) -> Floats:
     """Read a path from a CSV file with the header x_m,y_m,z_m,qw,qx,qy,qz.
 

@@ -39,14 +39,6 @@ def scaled_jacobians(nodes: Floats, elements: Ints) -> Floats:
     return worst
 
 
-def solid_volume(mesh: SolidMesh) -> float:
-    """Volume of the solid [m^3], exact for bilinear faces, from its boundary."""
-    volume = enclosed_volume(mesh.nodes, mesh.outer_faces)
-    if len(mesh.inner_faces):
-        volume -= enclosed_volume(mesh.nodes, mesh.inner_faces)
-    return volume
-
-
 # Faces of an element, normals outwards, by element size.
 QUADS = {
     8: ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),

@@ -38,15 +38,6 @@ def enclosed_volume(points: Floats, faces: Ints) -> float:
     return total / 12
 
 
-def node_areas(points: Floats, faces: Ints) -> Floats:
-    """Share of the surface that belongs to each node [m^2], shape (V,)."""
-    area = np.linalg.norm(face_vectors(points, faces), axis=1)
-    share = np.zeros(len(points))
-    for column in faces.T:
-        np.add.at(share, column, area / faces.shape[1])
-    return share
-
-
 def node_normals(points: Floats, faces: Ints) -> Floats:
     """Unit normals at the nodes: mean of the adjacent faces weighted with their angle there.
 

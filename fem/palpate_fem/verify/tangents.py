@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from palpate_fem.arrays import Floats
-from palpate_fem.indenter.shape import distance
+from palpate_fem.indenter.distance import distance
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.state import ForceBalance
 from palpate_fem.verify.bodies import MU, VerificationBody, ball, pose, round_core
