@@ -11,11 +11,10 @@ import pytest
 import warp as wp
 from numpy.typing import NDArray
 from tests.fem.numpy_indenter import distance
-from tests.fem.numpy_mechanics import Contact, ContactLaw, contact, elements, return_map
+from tests.fem.numpy_mechanics import Contact, ContactLaw, NeoHooke, contact, elements, return_map
 
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, ContactSurface, PosedIndenter
-from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.core import RigidCore

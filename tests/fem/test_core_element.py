@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import Elements, elements
+from tests.fem.numpy_mechanics import Elements, NeoHooke, elements
 
 from palpate_fem.mechanics.contact import ContactSettings
-from palpate_fem.mechanics.material import BARRIER_FROM, NeoHooke
+from palpate_fem.mechanics.material import BARRIER_FROM
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh

@@ -9,13 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import cavity, elements
+from tests.fem.numpy_mechanics import NeoHooke, cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics import newton as newton_module
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import elements
+from tests.fem.numpy_mechanics import NeoHooke, elements
 
 from palpate_fem.mechanics.contact import ContactSettings
-from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem, TangentPattern, make_pattern
 from palpate_fem.mesh.solid import SolidMesh

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import Elements, cavity, elements
+from tests.fem.numpy_mechanics import Elements, NeoHooke, cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.mechanics.load_stepping import VOIGT, LoadStepping, SolverSettings
-from palpate_fem.mechanics.material import NeoHooke
 from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.core import RigidCore

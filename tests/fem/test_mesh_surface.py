@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.fem.mesh_measures import node_areas, solid_volume
 
 from palpate.errors import SimulationError
-from palpate_fem.mesh.check import check_mesh, scaled_jacobians, solid_volume
+from palpate_fem.mesh.check import check_mesh, scaled_jacobians
 from palpate_fem.mesh.grid import bag
 from palpate_fem.mesh.solid import SolidMesh, extrude
 from palpate_fem.mesh.surface import (
     components,
     enclosed_volume,
     face_vectors,
-    node_areas,
     node_normals,
     open_edges,
 )

@@ -52,7 +52,7 @@ class SolverSettings:
         force_limit_n: An indentation ends where the force on the indenter exceeds this [N]; the
             paper saw 23-32 N at most.
         smallest_increment: Fraction of a step below which the indentation is given up.
-        volume_barrier: See `NeoHooke.barrier`.
+        volume_barrier: See `energy_density`.
         predict: Whether increments start from an extrapolation of the last two.
         solver: See `make_factor`.
     """

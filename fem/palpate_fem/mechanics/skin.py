@@ -32,7 +32,7 @@ class SkinElements:
             pairs: Block of each node pair of each element in the tangent, (E, n, n).
             shear_modulus_pa: Neo-Hookean modulus [Pa].
             bulk_ratio: Bulk over shear modulus.
-            volume_barrier: See `NeoHooke.barrier`.
+            volume_barrier: See `energy_density`.
         """
         self.mu, self.volume_barrier = shear_modulus_pa, volume_barrier
         self.gradient_values, self.weight_values = rest_gradients(mesh)

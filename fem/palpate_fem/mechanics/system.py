@@ -133,7 +133,7 @@ class EquilibriumSystem:
             shear_modulus_pa: Neo-Hookean modulus [Pa].
             bulk_ratio: Bulk over shear modulus.
             contact: Constants of the contact laws.
-            volume_barrier: See ``NeoHooke.barrier``.
+            volume_barrier: See `energy_density`.
             held: Prescribed components (V, 3); None = the mesh's fixed nodes. They keep the
                 positions that they have in the state.
         """

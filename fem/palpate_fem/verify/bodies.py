@@ -18,7 +18,7 @@ from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.load_stepping import SolverSettings
-from palpate_fem.mechanics.material import NeoHooke
+from palpate_fem.mechanics.material import energy_density
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
@@ -174,7 +174,7 @@ class VerificationBody:
         """Mixed energy: sum w W + sum p (v - v0) - v0 p^2 / (2 kappa) [J]."""
         skin = self.system.skin
         f = np.einsum("eai,eqaj->eqij", position[self.mesh.elements], skin.gradient_values)
-        isochoric = (skin.weight_values * NeoHooke(self.mu).function(f)).sum()
+        isochoric = (skin.weight_values * energy_density(f, self.mu)).sum()
         volume = (skin.weight_values * np.linalg.det(f)).sum(axis=1)
         swelling = pressure * (volume - skin.rest_volume)
         return float(isochoric + (swelling - skin.rest_volume * pressure**2 / 2 / self.bulk).sum())
