@@ -15,9 +15,9 @@ from palpate.errors import ConfigError, DatasetError, SimulationError
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import MeasuredIndentation
-from palpate_fem.calibration.recover import Planned, recover
+from palpate_fem.calibration.recover import recover
 from palpate_fem.calibration.result import Evaluation, read_parameters, write_calibration
-from palpate_fem.calibration.runs import SimulatedRun
+from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -110,13 +110,13 @@ def press(
     return path
 
 
-ANGLED = Planned("sphere_medium/00/angled-0", "sphere_medium", press(30.0))
-NORMAL = Planned("sphere_medium/00/normal", "sphere_medium", press())
+ANGLED = PlannedPath("sphere_medium/00/angled-0", "sphere_medium", press(30.0))
+NORMAL = PlannedPath("sphere_medium/00/normal", "sphere_medium", press())
 PLANS = (
     ANGLED,
     NORMAL,
-    Planned("sphere_large/01/angled-1", "sphere_large", press(30.0, 90.0)),
-    Planned("sphere_small/02/normal", "sphere_small", press()),
+    PlannedPath("sphere_large/01/angled-1", "sphere_large", press(30.0, 90.0)),
+    PlannedPath("sphere_small/02/normal", "sphere_small", press()),
 )
 TRUTH = FingertipParameters(
     skin_thickness_m=1.42e-3, shear_modulus_pa=3.4e5, friction_coefficient=0.25
@@ -124,7 +124,7 @@ TRUTH = FingertipParameters(
 
 
 def measure(
-    plans: Sequence[Planned] = PLANS, truth: FingertipParameters = TRUTH
+    plans: Sequence[PlannedPath] = PLANS, truth: FingertipParameters = TRUTH
 ) -> list[MeasuredIndentation]:
     """Perfect records of the formula."""
     return [

@@ -43,7 +43,8 @@ def drawn(seed: int) -> SpecimenParameters:
 
 def read(signals: ElectrodeSignals, ideal: Floats, elapsed_s: float) -> Counts:
     """Counts of one reading, shape (19,)."""
-    return signals.stream(ideal[None], np.array([elapsed_s]))[0]
+    counts: Counts = signals.stream(ideal[None], np.array([elapsed_s]))[0]
+    return counts
 
 
 @pytest.mark.parametrize("electrode", REST)

@@ -22,9 +22,9 @@ from palpate_fem.mesh.parametric import biotac
 from palpate_fem.population.fitting import (
     OVERTRAVELS_M,
     DeepStates,
-    TaredRange,
     fit_specimen,
     overtravel_for,
+    tared_range,
 )
 from palpate_fem.population.members import (
     PAPER,
@@ -69,17 +69,14 @@ def test_fit_finds_the_range_of_a_planted_specimen(
     planted = replace(
         SpecimenParameters(), sigma_s_m=0.30, squeeze_pa=1.2e4, floor_m=3e-6, side_closing_m=0.15e-3
     )
-    ends = TaredRange.of(tared(sensor.with_specimen(planted), pressed, rest))
+    ends = tared_range(tared(sensor.with_specimen(planted), pressed, rest))
     start = replace(SpecimenParameters(), name="one")
-    before = TaredRange.of(tared(sensor.with_specimen(start), pressed, rest))
-    assert max(abs(before.low - ends.low), abs(before.high - ends.high)) > 0.01
-    specimen, found = fit_specimen(
-        sensor.with_specimen(start), pressed, rest, (ends.low, ends.high)
-    )
-    assert found.low == pytest.approx(ends.low, abs=4e-3)
-    assert found.high == pytest.approx(ends.high, abs=4e-3)
-    again = TaredRange.of(tared(sensor.with_specimen(specimen), pressed, rest))
-    assert (again.low, again.high) == pytest.approx((found.low, found.high))
+    before = tared_range(tared(sensor.with_specimen(start), pressed, rest))
+    assert np.abs(np.subtract(before, ends)).max() > 0.01
+    specimen, found = fit_specimen(sensor.with_specimen(start), pressed, rest, ends)
+    assert found == pytest.approx(ends, abs=4e-3)
+    again = tared_range(tared(sensor.with_specimen(specimen), pressed, rest))
+    assert again == pytest.approx(found)
     assert specimen.name == "one"
 
 
@@ -100,7 +97,7 @@ def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
 def deep(indenter: str, forces: list[float]) -> DeepStates:
     """A trajectory planned to end at its third step, 0.1 mm a step."""
     left: Floats = np.array([1e-4 * (2 - k) for k in range(len(forces))])
-    return DeepStates(f"{indenter}/00/normal", indenter, left, np.array(forces), (None,) * 7)
+    return DeepStates(indenter, left, np.array(forces), (None,) * 7)
 
 
 def test_overtravel_is_what_the_largest_force_asks_for() -> None:

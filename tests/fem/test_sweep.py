@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError, RemoteError
+from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.result import IndentationOutcome, IndentationResult
-from palpate_fem.service.batch import BatchReport, PlannedPath, SimulationBatch, sweep_into_store
+from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.read import SimulationStore
 

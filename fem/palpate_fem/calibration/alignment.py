@@ -202,19 +202,13 @@ def align(
     start_m = float(ours.travel_m[0])
     if fit_offset:
         start_m += _best_shift(simulated, start_m, theirs, increments)
-    return _resampled(simulated, start_m, theirs, increments)
-
-
-def _resampled(
-    simulated: ForceCurve, start_m: float, measured: ForceCurve, increments: int
-) -> AlignedCurves:
-    """Sample a whole simulated curve from some travel on, and a measured one from its start."""
-    displacement, coverage = _common(simulated, start_m, measured, increments)
+    displacement, coverage = _common(simulated, start_m, theirs, increments)
+    measured_start_m = float(theirs.travel_m[0])
     return AlignedCurves(
         displacement,
         _at(simulated, start_m + displacement)[0],
-        _at(measured, measured.travel_m[0] + displacement)[0],
-        start_m - float(measured.travel_m[0]),
+        _at(theirs, measured_start_m + displacement)[0],
+        start_m - measured_start_m,
         coverage,
     )
 

@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate.errors import SimulationError
-from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.result import Calibration, Evaluation
-from palpate_fem.calibration.runs import SimulatedRun, SimulationRuns, Simulator
+from palpate_fem.calibration.runs import PlannedPath, SimulatedRun, SimulationRuns, Simulator
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -36,14 +35,6 @@ from palpate_fem.trajectory import angled_direction, pad_point, press_path
 
 TOLERANCES = {THICKNESS: 0.02, MODULUS: 0.02, FRICTION: 0.05, VOLUME: 0.01}
 """Largest allowed relative errors of the calibration."""
-
-
-class Planned(NamedTuple):
-    """A trajectory to simulate: id, indenter, poses (K, 7) that begin above the skin."""
-
-    name: str
-    indenter: str
-    path: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +82,7 @@ class ParameterRecovery:
 
 
 def noisy(
-    planned: Planned,
+    planned: PlannedPath,
     run: SimulatedRun,
     sensor: str,
     noise_n: float,
@@ -129,7 +120,7 @@ def noisy(
 def recover(
     simulator: Simulator,
     truth: FingertipParameters,
-    trajectories: Sequence[Planned],
+    trajectories: Sequence[PlannedPath],
     noise_n: float,
     seed: int,
     *,
@@ -213,7 +204,7 @@ CLEARANCE_M = 1e-3
 """Distance of the first pose from the skin [m]; the calibration tries thicker skins, too."""
 
 
-def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
+def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[PlannedPath]:
     """Paths of the indentations, from first contact with this finger's pad on."""
     surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
     planned = []
@@ -232,5 +223,5 @@ def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[Planned]:
             steps=steps,
             clearance_m=CLEARANCE_M,
         )
-        planned.append(Planned(name, press.indenter, path))
+        planned.append(PlannedPath(name, press.indenter, path))
     return planned

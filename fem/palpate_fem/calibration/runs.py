@@ -25,6 +25,15 @@ _PLACES = 9
 
 
 @dataclass(frozen=True, slots=True)
+class PlannedPath:
+    """A trajectory to simulate: id, indenter, poses (K, 7) that begin above the skin."""
+
+    name: str
+    indenter: str
+    path: Floats
+
+
+@dataclass(frozen=True, slots=True)
 class SimulatedRun:
     """One simulated indentation, reduced to what a comparison needs.
 

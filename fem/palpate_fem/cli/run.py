@@ -21,6 +21,7 @@ from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
 from palpate.process import typed_command
+from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import (
     console,
@@ -36,7 +37,6 @@ from palpate_fem.result import IndentationOutcome, IndentationResult, Indentatio
 from palpate_fem.service.batch import (
     FAILED,
     BatchReport,
-    PlannedPath,
     SimulationBatch,
     TrajectoryPlan,
     sweep_into_store,

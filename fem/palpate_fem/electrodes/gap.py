@@ -202,24 +202,7 @@ CLAMP_X_M, CLAMP_BLEND_M = -13.96e-3, 0.7e-3
 SIDES_RAD = (0.85, 1.25)
 
 
-@dataclass(frozen=True)
-class GapAdjustment:
-    """How the gap of one specimen differs from that of the mechanics, at each node of the film.
-
-    Attributes:
-        share: Share of the gap that stays open [1], shape (N,): below 1 behind the clamp's edge.
-        nearer_m: How much closer to the core the specimen's skin is [m], shape (N,).
-    """
-
-    share: Floats
-    nearer_m: Floats
-
-    def gap(self, gap: Floats) -> Floats:
-        """The specimen's gap [m] from that of the mechanics, same shape."""
-        return np.asarray(self.share * gap - self.nearer_m)
-
-
-def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> GapAdjustment:
+def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> tuple[Floats, Floats]:
     """How a specimen's gap differs from that of the mechanics, which all specimens share.
 
     Behind the clamp's edge skin and core are anchored together, as in the paper's model ("Finite
@@ -230,15 +213,17 @@ def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> GapAdjustmen
     Args:
         points: Nodes of the film [m], shape (N, 3), sensor frame.
         specimen: Its `clamp_closing` and `side_closing_m` are used.
+
+    Returns:
+        The share of the gap that stays open [1], and how much closer to the core the specimen's
+        skin is [m], both of shape (N,): its gap is share * gap - closer.
     """
     x, y, z = points.T
     behind = 0.5 * (1 + np.tanh((CLAMP_X_M - x) / (2 * CLAMP_BLEND_M)))
     angle = np.arctan2(np.abs(y), -z)
     low, high = SIDES_RAD
     t = np.clip((angle - low) / (high - low), 0.0, 1.0)
-    return GapAdjustment(
-        1 - specimen.clamp_closing * behind, specimen.side_closing_m * t * t * (3 - 2 * t)
-    )
+    return 1 - specimen.clamp_closing * behind, specimen.side_closing_m * t * t * (3 - 2 * t)
 
 
 def thickness(

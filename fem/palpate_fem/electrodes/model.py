@@ -112,7 +112,8 @@ class ElectrodeModel:
     def of_gap(self, gap: Gap, *, log_sigma: float = 0.0) -> ElectrodeResponse:
         """Response to known gaps."""
         specimen = self.specimen
-        film, by_gap, _ = thickness(self._adjustment.gap(gap.gap), gap.pressure, specimen)
+        share, closer_m = self._adjustment
+        film, by_gap, _ = thickness(share * gap.gap - closer_m, gap.pressure, specimen)
         solved = self.conduction.solve(
             film,
             sigma_s_m=specimen.sigma_s_m * float(np.exp(log_sigma)),
@@ -125,5 +126,5 @@ class ElectrodeModel:
             film=film,
             conduction=solved,
             _slope=counts_slope(solved.impedance, specimen),
-            _by_gap=by_gap * self._adjustment.share,
+            _by_gap=by_gap * share,
         )

@@ -149,7 +149,8 @@ def _draw_section(
     if len(cut.triangles):
         flat = points[:, right], points[:, 2], cut.triangles
         if colours is None:
-            axes.tripcolor(*flat, facecolors=np.zeros(len(cut.triangles)), cmap=_plain_map())
+            plain = require("matplotlib.colors", extra="fem").ListedColormap([SKIN])
+            axes.tripcolor(*flat, facecolors=np.zeros(len(cut.triangles)), cmap=plain)
         elif len(colours) == len(nodes):
             axes.tripcolor(*flat, cut.at(colours), shading="gouraud", **paint)
         else:
@@ -226,7 +227,3 @@ def _frame(panels: Any, points: Floats) -> None:
         axes.set_aspect("equal")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
-
-
-def _plain_map() -> Any:
-    return require("matplotlib.colors", extra="fem").ListedColormap([SKIN])

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from palpate_fem.calibration.alignment import AlignedCurves
-from palpate_fem.calibration.result import Calibration
+from palpate_fem.calibration.result import Calibration, TrajectoryFit
 from palpate_fem.plot.style import AXES, AXIS_COLOURS, GRID, INK, MM, grid, label, new_figure, save
 from palpate_fem.study import DISPLACEMENT_CHANGE_M, FORCE_CHANGE, StudyRow
 from palpate_fem.validation.validate import (
@@ -29,33 +28,23 @@ _MARKERS = ("o", "s", "^", "D", "v")
 _SENSOR_COLOURS = ("#2f6fb5", "#e09f3e", "#2e8b57", "#8d5fb0", "#d1495b")
 
 
-class _Drawn(Protocol):
-    """A compared trajectory, as far as a panel needs it."""
-
-    @property
-    def sensor(self) -> str: ...
-    @property
-    def pair(self) -> AlignedCurves: ...
-
-
-def plot_calibration(result: Calibration, path: Path, *, title: str = "") -> None:
+def plot_calibration(result: Calibration, path: Path) -> None:
     """Draw the calibrated simulation against each sensor's measurement, one trajectory in a row.
 
     Args:
         result: Of the calibration.
         path: The PNG to write; the first six trajectories are drawn.
-        title: Title; empty = the parameters.
 
     Raises:
         StoreDiskError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
-    groups: dict[str, list[Any]] = {}
+    groups: dict[str, list[TrajectoryFit]] = {}
     for fit in result.trajectories:
         groups.setdefault(fit.name.removesuffix(f"/{fit.sensor}"), []).append(fit)
     rows = list(groups.items())[:_ROWS]
     figure = new_figure(10, 0.6 + 2.3 * len(rows))
-    figure.suptitle(title or _parameters(result), color=INK, fontsize=11)
+    figure.suptitle(_parameters(result), color=INK, fontsize=11)
     panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
     for at, (row, (name, fits)) in enumerate(zip(panels, rows, strict=True)):
         below = "displacement from 0.5 N [mm]" if at == len(rows) - 1 else ""
@@ -67,7 +56,7 @@ def plot_calibration(result: Calibration, path: Path, *, title: str = "") -> Non
     save(figure, path)
 
 
-def _axis_panel(panel: Any, fits: Sequence[_Drawn], axis: int) -> None:
+def _axis_panel(panel: Any, fits: Sequence[TrajectoryFit], axis: int) -> None:
     """Draw one axis of one trajectory: a line for the simulation, dots for each sensor."""
     grid(panel)
     longest = max(fits, key=lambda fit: fit.pair.displacement_m[-1])
@@ -87,23 +76,20 @@ def _axis_panel(panel: Any, fits: Sequence[_Drawn], axis: int) -> None:
     panel.set_ylim(low - missing, high + missing)
 
 
-def plot_examples(
-    validation: Validation, path: Path, *, names: Iterable[str] = (), seed: int = 0
-) -> None:
+def plot_examples(validation: Validation, path: Path) -> None:
     """Draw four trajectories with all axes: simulation as lines, sensors as dots.
+
+    As in the paper, the one with the highest force for each of four random indenters.
 
     Args:
         validation: With at least one compared trajectory.
         path: The PNG to write.
-        names: Trajectories to draw, without sensor; empty = as in the paper, the one with the
-            highest force for each of four random indenters.
-        seed: For that choice.
 
     Raises:
         StoreDiskError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
-    chosen = list(names)[:_PANELS] or examples(validation, seed)
+    chosen = examples(validation)
     figure = new_figure(10, 7)
     figure.suptitle(validation.title, color=INK, fontsize=11)
     panels = figure.subplots(2, 2).ravel()
@@ -115,7 +101,7 @@ def plot_examples(
     save(figure, path)
 
 
-def examples(validation: Validation, seed: int = 0) -> list[str]:
+def examples(validation: Validation) -> list[str]:
     """The trajectory with the highest force for each of four random indenters."""
     best: dict[str, ComparedTrajectory] = {}
     for item in validation.compared:
@@ -124,7 +110,7 @@ def examples(validation: Validation, seed: int = 0) -> list[str]:
             best[item.indenter] = item
     names = sorted(best)
     count = min(_PANELS, len(names))
-    drawn = np.random.default_rng(seed).choice(len(names), count, replace=False)
+    drawn = np.random.default_rng(0).choice(len(names), count, replace=False)
     return [best[names[i]].path_name for i in sorted(drawn.tolist())]
 
 

@@ -38,17 +38,9 @@ KEPT = 3
 """Number of states that are kept for each electrode and each end of the range while fitting."""
 
 
-@dataclass(frozen=True, slots=True)
-class TaredRange:
-    """Smallest and largest tared value of all electrodes and states, over full scale."""
-
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, tared: Floats) -> TaredRange:
-        """Range of tared values over full scale, shape (N, 19)."""
-        return cls(float(tared.min()), float(tared.max()))
+def tared_range(tared: Floats) -> tuple[float, float]:
+    """Smallest and largest of tared values over full scale, shape (N, 19)."""
+    return float(tared.min()), float(tared.max())
 
 
 def fit_specimen(
@@ -58,7 +50,7 @@ def fit_specimen(
     wanted: tuple[float, float],
     *,
     rounds: int = 4,
-) -> tuple[SpecimenParameters, TaredRange]:
+) -> tuple[SpecimenParameters, tuple[float, float]]:
     """Fit a specimen, starting from its present parameters.
 
     A range is set by a few extreme states, so only those are evaluated while fitting; they are
@@ -95,16 +87,18 @@ def fit_specimen(
         some = [states[i] for i in sorted(chosen)]
 
         def misfit(scaled: Floats, some: list[Gap] = some) -> Floats:
-            ends = TaredRange.of(_tared(sensor.with_specimen(specimen_at(scaled)), some, rest))
+            lowest, highest = tared_range(
+                _tared(sensor.with_specimen(specimen_at(scaled)), some, rest)
+            )
             # Misfit and priors in one vector of residuals: the fit is a maximum a posteriori
             # estimate.
-            missed = np.array([ends.low - wanted[0], ends.high - wanted[1]]) / TOLERANCE
+            missed = np.array([lowest - wanted[0], highest - wanted[1]]) / TOLERANCE
             return np.concatenate([missed, scaled])
 
         found = least_squares(misfit, scaled, diff_step=1e-2, x_scale=1.0, max_nfev=25)
         scaled = found.x
     specimen = specimen_at(scaled)
-    return specimen, TaredRange.of(_tared(sensor.with_specimen(specimen), states, rest))
+    return specimen, tared_range(_tared(sensor.with_specimen(specimen), states, rest))
 
 
 def _tared(sensor: ElectrodeModel, states: Sequence[Gap], rest: Gap) -> Floats:
@@ -140,14 +134,12 @@ class DeepStates:
     """A stored trajectory's force by depth, and the film at some depths.
 
     Attributes:
-        name: Of the trajectory.
         indenter: Its indenter.
         left_m: Planned travel that remains at each step [m], shape (S,); negative beyond the plan.
         force_n: Magnitude of the net force [N], shape (S,).
         gaps: Film at the deepest step for each of ``OVERTRAVELS_M``; None where there is no step.
     """
 
-    name: str
     indenter: str
     left_m: Floats
     force_n: Floats
@@ -185,7 +177,6 @@ def deep_states(
         poses = np.array([step.pose[:3] for step in steps]).reshape(-1, 3)
         travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1)
         deep = DeepStates(
-            name,
             trajectory.indenter,
             planned(name) - travel,
             np.linalg.norm(trajectory.forces[: len(steps)], axis=1),
@@ -269,12 +260,12 @@ def fit_member(
         for deep in states
         if published.pressed_with(deep.indenter) and (gap := deep.gaps[extra]) is not None
     ]
-    specimen, reached = fit_specimen(
+    specimen, (low, high) = fit_specimen(
         ElectrodeModel(geometry, start), gaps, rest, (published.low, published.high)
     )
     found = {
-        "low": reached.low,
-        "high": reached.high,
+        "low": low,
+        "high": high,
         "max_force_n": force,
         "states": float(len(gaps)),
     }

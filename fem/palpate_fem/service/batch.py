@@ -14,12 +14,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from palpate.errors import RemoteError, SimulationError
 from palpate.process import Closing
 from palpate_fem.arrays import Floats
-from palpate_fem.calibration.runs import SimulatedRun
+from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import check_path
@@ -37,38 +36,15 @@ from palpate_fem.service.pool import WorkerPool
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
+from palpate_fem.trajectory import PlannedIndentation
 
 _POLL_S = 0.1
 FAILED = "failed"
 """Outcome, in a report, of a trajectory that could not be run or whose worker died."""
 
 
-class TrajectoryPlan(Protocol):
-    """One trajectory to run, e.g. of ``palpate_fem.trajectory.Campaign``."""
-
-    @property
-    def name(self) -> str:
-        """Its id in a store; unique."""
-        ...
-
-    @property
-    def indenter(self) -> str:
-        """Name of the indenter."""
-        ...
-
-    @property
-    def path(self) -> Floats:
-        """Poses, shape (K, 7); the first does not touch the skin."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedPath:
-    """A trajectory to run along any path."""
-
-    name: str
-    indenter: str
-    path: Floats
+TrajectoryPlan = PlannedPath | PlannedIndentation
+"""One trajectory to run."""
 
 
 @dataclass(frozen=True, slots=True)

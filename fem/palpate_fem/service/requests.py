@@ -36,13 +36,7 @@ from palpate_fem.service.fingertips import check_start, without_friction
 from palpate_fem.service.jobs import SimulationJob
 from palpate_fem.store.content import StoredFingertip
 
-OUTCOMES = {
-    IndentationOutcome.COMPLETE: SimulationOutcome.COMPLETE,
-    IndentationOutcome.FORCE_LIMIT: SimulationOutcome.FORCE_LIMIT,
-    IndentationOutcome.DIVERGED: SimulationOutcome.DIVERGED,
-    IndentationOutcome.DEADLINE: SimulationOutcome.DEADLINE,
-    IndentationOutcome.CANCELLED: SimulationOutcome.CANCELLED,
-}
+OUTCOMES = {outcome: SimulationOutcome[outcome.name] for outcome in IndentationOutcome}
 
 _STEP_BYTES = 1024  # upper bound for the scalars of a step and of its message; really about 400
 
