@@ -79,9 +79,8 @@ def calibrate(
         DatasetError: No measured trajectory can be compared.
         SimulationError: No simulation can be compared with its measurement.
     """
-    search = _Search(simulator, measured, settings or CalibrationSettings(), executor, on_run)
-    search.on_evaluation = on_evaluation
-    return search.run()
+    runs = SimulationRuns(simulator, executor, on_run)
+    return _Search(runs, measured, settings or CalibrationSettings(), on_evaluation).run()
 
 
 class _Search:
@@ -89,15 +88,12 @@ class _Search:
 
     def __init__(
         self,
-        simulator: Simulator,
+        runs: SimulationRuns,
         measured: Sequence[MeasuredIndentation],
         settings: CalibrationSettings,
-        executor: Executor | None,
-        on_run: Callable[[int, int], None] | None,
+        on_evaluation: Callable[[Evaluation], None] | None,
     ) -> None:
-        self.settings = settings
-        self.runs = SimulationRuns(simulator, executor, on_run)
-        self.on_evaluation: Callable[[Evaluation], None] | None = None
+        self.settings, self.runs, self.on_evaluation = settings, runs, on_evaluation
         self.history: list[Evaluation] = []
         self.excluded: dict[str, str] = {}
         self.notes: list[str] = []

@@ -54,6 +54,9 @@ FrictionOption = Annotated[
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=0, help="Solver processes; 0 = one for each core.")
 ]
+OnlyOption = Annotated[
+    list[str] | None, typer.Option("--only", help="Only names with this prefix; repeatable.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 MeasuredArgument = Annotated[
     Path, typer.Argument(metavar="MEASURED.h5", help="Measured indentations.")
@@ -185,7 +188,7 @@ def export(
     """Copy a store into one HDF5 file to pass on; all commands read it like the store."""
     from palpate_fem.cli.run import export_command
 
-    raise typer.Exit(export_command(store, out))
+    export_command(store, out)
 
 
 @fem_app.command(epilog=_example("palpate fem verify", "palpate fem verify --only hertz --json"))
@@ -218,7 +221,7 @@ def bench(
     """Time a trajectory of 20 steps; compare its GFlop/s with the peak of the machine."""
     from palpate_fem.cli.check import bench_command
 
-    raise typer.Exit(bench_command(edge_mm=edge_mm, layers=layers, as_json=json_))
+    bench_command(edge_mm=edge_mm, layers=layers, as_json=json_)
 
 
 @fem_app.command(epilog=_example("palpate fem study mesh --png mesh.png"))
@@ -239,9 +242,7 @@ def calibrate(
     out: Annotated[
         Path, typer.Option(metavar="FIT.json", help="Result, for `run --parameters`.")
     ] = Path("fit.json"),
-    only: Annotated[
-        list[str] | None, typer.Option("--only", help="Only names with this prefix; repeatable.")
-    ] = None,
+    only: OnlyOption = None,
     png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the fit.")] = None,
     workers: WorkersOption = 0,
     mesh: MeshOption = "biotac",
@@ -286,9 +287,7 @@ def validate(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for table and plots.")] = Path(
         "runs/validation"
     ),
-    only: Annotated[
-        list[str] | None, typer.Option("--only", help="Only names with this prefix; repeatable.")
-    ] = None,
+    only: OnlyOption = None,
     store: Annotated[
         Path | None,
         typer.Option(metavar="NAME.sim", help="Use simulations of this store; run none."),
@@ -364,7 +363,7 @@ def fit(
     """Fit three specimens to the ranges and forces that the paper publishes."""
     from palpate_fem.cli.identify import fit_units_command
 
-    raise typer.Exit(fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3))
+    fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3)
 
 
 @units_app.command(epilog="Example: palpate fem units show")
@@ -378,4 +377,4 @@ def show(
     """Show the parameters of the specimens, and what they were fitted to."""
     from palpate_fem.cli.identify import show_units_command
 
-    raise typer.Exit(show_units_command(file, as_json=as_json))
+    show_units_command(file, as_json=as_json)

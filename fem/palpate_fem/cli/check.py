@@ -27,17 +27,8 @@ if TYPE_CHECKING:
 def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as_json: bool) -> int:
     """Run the verification suite, and print one line for each check.
 
-    Args:
-        only: Word in the names of the checks that are run; None = all.
-        slow: Also those that take minutes.
-        shared_data: Folder that holds the public BioTac's folder; None = next to the project.
-        as_json: Print JSON instead of a table.
-
     Returns:
         0, or 1 if a check failed; a skipped check has not failed.
-
-    Raises:
-        ConfigError: No check has such a name, or the public BioTac is not in ``shared_data``.
     """
     from palpate_fem.verify import PUBLIC_SKIN, run
 
@@ -65,12 +56,8 @@ def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as
     return 0 if all(check.passed for check in checks) else 1
 
 
-def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
-    """Measure, and print each metric.
-
-    Returns:
-        0.
-    """
+def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> None:
+    """Measure, and print each metric."""
     bench: Any = importlib.import_module("palpate_fem.bench")
     with progress_bar() as bar:
         task = bar.add_task("bench", total=None)
@@ -81,7 +68,7 @@ def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
         )
     if as_json:
         typer.echo(json.dumps(dict(metrics), indent=1))
-        return 0
+        return
     print_table(
         ("metric", "value"),
         [
@@ -91,7 +78,6 @@ def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> int:
         title="one trajectory",
         numbers_from=1,
     )
-    return 0
 
 
 def _show_checks(checks: list[VerificationCheck]) -> None:
@@ -136,12 +122,7 @@ def _plain(check: VerificationCheck) -> dict[str, object]:
 
 
 def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
-    """Run a study.
-
-    Args:
-        what: ``mesh`` or ``steps``.
-        png: Picture to draw.
-        as_json: Print JSON instead of a table.
+    """Run a study of ``mesh`` or ``steps``.
 
     Returns:
         0, or 1 if the last refinement changed more than is accepted, or an indentation did not

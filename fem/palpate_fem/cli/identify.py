@@ -23,7 +23,7 @@ from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
 from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
-from palpate_fem.calibration.runs import SimulatedRun, simulate_all
+from palpate_fem.calibration.runs import simulate_all
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
 from palpate_fem.config import EDGE_M, FingertipParameters
@@ -59,18 +59,9 @@ def calibrate_command(
     png: Path | None,
     workers: int,
 ) -> int:
-    """Calibrate and write the result.
-
-    Returns:
-        0, or 1 if the search did not converge.
-
-    Raises:
-        DatasetError: The file is damaged, or nothing in it can be compared.
-        SimulationError: No simulation can be compared with its measurement.
-        ConfigError: No trajectory is left.
-    """
+    """Calibrate and write the result; 1 if the search did not converge."""
     chosen = _chosen(measured, only)
-    with simulator_for(model, workers, len(chosen)) as (simulator, executor), _search_bar() as bar:
+    with simulator_for(model, workers, len(chosen)) as (simulator, executor, bar):
         result = calibrate(
             simulator,
             chosen,
@@ -94,21 +85,16 @@ def validate_command(
     store: Path | None,
     workers: int,
 ) -> int:
-    """Compare, and write table and plots.
-
-    Returns:
-        0, or 1 if nothing could be compared.
-
-    Raises:
-        DatasetError: A file is damaged.
-        ConfigError: No trajectory is left.
-    """
+    """Compare, and write table and plots; 1 if nothing could be compared."""
     chosen = _chosen(measured, only)
     refused: dict[str, str] = {}
     if store is not None:
         simulated, refused = simulated_from(SimulationStore.open(store), chosen)
     else:
-        simulated = _simulated(chosen, model, workers)
+        with simulator_for(model, workers, len(chosen)) as (simulator, executor, bar):
+            simulated = simulate_all(
+                simulator, model.parameters, chosen, executor=executor, on_run=bar.on_run
+            )
     result = validate(chosen, simulated)
     print_lines(*(f"{name}: {why}" for name, why in refused.items()))
     if result.compared:
@@ -121,15 +107,6 @@ def validate_command(
     plot_indenters(result, files[-1])
     print_lines(f"wrote {out}: {', '.join(file.name for file in files)}")
     return 0
-
-
-def _simulated(
-    chosen: Sequence[MeasuredIndentation], model: FingertipModel, workers: int
-) -> dict[str, SimulatedRun]:
-    with simulator_for(model, workers, len(chosen)) as (simulator, executor), _search_bar() as bar:
-        return simulate_all(
-            simulator, model.parameters, chosen, executor=executor, on_run=bar.on_run
-        )
 
 
 def _chosen(measured: Path, only: Sequence[str]) -> list[MeasuredIndentation]:
@@ -155,17 +132,18 @@ def _chosen(measured: Path, only: Sequence[str]) -> list[MeasuredIndentation]:
 @contextmanager
 def simulator_for(
     model: FingertipModel, workers: int, jobs: int
-) -> Iterator[tuple[PoolSimulator, ThreadPoolExecutor]]:
-    """A simulator over worker processes, and an executor with a thread for each of them."""
+) -> Iterator[tuple[PoolSimulator, ThreadPoolExecutor, _SearchBar]]:
+    """A simulator over worker processes, an executor with a thread for each, and a progress bar."""
     count, threads = workers_for(workers, jobs)
     with (
         PoolSimulator(
             model.setup(keep=2), workers=count, threads=threads, limit_s=_LIMIT_S
         ) as simulator,
         ThreadPoolExecutor(count) as executor,
+        progress_bar() as bar,
     ):
         try:
-            yield simulator, executor
+            yield simulator, executor, _SearchBar(bar)
         except BaseException:
             simulator.close()  # before the executor, whose threads wait for the simulator
             raise
@@ -187,12 +165,6 @@ class _SearchBar:
 
     def on_run(self, done: int, total: int) -> None:
         self._bar.update(self._task, completed=done, total=total)
-
-
-@contextmanager
-def _search_bar() -> Iterator[_SearchBar]:
-    with progress_bar() as bar:
-        yield _SearchBar(bar)
 
 
 def _show_calibration(result: Calibration, out: Path) -> None:
@@ -222,27 +194,15 @@ def recover_command(
     workers: int,
     as_json: bool,
 ) -> int:
-    """Simulate with known parameters, add noise, calibrate, compare.
+    """Simulate with known parameters, add noise, calibrate; 1 if an error exceeds its tolerance.
 
-    Args:
-        model: Mesh of the calibration; its parameters are not used.
-        edge_mm: Edge of that mesh on the pad [mm]; None = the default mesh.
-        noise_n: Standard deviation of the noise of each axis [N].
-        seed: For the noise.
-        workers: Processes that solve.
-        as_json: Print JSON instead of a table.
-
-    Returns:
-        0, or 1 if the error of a parameter exceeds its tolerance.
+    Of the model only the mesh is used.
     """
     geometry = biotac(
         thickness_m=PLANTED.skin_thickness_m, edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3
     )
     planned = plan_recovery(Fingertip.pressurised(geometry, replace(PLANTED)))
-    with (
-        simulator_for(model, workers, len(planned)) as (simulator, executor),
-        _search_bar() as bar,
-    ):
+    with simulator_for(model, workers, len(planned)) as (simulator, executor, bar):
         recovery = recover(
             simulator,
             PLANTED,
@@ -286,18 +246,8 @@ def planned_travel_m(name: str) -> float:
     return CLEARANCE_M + (NORMAL_DEPTH_M if name.endswith("/normal") else ANGLED_DEPTH_M)
 
 
-def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> int:
-    """Fit the paper's three specimens on a store.
-
-    Args:
-        store: Trajectories of the whole set.
-        out: Population file to write.
-        overtravel_m: How much deeper than planned the store's paths go [m].
-
-    Raises:
-        ConfigError: The overtravel is negative.
-        DatasetError: The store is empty, damaged, or of another mesh.
-    """
+def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> None:
+    """Fit the paper's three specimens on a store of the whole set, and write the population."""
     if overtravel_m < 0:
         raise ConfigError(f"overtravel of {overtravel_m} m", remedy="give 0 or more")
     opened = SimulationStore.open(store)
@@ -322,21 +272,15 @@ def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> int:
     write_population(out, members, source=source)
     _show_members(members)
     print_lines(f"wrote {out}")
-    return 0
 
 
-def show_units_command(file: Path | None, *, as_json: bool) -> int:
-    """Print a population.
-
-    Raises:
-        ConfigError: The file cannot be read, or is none.
-    """
+def show_units_command(file: Path | None, *, as_json: bool) -> None:
+    """Print a population."""
     members = read_population(file)
     if as_json:
         typer.echo(json.dumps([member.to_dict() for member in members], indent=2))
     else:
         _show_members(members)
-    return 0
 
 
 def _show_members(members: Sequence[Member]) -> None:

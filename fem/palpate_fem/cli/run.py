@@ -138,10 +138,6 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
 
     Returns:
         0, or 1 if a trajectory neither completed nor ended at the force limit.
-
-    Raises:
-        ConfigError: An option makes no sense.
-        PalpateError: The solver does not start, or the store cannot be written.
     """
     options.check()
     sweep, store = options.sweep, options.store
@@ -204,17 +200,8 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
     return 0 if not report.stopped and all(early.how in GOOD for early in report.early) else 1
 
 
-def export_command(store: Path, out: Path) -> int:
-    """Check a store against its checksums, copy it into one file and print what is in it.
-
-    Returns:
-        0.
-
-    Raises:
-        ConfigError: ``out`` exists, or does not end in ``.h5``.
-        DatasetError: ``store`` is not a store, is one file already, or is damaged.
-        StoreDiskError: The disk is full or refuses.
-    """
+def export_command(store: Path, out: Path) -> None:
+    """Check a store against its checksums, copy it into one file and print what is in it."""
     if out.suffix != EXPORT_SUFFIX:
         raise ConfigError(
             f"{out} does not end in {EXPORT_SUFFIX}", remedy=f"call it {out.stem}{EXPORT_SUFFIX}"
@@ -235,7 +222,6 @@ def export_command(store: Path, out: Path) -> int:
             command=typed_command(),
         )
     print_lines(f"{out}: {count} trajectories, {out.stat().st_size / 1e6:.1f} MB")
-    return 0
 
 
 def serve_command(
@@ -248,13 +234,7 @@ def serve_command(
     waiting: int,
     max_deadline_s: float,
 ) -> None:
-    """Serve until ``SIGINT`` or ``SIGTERM``.
-
-    Raises:
-        ConfigError: An option is out of range.
-        LinkError: There is no router.
-        RemoteError: The solver does not start.
-    """
+    """Serve until ``SIGINT`` or ``SIGTERM``."""
     # Only this command needs the bus.
     from palpate_fem.service import node
     from palpate_fem.service.config import FemConfig

@@ -87,9 +87,8 @@ def fit_specimen(
         some = [states[i] for i in sorted(chosen)]
 
         def misfit(scaled: Floats, some: list[Gap] = some) -> Floats:
-            lowest, highest = tared_range(
-                _tared(sensor.with_specimen(specimen_at(scaled)), some, rest)
-            )
+            tried = sensor.with_specimen(specimen_at(scaled))
+            lowest, highest = tared_range(_tared(tried, some, rest))
             # Misfit and priors in one vector of residuals: the fit is a maximum a posteriori
             # estimate.
             missed = np.array([lowest - wanted[0], highest - wanted[1]]) / TOLERANCE

@@ -80,15 +80,10 @@ class Population:
                 remedy="give each a different name",
             )
         self.electrodes: dict[str, ElectrodeModel] = {}
-        first: ElectrodeModel | None = None
+        model = ElectrodeModel(geometry, specimens[0])
         for specimen in specimens:
-            first = (
-                ElectrodeModel(geometry, specimen)
-                if first is None
-                else first.with_specimen(specimen)
-            )
-            self.electrodes[specimen.name] = first
-        assert first is not None
+            model = model.with_specimen(specimen)
+            self.electrodes[specimen.name] = model
         self._nodes = fingertip.pressurised_nodes
         self._groups = _sharing_films(self.electrodes)
         rest = {name: self.gap(name) for name in self.electrodes}

@@ -71,7 +71,7 @@ def biotac(
         mesh: ``biotac`` for the open parametric mesh, else the folder of the public meshes.
         edge_m: Edge of the parametric mesh's elements on the pad [m]; None = ``EDGE_M``.
         layers: Elements through the skin.
-        solver: SolverSettings of the solver by name, e.g. ``{"force_limit_n": 32.0}``.
+        solver: Settings of the solver by name, e.g. ``{"force_limit_n": 32.0}``.
 
     Raises:
         ConfigError: An option makes no mesh, or a setting does not exist.

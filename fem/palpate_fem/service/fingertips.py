@@ -44,12 +44,8 @@ class PressurisedTip(Protocol):
         ...
 
 
-class BuildTip(Protocol):
-    """Builds a pressurised fingertip."""
-
-    def __call__(self, parameters: FingertipParameters, on_fraction: OnFraction) -> PressurisedTip:
-        """Build and pressurise."""
-        ...
+BuildTip = Callable[[FingertipParameters, OnFraction], PressurisedTip]
+"""Builds a fingertip and pressurises it."""
 
 
 class FingertipCache:

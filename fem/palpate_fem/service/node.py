@@ -254,7 +254,7 @@ class SimulationService(Closing):
         self._health.set_counts({"worker_restarts": self.pool.restarts})
 
     def close(self) -> None:
-        """QueryAnswer whatever waits or runs with UNAVAILABLE, and end the workers."""
+        """Answer whatever waits or runs with UNAVAILABLE, and end the workers."""
         self.pool.close()
 
     def _on_event(self, active: ActiveSimulation, event: JobEvent) -> None:

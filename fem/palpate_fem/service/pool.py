@@ -392,7 +392,11 @@ class WorkerPool(Closing):
                 self._failed_starts += 1
                 pause_s = min(_PAUSE_S * 2.0**self._failed_starts, _LONGEST_PAUSE_S)
                 if not self._ever_ready and self._failed_starts >= _STARTS_BEFORE_GIVING_UP:
-                    self.broken = self.broken or _not_starting(how)
+                    self.broken = self.broken or RemoteError(
+                        f"the solver's process {how} before it was ready, again and again",
+                        remedy="look at the log above; try it alone: palpate fem run",
+                        code=ErrorCode.UNAVAILABLE,
+                    )
             self._starts_at.append(time.monotonic() + pause_s)
             self.restarts += not closing
         if not closing:
@@ -483,14 +487,6 @@ def _stopping() -> RemoteError:
         remedy="ask again when it is back: palpate status",
         code=ErrorCode.UNAVAILABLE,
         retry_after_s=2.0,
-    )
-
-
-def _not_starting(how: str) -> RemoteError:
-    return RemoteError(
-        f"the solver's process {how} before it was ready, again and again",
-        remedy="look at the log above; try it alone: palpate fem run",
-        code=ErrorCode.UNAVAILABLE,
     )
 
 

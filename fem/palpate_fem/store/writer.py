@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,7 @@ class StoreWriter(SimulationStore, Closing):
     ) -> None:
         super().__init__(path)
         self._fingertip, self._stress, self._command = fingertip, stress, command
-        self._outline = outline
-        self._outlines: dict[str, Outline] = {}
+        self._outline = cache(outline) if outline else None
         self._prepare_folder()
         self._lock: FolderLock | None = FolderLock(path, shared=shared)
         try:
@@ -144,18 +144,11 @@ class StoreWriter(SimulationStore, Closing):
                 nodes=len(self._fingertip.mesh.nodes),
                 fingertip=self._fingertip.key,
                 sensor=sensor,
-                outline=self._outline_of(result.indenter),
+                outline=self._outline(result.indenter) if self._outline else None,
                 stress=self._stress,
             )
 
         return file_image(fill, command=self._command)
-
-    def _outline_of(self, indenter: str) -> Outline | None:
-        if self._outline is None:
-            return None
-        if indenter not in self._outlines:
-            self._outlines[indenter] = self._outline(indenter)
-        return self._outlines[indenter]
 
     def _prepare_folder(self) -> None:
         if self.path.suffix != SUFFIX:

@@ -62,7 +62,7 @@ class ComparedTrajectory:
         peak_n: Greatest measured force in the compared part [N].
         relative: RMS error over the greatest force.
         depth_offset_m: Depth at which the simulation reaches 0.5 N, minus the measured one [m].
-        displacement_m: ComparedTrajectory displacement from there [m].
+        displacement_m: Compared displacement from there [m].
         coverage: Its part of the measured one.
         outcome: How the simulation ended.
         pair: The curves.
