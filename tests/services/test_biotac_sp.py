@@ -25,7 +25,7 @@ from palpate.messages import ElectrodeFrame, SensorType, ServiceState, Tare
 from palpate_services.config import FeaturesServiceConfig, FieldServiceConfig, RecorderConfig
 from palpate_services.inference.estimates import EstimateRefusal, estimate, estimate_field
 from palpate_services.inference.model import load
-from palpate_services.inference.services import run_features, run_field
+from palpate_services.inference.services import run_estimating
 from palpate_services.recorder.writer import RecordFiles
 
 bundles: Any = importlib.import_module("field_bundles")
@@ -84,7 +84,7 @@ def test_features_service_names_the_sensor_and_serves_the_others(
     until: Until,
 ) -> None:
     config = FeaturesServiceConfig(bundle=str(make_bundle()), max_age_s=10.0)
-    with running(run_features, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
+    with running(run_estimating, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         session = robot.session
         estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
@@ -115,7 +115,7 @@ def test_field_service_answers_by_an_error(
     link: LinkConfig, make_frame: Frames, make_tare: Tares, until: Until, tmp_path: Path
 ) -> None:
     config = FieldServiceConfig(bundle=str(bundles.write(tmp_path / "f", "field")))
-    with running(run_field, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
+    with running(run_estimating, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         announce(robot.session, "thumb", make_tare(sensor_type=SP))
         with pytest.raises(RemoteError, match="made for another type of sensor") as caught:
@@ -182,7 +182,7 @@ def test_a_lost_pac_sample_is_a_gap_in_the_picture(make_frame: Frames) -> None:
     frame = replace(frame, validity=frame.validity & ~(1 << lost))
     scene = SensorTimeline()
     scene.add(frame)
-    (row,) = scene.take().pressure
+    (row,) = scene.take()["pressure"]
     assert np.flatnonzero(np.isnan(row.values)).tolist() == [1 + 5]
     assert row.values.shape == (28,)
     assert scene.sensor_type is SP

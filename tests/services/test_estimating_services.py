@@ -25,7 +25,7 @@ from palpate_services.config import (
 )
 from palpate_services.inference.estimates import estimate, estimate_field, synthesise
 from palpate_services.inference.model import Runtime, load
-from palpate_services.inference.services import run_features, run_field, run_synthesis
+from palpate_services.inference.services import run_estimating
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -38,7 +38,6 @@ class Case:
     """One service: how it is run, what goes in, what comes out, and by which pure function."""
 
     name: str
-    run: Callable[..., None]
     config: Callable[..., Any]
     source: Topic[Any]
     target: Topic[Any]
@@ -70,19 +69,19 @@ def _synthesise(message: Any, _: Tare, runtime: Runtime) -> Any:
 
 CASES = {
     "features": Case(
-        "features", run_features, FeaturesServiceConfig, ELECTRODES, FEATURES, _electrodes,
+        "features", FeaturesServiceConfig, ELECTRODES, FEATURES, _electrodes,
         estimate, "frames_received",
     ),
     "field": Case(
-        "field", run_field, FieldServiceConfig, ELECTRODES, FIELD, _electrodes, estimate_field,
+        "field", FieldServiceConfig, ELECTRODES, FIELD, _electrodes, estimate_field,
         "frames_received",
     ),
     "synthesis of truth": Case(
-        "synthesis", run_synthesis, SynthesisServiceConfig, FIELD_TRUTH, SYNTHESIS, _known,
+        "synthesis", SynthesisServiceConfig, FIELD_TRUTH, SYNTHESIS, _known,
         _synthesise, "fields_received", "truth",
     ),
     "synthesis of estimates": Case(
-        "synthesis", run_synthesis, SynthesisServiceConfig, FIELD, SYNTHESIS, _guessed, _synthesise,
+        "synthesis", SynthesisServiceConfig, FIELD, SYNTHESIS, _guessed, _synthesise,
         "fields_received", "estimate",
     ),
 }  # fmt: skip
@@ -113,7 +112,7 @@ def serve(case: Case, folder: Path, link: LinkConfig, until: Until) -> Serve:
         stop = threading.Event()
         source = {"source": case.source_name} if case.source_name else {}
         settings = case.config(bundle=str(folder), **source, **case.options(), **config)
-        node = threading.Thread(target=case.run, args=(settings, link, "lab", stop))
+        node = threading.Thread(target=run_estimating, args=(settings, link, "lab", stop))
         node.start()
         try:
             with Session.open(link) as session:

@@ -33,7 +33,7 @@ from palpate.messages import (
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference.estimates import estimate
 from palpate_services.inference.model import Runtime
-from palpate_services.inference.services import run_features
+from palpate_services.inference.services import run_estimating
 
 Frames = Callable[..., ElectrodeFrame]
 Tares = Callable[..., Tare]
@@ -49,7 +49,7 @@ def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> S
     def running(**config: Any) -> Iterator[Session]:
         stop = threading.Event()
         settings = FeaturesServiceConfig(bundle=str(make_bundle()), **config)
-        node = threading.Thread(target=run_features, args=(settings, link, "lab", stop))
+        node = threading.Thread(target=run_estimating, args=(settings, link, "lab", stop))
         node.start()
         try:
             with Session.open(link) as session:
@@ -275,6 +275,6 @@ def test_ready_token_goes_when_it_stops(serve: Serve, link: LinkConfig, until: U
 
 def test_unknown_bundle_lists_what_there_is() -> None:
     with pytest.raises(ConfigError, match="bundle 'no-such'"):
-        run_features(
+        run_estimating(
             FeaturesServiceConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event()
         )

@@ -152,9 +152,3 @@ def test_a_model_wider_than_its_mesh_is_not_served(tmp_path: Path) -> None:
     folder = bundles.write(tmp_path / "field", "field", spoiled=spoiled)
     with pytest.raises(BundleError, match=r"displacement float32\[-1, 183\]"):
         load(read_bundle(folder), "field")
-
-
-def test_a_bundle_of_fields_made_without_its_mesh_is_not_served(tmp_path: Path) -> None:
-    bundle = read_bundle(bundles.write(tmp_path / "field", "field"))
-    with pytest.raises(BundleError, match="needs a mesh"):
-        load(dataclasses.replace(bundle, mesh=None), "field")

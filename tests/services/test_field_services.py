@@ -23,7 +23,7 @@ from palpate_services.config import FieldServiceConfig, SynthesisServiceConfig
 from palpate_services.inference.estimates import estimate_field
 from palpate_services.inference.loop import RateLimit
 from palpate_services.inference.model import load
-from palpate_services.inference.services import run_field, run_synthesis
+from palpate_services.inference.services import run_estimating
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -41,8 +41,8 @@ def station(link: LinkConfig, tmp_path: Path, until: Until) -> Iterator[Client]:
         bundle=str(bundles.write(tmp_path / "s", "synthesis")), source="estimate", **replay
     )
     nodes = [
-        threading.Thread(target=run_field, args=(fields, link, "lab", stop)),
-        threading.Thread(target=run_synthesis, args=(counts, link, "lab", stop)),
+        threading.Thread(target=run_estimating, args=(fields, link, "lab", stop)),
+        threading.Thread(target=run_estimating, args=(counts, link, "lab", stop)),
     ]
     for node in nodes:
         node.start()

@@ -73,9 +73,9 @@ def test_scene_keeps_truth_estimate_and_synthesis_apart(make_frame: Frames) -> N
     assert scene.has_fields
     rows = scene.take()
     for name, depth_m in (("truth", 1e-3), ("estimate", 2e-3)):
-        (row,) = rows.fields[name]
+        (row,) = rows[f"field/{name}"]
         np.testing.assert_array_equal(row.displacement, bundles.pressed(depth_m))
-    assert [row.values[18] for row in rows.synthesised] == [18.0]
+    assert [row.values[18] for row in rows["synthesised"]] == [18.0]
     assert {"field", "field_truth", "synthesis"} <= SensorTimeline.TOPICS
 
 

@@ -30,7 +30,7 @@ from palpate.messages import (
     Tare,
 )
 from palpate_services.config import FeaturesServiceConfig, RecorderConfig
-from palpate_services.inference.services import run_features
+from palpate_services.inference.services import run_estimating
 from palpate_services.recorder.service import run_recorder
 from palpate_services.recorder.writer import leftovers, recover_all
 
@@ -56,7 +56,7 @@ def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) ->
         keep = RecorderConfig(delivery="every" if lossless else "queue", **config)
         on = link.model_copy(update={"direct": not lossless})  # as the replay profile does it
         nodes = [
-            threading.Thread(target=run_features, args=(serve, on, "lab", stops["features"])),
+            threading.Thread(target=run_estimating, args=(serve, on, "lab", stops["features"])),
             threading.Thread(target=run_recorder, args=(keep, on, "lab", stops["recorder"])),
         ]
         for node in nodes:

@@ -86,11 +86,9 @@ def _entry_point(service: Service) -> Callable[..., None]:
         from palpate_services.recorder.service import run_recorder
 
         return run_recorder
-    from palpate_services.inference import services
+    from palpate_services.inference.services import run_estimating
 
-    if service == "features":
-        return services.run_features
-    return services.run_field if service == "field" else services.run_synthesis
+    return run_estimating
 
 
 def service_named(name: str) -> Service:

@@ -255,28 +255,17 @@ def serve(
     station: str,
     stop: threading.Event,
     *,
-    instance: str,
+    instance: str | None,
     prepare: Callable[[Session, Runtime, Health], EstimateFrom[M, E]],
     rate_hz: float | None = None,
 ) -> None:
     """Serve until ``stop`` is set; then withdraw, answer what has already come, and leave.
 
-    Args:
-        route: From which topic to which.
-        config: Which bundle is served, and to whom.
-        link: How to join the bus.
-        station: The station to serve.
-        stop: Set it to end.
-        instance: Name of this process among several of its kind.
-        prepare: Returns what makes the estimates; it may also declare endpoints of the service.
-        rate_hz: Estimates a second and sensor at most [Hz]; None = no limit.
-
-    Raises:
-        ConfigError: There is no such bundle.
-        BundleError: The bundle breaks its contract.
-        MissingExtraError: ONNX Runtime is not installed.
-        LinkError: The bus cannot be joined.
+    ``route`` says from which topic to which; ``prepare`` returns what makes the estimates, and may
+    declare endpoints of the service; ``rate_hz`` limits the estimates a second and sensor [Hz]. The
+    other arguments and the errors are those of ``run_estimating``.
     """
+    instance = instance or route.service
     # Before the bus is joined: no message may wait while the model loads and warms up.
     runtime = load(read_bundle(resolve(config.bundle)), route.service)
     health = Health(route.service, instance)

@@ -17,13 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError
-from palpate.files.bundle import (
-    BUNDLE_CONTRACT_VERSION,
-    Bundle,
-    Manifest,
-    check_bundle_mesh,
-    check_task,
-)
+from palpate.files.bundle import Bundle, Manifest
 from palpate.messages import FloatArray, ModelMetadata, SensorType
 from palpate.process import require
 
@@ -94,10 +88,15 @@ class Runtime:
         self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
         self._lock = threading.Lock()
         self._label = f"bundle {manifest.name}:{manifest.version}"
-        _check_manifest(manifest, task, self._label)
+        if manifest.task != task:
+            raise BundleError(
+                f"{self._label} is for the task {manifest.task!r}, not {task!r}",
+                remedy=f"serve a bundle whose manifest says task = {task!r}",
+            )
         self.sensor_type = SensorType[manifest.sensor_type]
-        check_bundle_mesh(bundle.mesh, manifest, self._label)
-        self._session = _open_model(bundle.model, manifest, self._label)
+        _check_self_contained(bundle.model, self._label)
+        self._session = _open_session(bundle.model, self._label)
+        _check_model(manifest, self._session, self._label)
         self._check_golden(bundle.golden)
         self._bind()
         self._warm_up()
@@ -234,35 +233,6 @@ class Runtime:
                 "standard deviation is negative",
                 remedy=_REMEDY,
             )
-
-
-def _check_manifest(manifest: Manifest, task: str, label: str) -> None:
-    """Checks that ``read_bundle`` makes too, for bundles that were made in memory."""
-    if manifest.contract_version > BUNDLE_CONTRACT_VERSION:
-        raise BundleError(
-            f"{label} is written for bundle contract v{manifest.contract_version}, this palpate "
-            f"knows v{BUNDLE_CONTRACT_VERSION}",
-            remedy="upgrade palpate on this host: pip install --upgrade palpate",
-        )
-    if manifest.task != task:
-        raise BundleError(
-            f"{label} is for the task {manifest.task!r}, not {task!r}",
-            remedy=f"serve a bundle whose manifest says task = {task!r}",
-        )
-    check_task(manifest, label)
-    if manifest.sensor_type not in SensorType.__members__:
-        raise BundleError(
-            f"{label} is for the unknown sensor type {manifest.sensor_type!r}",
-            remedy=f"known sensor types: {', '.join(SensorType.__members__)}",
-        )
-
-
-def _open_model(model: bytes, manifest: Manifest, label: str) -> Any:
-    """ONNX Runtime's session of a model that agrees with its manifest."""
-    _check_self_contained(model, label)
-    session = _open_session(model, label)
-    _check_model(manifest, session, label)
-    return session
 
 
 def _check_self_contained(model: bytes, label: str) -> None:

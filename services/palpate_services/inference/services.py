@@ -1,27 +1,18 @@
-"""The three estimating services: features, field and synthesis.
-
-Each ``run_*`` serves until ``stop`` is set. ``config`` is its table of the profile, ``link`` how it
-joins the bus, ``station`` the station that it serves, ``instance`` its name among several processes
-of its kind. The errors are those of ``palpate_services.inference.loop.serve``.
-"""
+"""The three estimating services: features, field and synthesis."""
 
 from __future__ import annotations
 
 import threading
+from functools import partial
 from typing import Any
 
 from palpate.bus import Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, FIELD_TRUTH, SYNTHESIS
 from palpate.config import LinkConfig
 from palpate.health import Health
-from palpate.messages import (
-    ElectrodeFrame,
-    FeatureEstimate,
-    FieldEstimate,
-    FieldRequest,
-    SynthesisEstimate,
-)
+from palpate.messages import FieldEstimate, FieldRequest
 from palpate_services.config import (
+    EstimatingConfig,
     FeaturesServiceConfig,
     FieldServiceConfig,
     SynthesisServiceConfig,
@@ -35,96 +26,74 @@ from palpate_services.inference.estimates import (
 from palpate_services.inference.loop import EstimateFrom, ServiceRoute, reply, serve
 from palpate_services.inference.model import Runtime
 
-_FEATURES: ServiceRoute[ElectrodeFrame, FeatureEstimate] = ServiceRoute(
-    "features", ELECTRODES, FEATURES, "frames_received"
-)
-_FIELD: ServiceRoute[ElectrodeFrame, FieldEstimate] = ServiceRoute(
-    "field", ELECTRODES, FIELD, "frames_received"
-)
-_SYNTHESIS: dict[str, ServiceRoute[Any, SynthesisEstimate]] = {
+_FEATURES = ServiceRoute("features", ELECTRODES, FEATURES, "frames_received")
+_FIELD = ServiceRoute("field", ELECTRODES, FIELD, "frames_received")
+_SYNTHESIS: dict[str, ServiceRoute[Any, Any]] = {
     "truth": ServiceRoute("synthesis", FIELD_TRUTH, SYNTHESIS, "fields_received"),
     "estimate": ServiceRoute("synthesis", FIELD, SYNTHESIS, "fields_received"),
 }  # by SynthesisServiceConfig.source
 
 
-def run_features(
-    config: FeaturesServiceConfig,
+def run_estimating(
+    config: EstimatingConfig,
     link: LinkConfig,
     station: str,
     stop: threading.Event,
     *,
-    instance: str = "features",
+    instance: str | None = None,
 ) -> None:
-    """Serve features: from electrodes to force and contact location."""
+    """Serve the service whose configuration is given, until ``stop`` is set.
 
-    def prepare(
-        session: Session, runtime: Runtime, health: Health
-    ) -> EstimateFrom[ElectrodeFrame, FeatureEstimate]:
-        return TaredEstimator(session, config, runtime, estimate, health).estimate
+    Features are estimated from electrodes, as are fields, at a limited rate; synthesis goes from
+    fields to tared counts. The endpoint ``estimate`` of the field service replies with the field of
+    the frame in a request; ``synthesise`` with the tared counts of the field in a request.
 
-    serve(_FEATURES, config, link, station, stop, instance=instance, prepare=prepare)
+    Args:
+        config: Its table of the profile.
+        link: How to join the bus.
+        station: The station to serve.
+        stop: Set it to end.
+        instance: Name of this process among several of its kind; None = that of the service.
 
-
-def run_field(
-    config: FieldServiceConfig,
-    link: LinkConfig,
-    station: str,
-    stop: threading.Event,
-    *,
-    instance: str = "field",
-) -> None:
-    """Serve fields: from electrodes to the displacement of each skin node, at a limited rate.
-
-    Its endpoint ``estimate`` replies with the field of the frame in the request.
+    Raises:
+        ConfigError: There is no such bundle.
+        BundleError: The bundle breaks its contract.
+        MissingExtraError: ONNX Runtime is not installed.
+        LinkError: The bus cannot be joined.
     """
+    run = partial(serve, config=config, link=link, station=station, stop=stop, instance=instance)
+    if isinstance(config, FeaturesServiceConfig):
+        run(_FEATURES, prepare=partial(_features, config))
+    elif isinstance(config, FieldServiceConfig):
+        run(_FIELD, prepare=partial(_field, config), rate_hz=config.rate_hz)
+    elif isinstance(config, SynthesisServiceConfig):
+        run(_SYNTHESIS[config.source], prepare=_synthesis)
 
-    def prepare(
-        session: Session, runtime: Runtime, health: Health
-    ) -> EstimateFrom[ElectrodeFrame, FieldEstimate]:
-        # Requests come in a thread of their own, and an estimator belongs to one thread.
-        requested = TaredEstimator(session, config, runtime, estimate_field, health, any_age=True)
 
-        def handle(request: FieldRequest) -> FieldEstimate:
-            return reply(requested.estimate(request.sensor, request.frame), health)
+def _features(
+    config: FeaturesServiceConfig, session: Session, runtime: Runtime, health: Health
+) -> EstimateFrom[Any, Any]:
+    return TaredEstimator(session, config, runtime, estimate, health).estimate
 
-        session.queryable(endpoints.ESTIMATE_FIELD, handle, service="field", instance=instance)
-        return TaredEstimator(session, config, runtime, estimate_field, health).estimate
 
-    serve(
-        _FIELD,
-        config,
-        link,
-        station,
-        stop,
-        instance=instance,
-        prepare=prepare,
-        rate_hz=config.rate_hz,
+def _field(
+    config: FieldServiceConfig, session: Session, runtime: Runtime, health: Health
+) -> EstimateFrom[Any, Any]:
+    # Requests come in a thread of their own, and an estimator belongs to one thread.
+    requested = TaredEstimator(session, config, runtime, estimate_field, health, any_age=True)
+
+    def handle(request: FieldRequest) -> FieldEstimate:
+        return reply(requested.estimate(request.sensor, request.frame), health)
+
+    session.queryable(endpoints.ESTIMATE_FIELD, handle, service="field", instance=health.instance)
+    return TaredEstimator(session, config, runtime, estimate_field, health).estimate
+
+
+def _synthesis(session: Session, runtime: Runtime, health: Health) -> EstimateFrom[Any, Any]:
+    session.queryable(
+        endpoints.SYNTHESISE,
+        lambda field: reply(synthesise(field, runtime), health),
+        service="synthesis",
+        instance=health.instance,
     )
-
-
-def run_synthesis(
-    config: SynthesisServiceConfig,
-    link: LinkConfig,
-    station: str,
-    stop: threading.Event,
-    *,
-    instance: str = "synthesis",
-) -> None:
-    """Serve synthesis: from displacement fields to tared counts of the electrodes.
-
-    Its endpoint ``synthesise`` replies with the tared counts of the field in the request.
-    """
-
-    def prepare(
-        session: Session, runtime: Runtime, health: Health
-    ) -> EstimateFrom[Any, SynthesisEstimate]:
-        session.queryable(
-            endpoints.SYNTHESISE,
-            lambda field: reply(synthesise(field, runtime), health),
-            service="synthesis",
-            instance=instance,
-        )
-        return lambda _, field: synthesise(field, runtime)
-
-    route = _SYNTHESIS[config.source]
-    serve(route, config, link, station, stop, instance=instance, prepare=prepare)
+    return lambda _, field: synthesise(field, runtime)

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from palpate.health import Health
 from palpate.messages import ServiceState
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.repository import MeshLibrary
-from palpate_services.viewer.record_view import LiveView
+from palpate_services.viewer.record_view import LiveView, RerunView
 from palpate_services.viewer.timeline import SensorTimeline
 
 
@@ -317,12 +318,14 @@ class RecordFiles:
         self._size = self._unflushed = 0
         self._opened_s = time.monotonic()
         if self._config.rrd:
-            self._view = LiveView(
+            make = partial(
+                RerunView,
                 path.with_suffix(".rrd"),
                 title=path.stem,
                 max_bytes=self._config.rrd_max_bytes,
                 meshes=self._meshes,
             )
+            self._view = LiveView(make)
             self._views.append(self._view)
         self._health.set_state(ServiceState.READY, f"recording to {path}")
         self._counts["records_opened"] += 1

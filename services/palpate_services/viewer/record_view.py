@@ -56,6 +56,8 @@ BATCH_MESSAGES = 200
 ARROW_M_PER_N = 2e-3
 """Length of a force arrow [m/N]."""
 
+_CURVES = ("electrodes/raw", "electrodes/tared", "error/force", "error/location", "synthesised")
+
 Send = Callable[[str, list[Any], Iterable[Any]], None]
 
 
@@ -254,71 +256,49 @@ class RerunView:
             for entity, value in record_fixtures(kinds[sensor], again=sensor in again):
                 self._stream.log(f"{sensor}/{entity}", value, static=True)
 
-    def _draw(self, sensor: str, scene: SensorTimeline) -> None:
+    def _draw(self, sensor: str, timeline: SensorTimeline) -> None:
         rr = self._rr
-        rows = scene.take()
-        for kind in ("raw", "tared"):
-            for frames in _of_one_width(rows.electrodes[kind]):
-                values = np.stack([frame.values for frame in frames])
-                self._send(
-                    f"{sensor}/electrodes/{kind}", frames, rr.Scalars.columns(scalars=values)
-                )
-        for tared in _of_one_width(rows.electrodes["tared"]):
+        rows = timeline.take()
+        for name in _CURVES:
+            for same in _of_one_width(rows[name]):
+                values = np.stack([row.values for row in same])
+                self._send(f"{sensor}/{name}", same, rr.Scalars.columns(scalars=values))
+        for tared in _of_one_width(rows["electrodes/tared"]):
             shades = electrode_shades(np.stack([frame.values for frame in tared]))
             count = shades.shape[1]
             columns = rr.Points3D.columns(colors=shades.reshape(-1)).partition([count] * len(tared))
             self._send(f"{sensor}/finger/electrodes", tared, columns)
-        for pressure in _of_one_width(rows.pressure):
+        for pressure in _of_one_width(rows["pressure"]):
             pdc = np.array([row.values[0] for row in pressure], np.float64)
             self._send(f"{sensor}/pdc", pressure, rr.Scalars.columns(scalars=pdc))
             self._send_pac(f"{sensor}/pac", pressure)
         for name in ("truth", "estimate"):
-            self._draw_force(sensor, name, rows.force[name])
-            self._draw_arrows(sensor, name, rows.arrow[name])
-            self._draw_location(sensor, name, rows.location[name])
-        for what, errors in rows.error.items():
-            if errors:
-                values = np.array([row.values[0] for row in errors])
-                self._send(f"{sensor}/error/{what}", errors, rr.Scalars.columns(scalars=values))
+            if forces := rows[f"force/{name}"]:
+                force = np.stack([row.values for row in forces]).astype(np.float64)
+                for axis, values in zip(AXES, force.T, strict=True):
+                    columns = rr.Scalars.columns(scalars=values)
+                    self._send(f"{sensor}/force/{axis}/{name}", forces, columns)
+            # Force on the skin, ending where the finger is pressed.
+            arrows = rows[f"arrow/{name}"]
+            vectors = [ARROW_M_PER_N * row.values for row in arrows if row.at is not None]
+            ends = [row.at for row in arrows if row.at is not None]
+            parts = {"vectors": _points(vectors), "origins": _points(ends) - _points(vectors)}
+            there = [row.at is not None for row in arrows]
+            columns = rr.Arrows3D.columns(**parts)
+            self._send_some(f"{sensor}/finger/force/{name}", arrows, there, columns)
+            places = rows[f"location/{name}"]
+            points = _points([row.values for row in places if row.values is not None])
+            there = [row.values is not None for row in places]
+            columns = rr.Points3D.columns(positions=points)
+            self._send_some(f"{sensor}/finger/contact/{name}", places, there, columns)
+            self._fields.draw(f"{sensor}/field/{name}", rows[f"field/{name}"])
 
-        for name, fields in rows.fields.items():
-            self._fields.draw(f"{sensor}/field/{name}", fields)
-        if rows.synthesised:
-            values = np.stack([row.values for row in rows.synthesised])
-            columns = rr.Scalars.columns(scalars=values)
-            self._send(f"{sensor}/synthesised", rows.synthesised, columns)
-
-    def _draw_force(self, sensor: str, name: str, rows: list[TimelineRow]) -> None:
-        if not rows:
-            return
-        rr = self._rr
-        force = np.stack([row.values for row in rows])
-        for at, axis in enumerate(AXES):
-            columns = rr.Scalars.columns(scalars=force[:, at].astype(np.float64))
-            self._send(f"{sensor}/force/{axis}/{name}", rows, columns)
-
-    def _draw_arrows(self, sensor: str, name: str, rows: list[TimelineRow]) -> None:
-        """Force on the skin, ending where the finger is pressed."""
-        if not rows:
-            return
-        anchored = [row.at is not None for row in rows]
-        ends = np.array([row.at for row in rows if row.at is not None], np.float32).reshape(-1, 3)
-        force = np.stack([row.values for row in rows])[anchored]
-        vectors = (ARROW_M_PER_N * force).astype(np.float32)
-        columns = self._rr.Arrows3D.columns(vectors=vectors, origins=ends - vectors).partition(
-            np.array(anchored, int)
-        )
-        self._send(f"{sensor}/finger/force/{name}", rows, columns)
-
-    def _draw_location(self, sensor: str, name: str, rows: list[TimelineRow]) -> None:
-        if not rows:
-            return
-        touching = [row.values is not None for row in rows]
-        points = np.array([row.values for row in rows if row.values is not None], np.float32)
-        columns = self._rr.Points3D.columns(positions=points.reshape(-1, 3)).partition(
-            np.array(touching, int)
-        )
-        self._send(f"{sensor}/finger/contact/{name}", rows, columns)
+    def _send_some(
+        self, entity: str, rows: list[TimelineRow], there: list[bool], columns: Any
+    ) -> None:
+        """Send columns that have a value only in some of the rows."""
+        if rows:
+            self._send(entity, rows, columns.partition(np.array(there, int)))
 
     def _send_pac(self, entity: str, rows: list[TimelineRow]) -> None:
         """All PAC samples at their own times: electrode, PAC, electrode, PAC, ..."""
@@ -341,6 +321,10 @@ class RerunView:
         self._stream.send_columns(entity, times, columns)
 
 
+def _points(values: list[Any]) -> FloatArray:
+    return np.array(values, np.float32).reshape(-1, 3)
+
+
 def _of_one_width(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
     """Rows by their number of values: two kinds where a finger was exchanged for an SP."""
     widths = dict.fromkeys(len(row.values) for row in rows)
@@ -354,20 +338,15 @@ class LiveView:
     what the view counts, e.g. ``view_no_mesh``.
 
     Args:
-        path: The file to write.
-        title: Shown as the recording's name.
-        max_bytes: At this size the file is closed [bytes].
-        meshes: Finds the meshes of fields.
+        make: Makes the view. It is called in that thread, because it imports Rerun, which takes
+            half a second: the record must not wait for it.
     """
 
-    def __init__(self, path: Path, *, title: str, max_bytes: int, meshes: MeshLibrary) -> None:
-        self.path = path
+    def __init__(self, make: Callable[[], RerunView]) -> None:
+        self._make = make
         self._counts: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._failed = False
-        self._title = title
-        self._max_bytes = max_bytes
-        self._meshes = meshes
         # Fields have a limit of their own: 100,000 of them would take 8 GB.
         self._room_for_fields = threading.Semaphore(FIELD_CAPACITY)
         # Filled by the recorder's thread, emptied by the view's: append and popleft of a deque are
@@ -404,25 +383,19 @@ class LiveView:
 
     def _run(self) -> None:
         try:
-            # Here Rerun is imported, which takes half a second: the record must not wait for it.
-            with RerunView(
-                self.path, title=self._title, max_bytes=self._max_bytes, meshes=self._meshes
-            ) as view:
+            with self._make() as view:
                 while not self._stop.wait(PERIOD_S):
                     self._draw(view)
                 self._draw(view)
-        except PalpateError as error:
-            _log.warning("the view is given up, the record goes on: %s", error)
-            self._give_up()
-        except Exception:
+        except Exception as error:
             # A defect of the picture must be visible in the log, and must not stop the record.
-            _log.exception("the view is given up, the record goes on")
-            self._give_up()
-
-    def _give_up(self) -> None:
-        self._count({"view_failed": 1})
-        self._failed = True
-        self._waiting.clear()
+            if isinstance(error, PalpateError):
+                _log.warning("the view is given up, the record goes on: %s", error)
+            else:
+                _log.exception("the view is given up, the record goes on")
+            self._count({"view_failed": 1})
+            self._failed = True
+            self._waiting.clear()
 
     def _draw(self, view: RerunView) -> None:
         # Only what waits now: messages that arrive meanwhile are drawn in the next period.

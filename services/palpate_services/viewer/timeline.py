@@ -5,9 +5,9 @@ Free of any drawing library, so that ``record_view`` and ``plot`` remain thin.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -68,18 +68,16 @@ class FieldThinner:
             return None
         self._period = period
         row = FieldRow(stamp.wall_ns, stamp.sequence, field.mesh_sha256, field.displacement)
-        if self._drawn is not None and _alike(row, self._drawn):
+        last = self._drawn
+        if (
+            last is not None
+            and row.mesh_sha256 == last.mesh_sha256
+            and row.displacement.shape == last.displacement.shape
+            and float(np.abs(row.displacement - last.displacement).max()) < VISIBLE_M
+        ):
             return None
         self._drawn = row
         return row
-
-
-def _alike(one: FieldRow, other: FieldRow) -> bool:
-    return (
-        one.mesh_sha256 == other.mesh_sha256
-        and one.displacement.shape == other.displacement.shape
-        and float(np.abs(one.displacement - other.displacement).max()) < VISIBLE_M
-    )
 
 
 Values = npt.NDArray[Any]
@@ -107,40 +105,6 @@ class TimelineRow:
     values: Any
     at: Values | None = None
     slot_period_ns: int = 0
-
-
-def _by_source() -> dict[str, list[TimelineRow]]:
-    return {"truth": [], "estimate": []}
-
-
-@dataclass(slots=True)
-class TimelineRows:
-    """The rows since the last drawing.
-
-    Attributes:
-        electrodes: Counts by ``raw`` or ``tared``, values of shape ``(19,)`` (SP: 24) [counts].
-        pressure: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28); NaN
-            where not valid, e.g. lost.
-        force: Force by ``truth`` or ``estimate`` [N], shape ``(3,)``.
-        arrow: The same, at instants whose contact location is known or known to be absent.
-        location: Contact location likewise [m], shape ``(3,)`` or None.
-        error: Magnitude of the error of ``force`` [N] and ``location`` [m], shape ``(1,)``.
-        fields: Fields to draw by ``truth`` or ``estimate``.
-        synthesised: Tared counts synthesised from a field, shape ``(19,)`` [counts].
-    """
-
-    electrodes: dict[str, list[TimelineRow]] = field(
-        default_factory=lambda: {"raw": [], "tared": []}
-    )
-    pressure: list[TimelineRow] = field(default_factory=list)
-    force: dict[str, list[TimelineRow]] = field(default_factory=_by_source)
-    arrow: dict[str, list[TimelineRow]] = field(default_factory=_by_source)
-    location: dict[str, list[TimelineRow]] = field(default_factory=_by_source)
-    error: dict[str, list[TimelineRow]] = field(
-        default_factory=lambda: {"force": [], "location": []}
-    )
-    fields: dict[str, list[FieldRow]] = field(default_factory=lambda: {"truth": [], "estimate": []})
-    synthesised: list[TimelineRow] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -204,7 +168,7 @@ class SensorTimeline:
     )
 
     def __init__(self) -> None:
-        self._rows = TimelineRows()
+        self._rows: defaultdict[str, list[Any]] = defaultdict(list)
         self._matcher = TruthMatcher()
         self._tares: dict[int, Tare] = {}
         self._thinners = {"truth": FieldThinner(), "estimate": FieldThinner()}
@@ -224,20 +188,36 @@ class SensorTimeline:
         elif isinstance(message, FeatureEstimate):
             self._add_estimate(message)
         elif isinstance(message, WrenchFrame):
-            self._add_wrench(message)
+            instant = self._matcher.add(message)
+            self._rows["force/truth"].append(_row(message.stamp, message.force))
+            self._add_true_arrow(instant)
+            self._add_error("force", message.stamp, instant.force_error())
         elif isinstance(message, IndenterPoseFrame):
-            self._add_pose(message)
+            instant = self._matcher.add(message)
+            position = message.position if message.in_contact else None
+            self._rows["location/truth"].append(_row(message.stamp, position))
+            self._add_true_arrow(instant)
+            self._add_location_error(message.stamp, instant)
         elif isinstance(message, FieldFrame):
             self._add_field("truth", message)
         elif isinstance(message, FieldEstimate):
             self._add_field("estimate", as_field_frame(message))
         elif isinstance(message, SynthesisEstimate):
             self.has_fields = True
-            self._rows.synthesised.append(_row(message.source, message.tared_counts))
+            self._rows["synthesised"].append(_row(message.source, message.tared_counts))
 
-    def take(self) -> TimelineRows:
-        """The rows since the last call."""
-        rows, self._rows, self.pending = self._rows, TimelineRows(), False
+    def take(self) -> defaultdict[str, list[Any]]:
+        """The rows since the last call, by what they show.
+
+        ``electrodes/raw`` or ``electrodes/tared``: counts, values of shape ``(19,)`` (SP: 24).
+        ``pressure``: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28);
+        NaN where not valid. Of ``truth`` and ``estimate`` each: ``force/...`` [N], shape ``(3,)``;
+        ``arrow/...``, the same at instants whose contact location is known or known to be absent;
+        ``location/...`` [m], shape ``(3,)`` or None; ``field/...``, each a ``FieldRow``.
+        ``error/force`` [N] and ``error/location`` [m]: magnitudes, shape ``(1,)``.
+        ``synthesised``: tared counts synthesised from a field, shape ``(19,)``.
+        """
+        rows, self._rows, self.pending = self._rows, defaultdict(list), False
         return rows
 
     def _add_frame(self, frame: ElectrodeFrame) -> None:
@@ -247,53 +227,36 @@ class SensorTimeline:
             kind, counts = "raw", frame.electrodes.astype(np.float32)
         else:
             kind, counts = "tared", frame.electrodes - tare.electrodes
-        self._rows.electrodes[kind].append(_row(frame.stamp, counts))
+        self._rows[f"electrodes/{kind}"].append(_row(frame.stamp, counts))
         pressure = np.concatenate([[frame.pdc], frame.pac]).astype(np.float32)
         layout = frame.sensor_type.layout
         if frame.validity != layout.all_valid:
             bits = (layout.pdc_bit, *range(layout.first_pac_bit, layout.slots))
             pressure[[not frame.validity >> bit & 1 for bit in bits]] = np.nan
-        stamp = frame.stamp
-        self._rows.pressure.append(
-            TimelineRow(
-                stamp.wall_ns, stamp.sequence, pressure, slot_period_ns=frame.slot_period_ns
-            )
-        )
+        row = _row(frame.stamp, pressure, slot_period_ns=frame.slot_period_ns)
+        self._rows["pressure"].append(row)
 
     def _add_estimate(self, estimate: FeatureEstimate) -> None:
         instant = self._matcher.add(estimate)
         location = estimate.contact_location
         row = _row(estimate.source, estimate.force, at=location)
-        self._rows.force["estimate"].append(row)
-        self._rows.arrow["estimate"].append(row)
-        self._rows.location["estimate"].append(_row(estimate.source, location))
+        self._rows["force/estimate"].append(row)
+        self._rows["arrow/estimate"].append(row)
+        self._rows["location/estimate"].append(_row(estimate.source, location))
         self._add_error("force", estimate.source, instant.force_error())
         self._add_location_error(estimate.source, instant)
-
-    def _add_wrench(self, wrench: WrenchFrame) -> None:
-        instant = self._matcher.add(wrench)
-        self._rows.force["truth"].append(_row(wrench.stamp, wrench.force))
-        self._add_true_arrow(instant)
-        self._add_error("force", wrench.stamp, instant.force_error())
-
-    def _add_pose(self, pose: IndenterPoseFrame) -> None:
-        instant = self._matcher.add(pose)
-        position = pose.position if pose.in_contact else None
-        self._rows.location["truth"].append(_row(pose.stamp, position))
-        self._add_true_arrow(instant)
-        self._add_location_error(pose.stamp, instant)
 
     def _add_field(self, name: str, known: FieldFrame) -> None:
         self.has_fields = True
         row = self._thinners[name].row(known)
         if row is not None:
-            self._rows.fields[name].append(row)
+            self._rows[f"field/{name}"].append(row)
 
     def _add_true_arrow(self, instant: MatchedMessages) -> None:
         if instant.wrench is not None and instant.pose is not None:
             at = instant.pose.position if instant.pose.in_contact else None
             row = _row(instant.wrench.stamp, instant.wrench.force, at=at)
-            self._rows.arrow["truth"].append(row)
+            self._rows["arrow/truth"].append(row)
 
     def _add_location_error(self, stamp: Stamp, instant: MatchedMessages) -> None:
         error = instant.location_error()
@@ -303,8 +266,10 @@ class SensorTimeline:
 
     def _add_error(self, what: str, stamp: Stamp, error: Values | None) -> None:
         if error is not None:
-            self._rows.error[what].append(_row(stamp, np.array([np.linalg.norm(error)])))
+            self._rows[f"error/{what}"].append(_row(stamp, np.array([np.linalg.norm(error)])))
 
 
-def _row(stamp: Stamp, values: Any, *, at: Values | None = None) -> TimelineRow:
-    return TimelineRow(stamp.wall_ns, stamp.sequence, values, at=at)
+def _row(
+    stamp: Stamp, values: Any, *, at: Values | None = None, slot_period_ns: int = 0
+) -> TimelineRow:
+    return TimelineRow(stamp.wall_ns, stamp.sequence, values, at, slot_period_ns)
