@@ -8,11 +8,10 @@ them with the truth.
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,9 @@ from rich.progress import Progress
 from rich.table import Table
 
 from palpate.alignment import AlignmentClock, electrode_instants, linear, times_of
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, ReceivedMessage, Subscriber
 from palpate.bus.topics import ELECTRODES, POSE, WRENCH
-from palpate.config import LinkConfig
-from palpate.errors import LinkError, StreamTimeout
+from palpate.errors import LinkError
 from palpate.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
 from palpate.sampling import sample_offsets
 from palpate_deploy.bench.alignment_parts import (
@@ -38,9 +36,10 @@ from palpate_deploy.bench.alignment_parts import (
     OnTime,
     time_of,
 )
+from palpate_deploy.bench.harness import received
 from palpate_deploy.bench.results import finish, machine, progress_bar
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
-from palpate_deploy.station.host import write_profile
+from palpate_deploy.station.host import join, write_profile
 from palpate_deploy.station.processes import FiniteRun, command_line
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
@@ -67,6 +66,11 @@ class ErrorSpread:
     p95_s: float
     p99_s: float
     max_s: float
+
+    def cells(self) -> list[str]:
+        """The numbers as a row of a table."""
+        numbers = (self.median_s, self.p95_s, self.p99_s, self.max_s)
+        return [f"{self.count:,}", *(f"{1e3 * value:.3f} ms" for value in numbers)]
 
 
 def spread(errors_s: Floats) -> ErrorSpread:
@@ -101,12 +105,21 @@ def _shares(frames: Sequence[ElectrodeFrame], *, pac: bool) -> Floats:
     return np.where(good == 1, (counts - LOW_COUNTS) / SPAN_COUNTS, np.nan)
 
 
-def _forces(frames: Sequence[WrenchFrame]) -> Floats:
-    return np.array([[frame.force[2]] for frame in frames], np.float64)
-
-
-def _travels(frames: Sequence[IndenterPoseFrame]) -> Floats:
-    return np.array([[frame.position[0]] for frame in frames], np.float64)
+def _signals(
+    wrenches: Wrenches, poses: Sequence[IndenterPoseFrame]
+) -> dict[str, tuple[npt.NDArray[np.int64], Floats, float, float]]:
+    """Of each stream: times [ns], values of shape ``(N, 1)``, and lowest value and span."""
+    found = {
+        name: (
+            times_of(stream, AlignmentClock.MONOTONIC),
+            np.array([[frame.force[2]] for frame in stream], np.float64),
+            LOW_N,
+            SPAN_N,
+        )
+        for name, stream in wrenches.items()
+    }
+    travels = np.array([[frame.position[0]] for frame in poses], np.float64)
+    return {**found, "pose": (times_of(poses, AlignmentClock.MONOTONIC), travels, 0.0, SPAN_M)}
 
 
 def stamp_errors(
@@ -127,11 +140,8 @@ def stamp_errors(
         "electrodes, all at the stamp": _off(shares, at_ns, counts)
         - _seconds(at_ns - stamps_ns[:, None]),
     }
-    for name, stream in wrenches.items():
-        share = (_forces(stream)[:, 0] - LOW_N) / SPAN_N
-        errors[name] = _off(share, times_of(stream, AlignmentClock.MONOTONIC), counts)
-    shares = _travels(poses)[:, 0] / SPAN_M
-    errors["pose"] = _off(shares, times_of(poses, AlignmentClock.MONOTONIC), counts)
+    for name, (times_ns, values, low, span) in _signals(wrenches, poses).items():
+        errors[name] = _off((values[:, 0] - low) / span, times_ns, counts)
     return {name: spread(found) for name, found in errors.items()}
 
 
@@ -151,12 +161,9 @@ def apart(
     shares = _shares(frames, pac=False)
     electrodes_s = np.where(counts(about_s), time_of(shares, about_s), np.nan)
     out = {}
-    for name, stream in wrenches.items():
-        force, _ = linear(at_ns, times_of(stream, AlignmentClock.MONOTONIC), _forces(stream))
-        share = (force[..., 0] - LOW_N) / SPAN_N
-        out[name] = spread(electrodes_s - time_of(share, about_s))
-    travel, _ = linear(at_ns, times_of(poses, AlignmentClock.MONOTONIC), _travels(poses))
-    out["pose"] = spread(electrodes_s - time_of(travel[..., 0] / SPAN_M, about_s))
+    for name, (times_ns, values, low, span) in _signals(wrenches, poses).items():
+        value, _ = linear(at_ns, times_ns, values)
+        out[name] = spread(electrodes_s - time_of((value[..., 0] - low) / span, about_s))
     return out
 
 
@@ -219,10 +226,7 @@ def _table(rows: dict[str, ErrorSpread]) -> str:
         "| | readings | median | 95 % | 99 % | largest |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]
-    for name, one in rows.items():
-        numbers = (one.median_s, one.p95_s, one.p99_s, one.max_s)
-        cells = " | ".join(f"{1e3 * value:.3f} ms" for value in numbers)
-        out.append(f"| {name} | {one.count:,} | {cells} |")
+    out += [f"| {name} | {' | '.join(one.cells())} |" for name, one in rows.items()]
     return "\n".join(out)
 
 
@@ -231,6 +235,7 @@ CHANNEL = "239.74.163.7"
 _WRENCHES = ("kms40", "rdt", "bota")
 _DEVICES = ("finger", *_WRENCHES)
 _READY_S = 30.0
+_PARTS = "bench.alignment_parts"
 _IDENTITY = {"position_m": (0.0, 0.0, 0.0), "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
 
 
@@ -251,24 +256,6 @@ class AlignmentResult:
     stamps: dict[str, ErrorSpread]
     apart: dict[str, ErrorSpread]
     gauges: dict[str, float]
-
-
-@dataclass(slots=True)
-class _Received:
-    """Frames that the client received."""
-
-    frames: list[ElectrodeFrame] = field(default_factory=list)
-    wrenches: dict[str, list[WrenchFrame]] = field(default_factory=dict)
-    poses: list[IndenterPoseFrame] = field(default_factory=list)
-
-    def take(self, sensor: str, message: object) -> None:
-        """Keep a message."""
-        if isinstance(message, ElectrodeFrame):
-            self.frames.append(message)
-        elif isinstance(message, WrenchFrame):
-            self.wrenches.setdefault(sensor, []).append(message)
-        elif isinstance(message, IndenterPoseFrame):
-            self.poses.append(message)
 
 
 def run_alignment(
@@ -298,48 +285,40 @@ def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> A
         profile = gateway_station(sensors)
         endpoint = profile.link.connect[0]
         children.start_profile(profile)
-        part = [sys.executable, "-m", "palpate_deploy.bench.alignment_parts"]
-        robot = [*part, "robot", endpoint, profile.station, _late_file(children, "robot")]
-        children.start("robot", robot)
+        late_file = _late_file(children, "robot")
+        children.start_module("robot", _PARTS, "robot", endpoint, profile.station, late_file)
         children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
         wait_ready(profile, {"gateway"})
         task = bar.add_task("clocks settle", total=1)
         time.sleep(settle_seconds)
         bar.advance(task)
         names = [*_DEVICES, "robot", "gateway"]
-        received, gauges = _catch(profile, seconds, children, names, bar)
+        frames, wrenches, poses, gauges = _catch(profile, seconds, children, names, bar)
         for name in ("robot", *_DEVICES):
             children.stop_one(name)
-        late = [Path(_late_file(children, name)) for name in ("robot", *_DEVICES)]
+        late = [_late_file(children, name) for name in ("robot", *_DEVICES)]
     on_time = OnTime.of(late)
-    begin_s, end_s = (1e-9 * received.frames[at].stamp.monotonic_ns for at in (0, -1))
-    streams = received.frames, received.wrenches, received.poses
+    begin_s, end_s = (1e-9 * frames[at].stamp.monotonic_ns for at in (0, -1))
     return AlignmentResult(
         seconds,
         float(on_time(np.linspace(begin_s, end_s, 10_000)).mean()),
-        stamp_errors(*streams, on_time),
-        apart(*streams, on_time),
+        stamp_errors(frames, wrenches, poses, on_time),
+        apart(frames, wrenches, poses, on_time),
         {name: value for name, value in sorted(gauges.items()) if "clock" in name},
     )
 
 
-def _late_file(children: FiniteRun, name: str) -> str:
-    return str(children.folder / f"late-{name}.npy")
+def _late_file(children: FiniteRun, name: str) -> Path:
+    return children.folder / f"late-{name}.npy"
 
 
 def _start_devices(children: FiniteRun) -> list[dict[str, Any]]:
     """Start the emulators; returns the gateway's sensors."""
     can, tcp, udp, web = (free_port() for _ in range(4))
     line = children.folder / "bota"
-    told = {
-        "finger": [CHANNEL, str(can)],
-        "kms40": [str(tcp)],
-        "rdt": [str(udp), str(web)],
-        "bota": [str(line)],
-    }
-    part = [sys.executable, "-m", "palpate_deploy.bench.alignment_parts"]
+    told = {"finger": (CHANNEL, can), "kms40": (tcp,), "rdt": (udp, web), "bota": (line,)}
     for name, words in told.items():
-        children.start(name, [*part, name, *words, _late_file(children, name)])
+        children.start_module(name, _PARTS, name, *words, _late_file(children, name))
     bus = {"interface": "udp_multicast", "channel": CHANNEL, "bus_options": {"port": can}}
     rdt = {"product": "ati_net_ft", "host": "127.0.0.1", "port": udp, "http_port": web}
     pose = {"robot": "arm", "rate_hz": 250.0, "indenter": "sphere_7mm"}
@@ -356,24 +335,15 @@ def _start_devices(children: FiniteRun) -> list[dict[str, Any]]:
 
 def _catch(
     profile: Profile, seconds: float, children: FiniteRun, names: list[str], bar: Progress
-) -> tuple[_Received, dict[str, float]]:
-    received, stop = _Received(), threading.Event()
-    link = LinkConfig(connect=profile.link.connect, wait_for_router_s=_READY_S)
-    with Session.open(link, station=profile.station) as session:
-        streams = [
-            session.subscriber(topic, delivery=Delivery.QUEUE)
-            for topic in (ELECTRODES, WRENCH, POSE)
-        ]
-
-        def take(stream: Any) -> None:
-            while not stop.is_set():
-                try:
-                    got = stream.next(timeout_s=0.1)
-                except StreamTimeout:
-                    continue
-                received.take(got.sensor, got.message)
-
-        threads = [threading.Thread(target=take, args=(stream,)) for stream in streams]
+) -> tuple[list[ElectrodeFrame], Wrenches, list[IndenterPoseFrame], dict[str, float]]:
+    """Frames, wrenches by sensor and poses of the measurement; the gateway's gauges at its end."""
+    stop = threading.Event()
+    with join(profile, wait_s=_READY_S) as session:
+        taken: list[list[ReceivedMessage[Any]]] = [[], [], []]
+        threads = []
+        for topic, into in zip((ELECTRODES, WRENCH, POSE), taken, strict=True):
+            stream: Subscriber[Any] = session.subscriber(topic, delivery=Delivery.QUEUE)
+            threads.append(threading.Thread(target=into.extend, args=(received(stream, stop),)))
         for thread in threads:
             thread.start()
         try:
@@ -387,15 +357,22 @@ def _catch(
             for thread in threads:
                 thread.join()
         told = [one for one in ask_status(session, timeout_s=5.0) if one.service == "gateway"]
-    missing = [name for name in _WRENCHES if not received.wrenches.get(name)]
-    missing += [] if received.frames else ["finger"]
-    missing += [] if received.poses else ["pose"]
+    frames, forces, poses = taken
+    came = {got.sensor for got in forces} | ({"pose"} if poses else set())
+    came |= {"finger"} if frames else set()
+    missing = [name for name in (*_DEVICES, "pose") if name not in came]
     if missing or not told:
         raise LinkError(
             f"no message of {', '.join(missing) or 'the gateway'} came",
             remedy=f"see the logs in {children.folder / 'logs'}",
         )
-    return received, dict(told[0].gauges)
+    wrenches = {name: [got.message for got in forces if got.sensor == name] for name in _WRENCHES}
+    return (
+        [got.message for got in frames],
+        wrenches,
+        [got.message for got in poses],
+        dict(told[0].gauges),
+    )
 
 
 def _print(result: AlignmentResult) -> None:
@@ -408,8 +385,7 @@ def _print(result: AlignmentResult) -> None:
         for column in ("", "readings", "median", "p95", "p99", "max"):
             table.add_column(column, justify="right" if column else "left")
         for name, one in rows.items():
-            numbers = (one.median_s, one.p95_s, one.p99_s, one.max_s)
-            table.add_row(name, f"{one.count:,}", *(f"{1e3 * value:.3f} ms" for value in numbers))
+            table.add_row(name, *one.cells())
         console.print(table)
     console.print(
         f"{result.kept:.0%} of {result.seconds:g} s count; at other times an emulator was late",

@@ -51,11 +51,9 @@ def share_at(time_s: Floats) -> Floats:
 
 
 def time_of(share: Floats, about_s: Floats) -> Floats:
-    """When the signal had a value [s]; NaN near turning points.
+    """When the signal had a value, 0..1 [s]; NaN near turning points.
 
-    Args:
-        share: 0..1.
-        about_s: That time to a tenth of a ramp [s]; same shape.
+    ``about_s`` is that time to a tenth of a ramp [s], of the same shape.
     """
     ramp = np.floor(about_s / RAMP_S)
     rising = np.mod(ramp, 2.0) == 0.0

@@ -8,7 +8,6 @@ speed. The load test sends frames of many fingers and accounts for each that is 
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -20,7 +19,6 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from palpate.bus import Session
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import ServiceState
@@ -28,9 +26,9 @@ from palpate_deploy.bench.harness import SourceGate, read_rows
 from palpate_deploy.bench.results import Latency, finish, latency, progress_bar
 from palpate_deploy.bench.station import SETTLE_S, wait_ready
 from palpate_deploy.diagnose.replay import total
-from palpate_deploy.station.host import free_endpoint, write_profile
+from palpate_deploy.station.host import free_endpoint, join, private_profile, write_profile
 from palpate_deploy.station.processes import FiniteRun
-from palpate_deploy.station.profile import Profile, changed, load_profile
+from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
 from palpate_services.inference.repository import resolve
 
@@ -108,14 +106,7 @@ def ramp_rate(base: LoadResult, *, bundle: str, bar: Progress) -> LoadResult | N
 def run_load(
     *, sensors: int, rate_hz: float, seconds: float, bundle: str, bar: Progress
 ) -> LoadResult:
-    """Send frames of many fingers through gateway, features and client, and account for each.
-
-    Args:
-        sensors: How many fingers, in one gateway.
-        rate_hz: Of each [Hz].
-        seconds: How long [s].
-        bundle: Bundle that is served.
-        bar: Progress.
+    """Send frames of many fingers through one gateway, features and client, and account for each.
 
     Raises:
         ProcessEnded: A process of the benchmark ended early.
@@ -136,9 +127,8 @@ def run_load(
         began = time.monotonic()
         # The client queues all messages: a frame counts as lost if its estimate did not arrive.
         profile = start_palpate(children, bundle, out, fingers, delivery="queue")
-        link = LinkConfig(connect=profile.link.connect, wait_for_router_s=10)
         deadline = time.monotonic() + seconds * 3 + _GRACE_S
-        with Session.open(link, station=profile.station) as session:
+        with join(profile, wait_s=10.0) as session:
             # Rarely: every request for the status is load as well.
             time.sleep(seconds)
             while True:
@@ -286,28 +276,19 @@ def start_palpate(
     Raises:
         LinkError: They are not ready in time.
     """
-    endpoint = free_endpoint()
-    profile = changed(
-        load_profile("bench"),
-        router={"listen": (endpoint,)},
-        link={"connect": (endpoint,)},
+    profile = private_profile(
+        "bench",
         features={"bundle": bundle},
         gateway={"sensors": sensors},
         log={"level": "warning"},
     )
     children.start_profile(profile)
-    part = [sys.executable, "-m", "palpate_deploy.bench.parts"]
-    children.start("client", [*part, "client", endpoint, profile.station, str(out), delivery])
+    where = profile.link.connect[0], profile.station
+    children.start_module("client", "bench.parts", "client", *where, out, delivery)
     wait_ready(profile, {"features", "client"})
-    start_gateway(children, profile)
-    return profile
-
-
-def start_gateway(children: FiniteRun, profile: Profile, name: str = "gateway") -> None:
-    """Start the gateway of a benchmark with the benchmark's driver."""
     path = write_profile(profile, children.folder)
-    part = [sys.executable, "-m", "palpate_deploy.bench.parts"]
-    children.start(name, [*part, "gateway", str(path)])
+    children.start_module("gateway", "bench.parts", "gateway", path)
+    return profile
 
 
 def _one_finger(gates: Path) -> list[dict[str, Any]]:
@@ -316,28 +297,22 @@ def _one_finger(gates: Path) -> list[dict[str, Any]]:
 
 
 def _start_floor(children: FiniteRun, model: Path, out: Path, gates: Path) -> None:
-    endpoint = free_endpoint()
-    settings = {
-        "router": _settings(children, "router", LinkConfig(connect=(), listen=(endpoint,))),
-        "peer": _settings(children, "peer", LinkConfig(connect=(endpoint,))),
-    }
-    floor = [sys.executable, "-m", "palpate_deploy.bench.floor"]
-    children.start("floor-router", [*floor, "router", settings["router"]])
-    time.sleep(0.5)
-    children.start("floor-service", [*floor, "service", settings["peer"], str(model)])
-    children.start("floor-client", [*floor, "client", settings["peer"], str(out)])
-    time.sleep(1.5)
-    children.start("floor-source", [*floor, "source", settings["peer"], str(gates), str(RATE_HZ)])
-    time.sleep(1.0)
-
-
-def _settings(children: FiniteRun, mode: str, link: LinkConfig) -> str:
-    """Palpate's Zenoh settings as a file, so that both sides have the same."""
     from palpate.bus.link import zenoh_config
 
-    path = children.folder / f"floor-{mode}.json5"
-    path.write_text(str(zenoh_config(link, mode)), encoding="utf-8")
-    return str(path)
+    # Palpate's Zenoh settings as files, so that both sides have the same.
+    endpoint = free_endpoint()
+    router, peer = (children.folder / f"floor-{mode}.json5" for mode in ("router", "peer"))
+    listening = LinkConfig(connect=(), listen=(endpoint,))
+    router.write_text(str(zenoh_config(listening, "router")), encoding="utf-8")
+    joining = LinkConfig(connect=(endpoint,))
+    peer.write_text(str(zenoh_config(joining, "peer")), encoding="utf-8")
+    children.start_module("floor-router", "bench.floor", "router", router)
+    time.sleep(0.5)
+    children.start_module("floor-service", "bench.floor", "service", peer, model)
+    children.start_module("floor-client", "bench.floor", "client", peer, out)
+    time.sleep(1.5)
+    children.start_module("floor-source", "bench.floor", "source", peer, gates, RATE_HZ)
+    time.sleep(1.0)
 
 
 def _values(

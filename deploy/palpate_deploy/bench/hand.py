@@ -23,13 +23,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from palpate.bus import Session
-from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import Status
+from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
-from palpate_deploy.station.host import write_profile
+from palpate_deploy.station.host import join, write_profile
 from palpate_deploy.station.processes import FiniteRun, command_line
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
@@ -102,19 +101,12 @@ def account(
     before: Mapping[str, int],
     looks: Sequence[Status],
 ) -> HandResult:
-    """Count what arrived between two instants.
+    """Count what arrived between two instants of the monotonic clock [ns].
 
-    Args:
-        rows_file: Rows of the client.
-        floor_file: Results of the bare reader.
-        begin_ns: Beginning by the monotonic clock [ns].
-        end_ns: End [ns].
-        used: CPU time and drops of the gateway's process.
-        before: The gateway's counters at the beginning.
-        looks: Its status during the run; the last one at the end.
+    ``before`` holds the gateway's counters at the beginning, ``looks`` its status during the run,
+    the last one at the end; the files hold the client's rows and the bare reader's result.
     """
-    with np.load(rows_file, allow_pickle=False) as archive:
-        names, rows, lost = archive["sensors"], archive["rows"], int(archive["dropped"])
+    names, rows, lost = read_rows(rows_file)
     # Selected by arrival, so that frames still on their way at the end do not count as lost.
     rows = rows[(rows[:, 4] >= begin_ns) & (rows[:, 4] < end_ns)]
     of_finger = np.array([str(name).startswith("finger") for name in names])
@@ -192,6 +184,7 @@ def show(result: HandResult) -> None:
 
 _BUSES = ({"channel": "239.74.163.2", "fingers": 3}, {"channel": "239.74.163.3", "fingers": 2})
 _SETTLE_S = 4.0
+_PARTS = "bench.hand_parts"
 
 
 def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool) -> None:
@@ -245,8 +238,7 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
             "sockets": [[wrenches["kms40"]["host"], wrenches["kms40"]["port"]]],
             "lines": [[wrenches["bota"]["port"], wrenches["bota"]["baud"]]],
         }
-        part = [sys.executable, "-m", "palpate_deploy.bench.hand_parts"]
-        children.start("floor", [*part, "floor", str(floor_file), json.dumps(plan)])
+        children.start_module("floor", _PARTS, "floor", floor_file, json.dumps(plan))
         if children.wait("floor", floor_seconds + 20.0) != 0:
             raise children.ended("floor", -1)
         bar.advance(task)
@@ -317,8 +309,7 @@ def _start_gateway(
     profile = gateway_station(sensors)
     endpoint = profile.link.connect[0]
     children.start_profile(profile)
-    part = [sys.executable, "-m", "palpate_deploy.bench.hand_parts"]
-    children.start("client", [*part, "client", endpoint, profile.station, str(rows_file)])
+    children.start_module("client", _PARTS, "client", endpoint, profile.station, rows_file)
     wait_ready(profile, {"client"})
     children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
     wait_ready(profile, {"gateway"})
@@ -349,8 +340,7 @@ def _kernel_drops(pid: int) -> int:
 
 
 def _status(profile: Profile) -> Status:
-    link = LinkConfig(connect=profile.link.connect, wait_for_router_s=10)
-    with Session.open(link, station=profile.station) as session:
+    with join(profile, wait_s=10.0) as session:
         for _ in range(5):
             for status in ask_status(session):
                 if status.service == "gateway":

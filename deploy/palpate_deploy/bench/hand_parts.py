@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import StreamTimeout
-from palpate_deploy.bench.harness import stop_on_sigterm
+from palpate_deploy.bench.harness import dropped_by, received, stop_on_sigterm, write_rows
 
 _LAST_SLOT = 0x86
 """Command byte of TDC, the last slot but one of a round."""
@@ -45,11 +44,7 @@ def client(endpoint: str, station: str, out: Path) -> None:
         streams = [session.subscriber(one, delivery=Delivery.QUEUE) for one in (ELECTRODES, WRENCH)]
 
         def take(stream: Any) -> None:
-            while not stop.is_set():
-                try:
-                    got = stream.next(timeout_s=0.1)
-                except StreamTimeout:
-                    continue
+            for got in received(stream, stop):
                 now_ns = time.monotonic_ns()
                 frame, stamp = got.message, got.message.stamp
                 last_ns, bad = stamp.monotonic_ns, 0
@@ -69,23 +64,14 @@ def client(endpoint: str, station: str, out: Path) -> None:
             stop.wait()
         for thread in threads:
             thread.join()
-        dropped = sum(
-            stream.counters.get(key, 0) for stream in streams for key in ("dropped", "overflow")
-        )
-    np.savez(
-        out,
-        sensors=np.array(list(names), dtype=str),
-        rows=np.array(rows, dtype=np.int64).reshape(-1, 6),
-        dropped=np.int64(dropped),
-    )
+        dropped = dropped_by(*streams)
+    write_rows(out, list(names), rows, dropped=dropped, columns=6)
 
 
 def floor(out: Path, plan_json: str) -> None:
     """Read the devices of a plan for a while, a thread for each, and write delays and CPU time.
 
-    Args:
-        out: File to write.
-        plan_json: ``seconds``, and the addresses of ``buses``, ``sockets`` and ``lines``.
+    The plan holds ``seconds``, and the addresses of ``buses``, ``sockets`` and ``lines``.
     """
     import can
     import serial
@@ -94,28 +80,26 @@ def floor(out: Path, plan_json: str) -> None:
     plan = json.loads(plan_json)
     until_s = time.monotonic() + plan["seconds"]
     offset_s = time.time() - time.monotonic()
-    lates, counts = [array("d") for _ in plan["buses"]], [0] * 3
+    lates = [array("d") for _ in plan["buses"]]
 
     def read_bus(options: dict[str, Any], late: array[float]) -> None:
         with can.Bus(**options) as bus:
             while time.monotonic() < until_s:
                 message = bus.recv(0.1)
-                if message is not None:
-                    counts[0] += 1
-                    if message.data[0] == _LAST_SLOT:
-                        late.append(time.monotonic() + offset_s - message.timestamp)
+                if message is not None and message.data[0] == _LAST_SLOT:
+                    late.append(time.monotonic() + offset_s - message.timestamp)
 
     def read_socket(host: str, port: int) -> None:
         with socket.create_connection((host, port), timeout=2.0) as link:
             link.sendall(b"L1()\n")
             while time.monotonic() < until_s:
-                counts[1] += link.recv(65536).count(b"\n")
+                link.recv(65536)
 
     def read_line(line: str, baud: int) -> None:
         with serial.Serial(line, baud, timeout=0.1) as port:
             port.write(b"R")
             while time.monotonic() < until_s:
-                counts[2] += len(port.read(max(1, port.in_waiting)))
+                port.read(max(1, port.in_waiting))
 
     threads = [
         *(
@@ -134,11 +118,7 @@ def floor(out: Path, plan_json: str) -> None:
     np.savez(
         out,
         late_s=np.concatenate([np.array(late) for late in lates]),
-        slots=np.int64(counts[0]),
-        lines=np.int64(counts[1]),
-        serial_bytes=np.int64(counts[2]),
         core=np.float64((time.process_time() - used_s) / elapsed_s),
-        seconds=np.float64(elapsed_s),
     )
 
 

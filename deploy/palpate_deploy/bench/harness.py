@@ -6,12 +6,20 @@ import mmap
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from palpate.errors import StreamTimeout
 from palpate_deploy.station.lifetime import end_with_parent, stop_on_signals
+
+if TYPE_CHECKING:  # the floor, which uses this module too, does without palpate's bus
+    from palpate.bus import ReceivedMessage, Subscriber
+
+M = TypeVar("M")
 
 SERIAL = "BENCH-0001"
 REST_COUNTS = 3000
@@ -33,11 +41,8 @@ def bench_counts() -> npt.NDArray[np.uint16]:
 class SourceGate:
     """Pauses a source by one byte of shared memory, which costs nothing to read.
 
-    A source stopped by a signal would lose its links once their lease has expired.
-
-    Args:
-        path: File of the bytes; made if absent.
-        index: The source's byte.
+    A source stopped by a signal would lose its links once their lease has expired. ``path`` is the
+    file of the bytes, made if absent; ``index`` the source's byte.
     """
 
     SIZE = 16
@@ -71,14 +76,27 @@ def stop_on_sigterm() -> threading.Event:
     return stop
 
 
-def write_rows(
-    out: Path, sensors: list[str], rows: list[tuple[int, int, int]], *, dropped: int
-) -> None:
-    """Write sequence, stamp and arrival [ns] of each estimate that a client received."""
+def received(stream: Subscriber[M], stop: threading.Event) -> Iterator[ReceivedMessage[M]]:
+    """The messages of a stream until ``stop`` is set."""
+    while not stop.is_set():
+        try:
+            yield stream.next(timeout_s=0.1)
+        except StreamTimeout:
+            continue
+
+
+def dropped_by(*streams: Subscriber[Any]) -> int:
+    """How many messages did not find room in these streams."""
+    keys = ("dropped", "overflow")
+    return sum(stream.counters.get(key, 0) for stream in streams for key in keys)
+
+
+def write_rows(out: Path, sensors: list[str], rows: Any, *, dropped: int, columns: int = 3) -> None:
+    """Write rows of a client: by default sequence, stamp and arrival [ns] of each estimate."""
     np.savez(
         out,
         sensors=np.array(sensors, dtype=str),
-        rows=np.array(rows, dtype=np.int64).reshape(-1, 3),
+        rows=np.array(rows, dtype=np.int64).reshape(-1, columns),
         dropped=np.int64(dropped),
     )
 

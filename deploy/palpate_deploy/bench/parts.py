@@ -11,8 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from palpate.errors import StreamTimeout
-from palpate_deploy.bench.harness import stop_on_sigterm, write_rows
+from palpate_deploy.bench.harness import dropped_by, received, stop_on_sigterm, write_rows
 
 DRIVER = "palpate_deploy.bench.device:BenchDevice"
 
@@ -30,11 +29,7 @@ def gateway(profile: str) -> None:
 def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
     """Take estimates until ``SIGTERM``; then write sensor, sequence, stamp and arrival of each.
 
-    Args:
-        endpoint: The router.
-        station: Name of the station.
-        out: File to write.
-        delivery: ``newest`` as a robot's controller does, or ``queue`` to count what arrives.
+    ``delivery`` is ``newest``, as a robot's controller does, or ``queue`` to count what arrives.
     """
     from palpate.bus import Delivery, Session
     from palpate.bus.topics import FEATURES
@@ -47,17 +42,12 @@ def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
         stream = session.subscriber(FEATURES, delivery=Delivery(delivery))
         with session.presence("client", instance="client") as presence:
             presence.ready()
-            while not stop.is_set():
-                try:
-                    got = stream.next(timeout_s=0.1)
-                except StreamTimeout:
-                    continue
+            for got in received(stream, stop):
                 now_ns = time.monotonic_ns()  # the client has the decoded estimate
                 source = got.message.source
                 rows.append((source.sequence, source.monotonic_ns, now_ns))
                 sensors.append(got.sensor)
-        counters = stream.counters
-    dropped = counters.get("dropped", 0) + counters.get("overflow", 0)
+        dropped = dropped_by(stream)
     write_rows(out, sensors, rows, dropped=dropped)
 
 

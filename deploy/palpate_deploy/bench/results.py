@@ -33,12 +33,10 @@ class Latency:
 
 
 def latency(rows: npt.NDArray[np.int64], *, warm_up: int, lost: int) -> Latency:
-    """Latency from the rows of one side.
+    """Latency from the rows of one side: sequence, stamp and arrival [ns], shape ``(N, 3)``.
 
-    Args:
-        rows: Sequence, stamp [ns] and arrival [ns], shape ``(N, 3)``.
-        warm_up: Estimates left out after each pause: caches are cold, links slow.
-        lost: Frames that got no estimate.
+    ``warm_up`` estimates are left out after each pause: caches are cold, links slow. ``lost``
+    frames got no estimate.
     """
     kept = np.concatenate([part[warm_up:] for part in rounds(rows)])
     ages_s = (kept[:, 2] - kept[:, 1]) * 1e-9
@@ -61,14 +59,7 @@ def progress_bar() -> Progress:
 def finish(
     name: str, values: dict[str, Any], show: Callable[[], None], *, as_json: bool, save: bool
 ) -> None:
-    """Print a result, and append it to the history on request.
-
-    Args:
-        name: Name of the benchmark.
-        values: The result as plain values.
-        show: Prints it for people.
-        as_json: Print JSON instead.
-        save: Append to the history.
+    """Print a result, by ``show`` or as JSON, and append it to the history on request.
 
     Raises:
         ConfigError: The history is not there, see ``append_history``.

@@ -6,11 +6,9 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from palpate.bus import Session
-from palpate.config import LinkConfig
 from palpate.errors import LinkError
-from palpate_deploy.station.host import free_endpoint
-from palpate_deploy.station.profile import Profile, changed, load_profile
+from palpate_deploy.station.host import free_endpoint, join, private_profile
+from palpate_deploy.station.profile import Profile
 
 SETTLE_S = 0.4
 """Time that new subscriptions, or the last messages of a source, need to travel [s]."""
@@ -20,14 +18,8 @@ _READY_S = 20.0
 
 def gateway_station(sensors: Sequence[dict[str, Any]]) -> Profile:
     """The profile ``bench`` with its router alone, at ``link.connect[0]``, and these sensors."""
-    endpoint = free_endpoint()
-    return changed(
-        load_profile("bench").model_copy(update={"processes": ("router",)}),
-        router={"listen": (endpoint,)},
-        link={"connect": (endpoint,)},
-        gateway={"sensors": sensors},
-        log={"level": "warning"},
-    )
+    profile = private_profile("bench", gateway={"sensors": sensors}, log={"level": "warning"})
+    return profile.model_copy(update={"processes": ("router",)})
 
 
 def free_port() -> int:
@@ -41,9 +33,8 @@ def wait_ready(profile: Profile, services: set[str]) -> None:
     Raises:
         LinkError: They are not in time.
     """
-    link = LinkConfig(connect=profile.link.connect, wait_for_router_s=_READY_S)
     deadline = time.monotonic() + _READY_S
-    with Session.open(link, station=profile.station) as session:
+    with join(profile, wait_s=_READY_S) as session:
         while True:
             missing = services - {one.service for one in session.alive() if one.ready}
             if not missing:

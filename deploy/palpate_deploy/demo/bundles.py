@@ -177,10 +177,7 @@ alike, so the same number of frames is better used for five times as many indent
 def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
     """Record the virtual finger, ingest the record, train, and write the bundle.
 
-    Args:
-        out: Folder to write; None = the next free version of the packaged bundle.
-        frames: Frames of the virtual finger.
-        seed: Seed of the finger and of the training.
+    ``out`` None means the next free version of the packaged bundle.
 
     Raises:
         MissingExtraError: The training extra is not installed.

@@ -18,13 +18,10 @@ from palpate.errors import PalpateError, StreamTimeout
 from palpate.messages import (
     NO_TARE,
     ElectrodeFrame,
-    FeatureEstimate,
     FieldEstimate,
     FieldFrame,
-    IndenterPoseFrame,
     SynthesisEstimate,
     Tare,
-    WrenchFrame,
 )
 from palpate_services.viewer.timeline import TruthMatcher
 
@@ -41,15 +38,6 @@ _TOUCHED_COUNTS = 40.0
 """The sensor counts as touched if one electrode moves by this: above noise and drift [counts]."""
 
 Vector = npt.NDArray[Any]
-
-
-@dataclass(frozen=True, slots=True)
-class TruthStreams:
-    """Streams of estimates and of their truth."""
-
-    features: Subscriber[FeatureEstimate]
-    wrench: Subscriber[WrenchFrame]
-    pose: Subscriber[IndenterPoseFrame]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,38 +70,33 @@ class TouchComparison:
         self.count = 0
         self.newest: TouchMoment | None = None
         self._matcher = TruthMatcher(_KEPT)
+        self._truth: list[Subscriber[Any]] = []
         self._force_errors: list[Vector] = []
         self._location_errors: list[Vector] = []
         self._ages_s: list[float] = []
 
-    def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> TruthStreams:
+    def subscribe(self, session: Session, sensor: str) -> None:
         """Subscribe to estimates and truth of a sensor."""
-        return TruthStreams(
-            session.subscriber(FEATURES, sensor=sensor, delivery=delivery),
-            session.subscriber(WRENCH, sensor=sensor, delivery=delivery),
-            session.subscriber(POSE, sensor=sensor, delivery=delivery),
-        )
+        self._features = session.subscriber(FEATURES, sensor=sensor, delivery=Delivery.QUEUE)
+        self._truth = [
+            session.subscriber(WRENCH, sensor=sensor, delivery=Delivery.QUEUE),
+            session.subscriber(POSE, sensor=sensor, delivery=Delivery.QUEUE),
+        ]
 
-    def take(self, streams: TruthStreams, *, timeout_s: float) -> None:
+    def take(self, *, timeout_s: float) -> None:
         """Take the next estimate and all truth that has arrived.
 
         Raises:
             StreamTimeout: No estimate came in time.
         """
-        received = streams.features.next(timeout_s)
+        received = self._features.next(timeout_s)
         # After the wait: the truth of this estimate was published before it.
-        self.add_truth(streams)
-        self.add(received.message, received.received_monotonic_ns)
-
-    def add_truth(self, streams: TruthStreams) -> None:
-        """Take the truth that has arrived."""
-        for message in (*_all(streams.wrench), *_all(streams.pose)):
-            self._matcher.add(message)
-
-    def add(self, estimate: FeatureEstimate, received_ns: int) -> None:
-        """Take one estimate, received at ``received_ns`` of this host's monotonic clock."""
+        for stream in self._truth:
+            for message in _all(stream):
+                self._matcher.add(message)
+        estimate = received.message
         self.count += 1
-        age_s = clock.age_s(estimate.source, monotonic_ns=received_ns)
+        age_s = clock.age_s(estimate.source, monotonic_ns=received.received_monotonic_ns)
         self._ages_s.append(age_s)
         instant = self._matcher.add(estimate)
         wrench, pose = instant.wrench, instant.pose
@@ -202,14 +185,15 @@ class FieldComparison:
         self._errors: list[float] = []
         self._electrodes: list[float] = []
 
-    def subscribe(self, session: Session, sensor: str, delivery: Delivery) -> FieldStreams:
+    def subscribe(self, session: Session, sensor: str) -> FieldStreams:
         """Subscribe to estimates and truth of a sensor."""
         book = TareBook(session)
+        queue = Delivery.QUEUE
         return FieldStreams(
-            session.subscriber(FIELD, sensor=sensor, delivery=delivery),
-            session.subscriber(FIELD_TRUTH, sensor=sensor, delivery=delivery),
-            session.subscriber(SYNTHESIS, sensor=sensor, delivery=delivery),
-            session.subscriber(ELECTRODES, sensor=sensor, delivery=delivery),
+            session.subscriber(FIELD, sensor=sensor, delivery=queue),
+            session.subscriber(FIELD_TRUTH, sensor=sensor, delivery=queue),
+            session.subscriber(SYNTHESIS, sensor=sensor, delivery=queue),
+            session.subscriber(ELECTRODES, sensor=sensor, delivery=queue),
             lambda tare_id: book.baseline(sensor, tare_id),
         )
 

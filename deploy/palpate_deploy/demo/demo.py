@@ -13,7 +13,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from palpate import Client
-from palpate.bus import Delivery
 from palpate.errors import LinkError, PalpateError, StreamTimeout
 from palpate_deploy.demo.comparison import (
     FieldComparison,
@@ -22,10 +21,10 @@ from palpate_deploy.demo.comparison import (
     TouchMoment,
 )
 from palpate_deploy.diagnose.records import viewer_command
-from palpate_deploy.station.host import free_endpoint
+from palpate_deploy.station.host import private_profile
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
-from palpate_deploy.station.profile import Profile, changed, load_profile
+from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.supervision import Supervisor
 
 _SENSOR = "finger"
@@ -37,14 +36,7 @@ _FIRST_S = 20.0
 
 
 def run_demo(seconds: float, out: Path) -> int:
-    """Run the demo.
-
-    Args:
-        seconds: How long to compare [s], from the first estimate.
-        out: Folder of record, view and picture.
-
-    Returns:
-        0, or 1 if no estimate came.
+    """Run the demo until ``seconds`` after the first estimate; the exit code, 1 if none came.
 
     Raises:
         PalpateError: The demo cannot start.
@@ -52,13 +44,7 @@ def run_demo(seconds: float, out: Path) -> int:
     from palpate_services.inference.repository import resolve
 
     console = Console()
-    endpoint = free_endpoint()  # a station may run on this host, with the usual port
-    profile = changed(
-        load_profile("demo"),
-        router={"listen": (endpoint,)},
-        link={"connect": (endpoint,)},
-        recorder={"out": str(out)},
-    )
+    profile = private_profile("demo", recorder={"out": str(out)})
     for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
         resolve(bundle)  # a missing one is an error before anything starts
     before = set(out.glob("*.mcap"))
@@ -98,14 +84,14 @@ def _watch(
         Client(profile.link.connect[0], station=profile.station, timeout_s=_JOIN_S) as robot,
         Live(console=console, auto_refresh=False, transient=False) as live,
     ):
-        streams = comparison.subscribe(robot.session, _SENSOR, Delivery.QUEUE)
-        field_streams = fields.subscribe(robot.session, _SENSOR, Delivery.QUEUE)
+        comparison.subscribe(robot.session, _SENSOR)
+        field_streams = fields.subscribe(robot.session, _SENSOR)
         end = time.monotonic() + _FIRST_S
         redraw = 0.0
         started = False
         while (now := time.monotonic()) < end and not stop.is_set():
             try:
-                comparison.take(streams, timeout_s=0.05)
+                comparison.take(timeout_s=0.05)
             except StreamTimeout:
                 continue
             finally:

@@ -19,11 +19,13 @@ from rich.console import Console
 
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import LinkError, PalpateError
-from palpate_deploy.station.host import check_free, state_folder
+from palpate_deploy.station.host import check_free, join, state_folder
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile, load_profile
 
 Grade = Literal["ok", "warn", "fail"]
+Found = tuple[Grade, str, str]
+"""Grade, result and fix of one check, see ``Finding``."""
 
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 _PYTHON_MIN = (3, 11)
@@ -100,18 +102,11 @@ def _all(profile_name: str) -> Iterator[Finding]:
         yield Finding("profile", "fail", error.problem, error.remedy)
         return
     yield Finding("profile", "ok", f"{profile_name}: {', '.join(profile.processes)}")
-    looks: tuple[Callable[[Profile], Finding], ...] = (
-        _sensors,
-        _router,
-        _bundle,
-        _disk,
-        _state,
-    )
-    for look in looks:
-        yield look(profile)
-    yield _clock()
-    yield _wall(profile)
-    yield _cpu()
+    for what, check in _CHECKS.items():
+        try:
+            yield Finding(what, *check(profile))
+        except PalpateError as error:
+            yield Finding(what, "fail", error.problem, error.remedy)
 
 
 def _python() -> Finding:
@@ -138,53 +133,43 @@ def _packages() -> Iterator[Finding]:
         yield Finding("package", "ok", found)
 
 
-def _sensors(profile: Profile) -> Finding:
+def _sensors(profile: Profile) -> Found:
     if "gateway" not in profile.processes:
-        return Finding("sensors", "ok", "no gateway in this profile")
+        return "ok", "no gateway in this profile", ""
     from palpate_gateway.drivers import make_device
 
     names = []
     for sensor in profile.gateway.sensors:
-        try:
-            make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
-        except PalpateError as error:
-            return Finding("sensors", "fail", error.problem, error.remedy)
+        make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
         path = sensor.options.get("path")
         if path is not None and not Path(str(path)).is_file():
-            return Finding(
-                "sensors", "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
-            )
+            return "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
         names.append(f"{sensor.name} ({sensor.driver})")
-    return Finding("sensors", "ok", ", ".join(names))
+    return "ok", ", ".join(names), ""
 
 
-def _router(profile: Profile) -> Finding:
-    from palpate.bus import Session
-
+def _router(profile: Profile) -> Found:
     where = ", ".join(profile.link.connect)
-    link = profile.link.model_copy(update={"wait_for_router_s": _ROUTER_WAIT_S})
     try:
-        with Session.open(link, station=profile.station) as session:
+        with join(profile, wait_s=_ROUTER_WAIT_S) as session:
             alive = sorted({one.service for one in session.alive()})
-        return Finding(
-            "router", "ok", f"answers at {where}; running: {', '.join(alive) or 'nothing'}"
-        )
+        return "ok", f"answers at {where}; running: {', '.join(alive) or 'nothing'}", ""
     except LinkError as error:
         if "router" not in profile.processes:
-            return Finding("router", "fail", error.problem, f"start the router at {where}")
+            return "fail", error.problem, f"start the router at {where}"
     try:
         check_free(profile.router.listen)
     except LinkError as error:
-        return Finding("router", "fail", f"{error.problem} by another program", error.remedy)
+        return "fail", f"{error.problem} by another program", error.remedy
     exposed = [e for e in profile.router.listen if not is_loopback(endpoint_host_port(e)[0])]
     if exposed and profile.link.tls is not None:
         for path in (profile.link.tls.root_ca_certificate, profile.link.tls.certificate):
             if not path.is_file():
-                return Finding("router", "fail", f"{path} does not exist", "set [link.tls]")
-    return Finding("router", "ok", f"not running; port free at {', '.join(profile.router.listen)}")
+                return "fail", f"{path} does not exist", "set [link.tls]"
+    return "ok", f"not running; port free at {', '.join(profile.router.listen)}", ""
 
 
-def _bundle(profile: Profile) -> Finding:
+def _bundle(profile: Profile) -> Found:
     tables = {
         "features": profile.features,
         "field": profile.field,
@@ -192,77 +177,61 @@ def _bundle(profile: Profile) -> Finding:
     }
     served = {task: table.bundle for task, table in tables.items() if task in profile.processes}
     if not served:
-        return Finding("bundle", "ok", "no service of this profile needs one")
+        return "ok", "no service of this profile needs one", ""
     from palpate.files.bundle import read_bundle
     from palpate_services.inference.model import load
     from palpate_services.inference.repository import resolve
 
     names = []
     for task, name in served.items():
-        try:
-            bundle = read_bundle(resolve(name))
-            load(bundle, task)
-        except PalpateError as error:
-            return Finding("bundle", "fail", error.problem, error.remedy)
-        names.append(f"{bundle.manifest.name}:{bundle.manifest.version}")
+        manifest = load(read_bundle(resolve(name)), task).manifest
+        names.append(f"{manifest.name}:{manifest.version}")
     what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
-    return Finding("bundle", "ok", f"{', '.join(names)} {what}")
+    return "ok", f"{', '.join(names)} {what}", ""
 
 
-def _disk(profile: Profile) -> Finding:
+def _disk(profile: Profile) -> Found:
     if "recorder" not in profile.processes:
-        return Finding("disk", "ok", "no recorder in this profile")
+        return "ok", "no recorder in this profile", ""
     folder = profile.recorder.out.absolute()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not os.access(existing, os.W_OK):
-        return Finding(
-            "disk", "fail", f"{existing} is not writable", "set [recorder] out to another folder"
-        )
+        return "fail", f"{existing} is not writable", "set [recorder] out to another folder"
     free = shutil.disk_usage(existing).free
     found = f"{free / 1e9:.1f} GB free at {existing}"
     if free < profile.recorder.min_free_bytes:
-        return Finding("disk", "fail", found, "free space: the recorder pauses below its limit")
+        return "fail", found, "free space: the recorder pauses below its limit"
     if free < 10 * profile.recorder.min_free_bytes:
-        return Finding("disk", "warn", found, "free space soon")
-    return Finding("disk", "ok", found)
+        return "warn", found, "free space soon"
+    return "ok", found, ""
 
 
-def _state(profile: Profile) -> Finding:
+def _state(_: Profile) -> Found:
     folder = state_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        return Finding(
-            "state",
-            "fail",
-            f"{folder}: {error.strerror}",
-            "set XDG_STATE_HOME to a writable folder",
-        )
-    return Finding("state", "ok", f"run folders and logs in {folder}")
+        return "fail", f"{folder}: {error.strerror}", "set XDG_STATE_HOME to a writable folder"
+    return "ok", f"run folders and logs in {folder}", ""
 
 
-def _clock() -> Finding:
+def _clock(_: Profile) -> Found:
     year = time.gmtime().tm_year
     if year < _YEAR_MIN:
-        return Finding(
-            "clock",
-            "fail",
-            f"the wall clock says {year}",
-            "set it and synchronise it: chrony",
-        )
+        return "fail", f"the wall clock says {year}", "set it and synchronise it: chrony"
     lateness = []
-    for _ in range(50):
+    for _attempt in range(50):
         began = time.monotonic()
         time.sleep(_SLEEP_S)
         lateness.append(time.monotonic() - began - _SLEEP_S)
     worst = max(lateness)
     found = f"a 10 ms sleep is late by {worst * 1e3:.1f} ms at worst of 50"
     if worst > _LATE_WARN_S:
-        return Finding("clock", "warn", found, "the host is busy: frames will be late or dropped")
-    return Finding("clock", "ok", found)
+        return "warn", found, "the host is busy: frames will be late or dropped"
+    return "ok", found, ""
 
 
-def _wall(profile: Profile) -> Finding:
+def _wall(profile: Profile) -> Found:
     from palpate_deploy.station.status import wall_words
     from palpate_gateway.clock.wall_clock import wall_discipline
 
@@ -271,23 +240,27 @@ def _wall(profile: Profile) -> Finding:
     ends = (*profile.router.listen, *profile.link.connect)
     alone = all(is_loopback(endpoint_host_port(end)[0]) for end in ends)
     if kept is None or kept.synchronised or alone:
-        return Finding("wall clock", "ok", found)
-    return Finding(
-        "wall clock",
-        "warn",
-        found,
-        "this profile spans several hosts: run chrony or ptp4l on each (docs/time.md)",
-    )
+        return "ok", found, ""
+    fix = "this profile spans several hosts: run chrony or ptp4l on each (docs/time.md)"
+    return "warn", found, fix
 
 
-def _cpu() -> Finding:
+def _cpu(_: Profile) -> Found:
     cpus = os.cpu_count() or 1
     load = os.getloadavg()[0]
     found = f"{cpus} CPUs, load {load:.1f}"
     if cpus < 2:
-        return Finding(
-            "cpu", "warn", found, "a station needs two: estimates will sometimes be late"
-        )
-    if load > cpus:
-        return Finding("cpu", "warn", found, "stop what else runs here")
-    return Finding("cpu", "ok", found)
+        return "warn", found, "a station needs two: estimates will sometimes be late"
+    return ("warn", found, "stop what else runs here") if load > cpus else ("ok", found, "")
+
+
+_CHECKS: dict[str, Callable[[Profile], Found]] = {
+    "sensors": _sensors,
+    "router": _router,
+    "bundle": _bundle,
+    "disk": _disk,
+    "state": _state,
+    "clock": _clock,
+    "wall clock": _wall,
+    "cpu": _cpu,
+}

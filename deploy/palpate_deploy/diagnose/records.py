@@ -123,13 +123,7 @@ def review_path(
 ) -> None:
     """Write the Rerun view of a record or of a store of simulations, and on request the picture.
 
-    Args:
-        path: What to look at.
-        view: The ``.rrd`` to write; None = beside it.
-        picture: The PNG to write; None = none.
-        trajectories: Of a store: which, by id or pattern; none = a choice from all.
-        most: Of a store: how many trajectories at most.
-        bundles: Of a record: bundles that hold the meshes of its fields, beside the packaged ones.
+    ``trajectories`` and ``most`` are for stores only, ``bundles`` for records: see the command.
 
     Raises:
         ConfigError: There is no such path or bundle.
@@ -154,13 +148,7 @@ def review_path(
 def review_record(
     path: Path, view: Path | None, picture: Path | None, *, bundles: Sequence[str] = ()
 ) -> None:
-    """Write the Rerun view of a record, and on request the picture.
-
-    Raises:
-        ConfigError: There is no such bundle.
-        RecordingError: The record is damaged or not palpate's.
-        MissingExtraError: Rerun or matplotlib is not installed.
-    """
+    """Write the Rerun view of a record, and on request the picture; errors as ``review_path``."""
     from palpate_services.viewer.record_view import review
 
     written = review(path, view, bundles=bundles)

@@ -7,6 +7,7 @@ estimates or a reason, as were published. The counts are read back from the reco
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections import Counter
@@ -22,12 +23,12 @@ from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.errors import LinkError, PalpateError, RecordingError
 from palpate.files.record import summarise
-from palpate.messages import ServiceState, Status
+from palpate.messages import ServiceState
 from palpate_deploy.diagnose.records import viewer_command
-from palpate_deploy.station.host import free_endpoint
+from palpate_deploy.station.host import join, private_profile
 from palpate_deploy.station.logs import DEVICE, FAILED, print_error
 from palpate_deploy.station.processes import FiniteRun
-from palpate_deploy.station.profile import Profile, changed, load_profile
+from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
 
 
@@ -66,21 +67,22 @@ class ReplayAccount:
         return self.features.get("estimates_published", 0)
 
     @property
-    def problems(self) -> list[str]:
-        """Counts that differ and should be equal.
+    def answered(self) -> int:
+        """Frames with an estimate, or without one for a reason that the service counted."""
+        return self.estimated + sum(self.unanswered.values())
 
-        A frame without estimate counts as answered if the service counted the reason.
-        """
+    @property
+    def problems(self) -> list[str]:
+        """Counts that differ and should be equal."""
         found = []
-        answered = self.estimated + sum(self.unanswered.values())
         frames = self.recorded.get(ELECTRODES.name, 0)
         estimates = self.recorded.get(FEATURES.name, 0)
         if not self.published:
             found.append("no frame was published")
         if frames != self.published:
             found.append(f"{self.published} frames published, {frames} recorded")
-        if answered != self.published:
-            found.append(f"{self.published} frames published, {answered} answered")
+        if self.answered != self.published:
+            found.append(f"{self.published} frames published, {self.answered} answered")
         if estimates != self.estimated:
             found.append(f"{self.estimated} estimates published, {estimates} recorded")
         if self.published and not self.estimated:
@@ -153,18 +155,11 @@ _POLL_S = 0.1
 _JOIN_S = 15.0
 _SETTLED_S = 20.0
 _LINGER_S = 1.0
+_ENDED = (ServiceState.FINISHED, ServiceState.DEGRADED)
 
 
 def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_json: bool) -> int:
-    """Replay a file and print the account.
-
-    Args:
-        file: A vendor's text log or a palpate record.
-        pace: ``fast`` (lossless) or ``recorded``.
-        out: Folder of the new record.
-        bundle: Bundle to serve.
-        rrd: Also write a Rerun view.
-        as_json: Print JSON instead of a table.
+    """Replay a vendor's text log or a palpate record at the pace ``fast`` or ``recorded``.
 
     Returns:
         0; 1 if something was lost on the way; 3 if the file is damaged.
@@ -203,14 +198,10 @@ def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) 
     Raises:
         ConfigError: A value is wrong.
     """
-    endpoint = free_endpoint()
     fast = pace == "fast"
     delivery = "every" if fast else "newest"
-    profile = load_profile("replay")
-    return changed(
-        profile,
-        router={"listen": (endpoint,)},
-        link={"connect": (endpoint,)},
+    return private_profile(
+        "replay",
         gateway={"pace": pace, "sensors": sensors_of(file), "linger_s": _LINGER_S},
         features={"bundle": bundle, "delivery": delivery, "accept_replayed": True},
         recorder={"out": str(out), "delivery": "every" if fast else "queue", "rrd": rrd},
@@ -222,30 +213,25 @@ def sensors_of(file: Path) -> list[dict[str, Any]]:
     with open(file, "rb") as stream:
         head = stream.read(len(_MCAP_MAGIC))
     path = str(file.absolute())
-    if head.startswith(_MCAP_MAGIC):
-        from palpate_gateway.recordings.record import recorded_sensors
+    if not head.startswith(_MCAP_MAGIC):
+        return [{"name": "finger", "driver": "text_log", "options": {"path": path}}]
+    from palpate_gateway.recordings.record import recorded_sensors
 
-        try:
-            names = recorded_sensors(file)
-        except RecordingError:
-            names = []  # the driver delivers what is before the damage, then raises the error
-        if not names:
-            return [{"name": "finger", "driver": "record", "options": {"path": path}}]
-        # With the name of the sensor the driver need not search the whole record for it.
-        return [
-            {"name": name, "driver": "record", "options": {"path": path, "sensor": name}}
-            for name in names
-        ]
-    return [{"name": "finger", "driver": "text_log", "options": {"path": path}}]
+    names = []
+    # Of a damaged record the driver delivers what is before the damage, then raises the error.
+    with contextlib.suppress(RecordingError):
+        names = recorded_sensors(file)
+    if not names:
+        return [{"name": "finger", "driver": "record", "options": {"path": path}}]
+    # With the name of the sensor the driver need not search the whole record for it.
+    return [
+        {"name": name, "driver": "record", "options": {"path": path, "sensor": name}}
+        for name in names
+    ]
 
 
 def replay(profile: Profile, file: Path, *, show: bool = False) -> ReplayAccount:
-    """Run a replay to its end.
-
-    Args:
-        profile: As made by ``replay_profile``.
-        file: The replayed file, for the account.
-        show: Show progress on the terminal.
+    """Run a replay with a profile of ``replay_profile`` to its end.
 
     Raises:
         LinkError: The bus cannot be joined.
@@ -257,16 +243,14 @@ def replay(profile: Profile, file: Path, *, show: bool = False) -> ReplayAccount
     began = time.monotonic()
     with FiniteRun("replay") as children:
         children.start_profile(profile)
-        link = profile.link.model_copy(update={"wait_for_router_s": _JOIN_S})
-        with Session.open(link, station=profile.station) as session, _progress(show) as bar:
+        with join(profile, wait_s=_JOIN_S) as session, _progress(show) as bar:
             task = bar.add_task(file.name, total=None, frames=0)
-            last = _follow(children, session, account, bar, task)
-        account.exit_status = last
+            account.exit_status = _follow(children, session, account, bar, task)
     account.seconds = time.monotonic() - began
     account.records = sorted(set(out.glob("*.mcap")) - before)
     account.recorded = count_topics(account.records)
-    if last != 0 and account.error is None:
-        account.error = children.ended("gateway", last)
+    if account.exit_status != 0:
+        account.error = children.ended("gateway", account.exit_status)
     return account
 
 
@@ -282,42 +266,24 @@ def _follow(
     while True:
         children.check(["router", "features", "recorder"])
         statuses = {status.service: status for status in ask_status(session)}
-        _take(account, statuses)
+        counters = {service: dict(status.counters) for service, status in statuses.items()}
+        account.gateway = counters.get("gateway", account.gateway)
+        account.features = counters.get("features", account.features)
         frames = account.published
         bar.update(task, completed=frames, frames=frames)
-        status = children.status("gateway")
-        gateway = statuses.get("gateway")
-        ended = gateway is not None and gateway.state in (
-            ServiceState.FINISHED,
-            ServiceState.DEGRADED,
-        )
+        exit_status = children.status("gateway")
         # The gateway ends before its last frames are estimated and recorded; what is still missing
         # after the wait is reported as a loss.
-        if status is not None or ended:
+        if exit_status is not None or (
+            "gateway" in statuses and statuses["gateway"].state in _ENDED
+        ):
             settled_by = min(settled_by, time.monotonic() + _SETTLED_S)
-            if status is not None and (
-                _settled(account, statuses) or time.monotonic() > settled_by
-            ):
+            recorded = counters.get("recorder", {}).get("recorded_electrodes", 0)
+            settled = min(account.answered, recorded) >= frames
+            if exit_status is not None and (settled or time.monotonic() > settled_by):
                 bar.update(task, total=max(frames, 1), completed=max(frames, 1), frames=frames)
-                return status
+                return exit_status
         time.sleep(_POLL_S)
-
-
-def _settled(account: ReplayAccount, statuses: dict[str, Status]) -> bool:
-    """Whether every published frame was answered and recorded."""
-    recorder = statuses.get("recorder")
-    recorded = 0 if recorder is None else recorder.counters.get("recorded_electrodes", 0)
-    return (
-        account.estimated + sum(account.unanswered.values()) >= account.published
-        and recorded >= account.published
-    )
-
-
-def _take(account: ReplayAccount, statuses: dict[str, Status]) -> None:
-    if "gateway" in statuses:
-        account.gateway = dict(statuses["gateway"].counters)
-    if "features" in statuses:
-        account.features = dict(statuses["features"].counters)
 
 
 def _progress(show: bool) -> Progress:

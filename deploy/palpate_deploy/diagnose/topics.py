@@ -113,16 +113,7 @@ def echo_topic(
     timeout_s: float,
     as_json: bool,
 ) -> None:
-    """Print messages of a topic.
-
-    Args:
-        link: The station's router.
-        station: Name of the station.
-        name: The topic.
-        sensor: One sensor, or ``*``.
-        count: End after so many; 0 = at Ctrl-C.
-        timeout_s: End when none comes for so long [s].
-        as_json: Print one JSON object a line.
+    """Print messages of a topic: ``count`` (0 = until Ctrl-C), until none comes for ``timeout_s``.
 
     Raises:
         ConfigError: There is no such topic.

@@ -7,14 +7,16 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import tomli_w
 
+from palpate.bus import Session
 from palpate.config import endpoint_host_port
 from palpate.errors import ConfigError, LinkError
-from palpate_deploy.station.profile import Profile, plain_values
+from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
 
 
 def check_free(endpoints: Iterable[str]) -> None:
@@ -49,6 +51,26 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def private_profile(name: str, **tables: Mapping[str, Any]) -> Profile:
+    """A shipped profile, its router at a free port: independent of any station of this host.
+
+    Raises:
+        ConfigError: A value of ``tables``, which replace keys as in ``changed``, is wrong.
+    """
+    here = (free_endpoint(),)
+    return changed(load_profile(name), router={"listen": here}, link={"connect": here}, **tables)
+
+
+def join(profile: Profile, *, wait_s: float) -> Session:
+    """Join a profile's station; ``wait_s`` is the wait for its router [s], negative = no limit.
+
+    Raises:
+        LinkError: There is no router.
+    """
+    link = profile.link.model_copy(update={"wait_for_router_s": wait_s})
+    return Session.open(link, station=profile.station)
 
 
 def _bind(host: str, port: int) -> None:

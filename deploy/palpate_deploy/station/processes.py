@@ -36,12 +36,7 @@ START_ORDER: tuple[Service, ...] = (
 
 
 def command_line(service: Service, profile: Path) -> list[str]:
-    """Command that runs one process of a profile, with this very Python.
-
-    Args:
-        service: Which.
-        profile: The resolved profile's file.
-    """
+    """Command that runs one process of a profile's file, with this very Python."""
     return [sys.executable, "-m", "palpate_deploy", "run", service, "--profile", str(profile)]
 
 
@@ -110,13 +105,7 @@ STOP_WAIT_S = 60.0
 
 
 class ProcessEnded(PalpateError, RuntimeError):
-    """A process of a finite run ended too early.
-
-    Args:
-        problem: What was wrong.
-        remedy: What to do.
-        status: Its exit status.
-    """
+    """A process of a finite run ended too early, with this exit status."""
 
     def __init__(self, problem: str, *, remedy: str, status: int) -> None:
         super().__init__(problem, remedy=remedy)
@@ -126,10 +115,7 @@ class ProcessEnded(PalpateError, RuntimeError):
 class FiniteRun:
     """Processes that are started once, watched and stopped; none is restarted.
 
-    Each writes a log of its own, and all end with this process.
-
-    Args:
-        name: Part of the name of the run's folder.
+    Each writes a log of its own, and all end with this process. The run's folder bears the name.
     """
 
     def __init__(self, name: str) -> None:
@@ -147,6 +133,11 @@ class FiniteRun:
                 env=environment_for_children(),
                 start_new_session=True,
             )
+
+    def start_module(self, name: str, module: str, *arguments: object) -> None:
+        """Start ``python -m palpate_deploy.MODULE ARGUMENTS``."""
+        command = [sys.executable, "-m", f"palpate_deploy.{module}", *map(str, arguments)]
+        self.start(name, command)
 
     def start_profile(self, profile: Profile) -> None:
         """Start every process of a profile in ``START_ORDER``."""

@@ -181,14 +181,10 @@ def load_profile(profile: str | Path) -> Profile:
 
 
 def parse_profile(values: Mapping[str, Any], *, where: str) -> Profile:
-    """Build a profile from plain values and the environment.
-
-    Args:
-        values: As in the TOML file.
-        where: Where they come from, for the error.
+    """Build a profile from plain values, as in the TOML file, and the environment.
 
     Raises:
-        ConfigError: Names ``where``, the key and what was expected.
+        ConfigError: Names ``where`` the values come from, the key and what was expected.
     """
     _check_environment()
     try:
@@ -213,14 +209,10 @@ def parse_profile(values: Mapping[str, Any], *, where: str) -> Profile:
 
 
 def changed(profile: Profile, **tables: Mapping[str, Any]) -> Profile:
-    """A copy with some keys of some tables replaced; it is checked like a file.
-
-    Args:
-        profile: The profile to start from.
-        tables: For each table the keys to replace, e.g. ``recorder={"out": "runs/1"}``.
+    """A copy with some keys of some tables replaced, e.g. ``recorder={"out": "runs/1"}``.
 
     Raises:
-        ConfigError: A replaced value is wrong.
+        ConfigError: A replaced value is wrong; values are checked like those of a file.
     """
     values = plain_values(profile)
     for table, keys in tables.items():

@@ -57,11 +57,7 @@ class ProcessState:
 
 
 class Supervisor:
-    """The processes of a profile, kept running until ``stop``.
-
-    Args:
-        profile: What to run.
-        name: Part of the name of the run's folder.
+    """The processes of a profile, kept running until ``stop``; the run's folder bears the name.
 
     Raises:
         LinkError: The router's port is in use.

@@ -12,10 +12,11 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from palpate.bus import Delivery, Session, Subscriber
+from palpate.bus import Delivery, Subscriber
 from palpate.bus.topics import STATUS
 from palpate.errors import StreamTimeout
 from palpate.messages import ServiceState, Status
+from palpate_deploy.station.host import join
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
@@ -29,14 +30,7 @@ _STATE_COLOURS = {"RUNNING": "green", "STARTING": "yellow", "STOPPING": "yellow"
 
 
 def run_up(profile: Profile, name: str) -> int:
-    """Run a station until a signal, or until its finite source has ended.
-
-    Args:
-        profile: What to run.
-        name: Part of the name of the run's folder.
-
-    Returns:
-        The exit code.
+    """Run a station until a signal, or until its finite source has ended; the exit code.
 
     Raises:
         LinkError: The router's port is in use.
@@ -52,8 +46,7 @@ def run_up(profile: Profile, name: str) -> int:
             soft_wrap=True,
             markup=False,
         )
-        link = profile.link.model_copy(update={"wait_for_router_s": -1.0})
-        with Session.open(link, station=profile.station) as session:
+        with join(profile, wait_s=-1.0) as session:
             statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
             if console.is_terminal:
                 finished = _watch_on_screen(console, supervisor, statuses, stop)

@@ -141,14 +141,9 @@ def estimate_field(
 def synthesise(
     field: FieldFrame | FieldEstimate, runtime: Runtime
 ) -> SynthesisEstimate | EstimateRefusal:
-    """Estimate the tared counts that belong to a displacement field.
+    """Estimate the tared counts that belong to a displacement field on the mesh of the bundle.
 
-    Args:
-        field: Known or estimated, on the mesh of the bundle.
-        runtime: A loaded bundle of the task ``synthesis``.
-
-    Returns:
-        The estimate, or why there is none.
+    Returns the estimate, or why there is none; ``runtime`` is a bundle of the task ``synthesis``.
     """
     known = as_field_frame(field)
     sample = known.displacement.reshape(-1)
@@ -209,15 +204,11 @@ class AgeLimit:
 
 
 class TareLookup:
-    """Finds the tares that frames name. Use from one thread.
+    """Finds the tares that frames name in the station's ``book``. Use from one thread.
 
     A tare that is not found is not asked for again at once, because every question blocks the
-    thread that serves all sensors.
-
-    Args:
-        book: The station's tares.
-        wait: Wait up to ``REPLAY_WAIT_S`` for a tare that is not known yet (lossless replay, in
-            which frames can arrive before their tare).
+    thread that serves all sensors. With ``wait`` a tare that is not known yet is waited for up to
+    ``REPLAY_WAIT_S`` (lossless replay, in which frames can arrive before their tare).
     """
 
     def __init__(self, book: TareBook, *, wait: bool) -> None:
@@ -227,14 +218,9 @@ class TareLookup:
         self._misses: dict[tuple[str, int], tuple[float, float]] = {}
 
     def find(self, sensor: str, tare_id: int) -> tuple[Tare | None, bool]:
-        """The tare that a frame names.
+        """The tare that a frame names by ``tare_id``, which is not ``NO_TARE``; None if unknown.
 
-        Args:
-            sensor: Name of the sensor.
-            tare_id: From the frame; not ``NO_TARE``.
-
-        Returns:
-            The tare, or None if it is not known; and whether the search may have taken time.
+        The second value says whether the search may have taken time.
         """
         key = (sensor, tare_id)
         miss = self._misses.get(key) if self._misses else None
@@ -264,14 +250,10 @@ class TareLookup:
 class TaredEstimator(Generic[E]):
     """Estimates from electrode frames, each with the tare that it names. Use from one thread.
 
-    Args:
-        session: Receives announced tares, and asks gateways for others.
-        config: How long a search for a tare may take.
-        runtime: The loaded bundle.
-        estimate: The pure function of frame, tare and bundle.
-        health: Gets one error for each sensor whose type the bundle was not made for.
-        any_age: Estimate also from a frame that became too old during the search for its tare:
-            right for a request, whose sender wants this very frame.
+    ``health`` gets one error for each sensor whose type the bundle was not made for.
+
+    With ``any_age`` also a frame that became too old during the search for its tare gets an
+    estimate: right for a request, whose sender wants this very frame.
     """
 
     def __init__(

@@ -102,9 +102,7 @@ class RateLimit:
     """Lets the first message of each period pass, by the clock of the messages.
 
     The clock of this process would not do: a replay at any speed must give the same estimates.
-
-    Args:
-        rate_hz: Messages a second and sensor at most [Hz]; None = all.
+    ``rate_hz`` limits the messages a second and sensor [Hz]; None = all pass.
     """
 
     def __init__(self, rate_hz: float | None) -> None:
@@ -126,13 +124,8 @@ class RateLimit:
 class EstimatePublisher(Generic[M, E]):
     """Publishes an estimate for each message, or counts why there is none. Use from one thread.
 
-    Args:
-        route: From which topic to which.
-        session: Where estimates are published.
-        config: Which sensors and messages are answered.
-        health: Gets counters and gauges.
-        estimate: Makes the estimate.
-        rate_hz: Estimates a second and sensor at most [Hz]; None = no limit.
+    ``health`` gets counters and gauges; ``estimate`` makes the estimate; ``rate_hz`` limits the
+    estimates a second and sensor [Hz], None = no limit.
     """
 
     def __init__(
@@ -231,11 +224,9 @@ class EstimatePublisher(Generic[M, E]):
 
 
 def reply(estimate: E | EstimateRefusal, health: Health) -> E:
-    """The reply to a request for one estimate, counted as ``asked``.
+    """The reply to a request for one estimate.
 
-    Args:
-        estimate: The estimate, or the reason why there is none.
-        health: Counts requests, and refused ones as ``asked_<reason>``.
+    Requests are counted as ``asked``, refused ones also as ``asked_<reason>``.
 
     Raises:
         RemoteError: There is none; it says why and what to do.

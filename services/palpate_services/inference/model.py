@@ -52,11 +52,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 
 
 def load(bundle: Bundle, task: str) -> Runtime:
-    """Load a bundle for a task and warm it up.
-
-    Args:
-        bundle: As read by ``palpate.files.bundle.read_bundle``.
-        task: The task that it shall serve, e.g. ``"features"``.
+    """Load a bundle for a task, e.g. ``"features"``, and warm it up.
 
     Raises:
         BundleError: It breaks the contract; the error names what and where.

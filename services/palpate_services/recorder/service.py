@@ -38,12 +38,7 @@ def run_recorder(
 ) -> None:
     """Record until ``stop`` is set; then write the samples that have arrived and close the files.
 
-    Args:
-        config: What is recorded, and where.
-        link: How to join the bus.
-        station: The station to record.
-        stop: Set it to end.
-        instance: Name of this process among several recorders.
+    The arguments are those of ``run_estimating``.
 
     Raises:
         ConfigError: An unknown topic, or a bundle that does not exist.

@@ -80,12 +80,7 @@ def leftovers(folder: Path) -> list[Path]:
 def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> list[Path]:
     """Recover leftovers; one that cannot be read stays as it is.
 
-    Args:
-        parts: As found by :func:`leftovers`.
-        stop: Ends the work between two files.
-
-    Returns:
-        The recovered records.
+    ``stop`` ends the work between two files. Returns the recovered records.
     """
     done: list[Path] = []
     for part in parts:
@@ -104,9 +99,7 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
 class RecordRecovery:
     """Recovers leftovers in a thread, because a large one must not delay the new record.
 
-    Args:
-        folder: Folder of records.
-        health: Counts ``recovered_records``.
+    Counts ``recovered_records``.
     """
 
     def __init__(self, folder: Path, health: Health) -> None:
@@ -167,11 +160,6 @@ RETRY_S = 1.0
 
 class RecordFiles:
     """Writes samples to the present record, and draws them into its view. Use from one thread.
-
-    Args:
-        config: What is recorded, and where.
-        station: Part of the names of the files.
-        health: Gets counters, gauges, state and errors.
 
     Raises:
         ConfigError: One of ``config.bundles`` does not exist.

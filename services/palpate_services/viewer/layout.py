@@ -49,9 +49,7 @@ _POSITIONS = {
 def record_layout(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
     """Layout of a record: a tab for each sensor, its fingertip left, its signals right.
 
-    Args:
-        sensors: Types of the sensors by name, in order of their tabs.
-        with_fields: Those of them that have fields; their tab gets one more row.
+    The tabs of ``with_fields``, the sensors that have fields, get one more row.
     """
     rrb = require("rerun.blueprint", extra="services")
     tabs = [
@@ -62,12 +60,7 @@ def record_layout(sensors: Mapping[str, SensorType], *, with_fields: Collection[
 
 
 def simulation_layout(trajectories: Sequence[str], longest_m: float) -> Any:
-    """Layout of simulations: a tab for each trajectory.
-
-    Args:
-        trajectories: Ids, in order of their tabs.
-        longest_m: Displacement that has the last colour [m].
-    """
+    """Layout of simulations: a tab for each trajectory; ``longest_m`` has the last colour [m]."""
     rrb = require("rerun.blueprint", extra="services")
     tabs = [_trajectory_tab(rrb, name, longest_m) for name in trajectories]
     return _screen(rrb, tabs, timeline=STEP, fps=5.0)
@@ -190,11 +183,8 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
     """What never changes, as entity (below the sensor) and value: names, colours, the body.
 
     The electrodes of a BioTac SP are drawn in the sensor frame of their table and without a body,
-    because no source gives its shape.
-
-    Args:
-        kind: Type of the sensor.
-        again: Whether these replace the fixtures of another type (an exchanged finger).
+    because no source gives its shape. ``again``: these replace the fixtures of another type (an
+    exchanged finger).
     """
     rr = require("rerun", extra="services")
 
@@ -268,14 +258,7 @@ def electrode_colours(count: int) -> list[tuple[int, int, int]]:
 
 
 def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
-    """Colours of electrodes by their tared counts: blue where negative, orange where positive.
-
-    Args:
-        tared: Tared counts, shape ``(N, 19)`` (SP: 24).
-
-    Returns:
-        Packed RGBA, uint32, of the same shape.
-    """
+    """Packed RGBA of tared counts: blue where negative, orange where positive; the same shape."""
     strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
     rest = np.array([150.0, 156.0, 166.0])
     full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))

@@ -72,16 +72,10 @@ class _Skin:
 
 
 class FieldDrawer:
-    """Draws fields on the skins of their meshes.
+    """Draws fields on the skins of their meshes, with the ``send`` of a view.
 
     ``counters``: ``view_no_mesh`` (fields of a mesh that no bundle holds), ``view_wrong_mesh``
     (fields with another number of nodes than their mesh).
-
-    Args:
-        rr: Rerun.
-        stream: Rerun's recording stream, for the parts that do not change.
-        send: Sends columns of an entity at the times of rows.
-        meshes: Finds meshes by content hash.
     """
 
     def __init__(self, rr: Any, stream: Any, send: Send, meshes: MeshLibrary) -> None:
@@ -94,12 +88,7 @@ class FieldDrawer:
         self._begun: set[str] = set()
 
     def draw(self, entity: str, rows: list[FieldRow]) -> None:
-        """Draw the fields of one stream.
-
-        Args:
-            entity: Its entity; each mesh gets one below it.
-            rows: Fields in order of time.
-        """
+        """Draw fields in order of time; each mesh gets an entity below ``entity``."""
         for sha256, group in groupby(rows, key=lambda row: row.mesh_sha256):
             same = list(group)
             mesh = self._meshes.find(sha256)
@@ -179,12 +168,7 @@ class RerunView:
         return self._fields.counters
 
     def add(self, sensor: str, message: Any) -> None:
-        """Take one message; it is drawn with the next :meth:`flush`.
-
-        Args:
-            sensor: The sensor it belongs to.
-            message: A decoded message of one of ``SensorTimeline.TOPICS``.
-        """
+        """Take one message of ``SensorTimeline.TOPICS``; it is drawn with the next ``flush``."""
         if self.full:
             return
         scene = self._scenes.get(sensor)
@@ -335,11 +319,8 @@ class LiveView:
     """The view beside a running record, drawn in a thread of its own: it may fail, the record not.
 
     Counts ``view_dropped`` (messages came too fast), ``view_failed`` (the view was given up), and
-    what the view counts, e.g. ``view_no_mesh``.
-
-    Args:
-        make: Makes the view. It is called in that thread, because it imports Rerun, which takes
-            half a second: the record must not wait for it.
+    what the view counts, e.g. ``view_no_mesh``. ``make`` is called in that thread, because it
+    imports Rerun, which takes half a second: the record must not wait for it.
     """
 
     def __init__(self, make: Callable[[], RerunView]) -> None:
