@@ -22,8 +22,8 @@ from rich.progress import Progress
 from rich.table import Table
 
 from palpate.alignment import AlignmentClock, electrode_instants, linear, times_of
-from palpate.bus import Delivery, ReceivedMessage, Subscriber
-from palpate.bus.topics import ELECTRODES, POSE, WRENCH
+from palpate.bus import Delivery, ReceivedMessage
+from palpate.bus.topics import ELECTRODES, POSE, WRENCH, Topic
 from palpate.errors import LinkError
 from palpate.messages import ElectrodeFrame, IndenterPoseFrame, WrenchFrame
 from palpate.sampling import sample_offsets
@@ -340,9 +340,10 @@ def _catch(
     stop = threading.Event()
     with join(profile, wait_s=_READY_S) as session:
         taken: list[list[ReceivedMessage[Any]]] = [[], [], []]
+        topics: tuple[Topic[Any], ...] = (ELECTRODES, WRENCH, POSE)
         threads = []
-        for topic, into in zip((ELECTRODES, WRENCH, POSE), taken, strict=True):
-            stream: Subscriber[Any] = session.subscriber(topic, delivery=Delivery.QUEUE)
+        for topic, into in zip(topics, taken, strict=True):
+            stream = session.subscriber(topic, delivery=Delivery.QUEUE)
             threads.append(threading.Thread(target=into.extend, args=(received(stream, stop),)))
         for thread in threads:
             thread.start()

@@ -116,27 +116,18 @@ def _table(comparison: TouchComparison, fields: FieldMedians, left_s: float) -> 
     for column in ("truth", "estimate", "error", "median error"):
         table.add_column(column, justify="right", min_width=9)
     medians = comparison.medians()
-    for axis, name in enumerate("xyz"):
-        table.add_row(
-            escape(f"force {name} [N]"),
-            f"{moment.true_force[axis]:+.2f}",
-            f"{moment.force[axis]:+.2f}",
-            f"{moment.force[axis] - moment.true_force[axis]:+.2f}",
-            f"{medians.force_axes_n[axis]:.3f}",
-            end_section=axis == 2,
-        )
-    for axis, name in enumerate("xyz"):
-        estimate, truth = moment.location, moment.true_location
-        table.add_row(
-            escape(f"location {name} [mm]"),
-            "-" if truth is None else f"{truth[axis] * 1e3:+.2f}",
-            "-" if estimate is None else f"{estimate[axis] * 1e3:+.2f}",
-            "-"
-            if truth is None or estimate is None
-            else f"{(estimate[axis] - truth[axis]) * 1e3:+.2f}",
-            f"{medians.location_axes_m[axis] * 1e3:.2f}",
-        )
-    table.add_section()
+    for what, scale, truth, estimate, errors in (
+        ("force {} [N]", 1.0, moment.true_force, moment.force, medians.force_axes_n),
+        ("location {} [mm]", 1e3, moment.true_location, moment.location, medians.location_axes_m),
+    ):
+        error = None if truth is None or estimate is None else estimate - truth
+        for axis, name in enumerate("xyz"):
+            cells = (
+                "-" if vector is None else f"{vector[axis] * scale:+.2f}"
+                for vector in (truth, estimate, error)
+            )
+            median = f"{errors[axis] * scale:.{3 if scale == 1.0 else 2}f}"
+            table.add_row(escape(what.format(name)), *cells, median, end_section=axis == 2)
     table.add_row(
         "skin, mean of all nodes [mm]",
         f"{fields.moved_m * 1e3:.3f}",

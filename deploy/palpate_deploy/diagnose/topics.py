@@ -9,7 +9,7 @@ import json
 import statistics
 import sys
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -43,21 +43,14 @@ def topic_named(name: str) -> Topic[Any]:
     return topic
 
 
-@dataclass(slots=True)
-class _TopicCount:
-    """Messages received of one topic."""
-
-    messages: int = 0
-    sources: set[str] = field(default_factory=set)
-
-
 def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool) -> None:
     """Receive all topics for a while and print them as a table.
 
     Raises:
         LinkError: There is no router.
     """
-    heard: defaultdict[str, _TopicCount] = defaultdict(_TopicCount)
+    messages: Counter[str] = Counter()
+    sources: defaultdict[str, set[str]] = defaultdict(set)
     with Session.open(link, station=station) as session:
         with session.tap(list(TOPICS.values())) as tap:
             began = time.monotonic()
@@ -66,41 +59,37 @@ def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool
                     sample = tap.next(left)
                 except StreamTimeout:
                     break
-                heard[sample.topic].messages += 1
-                heard[sample.topic].sources.add(sample.sensor)
+                messages[sample.topic] += 1
+                sources[sample.topic].add(sample.sensor)
+    # Messages per second of one source.
+    rates_hz = {name: messages[name] / seconds / max(1, len(sources[name])) for name in TOPICS}
     if as_json:
         rows = [
             {
-                "topic": topic.name,
+                "topic": name,
                 "message": topic.codec.schema,
                 "usual_rate_hz": topic.rate_hz,
-                "sources": sorted(heard[topic.name].sources),
-                "messages": heard[topic.name].messages,
-                "rate_hz": round(_rate_hz(heard[topic.name], seconds), 2),
+                "sources": sorted(sources[name]),
+                "messages": messages[name],
+                "rate_hz": round(rates_hz[name], 2),
             }
-            for topic in TOPICS.values()
+            for name, topic in TOPICS.items()
         ]
         print(json.dumps({"station": station, "topics": rows}, indent=2))
         return
     table = Table(title=f"station {station}, {seconds:g} s of listening", title_justify="left")
     for column in ("topic", "message", "from", "Hz now", "Hz usual", "what"):
         table.add_column(column, justify="right" if column.startswith("Hz") else "left")
-    for topic in TOPICS.values():
-        now = heard[topic.name]
+    for name, topic in TOPICS.items():
         table.add_row(
-            topic.name,
+            name,
             topic.codec.schema.rpartition(".")[2],
-            " ".join(sorted(now.sources)) or "[dim]-[/]",
-            f"{_rate_hz(now, seconds):.1f}" if now.messages else "[dim]-[/]",
+            " ".join(sorted(sources[name])) or "[dim]-[/]",
+            f"{rates_hz[name]:.1f}" if messages[name] else "[dim]-[/]",
             f"{topic.rate_hz:g}" if topic.rate_hz else "events",
             topic.doc,
         )
     Console().print(table)
-
-
-def _rate_hz(heard: _TopicCount, seconds: float) -> float:
-    """Messages per second of one source."""
-    return heard.messages / seconds / max(1, len(heard.sources))
 
 
 def echo_topic(

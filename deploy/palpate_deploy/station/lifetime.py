@@ -9,9 +9,12 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from types import FrameType
 
 PARENT_PID = "_PALPATE_PARENT_PID"
@@ -41,6 +44,30 @@ def environment_for_children() -> dict[str, str]:
     """
     kept = {k: v for k, v in os.environ.items() if not k.upper().startswith("PALPATE_")}
     return {**kept, PARENT_PID: str(os.getpid())}
+
+
+def start_child(command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
+    """Start a process that ends with this one and writes into a log of its own."""
+    with open(log, "ab") as output:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment_for_children(),
+            # Ctrl-C must reach only the command itself, which stops its children in order.
+            start_new_session=True,
+        )
+
+
+def stop_child(process: subprocess.Popen[bytes], timeout_s: float) -> int:
+    """Stop a process with ``SIGTERM``, after the timeout with ``SIGKILL``; its exit status."""
+    process.terminate()
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 def end_with_parent() -> None:

@@ -16,7 +16,8 @@ from palpate_deploy.station import logs
 from palpate_deploy.station.host import new_run_folder, write_profile
 from palpate_deploy.station.lifetime import (
     end_with_parent,
-    environment_for_children,
+    start_child,
+    stop_child,
     stop_on_signals,
 )
 from palpate_deploy.station.profile import Profile, Service
@@ -124,15 +125,7 @@ class FiniteRun:
 
     def start(self, name: str, command: Sequence[str]) -> None:
         """Start a process."""
-        with open(self.log(name), "ab") as output:
-            self._running[name] = subprocess.Popen(
-                list(command),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=environment_for_children(),
-                start_new_session=True,
-            )
+        self._running[name] = start_child(command, self.log(name))
 
     def start_module(self, name: str, module: str, *arguments: object) -> None:
         """Start ``python -m palpate_deploy.MODULE ARGUMENTS``."""
@@ -187,14 +180,7 @@ class FiniteRun:
 
     def stop_one(self, name: str) -> int:
         """Stop a process; its exit status."""
-        process = self._running[name]
-        if process.poll() is None:
-            process.terminate()
-            try:
-                process.wait(timeout=STOP_WAIT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-        return process.wait()
+        return stop_child(self._running[name], STOP_WAIT_S)
 
     def wait(self, name: str, timeout_s: float) -> int | None:
         """Wait for a process to end by itself; None if it does not in time."""

@@ -9,7 +9,6 @@ import os
 import shlex
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,7 +19,7 @@ from typing import Any, Self
 
 from palpate.errors import PalpateError
 from palpate_deploy.station.host import check_free, new_run_folder, write_profile
-from palpate_deploy.station.lifetime import environment_for_children
+from palpate_deploy.station.lifetime import start_child, stop_child
 from palpate_deploy.station.processes import START_ORDER, command_line
 from palpate_deploy.station.profile import Profile, Service
 
@@ -76,7 +75,9 @@ class Supervisor:
         self._socket = self._socket_folder / "supervisor.sock"
         config = self.folder / "supervisord.conf"
         config.write_text(self._config_text(write_profile(profile, self.folder)), encoding="utf-8")
-        self._process = self._spawn(config)
+        command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
+        command += ["-n", "-s", "-c", str(config)]
+        self._process = start_child(command, self.logs / "supervisord.out")
         self._rpc = xmlrpc.client.ServerProxy(
             "http://127.0.0.1", transport=_transport(self._socket)
         )
@@ -136,13 +137,8 @@ class Supervisor:
 
     def stop(self) -> None:
         """Stop all processes in reverse order of starting, then supervisord; may be repeated."""
-        if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(timeout=STOP_WAIT_S * len(self.profile.processes) + 5)
-            except subprocess.TimeoutExpired:
-                self._process.kill()  # its processes notice that and end (lifetime.end_with_parent)
-                self._process.wait()
+        # If it has to be killed, its processes notice that and end (lifetime.end_with_parent).
+        stop_child(self._process, STOP_WAIT_S * len(self.profile.processes) + 5)
         shutil.rmtree(self._socket_folder, ignore_errors=True)
 
     def log_tail(self, service: str, lines: int = 5) -> str:
@@ -212,19 +208,6 @@ class Supervisor:
             "stdout_logfile_maxbytes": "10MB",
             "stdout_logfile_backups": "3",
         }
-
-    def _spawn(self, config: Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
-        with open(self.logs / "supervisord.out", "wb") as output:
-            return subprocess.Popen(
-                [*command, "-n", "-s", "-c", str(config)],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=environment_for_children(),
-                # Ctrl-C must reach only `palpate up`, which stops the rest in order.
-                start_new_session=True,
-            )
 
     def _wait_for_rpc(self) -> None:
         deadline = time.monotonic() + _START_WAIT_S

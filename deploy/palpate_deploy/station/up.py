@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
 import time
@@ -48,10 +49,7 @@ def run_up(profile: Profile, name: str) -> int:
         )
         with join(profile, wait_s=-1.0) as session:
             statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
-            if console.is_terminal:
-                finished = _watch_on_screen(console, supervisor, statuses, stop)
-            else:
-                finished = _watch_plainly(console, supervisor, stop)
+            finished = _watch(console, supervisor, statuses, stop)
         if not stop.is_set() and not finished:
             raise SupervisorError(
                 "supervisord is gone", remedy=f"see {supervisor.logs / 'supervisord.log'}"
@@ -61,44 +59,41 @@ def run_up(profile: Profile, name: str) -> int:
     return 0 if finished in (None, 0) else FAILED
 
 
-def _watch_on_screen(
-    console: Console,
-    supervisor: Supervisor,
-    statuses: Subscriber[Status],
-    stop: threading.Event,
+def _watch(
+    console: Console, supervisor: Supervisor, statuses: Subscriber[Status], stop: threading.Event
 ) -> int | None:
-    """Redraw the screen until a signal (None) or the end of a finite source (its status)."""
+    """Show the processes until a signal (None) or the end of a finite source (its status)."""
     known: dict[str, tuple[Status, float]] = {}
-    with Live(console=console, auto_refresh=False) as live:
+    before: dict[str, tuple[str, int]] = {}
+    screen = Live(console=console, auto_refresh=False) if console.is_terminal else None
+    with screen or contextlib.nullcontext():
         while not stop.is_set() and supervisor.running:
             _take(statuses, known)
             processes = supervisor.processes()
-            live.update(_screen(processes, known), refresh=True)
+            if screen is not None:
+                screen.update(_screen(processes, known), refresh=True)
+            else:
+                _print_changes(console, processes, before)
             if (finished := _finished(supervisor, processes)) is not None:
                 return finished
             stop.wait(_REFRESH_S)
     return None
 
 
-def _watch_plainly(console: Console, supervisor: Supervisor, stop: threading.Event) -> int | None:
+def _print_changes(
+    console: Console, processes: list[ProcessState], before: dict[str, tuple[str, int]]
+) -> None:
     """Print only changes, for a log file or a service manager."""
-    before: dict[str, tuple[str, int]] = {}
-    while not stop.is_set() and supervisor.running:
-        processes = supervisor.processes()
-        for process in processes:
-            now = (process.state, process.pid)
-            if before.get(process.service) != now:
-                before[process.service] = now
-                console.print(
-                    f"{time.strftime('%H:%M:%S')} {process.service}: {process.state.lower()}"
-                    + (f", pid {process.pid}" if process.pid else "")
-                    + (f", restart {process.restarts}" if process.restarts else ""),
-                    highlight=False,
-                )
-        if (finished := _finished(supervisor, processes)) is not None:
-            return finished
-        stop.wait(_REFRESH_S)
-    return None
+    for process in processes:
+        now = (process.state, process.pid)
+        if before.get(process.service) != now:
+            before[process.service] = now
+            console.print(
+                f"{time.strftime('%H:%M:%S')} {process.service}: {process.state.lower()}"
+                + (f", pid {process.pid}" if process.pid else "")
+                + (f", restart {process.restarts}" if process.restarts else ""),
+                highlight=False,
+            )
 
 
 def _finished(supervisor: Supervisor, processes: list[ProcessState]) -> int | None:

@@ -74,7 +74,7 @@ def review_simulations(
     names = choose_trajectories(simulations.ids(), trajectories, most)
     finger = simulations.fingertip()
     # One scale for all, so that colours can be compared between tabs.
-    longest_m = max(_furthest(simulations.trajectory(name)) for name in names) or 1e-3
+    longest_m = max(_largest(simulations.trajectory(name).displacement) for name in names) or 1e-3
     target = store.with_suffix(".rrd") if view is None else view
     stream = rr.RecordingStream(APPLICATION)
     try:
@@ -95,10 +95,6 @@ def review_simulations(
     finally:
         stream.disconnect()
     return target
-
-
-def _furthest(press: DrawnTrajectory) -> float:
-    return float(np.linalg.norm(press.displacement, axis=2).max(initial=0.0))
 
 
 class _Drawing:
@@ -263,8 +259,9 @@ class _Drawing:
         self._stream.send_columns(f"{self._press.id}/{entity}", [steps], columns)
 
 
-def _largest(force: Floats) -> float:
-    return float(np.linalg.norm(force, axis=2).max(initial=0.0))
+def _largest(vectors: Floats) -> float:
+    """Largest magnitude of vectors of shape (K, V, 3)."""
+    return float(np.linalg.norm(vectors, axis=2).max(initial=0.0))
 
 
 @dataclass(frozen=True, slots=True)
