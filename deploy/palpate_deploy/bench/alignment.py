@@ -274,12 +274,7 @@ def run_alignment(
 
 
 def measure_alignment(seconds: float, settle_seconds: float, bar: Progress) -> AlignmentResult:
-    """Start everything, let the clocks settle, measure.
-
-    Raises:
-        ProcessEnded: A process of the benchmark ended early.
-        LinkError: They did not find one another in time, or a stream did not come.
-    """
+    """Start everything, let the clocks settle, measure."""
     with FiniteRun("bench-alignment") as children:
         sensors = _start_devices(children)
         profile = gateway_station(sensors)

@@ -106,12 +106,7 @@ def ramp_rate(base: LoadResult, *, bundle: str, bar: Progress) -> LoadResult | N
 def run_load(
     *, sensors: int, rate_hz: float, seconds: float, bundle: str, bar: Progress
 ) -> LoadResult:
-    """Send frames of many fingers through one gateway, features and client, and account for each.
-
-    Raises:
-        ProcessEnded: A process of the benchmark ended early.
-        LinkError: They did not find one another in time.
-    """
+    """Send frames of many fingers through gateway, features and client; account for each."""
     task = bar.add_task(f"{sensors} fingers at {rate_hz:g} Hz", total=None)
     frames = round(rate_hz * seconds) + _TARE_FRAMES
     fingers = [
@@ -221,17 +216,14 @@ def run_e2e(
 def measure_latency(
     *, seconds: float, rounds: int, bundle: str, model: Path, bar: Progress
 ) -> tuple[Latency, Latency]:
-    """Latency of palpate and of the floor, in turns.
-
-    Raises:
-        ProcessEnded: A process of the benchmark ended early.
-        LinkError: They did not find one another in time.
-    """
+    """Latency of palpate and of the floor, in turns."""
     with FiniteRun("bench") as children:
         gates = children.folder / "gates"
         opened = [SourceGate(gates, _PALPATE), SourceGate(gates, _FLOOR)]
         outs = [children.folder / "palpate.npz", children.folder / "floor.npz"]
-        start_palpate(children, bundle, outs[_PALPATE], _one_finger(gates), delivery="newest")
+        options = {"rate_hz": RATE_HZ, "gate": str(gates), "gate_index": _PALPATE}
+        finger = {"name": "finger", "driver": "bench", "options": options}
+        start_palpate(children, bundle, outs[_PALPATE], [finger], delivery="newest")
         _start_floor(children, model, outs[_FLOOR], gates)
         names = ["gateway", "features", "client", "floor-source", "floor-service", "floor-client"]
         # The first frames are not measured: tare, first inference, page faults.
@@ -271,11 +263,7 @@ def measure_latency(
 def start_palpate(
     children: FiniteRun, bundle: str, out: Path, sensors: list[dict[str, Any]], *, delivery: str
 ) -> Profile:
-    """Start router, features, client and the gateway; return when all but the gateway are ready.
-
-    Raises:
-        LinkError: They are not ready in time.
-    """
+    """Start router, features, client and the gateway; return when all but the gateway are ready."""
     profile = private_profile(
         "bench",
         features={"bundle": bundle},
@@ -289,11 +277,6 @@ def start_palpate(
     path = write_profile(profile, children.folder)
     children.start_module("gateway", "bench.parts", "gateway", path)
     return profile
-
-
-def _one_finger(gates: Path) -> list[dict[str, Any]]:
-    options = {"rate_hz": RATE_HZ, "gate": str(gates), "gate_index": _PALPATE}
-    return [{"name": "finger", "driver": "bench", "options": options}]
 
 
 def _start_floor(children: FiniteRun, model: Path, out: Path, gates: Path) -> None:

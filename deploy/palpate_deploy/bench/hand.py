@@ -201,12 +201,7 @@ def run_hand(*, seconds: float, floor_seconds: float, as_json: bool, save: bool)
 
 
 def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandResult:
-    """Start everything, measure the gateway, then the floor.
-
-    Raises:
-        ProcessEnded: A process of the benchmark ended early.
-        LinkError: They did not find one another in time.
-    """
+    """Start everything, measure the gateway, then the floor."""
     with FiniteRun("bench-hand") as children:
         buses, wrenches = _start_emulators(children)
         rows_file, floor_file = children.folder / "client.npz", children.folder / "floor.npz"

@@ -28,11 +28,7 @@ def free_port() -> int:
 
 
 def wait_ready(profile: Profile, services: set[str]) -> None:
-    """Wait until services are ready.
-
-    Raises:
-        LinkError: They are not in time.
-    """
+    """Wait until services are ready."""
     deadline = time.monotonic() + _READY_S
     with join(profile, wait_s=_READY_S) as session:
         while True:

@@ -55,14 +55,7 @@ _LATE_WARN_S = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the report.
-
-    Attributes:
-        what: What was checked.
-        grade: ``ok``, ``warn`` (a station runs, but something is missing) or ``fail``.
-        found: The result.
-        fix: What to do about it.
-    """
+    """One check: result and fix; ``warn`` means that a station runs, but lacks something."""
 
     what: str
     grade: Grade

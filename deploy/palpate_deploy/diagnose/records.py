@@ -142,24 +142,17 @@ def review_path(
             f"{path} is a record, which has no trajectories", remedy="leave out --trajectory"
         )
     else:
-        review_record(path, view, picture, bundles=bundles)
+        from palpate_services.viewer.record_view import review
 
+        written = review(path, view, bundles=bundles)
+        print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
+        if picture is not None:
+            from palpate_services.viewer.plot import plot_record
 
-def review_record(
-    path: Path, view: Path | None, picture: Path | None, *, bundles: Sequence[str] = ()
-) -> None:
-    """Write the Rerun view of a record, and on request the picture; errors as ``review_path``."""
-    from palpate_services.viewer.record_view import review
-
-    written = review(path, view, bundles=bundles)
-    print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
-    if picture is not None:
-        from palpate_services.viewer.plot import plot_record
-
-        for name, value in plot_record(path, picture).items():
-            print(f"  {name:24} {value:.4g}")
-        print(picture)
-    print(f"look at it: {viewer_command(written)}")
+            for name, value in plot_record(path, picture).items():
+                print(f"  {name:24} {value:.4g}")
+            print(picture)
+        print(f"look at it: {viewer_command(written)}")
 
 
 def _review_store(

@@ -36,15 +36,8 @@ from palpate_deploy.station.status import ask_status
 class ReplayAccount:
     """The account of a replay: what was published, estimated and recorded.
 
-    Attributes:
-        file: The file that was replayed.
-        seconds: How long it took [s].
-        gateway: Last counters of the gateway.
-        features: Last counters of the features service.
-        recorded: Recorded messages by topic, read back from the records.
-        records: The files written.
-        error: Why the file ended early, if it did.
-        exit_status: Exit status of the gateway.
+    ``gateway`` and ``features`` are the last counters of these services, ``recorded`` the messages
+    by topic, read back from ``records``, the files written; ``error`` is why the file ended early.
     """
 
     file: Path

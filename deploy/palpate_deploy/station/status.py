@@ -15,7 +15,6 @@ from palpate.config import LinkConfig
 from palpate.errors import PalpateError
 from palpate.messages import (
     SensorState,
-    SensorStatus,
     ServiceRequest,
     ServiceState,
     Status,
@@ -92,10 +91,8 @@ _COLOURS = {
     ServiceState.STOPPING: "yellow",
 }
 
-_SENSOR_COLOURS = {
+_SENSOR_COLOURS = {  # of all others yellow
     SensorState.LIVE: "green",
-    SensorState.WARMING: "yellow",
-    SensorState.STARTING: "yellow",
     SensorState.ZERO_LOST: "red",
     SensorState.LOST: "red",
     SensorState.ENDED: "cyan",
@@ -208,16 +205,13 @@ def _table(
 
 def _sensors(status: Status) -> str:
     """Each sensor with its state and its message, as rich markup."""
-    if not status.sensor_states:
-        return " ".join(status.sensors)
-    return "\n".join(map(_sensor, status.sensor_states))
-
-
-def _sensor(sensor: SensorStatus) -> str:
-    state = sensor.state.name.lower().replace("_", " ")
-    colour = _SENSOR_COLOURS.get(sensor.state, "yellow")
-    said = f" [dim]({escape(sensor.message)})[/]" if sensor.message else ""
-    return f"{escape(sensor.name)} [{colour}]{state}[/]{said}"
+    lines = []
+    for sensor in status.sensor_states:
+        state = sensor.state.name.lower().replace("_", " ")
+        colour = _SENSOR_COLOURS.get(sensor.state, "yellow")
+        said = f" [dim]({escape(sensor.message)})[/]" if sensor.message else ""
+        lines.append(f"{escape(sensor.name)} [{colour}]{state}[/]{said}")
+    return "\n".join(lines) or " ".join(status.sensors)
 
 
 def _as_json(
@@ -228,40 +222,36 @@ def _as_json(
 ) -> dict[str, Any]:
     processes = []
     for process in present:
-        entry: dict[str, Any] = {
-            "service": process.service,
-            "instance": process.instance,
-            "ready": process.ready,
-        }
         status = answers.get((process.service, process.instance))
-        if status is not None:
-            error = status.last_error
-            entry |= {
-                "state": status.state.name.lower(),
-                "uptime_s": round(status.uptime_s, 3),
-                "version": status.version,
-                "sensors": list(status.sensors),
-                "sensor_states": [_sensor_json(sensor) for sensor in status.sensor_states],
-                "message": status.message,
-                "counters": dict(status.counters),
-                "gauges": dict(status.gauges),
-                "last_error": None
-                if error is None
-                else {
-                    "code": error.code.name.lower(),
-                    "message": error.message,
-                    "remedy": error.remedy,
-                },
-            }
-        processes.append(entry)
+        entry = {key: getattr(process, key) for key in ("service", "instance", "ready")}
+        processes.append(entry | ({} if status is None else _status_json(status)))
     return {"station": station, "router": router, "processes": processes}
 
 
-def _sensor_json(sensor: SensorStatus) -> dict[str, Any]:
+def _status_json(status: Status) -> dict[str, Any]:
+    error = status.last_error
     return {
-        "name": sensor.name,
-        "state": sensor.state.name.lower(),
-        "since_monotonic_ns": sensor.since_monotonic_ns,
-        "faults": {fault.kind.name.lower(): list(fault.channels) for fault in sensor.faults},
-        "message": sensor.message,
+        "state": status.state.name.lower(),
+        "uptime_s": round(status.uptime_s, 3),
+        "version": status.version,
+        "sensors": list(status.sensors),
+        "sensor_states": [
+            {
+                "name": sensor.name,
+                "state": sensor.state.name.lower(),
+                "since_monotonic_ns": sensor.since_monotonic_ns,
+                "faults": {f.kind.name.lower(): list(f.channels) for f in sensor.faults},
+                "message": sensor.message,
+            }
+            for sensor in status.sensor_states
+        ],
+        "message": status.message,
+        "counters": dict(status.counters),
+        "gauges": dict(status.gauges),
+        "last_error": error
+        and {
+            "code": error.code.name.lower(),
+            "message": error.message,
+            "remedy": error.remedy,
+        },
     }

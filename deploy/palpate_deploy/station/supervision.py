@@ -38,13 +38,9 @@ class SupervisorError(PalpateError, RuntimeError):
 class ProcessState:
     """One supervised process.
 
-    Attributes:
-        service: Which.
-        state: As supervisord names it: ``RUNNING``, ``STARTING``, ``BACKOFF``, ``EXITED``, ...
-        pid: Its process id; 0 = not running.
-        uptime_s: Since its last start [s].
-        restarts: How often it was restarted in this run, as far as that was observed.
-        exit_status: Exit status of its last run.
+    ``state`` is named by supervisord: ``RUNNING``, ``STARTING``, ``BACKOFF``, ``EXITED``, ...;
+    ``pid`` is 0 if it does not run; ``uptime_s`` counts from its last start [s]; ``restarts`` are
+    those that were observed; ``exit_status`` is that of its last run.
     """
 
     service: Service

@@ -83,13 +83,9 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class ServiceRoute(Generic[M, E]):
-    """From which topic to which topic a service estimates.
+    """From which topic to which topic a service, named like its task, estimates.
 
-    Attributes:
-        service: Name of the service, which is also the task of its bundle.
-        source: Topic of the messages that it answers.
-        target: Topic of its estimates.
-        received: Name of its counter of received messages.
+    ``received`` is the name of its counter of received messages.
     """
 
     service: str
