@@ -51,15 +51,7 @@ Wrenches = dict[str, list[WrenchFrame]]
 
 @dataclass(frozen=True, slots=True)
 class ErrorSpread:
-    """Distribution of errors.
-
-    Attributes:
-        count: Number of readings.
-        median_s: Median, late is positive [s].
-        p95_s: 95th percentile of the magnitudes [s].
-        p99_s: 99th percentile of the magnitudes [s].
-        max_s: Largest magnitude [s].
-    """
+    """Distribution of errors [s]: median (late is positive), percentiles of the magnitudes."""
 
     count: int
     median_s: float
@@ -241,14 +233,10 @@ _IDENTITY = {"position_m": (0.0, 0.0, 0.0), "orientation_wxyz": (1.0, 0.0, 0.0, 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentResult:
-    """Errors of stamps and of the alignment.
+    """Errors of stamps and of the alignment, by stream.
 
-    Attributes:
-        seconds: Duration of the measurement [s].
-        kept: Share of it that counts, in which no emulator was late.
-        stamps: By stream, stamp minus truth.
-        apart: By stream, its error relative to the electrodes once aligned by stamps.
-        gauges: The gateway's gauges of the clocks.
+    ``kept`` is the share of ``seconds`` that counts, in which no emulator was late; ``stamps`` are
+    stamp minus truth, ``apart`` the error relative to the electrodes once aligned by stamps.
     """
 
     seconds: float
@@ -372,7 +360,7 @@ def _catch(
 
 
 def _print(result: AlignmentResult) -> None:
-    console = Console()
+    console = Console(highlight=False)
     for title, rows in (
         ("stamp minus truth", result.stamps),
         ("apart from the electrodes when aligned by stamps", result.apart),
@@ -385,6 +373,5 @@ def _print(result: AlignmentResult) -> None:
         console.print(table)
     console.print(
         f"{result.kept:.0%} of {result.seconds:g} s count; at other times an emulator was late",
-        highlight=False,
         soft_wrap=True,
     )

@@ -19,13 +19,9 @@ from palpate_gateway.readings import ElectrodeReading, Reading
 class BenchOptions(StrictConfig):
     """Options of the benchmark's device.
 
-    Attributes:
-        rate_hz: Frames per second [Hz].
-        phase: Share of the period by which its frames are shifted, so that those of many sensors
-            do not coincide.
-        frames: Frames, then the source ends; 0 = endless.
-        gate: File of the gate that pauses it; None = none.
-        gate_index: Its byte in that file.
+    ``phase`` shifts its frames by a share of their period, so that those of many sensors do not
+    coincide; it ends after ``frames``, 0 = never; the file ``gate``, by its byte ``gate_index``,
+    pauses it.
     """
 
     rate_hz: float = Field(default=100.0, ge=1)

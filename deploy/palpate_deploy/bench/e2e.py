@@ -323,7 +323,7 @@ def _print(
     *,
     ramped: bool,
 ) -> None:
-    console = Console()
+    console = Console(highlight=False)
     table = Table(
         title=f"frame stamp to estimate in the client, one finger at {RATE_HZ:g} Hz, loopback TCP",
         title_justify="left",
@@ -347,9 +347,9 @@ def _print(
         "",
     )
     console.print(table)
-    console.print(load.sentence(), soft_wrap=True, highlight=False)
+    console.print(load.sentence(), soft_wrap=True)
     if first_loss is not None:
-        console.print(f"first loss: {first_loss.sentence()}", soft_wrap=True, highlight=False)
+        console.print(f"first loss: {first_loss.sentence()}", soft_wrap=True)
     elif ramped:
         console.print("no frame was lost up to the end of the ramp")
 

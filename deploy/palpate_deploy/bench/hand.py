@@ -152,7 +152,7 @@ def _longest(looks: Sequence[Status], gauge: str) -> float:
 
 def show(result: HandResult) -> None:
     """Print it for people."""
-    console = Console()
+    console = Console(highlight=False)
     table = Table(
         title=f"five BioTacs on CAN, a KMS 40 and a Bota, {result.seconds:.0f} s",
         title_justify="left",
@@ -175,11 +175,10 @@ def show(result: HandResult) -> None:
         f"{result.publish_p50_s * 1e3:.2f}, p99 {result.publish_p99_s * 1e3:.2f} ms; "
         f"{result.stolen:.1%} of this machine's cores went to others",
         soft_wrap=True,
-        highlight=False,
     )
     if result.counters:
         told = ", ".join(f"{name} {count}" for name, count in result.counters.items())
-        console.print(f"counted by the gateway: {told}", soft_wrap=True, highlight=False)
+        console.print(f"counted by the gateway: {told}", soft_wrap=True)
 
 
 _BUSES = ({"channel": "239.74.163.2", "fingers": 3}, {"channel": "239.74.163.3", "fingers": 2})

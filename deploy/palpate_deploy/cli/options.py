@@ -64,11 +64,7 @@ def example(*lines: str) -> str:
 
 
 def client_link(connect: str) -> LinkConfig:
-    """Link of a command to a running station, with a short wait for its router.
-
-    Raises:
-        ConfigError: ``connect`` is not an endpoint.
-    """
+    """Link of a command to a running station, with a short wait for its router."""
     from palpate.config import LinkConfig, parse_config
 
     return parse_config(
@@ -79,11 +75,7 @@ def client_link(connect: str) -> LinkConfig:
 
 
 def existing_file(path: Path) -> Path:
-    """Check that a file exists.
-
-    Raises:
-        ConfigError: It does not.
-    """
+    """The path of an existing file; otherwise a ``ConfigError``."""
     from palpate.errors import ConfigError
 
     if not path.is_file():

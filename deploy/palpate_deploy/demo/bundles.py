@@ -108,17 +108,9 @@ def write_virtual_record(
 ) -> int:
     """Record the virtual finger as a gateway publishes it, with tare and ground truth.
 
-    Args:
-        path: ``NAME.mcap``.
-        frames: How many electrode frames.
-        seed: Seed of trajectories and noise.
-        unit: Number of the specimen.
-        rate_hz: Frames per second of the finger's time; a lower rate gives more indentations for
-            the same number of frames.
-        on_frames: Called with the frames written so far, for a progress bar.
-
-    Returns:
-        The electrode frames written.
+    ``unit`` is the number of the specimen; a lower ``rate_hz`` of the finger's time [Hz] gives more
+    indentations for as many frames; ``on_frames`` is called with the frames written so far. Returns
+    the electrode frames written.
 
     Raises:
         RecordingError: The disk is full or refuses to write.

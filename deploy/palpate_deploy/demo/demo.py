@@ -43,7 +43,7 @@ def run_demo(seconds: float, out: Path) -> int:
     """
     from palpate_services.inference.repository import resolve
 
-    console = Console()
+    console = Console(highlight=False)
     profile = private_profile("demo", recorder={"out": str(out)})
     for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
         resolve(bundle)  # a missing one is an error before anything starts
@@ -52,7 +52,6 @@ def run_demo(seconds: float, out: Path) -> int:
     console.print(
         "virtual finger -> features, fields, synthesis -> recorder, for "
         f"{seconds:g} s after the first estimate",
-        highlight=False,
     )
     comparison, fields = TouchComparison(), FieldComparison()
     with Supervisor(profile, "demo") as supervisor:
@@ -66,7 +65,7 @@ def run_demo(seconds: float, out: Path) -> int:
         if not comparison.count:
             for service in profile.processes:
                 if tail := supervisor.log_tail(service):
-                    console.print(f"--- {service}\n{tail}", markup=False, highlight=False)
+                    console.print(f"--- {service}\n{tail}", markup=False)
     records = sorted(set(out.glob("*.mcap")) - before)
     return _report(console, comparison, fields.medians(), records)
 
@@ -104,7 +103,7 @@ def _watch(
                 live.update(_table(comparison, fields.medians(), end - now), refresh=True)
                 redraw = now + _REFRESH_S
             else:
-                console.print(_line(comparison.newest), highlight=False, soft_wrap=True)
+                console.print(_line(comparison.newest), soft_wrap=True)
                 redraw = now + _LINE_S
 
 
@@ -169,14 +168,12 @@ def _report(
         f"{comparison.count:,} estimates; median error: force {medians.force_n:.3f} N, "
         f"location {medians.location_m * 1e3:.2f} mm (in contact); "
         f"median age at the client {medians.age_s * 1e3:.1f} ms",
-        highlight=False,
         soft_wrap=True,
     )
     console.print(
         f"{fields.fields:,} fields; median error of a node {fields.field_m * 1e3:.3f} mm where "
         f"nodes move {fields.moved_m * 1e3:.3f} mm; {fields.syntheses:,} syntheses of the "
         f"electrodes, median error {fields.counts:.0f} counts r.m.s.",
-        highlight=False,
         soft_wrap=True,
     )
     print(f"record   {record}")

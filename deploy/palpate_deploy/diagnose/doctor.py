@@ -64,21 +64,15 @@ class Finding:
 
 
 def run_doctor(profile_name: str, *, as_json: bool) -> int:
-    """Check everything and print the result.
-
-    Returns:
-        0, or 1 if a check failed.
-    """
-    console = Console()
+    """Check everything and print the result; the exit code, 1 if a check failed."""
+    console = Console(highlight=False)
     findings: list[Finding] = []
     for finding in _all(profile_name):
         findings.append(finding)
         if not as_json:
             colour = _COLOURS[finding.grade]
-            console.print(
-                f"[{colour}]{finding.grade:4}[/] {finding.what:12} ", end="", highlight=False
-            )
-            console.print(finding.found, markup=False, highlight=False, soft_wrap=True)
+            console.print(f"[{colour}]{finding.grade:4}[/] {finding.what:12} ", end="")
+            console.print(finding.found, markup=False, soft_wrap=True)
             if finding.fix:
                 console.print(f"     fix: {finding.fix}", markup=False, soft_wrap=True)
     if as_json:

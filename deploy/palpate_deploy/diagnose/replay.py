@@ -186,11 +186,7 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
 
 
 def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) -> Profile:
-    """The profile of a replay.
-
-    Raises:
-        ConfigError: A value is wrong.
-    """
+    """The profile of a replay, with its values checked."""
     fast = pace == "fast"
     delivery = "every" if fast else "newest"
     return private_profile(
@@ -250,11 +246,7 @@ def replay(profile: Profile, file: Path, *, show: bool = False) -> ReplayAccount
 def _follow(
     children: FiniteRun, session: Session, account: ReplayAccount, bar: Progress, task: Any
 ) -> int:
-    """Update the counters until the gateway has ended and its consumers have finished.
-
-    Returns:
-        The gateway's exit status.
-    """
+    """Update the counters until gateway and consumers have ended; the gateway's exit status."""
     settled_by = float("inf")
     while True:
         children.check(["router", "features", "recorder"])

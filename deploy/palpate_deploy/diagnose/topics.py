@@ -28,11 +28,7 @@ from palpate_deploy.station.logs import FAILED
 
 
 def topic_named(name: str) -> Topic[Any]:
-    """A topic of the contract.
-
-    Raises:
-        ConfigError: There is none of this name; the error names the nearest.
-    """
+    """A topic of the contract; a ``ConfigError`` names the nearest."""
     topic = TOPICS.get(name)
     if topic is None:
         near = difflib.get_close_matches(name, TOPICS, n=1, cutoff=0.5)

@@ -88,11 +88,7 @@ def _entry_point(service: Service) -> Callable[..., None]:
 
 
 def service_named(name: str) -> Service:
-    """A service by name.
-
-    Raises:
-        ConfigError: There is no such service.
-    """
+    """A service by name; a ``ConfigError`` lists what there is."""
     for service in START_ORDER:
         if service == name:
             return service

@@ -182,11 +182,7 @@ def _run_on_electrodes(
 
 
 class AgeLimit:
-    """Decides whether a message is recent enough, and of an origin, to be answered.
-
-    Args:
-        config: Holds ``max_age_s`` and ``accept_replayed``.
-    """
+    """Decides by ``max_age_s`` and ``accept_replayed`` whether a message may be answered."""
 
     def __init__(self, config: EstimatingConfig) -> None:
         self._limit_s = config.max_age_s
@@ -275,12 +271,7 @@ class TaredEstimator(Generic[E]):
         self._wrong_sensors: set[str] = set()
 
     def estimate(self, sensor: str, frame: ElectrodeFrame) -> E | EstimateRefusal:
-        """The estimate from a frame, or the reason why there is none.
-
-        Args:
-            sensor: Name of the sensor.
-            frame: Raw counts of one sampling round.
-        """
+        """The estimate from a frame, or the reason why there is none."""
         if frame.sensor_type is not self._runtime.sensor_type:
             self._report_wrong_sensor(sensor, frame)
             return EstimateRefusal.WRONG_SENSOR

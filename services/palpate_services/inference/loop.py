@@ -196,11 +196,7 @@ class EstimatePublisher(Generic[M, E]):
         return publisher
 
     def report(self, *, last: bool = False) -> None:
-        """Hand counters and gauges to health. Call it often: it does so only at its own periods.
-
-        Args:
-            last: Hand everything over now.
-        """
+        """Hand counters and gauges to health at their own periods; with ``last`` now."""
         now_ns = time.monotonic_ns()
         if last or now_ns - self._counted_ns >= _COUNT_PERIOD_NS:
             self._counted_ns = now_ns

@@ -317,7 +317,7 @@ def has_external_data(model: bytes) -> bool:
     while waiting:
         kind, data = waiting.pop()
         try:
-            fields = UnknownFieldSet(Empty.FromString(data))
+            fields: Any = UnknownFieldSet(Empty.FromString(data))
         except DecodeError as error:
             raise ValueError(f"{kind}: {error}") from error
         for part in fields:

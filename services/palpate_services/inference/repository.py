@@ -18,11 +18,7 @@ PACKAGED = Path(__file__).parent.parent / "models"
 
 
 def available(models: Path = PACKAGED) -> list[str]:
-    """Bundles of a repository as ``name:version``, oldest version first.
-
-    Args:
-        models: Folder of the repository.
-    """
+    """Bundles of a repository's folder as ``name:version``, oldest version first."""
     found = [
         (folder.parent.name, int(folder.name))
         for folder in models.glob("*/*")
@@ -32,11 +28,7 @@ def available(models: Path = PACKAGED) -> list[str]:
 
 
 def resolve(bundle: str, models: Path = PACKAGED) -> Path:
-    """Find the folder of a bundle.
-
-    Args:
-        bundle: ``name`` (newest version), ``name:version``, or the path of a bundle's folder.
-        models: Folder of the repository.
+    """Find a bundle's folder by ``name`` (newest version), ``name:version``, or its own path.
 
     Raises:
         ConfigError: There is no such bundle; the error lists what exists.
@@ -65,11 +57,7 @@ def resolve(bundle: str, models: Path = PACKAGED) -> Path:
 
 
 class MeshLibrary:
-    """The meshes of fields, by content hash: those of the packaged bundles and of some more.
-
-    Args:
-        bundles: More bundles, by name or folder.
-        models: Folder of the packaged ones.
+    """The meshes of fields, by content hash: of packaged bundles, and of more by name or folder.
 
     Raises:
         ConfigError: One of ``bundles`` does not exist.

@@ -173,7 +173,6 @@ class RecordFiles:
         self._writer: RecordWriter | None = None
         self._view: LiveView | None = None
         self._views: list[LiveView] = []  # the present one, and earlier ones that are not finished
-        self._path: Path | None = None
         self._size = 0
         self._unflushed = 0
         self._opened_s = 0.0
@@ -248,10 +247,9 @@ class RecordFiles:
         return message, stamp.wall_ns, stamp.sequence
 
     def tick(self, *, idle: bool = False) -> None:
-        """Check disk, size and age of the record. Call it often: it does so every ``CHECK_S``.
+        """Check disk, size and age of the record every ``CHECK_S``; call it more often.
 
-        Args:
-            idle: No messages arrive at present, so none will cause a flush of the last ones.
+        ``idle``: no messages arrive at present, so none will cause a flush of the last ones.
         """
         now_s = time.monotonic()
         if now_s - self._checked_s < CHECK_S:
@@ -260,10 +258,7 @@ class RecordFiles:
         if self._writer is None:
             self._try_to_resume(now_s)
         else:
-            if idle:
-                self._flush()
-            self._check_space()
-            self._check_rotation(now_s)
+            self._check(self._writer, now_s, idle=idle)
         self.report()
 
     def report(self) -> None:
@@ -288,11 +283,6 @@ class RecordFiles:
             view.join(VIEW_CLOSE_S)
         self.report()
 
-    @property
-    def path(self) -> Path | None:
-        """The record that is being written; None while there is none."""
-        return self._path
-
     def _open(self) -> None:
         self._tried_s = time.monotonic()
         try:
@@ -302,7 +292,6 @@ class RecordFiles:
         except RecordingError as error:
             self._fail(error.problem)
             return
-        self._path = path
         self._size = self._unflushed = 0
         self._opened_s = time.monotonic()
         if self._config.rrd:
@@ -330,32 +319,16 @@ class RecordFiles:
         if free < wanted:
             raise DiskError(f"less than {wanted} bytes are free", remedy="free some space")
 
-    def _check_space(self) -> None:
-        if self._writer is None:
-            return
-        try:
-            self._check_room(self._config.min_free_bytes)
-        except DiskError as error:
-            self._pause(error.problem)
-
-    def _flush(self) -> None:
-        """Write the last messages before a silence of the streams."""
-        if self._writer is None:
-            return
-        try:
-            self._writer.flush()
-        except RecordingError as error:
-            self._count_unflushed()
-            self._pause(error.problem)
-        else:
-            # The size too: `write` takes a larger file for the sign of a flush of its own.
-            self._size, self._unflushed = self._writer.bytes_written, 0
-
-    def _check_rotation(self, now_s: float) -> None:
+    def _check(self, writer: RecordWriter, now_s: float, *, idle: bool) -> None:
         config = self._config
-        if self._writer is None:
+        try:
+            if idle:
+                self._flush(writer)
+            self._check_room(config.min_free_bytes)
+        except RecordingError as error:
+            self._pause(error.problem)
             return
-        full = config.rotate_bytes is not None and self._writer.bytes_written >= config.rotate_bytes
+        full = config.rotate_bytes is not None and writer.bytes_written >= config.rotate_bytes
         over = config.rotate_s is not None and now_s - self._opened_s >= config.rotate_s
         if full or over:
             problem = self._close_files()
@@ -363,6 +336,16 @@ class RecordFiles:
                 self._fail(problem)
             else:
                 self._open()
+
+    def _flush(self, writer: RecordWriter) -> None:
+        """Write the last messages before a silence of the streams."""
+        try:
+            writer.flush()
+        except RecordingError:
+            self._count_unflushed()
+            raise
+        # The size too: `write` takes a larger file for the sign of a flush of its own.
+        self._size, self._unflushed = writer.bytes_written, 0
 
     def _try_to_resume(self, now_s: float) -> None:
         if now_s - self._tried_s < RETRY_S:
@@ -400,7 +383,6 @@ class RecordFiles:
         """Close record and view; returns the problem if the record could not be closed."""
         writer, self._writer = self._writer, None
         view, self._view = self._view, None
-        self._path = None
         problem = None
         if writer is not None:
             try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -78,9 +79,9 @@ def _screen(rrb: Any, tabs: list[Any], **time_panel: Any) -> Any:
     )
 
 
-def _curves(rrb: Any, origin: str, name: str, *, legend: bool = False) -> Any:
+def _curves(rrb: Any, tab: str, entity: str, name: str, *, legend: bool = False) -> Any:
     return rrb.TimeSeriesView(
-        origin=origin,
+        origin=f"{tab}/{entity}",
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
@@ -109,8 +110,7 @@ def _space(
 
 
 def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any:
-    def plot(origin: str, name: str, *, legend: bool = True) -> Any:
-        return _curves(rrb, f"{sensor}/{origin}", name, legend=legend)
+    plot = partial(_curves, rrb, sensor)
 
     def body(origin: str, name: str) -> Any:
         # From the side of the pad, tip to the left, as one looks at one's own finger.
@@ -119,20 +119,20 @@ def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any
 
     finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
     signals = rrb.Vertical(
-        plot("electrodes", f"Electrodes E1-E{kind.electrode_count} [counts]", legend=False),
+        plot("electrodes", f"Electrodes E1-E{kind.electrode_count} [counts]"),
         rrb.Horizontal(
-            plot("pdc", "PDC, static pressure [counts]", legend=False),
-            plot("pac", "PAC, vibration [counts]", legend=False),
+            plot("pdc", "PDC, static pressure [counts]"),
+            plot("pac", "PAC, vibration [counts]"),
         ),
         row_shares=[3, 2],
     )
     forces = rrb.Vertical(
-        *(plot(f"force/{axis}", f"Force {axis} [N]") for axis in AXES),
+        *(plot(f"force/{axis}", f"Force {axis} [N]", legend=True) for axis in AXES),
         row_shares=[1, 1, 1],
     )
     errors = rrb.Vertical(
-        plot("error/force", "Error of the force [N]", legend=False),
-        plot("error/location", "Error of the contact location [m]", legend=False),
+        plot("error/force", "Error of the force [N]"),
+        plot("error/location", "Error of the contact location [m]"),
     )
     rows = [
         rrb.Horizontal(finger, signals, column_shares=[2, 3]),
@@ -142,8 +142,8 @@ def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any
         scale = f"grey 0 mm to yellow {1e3 * FIELD_FULL_M:g} mm"
         skins = [body(f"field/{of}", f"Skin, {of}: {scale}") for of in ("truth", "estimate")]
         compared = rrb.Vertical(
-            plot("electrodes/tared", "Electrodes, measured and tared [counts]", legend=False),
-            plot("synthesised", "Electrodes, synthesised from a field [counts]", legend=False),
+            plot("electrodes/tared", "Electrodes, measured and tared [counts]"),
+            plot("synthesised", "Electrodes, synthesised from a field [counts]"),
         )
         rows.insert(1, rrb.Horizontal(*skins, compared, column_shares=[1, 1, 1]))
     return rrb.Vertical(*rows, row_shares=[1] * len(rows), name=sensor)
@@ -155,9 +155,7 @@ def _trajectory_tab(rrb: Any, trajectory: str, longest_m: float) -> Any:
         target = (-0.005, 0.0, -0.003)
         return _space(rrb, f"{trajectory}/finger", name, position, target, contents=contents)
 
-    def plot(entity: str, name: str, *, legend: bool = False) -> Any:
-        return _curves(rrb, f"{trajectory}/{entity}", name, legend=legend)
-
+    plot = partial(_curves, rrb, trajectory)
     return rrb.Horizontal(
         rrb.Vertical(
             space(
@@ -204,7 +202,16 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
     for what in ("force", "location"):
         yield f"error/{what}", line(f"{what} error", [ERROR_COLOUR], 1.2)
     if kind is SensorType.BIOTAC:
-        yield from _body(rr)
+        vertices, triangles, normals = core_mesh()
+        core = rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=triangles,
+            vertex_normals=normals,
+            albedo_factor=(120, 130, 148),
+        )
+        yield "finger/core", core
+        skin = rr.LineStrips3D(skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
+        yield "finger/skin", skin
     elif again:
         yield "finger/core", rr.Mesh3D.cleared()
         yield "finger/skin", rr.LineStrips3D.cleared()
@@ -220,30 +227,16 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
 
 def simulation_fixtures(rr: Any) -> dict[str, Any]:
     """Colours and names of the curves, by entity below the trajectory."""
-    looks = {
-        f"force/{axis}": rr.SeriesLines(names=[f"F{axis}"], colors=[colour], widths=[2.0])
-        for axis, colour in zip(AXES, AXIS_COLOURS, strict=True)
+    curves = [
+        *((f"force/{axis}", f"F{axis}", AXIS_COLOURS[at]) for at, axis in enumerate(AXES)),
+        ("pressure", "fluid", QUIET_COLOUR),
+        ("area", "contact", QUIET_COLOUR),
+        ("newton", "Newton iterations", QUIET_COLOUR),
+    ]
+    return {
+        entity: rr.SeriesLines(names=[name], colors=[colour], widths=[2.0])
+        for entity, name, colour in curves
     }
-    for name, words in (
-        ("pressure", "fluid"),
-        ("area", "contact"),
-        ("newton", "Newton iterations"),
-    ):
-        looks[name] = rr.SeriesLines(names=[words], colors=[QUIET_COLOUR], widths=[2.0])
-    return looks
-
-
-def _body(rr: Any) -> Iterator[tuple[str, Any]]:
-    vertices, triangles, normals = core_mesh()
-    core = rr.Mesh3D(
-        vertex_positions=vertices,
-        triangle_indices=triangles,
-        vertex_normals=normals,
-        albedo_factor=(120, 130, 148),
-    )
-    skin = rr.LineStrips3D(skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
-    yield "finger/core", core
-    yield "finger/skin", skin
 
 
 def electrode_names(count: int) -> list[str]:

@@ -25,12 +25,7 @@ _MM_PER_M = 1e3  # the picture is in millimetres, everything else in SI units
 
 
 def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> dict[str, float]:
-    """Draw truth against estimate of one sensor.
-
-    Args:
-        record: An MCAP record of palpate.
-        picture: The PNG to write.
-        sensor: Name of the sensor; None = the one with the most estimates.
+    """Draw truth against estimate of one sensor, by default that with the most estimates, as PNG.
 
     Returns:
         Summary: ``estimates`` and ``matched`` (how many), ``duration_s``, ``force_median_error_n``,
@@ -41,7 +36,7 @@ def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> di
         RecordingError: The record is damaged or holds no estimates.
         MissingExtraError: matplotlib is not installed.
     """
-    name, instants = _instants(record, sensor)
+    whose, instants = _instants(record, sensor)
     times = np.array(sorted(ns for ns, item in instants.items() if item.estimate is not None))
     matched = [instants[ns] for ns in times.tolist()]
     seconds = (times - times[0]) * 1e-9
@@ -52,15 +47,13 @@ def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> di
         "matched": float(len(force_errors)),
         "duration_s": float(seconds[-1]),
     }
-    if len(force_errors):
-        summary["force_median_error_n"] = float(np.median(force_errors))
-        summary["force_p90_error_n"] = float(np.percentile(force_errors, 90))
-    if len(location_errors):
-        summary["location_median_error_m"] = float(np.median(location_errors))
-        summary["location_p90_error_m"] = float(np.percentile(location_errors, 90))
+    for name, unit, errors in (("force", "n", force_errors), ("location", "m", location_errors)):
+        if len(errors):
+            summary[f"{name}_median_error_{unit}"] = float(np.median(errors))
+            summary[f"{name}_p90_error_{unit}"] = float(np.percentile(errors, 90))
     figure = _draw(seconds, matched, force_errors, location_errors)
     figure.suptitle(
-        f"{name}: estimate against truth, {len(matched)} estimates in {seconds[-1]:.1f} s",
+        f"{whose}: estimate against truth, {len(matched)} estimates in {seconds[-1]:.1f} s",
         fontsize=13,
         color=_INK,
     )

@@ -123,13 +123,9 @@ class FieldDrawer:
 
 
 class RerunView:
-    """Writes one ``.rrd``. Use from one thread.
+    """Writes one ``.rrd``, which is closed at ``max_bytes``. Use from one thread.
 
-    Args:
-        path: The file to write.
-        title: Shown as the recording's name.
-        max_bytes: At this size the file is closed [bytes]; None = no limit.
-        meshes: Finds the meshes of fields; None = in the packaged bundles.
+    ``title`` is shown as the recording's name; ``meshes`` None = those of the packaged bundles.
     """
 
     def __init__(
@@ -399,15 +395,9 @@ def _is_field(message: Any) -> bool:
 
 
 def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = ()) -> Path:
-    """Make the view of an existing record.
+    """Make the view of an existing record, by default beside it with the ending ``.rrd``.
 
-    Args:
-        record: An MCAP record of palpate.
-        view: The file to write; None = beside the record with the ending ``.rrd``.
-        bundles: Bundles that hold the meshes of its fields, in addition to the packaged ones.
-
-    Returns:
-        The file written.
+    ``bundles`` hold meshes of its fields, beside the packaged ones. Returns the view's path.
 
     Raises:
         ConfigError: One of ``bundles`` does not exist.

@@ -53,17 +53,10 @@ def review_simulations(
     most: int = MOST,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Make the view of a store.
+    """Make the view of a store, by default beside it with the ending ``.rrd``; returns its path.
 
-    Args:
-        store: A folder ``NAME.sim`` or an exported file.
-        view: The file to write; None = beside the store with the ending ``.rrd``.
-        trajectories: Which, by id or pattern; none = evenly chosen from all.
-        most: How many at most.
-        progress: Called with the number of drawn trajectories and of all.
-
-    Returns:
-        The file written.
+    ``trajectories`` chooses some by id or pattern; without, ``most`` are evenly chosen from all.
+    ``progress`` is called with the number of drawn trajectories and of all.
 
     Raises:
         DatasetError: The store is damaged, has none of these, or the view cannot be written.
