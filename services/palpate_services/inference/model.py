@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from math import isfinite
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from google.protobuf.empty_pb2 import Empty
-from google.protobuf.message import DecodeError
-from google.protobuf.unknown_fields import UnknownFieldSet
 
 from palpate.errors import BundleError
 from palpate.files.bundle import Bundle, Manifest
@@ -51,7 +48,7 @@ _NESTED: dict[str, dict[int, str]] = {
     "sparse": {1: "tensor", 2: "tensor"},
 }
 _EXTERNAL_DATA, _DATA_LOCATION = 13, 14  # fields of TensorProto
-_BYTES = 2  # wire type of protobuf
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 
 
 def load(bundle: Bundle, task: str) -> Runtime:
@@ -308,23 +305,52 @@ def has_external_data(model: bytes) -> bool:
 
     No digest covers such weights, and ONNX Runtime reads them from the working directory even for a
     model that was loaded from bytes. The ``onnx`` package is no dependency of the services, so the
-    message is read by its field numbers.
+    protobuf is read by hand: only its length prefixes, never the weights.
 
     Raises:
         ValueError: The bytes are no protobuf.
     """
-    waiting = [("model", model)]
+    waiting = [("model", memoryview(model))]
     while waiting:
         kind, data = waiting.pop()
-        try:
-            fields: Any = UnknownFieldSet(Empty.FromString(data))
-        except DecodeError as error:
-            raise ValueError(f"{kind}: {error}") from error
-        for part in fields:
-            number = part.field_number
+        for number, value in _fields(data):
             if kind == "tensor":
-                if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and part.data != 0):
+                if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0):
                     return True
-            elif part.wire_type == _BYTES and number in _NESTED[kind]:
-                waiting.append((_NESTED[kind][number], part.data))
+            elif isinstance(value, memoryview) and number in _NESTED[kind]:
+                waiting.append((_NESTED[kind][number], value))
     return False
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Fields of one message: number, and a number or the bytes inside."""
+    at = 0
+    while at < len(data):
+        tag, at = _varint(data, at)
+        number, wire_type = tag >> 3, tag & 7
+        if wire_type == _VARINT:
+            value, at = _varint(data, at)
+            yield number, value
+            continue
+        if wire_type == _BYTES:
+            size, at = _varint(data, at)
+        elif wire_type in (_FIXED64, _FIXED32):
+            size = 8 if wire_type == _FIXED64 else 4
+        else:
+            raise ValueError(f"wire type {wire_type} at byte {at}")
+        if at + size > len(data):
+            raise ValueError(f"field {number} exceeds its message at byte {at}")
+        yield number, data[at : at + size]
+        at += size
+
+
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while at < len(data) and shift < 70:
+        byte = data[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+        shift += 7
+    raise ValueError(f"number cut off at byte {at}")
