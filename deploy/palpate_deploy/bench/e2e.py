@@ -42,17 +42,11 @@ _GRACE_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class LoadResult:
-    """The account of a load test.
+    """The account of a load test with ``sensors`` fingers, each at ``rate_hz``.
 
-    Attributes:
-        sensors: Number of fingers.
-        rate_hz: Rate of each [Hz].
-        published: Tared frames, which need an estimate, by the gateway's counters.
-        reached_hz: Frames per second and finger that the gateway sent [Hz].
-        received: Estimates that the client received.
-        lost_at: Lost frames by place and reason.
-        p50_s: Median age in the client [s].
-        p99_s: 99th percentile [s].
+    ``published`` counts the tared frames, which need an estimate, by the gateway's counters;
+    ``reached_hz`` is the rate of a finger that the gateway reached, ``received`` the estimates in
+    the client, ``lost_at`` lost frames by place and reason; the percentiles are ages there [s].
     """
 
     sensors: int

@@ -157,14 +157,10 @@ class FieldStreams:
 
 @dataclass(frozen=True, slots=True)
 class FieldMedians:
-    """Medians so far; NaN before the first comparison.
+    """Medians so far over touched frames; NaN before the first comparison.
 
-    Attributes:
-        fields: Estimates that were compared.
-        moved_m: Median over touched frames of the mean displacement of a node [m].
-        field_m: Median of the mean error of a node, touched [m].
-        syntheses: Syntheses that were compared.
-        counts: Median r.m.s. error of the 19 electrodes, touched [counts].
+    ``moved_m`` is the mean displacement of a node [m], ``field_m`` its mean error [m], ``counts``
+    the r.m.s. error of the 19 electrodes [counts]; compared were ``fields`` and ``syntheses``.
     """
 
     fields: int

@@ -195,13 +195,9 @@ _REPORT_S = 1.0
 class StreamRate:
     """Rate and losses of one source.
 
-    Attributes:
-        messages: How many came.
-        bytes: Their payloads [bytes].
-        lost: Gaps in the sequence numbers, of streams that are contiguous.
-        rejected: Payloads that do not decode.
-        missed: Frames that the device itself lost, from ``missed_before`` of the stamps.
-        gaps_s: Time between two arrivals [s].
+    ``bytes`` is the size of the payloads, ``rejected`` counts those that do not decode; ``lost``
+    are gaps in the sequence numbers of contiguous streams, ``missed`` the frames that the device
+    itself lost, by ``missed_before``; ``gaps_s`` are times between two arrivals [s].
     """
 
     messages: int = 0

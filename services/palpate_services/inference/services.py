@@ -42,18 +42,12 @@ def run_estimating(
     *,
     instance: str | None = None,
 ) -> None:
-    """Serve the service whose configuration is given, until ``stop`` is set.
+    """Serve the service whose table of the profile ``config`` is, until ``stop`` is set.
 
     Features are estimated from electrodes, as are fields, at a limited rate; synthesis goes from
     fields to tared counts. The endpoint ``estimate`` of the field service replies with the field of
     the frame in a request; ``synthesise`` with the tared counts of the field in a request.
-
-    Args:
-        config: Its table of the profile.
-        link: How to join the bus.
-        station: The station to serve.
-        stop: Set it to end.
-        instance: Name of this process among several of its kind; None = that of the service.
+    ``instance`` names this process among several of its kind; None = like the service.
 
     Raises:
         ConfigError: There is no such bundle.
