@@ -40,15 +40,15 @@ class ArrivalTimes:
         """
         step_ns, read_ns = self._period_ns, self._read_ns
         self._read_ns = now_ns
-        worth_ns = count * step_ns
+        waited = False
+        if read_ns is not None:
+            waited = self._waited(count * step_ns, now_ns - read_ns)
+            # Never before the last sample nor after now, and never at one time: a clump that came
+            # early is packed closer.
+            step_ns = min(step_ns, max(now_ns - self._last_ns, 0) // count)
         # After a pause count on from the last sample; else count back from now.
-        if read_ns is not None and self._waited(worth_ns, now_ns - read_ns):
-            times = [min(self._last_ns + k * step_ns, now_ns) for k in range(1, count + 1)]
-        else:
-            if read_ns is not None:
-                # Never before the last sample: a clump that came early is packed closer.
-                step_ns = min(step_ns, max(now_ns - self._last_ns, 0) // count)
-            times = [now_ns - k * step_ns for k in range(count - 1, -1, -1)]
+        first_ns = self._last_ns + step_ns if waited else now_ns - (count - 1) * step_ns
+        times = [first_ns + k * step_ns for k in range(count)]
         self._last_ns = times[-1]
         return times
 

@@ -27,6 +27,17 @@ def test_a_faster_sensor_than_it_says_does_not_run_backwards() -> None:
     assert ms(arrivals.times_ns(4, 104 * MS)) == [101.0, 102.0, 103.0, 104.0]
 
 
+def test_a_burst_of_a_faster_sensor_after_a_stall_is_not_piled_up_at_one_time() -> None:
+    """Forty samples in 20 ms, worth 80 ms: they are spread up to now, each at its own time."""
+    arrivals = ArrivalTimes(0.002)
+    arrivals.times_ns(1, 100 * MS)
+    times = arrivals.times_ns(40, 120 * MS)
+    assert times == sorted(set(times))
+    assert ms(times)[0] == 100.5
+    assert ms(times)[-1] == 120.0
+    assert arrivals.times_ns(1, 122 * MS) == [122 * MS]
+
+
 def test_after_a_stall_each_sample_has_the_time_at_which_it_was_taken() -> None:
     """A second at 500 Hz, read in pieces of what a buffer holds; then live again."""
     arrivals = ArrivalTimes(0.002)
