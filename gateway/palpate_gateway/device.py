@@ -17,12 +17,13 @@ Rules of ``read``, the same for hardware, virtual fingers and files:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import ClassVar, Self
 
 from palpate.config import LinkConfig, StrictConfig
-from palpate.errors import DeviceError
+from palpate.errors import DeviceError, RecordingError
 from palpate.messages import Origin, SensorType
 from palpate_gateway.readings import Reading
 
@@ -185,3 +186,45 @@ class BusDevice(Device):
     @abstractmethod
     def join(self, link: LinkConfig, station: str) -> None:
         """How the gateway has joined the bus; called once, before the first opening."""
+
+
+_BATCH = 64
+"""Largest number of readings of a file in one answer of ``read``."""
+
+
+class FileDevice(Device):
+    """A file as a finite device, which delivers as fast as it is read.
+
+    Subclasses call ``_deliver`` when they open it. Damage is raised once, after all readings before
+    it; then the source has ended.
+    """
+
+    def __init__(
+        self, driver: str, sensor_type: SensorType | None, model: str, rate_hz: float
+    ) -> None:
+        super().__init__(
+            DeviceInfo(
+                driver, sensor_type, model, rate_hz, live=False, finite=True, origin=Origin.REPLAYED
+            )
+        )
+        self._deliver(())
+
+    def _deliver(self, readings: Iterable[Reading]) -> None:
+        """Readings of the open file; taking one raises ``RecordingError`` at damage."""
+        self._readings: Iterator[Reading] = iter(readings)
+        self._damage: RecordingError | None = None
+
+    def _close(self) -> None:
+        self._deliver(())
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        batch: list[Reading] = []
+        try:
+            for reading in islice(self._readings, _BATCH):
+                batch.append(reading)
+        except RecordingError as error:
+            self._damage = error
+        if not batch and self._damage is not None:
+            damage, self._damage = self._damage, None
+            raise damage
+        return batch

@@ -6,25 +6,22 @@ those. This driver computes them again from the robot's poses, e.g. with a bette
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from itertools import chain, islice
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 
 from pydantic import Field
 
 from palpate.bus.topics import POSE, ROBOT_POSE
 from palpate.config import Name
-from palpate.errors import ConfigError, RecordingError, WireError
-from palpate.files.record import RecordItem, read_record
-from palpate.messages import Origin, RobotPoseFrame
-from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate.errors import RecordingError, WireError
+from palpate.files.record import RecordItem, only_name, read_record
+from palpate.messages import RobotPoseFrame
+from palpate_gateway.device import DeviceIdentity, FileDevice
 from palpate_gateway.pose.placement import Placement, PlacementOptions
 from palpate_gateway.pose.table import PoseRow, PoseTable
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
-from palpate_gateway.readings import Reading
-
-_BATCH = 64
-"""Largest number of readings in one answer of ``read``."""
+from palpate_gateway.readings import PoseReading
 
 
 class RecordedPoses:
@@ -43,7 +40,9 @@ class RecordedPoses:
         self._path = path
         self._track = PoseTrack()
         self._restarts = 0
-        self._robot = robot or self._only_robot()
+        self._robot = robot or only_name(path, ROBOT_POSE.name, "robot")
+        if not self._robot:
+            raise self._no_poses()
         self.start_wall_ns: int | None = None
         """Wall clock at the first pose [ns]; known once that has been read."""
 
@@ -100,25 +99,6 @@ class RecordedPoses:
                 remedy="replay another record; this one broke the contract when written",
             ) from error
 
-    def _only_robot(self) -> str:
-        robots: set[str] = set()
-        try:
-            for item in read_record(self._path):
-                if item.address.topic == ROBOT_POSE.name:
-                    robots.add(item.address.sensor)
-        except RecordingError:
-            # The readings before the damage are delivered, and the error comes after them.
-            if not robots:
-                raise
-        if len(robots) > 1:
-            raise ConfigError(
-                f"{self._path} holds {len(robots)} robots: {', '.join(sorted(robots))}",
-                remedy="choose one with the option robot",
-            )
-        if not robots:
-            raise self._no_poses()
-        return robots.pop()
-
     def _no_poses(self) -> RecordingError:
         return RecordingError(
             f"{self._path} holds no poses of a robot",
@@ -142,28 +122,17 @@ class PoseFileOptions(PlacementOptions):
     start_wall_ns: int | None = Field(default=None, ge=0, lt=1 << 63)
 
 
-class PoseFile(Device):
+class PoseFile(FileDevice):
     """A file of robot poses as a finite device, which delivers as fast as it is read."""
 
     options_class = PoseFileOptions
 
     def __init__(self, options: PoseFileOptions) -> None:
-        super().__init__(
-            DeviceInfo(
-                driver="pose_file",
-                sensor_type=None,
-                model=f"robot poses {options.path.name}, {options.indenter}",
-                rate_hz=POSE.rate_hz,
-                live=False,
-                finite=True,
-                origin=Origin.REPLAYED,
-            )
-        )
+        model = f"robot poses {options.path.name}, {options.indenter}"
+        super().__init__("pose_file", None, model, POSE.rate_hz)
         self._options = options
         self._placement = Placement(options)
         self._source: PoseTable | RecordedPoses | None = None
-        self._rows: Iterator[PoseRow] = iter(())
-        self._damage: RecordingError | None = None
         self._counts: Mapping[str, int] = {}
         self._samples = 0
 
@@ -175,7 +144,7 @@ class PoseFile(Device):
 
     def _open(self) -> DeviceIdentity:
         options = self._options
-        self._samples, self._damage = 0, None
+        self._samples = 0
         self._source = (
             RecordedPoses(options.path, options.robot or "")
             if options.path.suffix == ".mcap"
@@ -184,7 +153,7 @@ class PoseFile(Device):
         try:
             rows = self._source.rows()
             # The first row has the wall clock, and a file without a valid row must fail here.
-            self._rows = chain([next(rows)], rows)
+            self._deliver(self._poses(chain([next(rows)], rows)))
         except BaseException:
             self._close()
             raise
@@ -197,27 +166,14 @@ class PoseFile(Device):
 
     def _close(self) -> None:
         source, self._source = self._source, None
-        self._rows = iter(())
+        super()._close()
         if source is not None:
             self._counts = source.counters
             source.close()
 
-    def _read(self, timeout_s: float) -> list[Reading]:
-        batch: list[Reading] = []
-        try:
-            for row in islice(self._rows, _BATCH):
-                batch.append(
-                    self._placement.reading(
-                        row.pose,
-                        tick=row.tick,
-                        time_s=row.time_s,
-                        missed_before=row.missed_before,
-                    )
-                )
-        except RecordingError as error:
-            self._damage = error
-        if not batch and self._damage is not None:
-            damage, self._damage = self._damage, None
-            raise damage
-        self._samples += len(batch)
-        return batch
+    def _poses(self, rows: Iterable[PoseRow]) -> Iterator[PoseReading]:
+        for row in rows:
+            self._samples += 1
+            yield self._placement.reading(
+                row.pose, tick=row.tick, time_s=row.time_s, missed_before=row.missed_before
+            )

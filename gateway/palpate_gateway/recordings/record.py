@@ -13,15 +13,13 @@ from pathlib import Path
 from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 from palpate.codec import ELECTRODE_FRAME
 from palpate.config import StrictConfig
-from palpate.errors import ConfigError, RecordingError, WireError
-from palpate.files.record import RecordItem, read_record
-from palpate.messages import ElectrodeFrame, Origin, SensorType
-from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate_gateway.readings import Reading, RecordedMessage
+from palpate.errors import RecordingError, WireError
+from palpate.files.record import RecordItem, only_name, read_record
+from palpate.messages import ElectrodeFrame, SensorType
+from palpate_gateway.device import DeviceIdentity, FileDevice
+from palpate_gateway.readings import RecordedMessage
 
 _REPLAYED = frozenset(topic.name for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE))
-_BATCH = 64
-"""Largest number of messages in one answer of ``read``."""
 
 
 class RecordOptions(StrictConfig):
@@ -46,28 +44,16 @@ def recorded_sensors(path: Path) -> list[str]:
     return sorted(found)
 
 
-class RecordReplay(Device):
+class RecordReplay(FileDevice):
     """One sensor of a palpate record as a finite device."""
 
     options_class = RecordOptions
 
     def __init__(self, options: RecordOptions) -> None:
-        super().__init__(
-            DeviceInfo(
-                driver="record",
-                sensor_type=SensorType.BIOTAC,
-                model=f"palpate record {options.path.name}",
-                rate_hz=ELECTRODES.rate_hz,
-                live=False,
-                finite=True,
-                origin=Origin.REPLAYED,
-            )
-        )
+        model = f"palpate record {options.path.name}"
+        super().__init__("record", SensorType.BIOTAC, model, ELECTRODES.rate_hz)
         self._options = options
         self._sensor = options.sensor
-        self._items: Iterator[RecordItem] = iter(())
-        self._damage: RecordingError | None = None
-        self._slots = 0
         self._counters = {"messages": 0, "samples": 0}
 
     @property
@@ -76,60 +62,24 @@ class RecordReplay(Device):
         return dict(self._counters)
 
     def _open(self) -> DeviceIdentity:
-        self._sensor = self._options.sensor or self._only_sensor()
+        path = self._options.path
+        self._sensor = self._options.sensor or only_name(path, ELECTRODES.name, "sensor")
         first = self._first_frame()
-        self._items = read_record(self._options.path)
-        self._damage = None
-        self._slots = first.sensor_type.layout.slots
         self._counters = dict.fromkeys(self._counters, 0)
+        self._deliver(self._messages(first.sensor_type.layout.slots))
         return DeviceIdentity(
             serial=first.sensor_serial,
             slot_period_s=first.slot_period_ns * 1e-9,
             sensor_type=first.sensor_type,
         )
 
-    def _close(self) -> None:
-        self._items = iter(())
-
-    def _read(self, timeout_s: float) -> list[Reading]:
-        batch: list[Reading] = []
-        try:
-            for item in self._items:
-                if item.address.sensor != self._sensor or item.address.topic not in _REPLAYED:
-                    continue
+    def _messages(self, slots: int) -> Iterator[RecordedMessage]:
+        for item in read_record(self._options.path):
+            if item.address.sensor == self._sensor and item.address.topic in _REPLAYED:
                 self._counters["messages"] += 1
                 if _is_electrodes(item):
-                    self._counters["samples"] += self._slots
-                batch.append(
-                    RecordedMessage(item.address.topic, item.payload, item.log_time_ns * 1e-9)
-                )
-                if len(batch) == _BATCH:
-                    break
-        except RecordingError as error:
-            self._damage = error
-        if not batch and self._damage is not None:
-            damage, self._damage = self._damage, None
-            raise damage
-        return batch
-
-    def _only_sensor(self) -> str:
-        sensors: set[str] = set()
-        try:
-            for item in read_record(self._options.path):
-                if _is_electrodes(item):
-                    sensors.add(item.address.sensor)
-        except RecordingError:
-            # The messages before the damage are delivered, and the error comes after them.
-            if not sensors:
-                raise
-        if len(sensors) > 1:
-            raise ConfigError(
-                f"{self._options.path} holds {len(sensors)} sensors: {', '.join(sorted(sensors))}",
-                remedy="choose one with the option sensor",
-            )
-        if not sensors:
-            raise self._no_frames()
-        return sensors.pop()
+                    self._counters["samples"] += slots
+                yield RecordedMessage(item.address.topic, item.payload, item.log_time_ns * 1e-9)
 
     def _first_frame(self) -> ElectrodeFrame:
         for item in read_record(self._options.path):

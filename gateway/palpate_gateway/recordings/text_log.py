@@ -15,15 +15,14 @@ from pydantic import Field
 
 from palpate.config import StrictConfig
 from palpate.errors import ConfigError, RecordingError
-from palpate.messages import Origin, SensorType
+from palpate.messages import SensorType
 from palpate_gateway.biotac.frames import FrameAssembler
 from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock
-from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.device import DeviceIdentity, FileDevice
 from palpate_gateway.protocols import channels as ch
-from palpate_gateway.readings import ElectrodeReading, Reading
+from palpate_gateway.readings import ElectrodeReading
 from palpate_gateway.recordings.text_log_format import (
     LineBlocks,
-    LogHeader,
     count_columns,
     parse_rows,
     split_header,
@@ -221,33 +220,17 @@ class TextLogReader:
         )
 
 
-class TextLog(Device):
+class TextLog(FileDevice):
     """A vendor text log as a finite device, which delivers as fast as it is read."""
 
     options_class = TextLogOptions
 
     def __init__(self, options: TextLogOptions) -> None:
-        super().__init__(
-            DeviceInfo(
-                driver="text_log",
-                sensor_type=SensorType.BIOTAC,
-                model=f"vendor text log {options.path.name}",
-                rate_hz=ch.frame_rate_hz(SensorType.BIOTAC.layout),
-                live=False,
-                finite=True,
-                origin=Origin.REPLAYED,
-            )
-        )
+        model = f"vendor text log {options.path.name}"
+        rate_hz = ch.frame_rate_hz(SensorType.BIOTAC.layout)
+        super().__init__("text_log", SensorType.BIOTAC, model, rate_hz)
         self._options = options
         self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)
-        self._reader: TextLogReader | None = None
-        self._blocks: Iterator[SlotBlock] = iter(())
-
-    @property
-    def header(self) -> LogHeader:
-        """The header of the open log."""
-        _ = self.identity
-        return LogHeader() if self._reader is None else self._reader.header
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -260,11 +243,10 @@ class TextLog(Device):
 
     def _open(self) -> DeviceIdentity:
         reader = TextLogReader(self._options.path, port=self._options.port)
-        self._reader = reader
         self._assembler = FrameAssembler(
             reader.slot_period_s, reader.sensor_type.layout, timed=reader.timed
         )
-        self._blocks = reader.blocks()
+        self._deliver(self._frames(reader, self._assembler))
         return DeviceIdentity(
             serial=self._options.serial
             or reader.header.serial(reader.port)
@@ -274,30 +256,20 @@ class TextLog(Device):
             sensor_type=reader.sensor_type,
         )
 
-    def _close(self) -> None:
-        self._reader = None
-        self._blocks = iter(())
-
-    def _read(self, timeout_s: float) -> list[Reading]:
-        for block in self._blocks:
-            frames = self._assembler.push(block)
-            if frames:
-                return list(frames)
-        return list(self._last_frames())
-
-    def _last_frames(self) -> list[ElectrodeReading]:
-        """The last frames of the file; damage is raised once, then the source has ended."""
-        if self._reader is None:
-            return []
-        damage, self._reader.damage = self._reader.damage, None
-        if damage is None and self._assembler.ends_inside_frame:
+    def _frames(
+        self, reader: TextLogReader, assembler: FrameAssembler
+    ) -> Iterator[ElectrodeReading]:
+        for block in reader.blocks():
+            yield from assembler.push(block)
+        damage = reader.damage
+        if damage is None and assembler.ends_inside_frame:
             damage = RecordingError(
                 f"{self._options.path}: the log ends inside a frame, after "
-                f"{self._assembler.pending_slots} slots",
+                f"{assembler.pending_slots} slots",
                 remedy="the log is truncated; copy it again from its source (all whole frames "
                 "before the cut were delivered)",
             )
         if damage is not None:
-            self._assembler.discard_pending()
+            assembler.discard_pending()
             raise damage
-        return self._assembler.finish()
+        yield from assembler.finish()

@@ -125,26 +125,16 @@ class LogHeader:
 
     Attributes:
         lines: Number of lines before the first row; 0 = a log without header.
-        data_structure: Version of the format, e.g. ``"2.0"``.
-        operator: Name of the person who recorded.
         started_wall_ns: Date and time of the recording, read as UTC because the file names no zone
             [ns since the Unix epoch]; None where it has none.
-        flex_versions: Version of the flex circuit by port; empty = port not used.
-        firmware_versions: Firmware version by port.
         serials: Serial number by port, cut at the first non-printable byte.
-        structure: Names of the channels in order of sampling.
         sample_rate_hz: Slots per second [Hz].
         frames_in_batch: Frames in a batch (the public log says 7 and has 4).
     """
 
     lines: int = 0
-    data_structure: str = ""
-    operator: str = ""
     started_wall_ns: int | None = None
-    flex_versions: tuple[str, ...] = ()
-    firmware_versions: tuple[str, ...] = ()
     serials: tuple[str, ...] = ()
-    structure: tuple[str, ...] = ()
     sample_rate_hz: float = SLOT_RATE_HZ
     frames_in_batch: int = 0
 
@@ -211,13 +201,8 @@ def _parse(name: str, lines: list[bytes]) -> LogHeader:
         )
     return LogHeader(
         lines=len(lines),
-        data_structure=printable_prefix(values.get("datastructure", b"").strip()),
-        operator=printable_prefix(values.get("operator", b"").strip()),
         started_wall_ns=_started(values),
-        flex_versions=_by_port(values.get("flex version", b"")),
-        firmware_versions=_by_port(values.get("firmware version", b"")),
         serials=_by_port(values.get("serial number", b"")),
-        structure=_by_port(values.get("sampstructure", b"")),
         sample_rate_hz=rate,
         frames_in_batch=int(_number(name, values, "framesinbatch", 0.0)),
     )

@@ -123,15 +123,7 @@ class WrenchDevice(Device):
 
     def __init__(self, driver: str, model: str, rate_hz: float, options: WrenchOptions) -> None:
         super().__init__(
-            DeviceInfo(
-                driver=driver,
-                sensor_type=None,
-                model=model,
-                rate_hz=rate_hz,
-                live=True,
-                finite=False,
-                origin=Origin.LIVE,
-            )
+            DeviceInfo(driver, None, model, rate_hz, live=True, finite=False, origin=Origin.LIVE)
         )
         self._mount = Mount(options.mount)
         self._counts: Counter[str] = Counter()

@@ -18,17 +18,7 @@ from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.port import silent
 from palpate_gateway.ports.sockets import ReceivedBytes, TcpPort
 from palpate_gateway.protocols import kms40 as wire
-from palpate_gateway.protocols.kms40 import (
-    FAULTS,
-    KmsDecoder,
-    KmsFlags,
-    KmsForceLine,
-    KmsRefusal,
-    KmsReply,
-    flag_names,
-    over_range_axes,
-    parse_flags,
-)
+from palpate_gateway.protocols.kms40 import KmsDecoder, KmsFlags, KmsForceLine, KmsRefusal, KmsReply
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
@@ -155,10 +145,10 @@ class WrenchKms40(WrenchDevice):
 
     def _check_flags(self) -> None:
         self._ask(wire.query_request(wire.KmsQuery.FLAGS), "FLAGS")
-        faults = self._flags & FAULTS
+        faults = self._flags & wire.FAULTS
         if faults:
             raise DeviceError(
-                f"{self.info.model}: it reports {', '.join(flag_names(faults))}",
+                f"{self.info.model}: it reports {', '.join(wire.flag_names(faults))}",
                 remedy="its forces are not valid: check supply, temperature and calibration",
             )
         self._flags_due_s = time.monotonic() + self._flags_every_s
@@ -226,13 +216,14 @@ class WrenchKms40(WrenchDevice):
         if reply.name != wire.KmsQuery.FLAGS:
             return
         self._flags_asked = False
-        flags = parse_flags(reply.value)
+        flags = wire.parse_flags(reply.value)
         if flags is None:
             self._counts["bad_flags"] += 1
             return
         self._flags = flags
-        self._faulty, self._over_range = bool(flags & FAULTS), bool(over_range_axes(flags))
-        for name in flag_names(flags & ~_EXPECTED):
+        self._faulty = bool(flags & wire.FAULTS)
+        self._over_range = bool(wire.over_range_axes(flags))
+        for name in wire.flag_names(flags & ~_EXPECTED):
             self._counts["status_" + name.replace(" ", "_")] += 1
         if not flags & KmsFlags.CALIBRATION_VALID:
             self._counts["status_calibration_not_valid"] += 1

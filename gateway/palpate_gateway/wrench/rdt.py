@@ -20,24 +20,9 @@ from pydantic import Field, model_validator
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.ports.port import silent
 from palpate_gateway.ports.sockets import ReceivedBytes, UdpPort, read_page
+from palpate_gateway.protocols import rdt as wire
 from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
-from palpate_gateway.protocols.rdt import (
-    HEX,
-    HEX_FILTERS_HZ,
-    HEX_PERIOD_MAX_MS,
-    PORT,
-    PROFILES,
-    START_REQUEST,
-    STOP_REQUEST,
-    RdtDecoder,
-    RdtRecord,
-    RdtScale,
-    RdtSequence,
-    hex_filter_request,
-    hex_period_request,
-    hex_sensor_number,
-    unwrap,
-)
+from palpate_gateway.protocols.rdt import RdtDecoder, RdtRecord, RdtScale, RdtSequence, unwrap
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
@@ -71,13 +56,13 @@ class RdtOptions(WrenchOptions):
 
     product: Literal["ati_net_ft", "ati_axia", "schunk_ftn", "onrobot_hex"]
     host: str = Field(default="192.168.1.1", min_length=1)
-    port: int = Field(default=PORT, ge=1, le=65535)
+    port: int = Field(default=wire.PORT, ge=1, le=65535)
     http_port: int = Field(default=80, ge=1, le=65535)
     rate_hz: float = Field(default=1000.0, ge=1.0, le=8000.0)
     counts_per_n: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     counts_per_n_m: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     counter_hz: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
-    filter_code: int | None = Field(default=None, ge=0, le=max(HEX_FILTERS_HZ))
+    filter_code: int | None = Field(default=None, ge=0, le=max(wire.HEX_FILTERS_HZ))
     sensor: int | None = Field(default=None, ge=0, le=7)
 
     @property
@@ -97,11 +82,11 @@ class RdtOptions(WrenchOptions):
             raise ValueError("counts_per_n and counts_per_n_m must be given together")
         if self.product == "onrobot_hex":
             period_ms = self.period_ms
-            fits = 1 <= period_ms <= HEX_PERIOD_MAX_MS
+            fits = 1 <= period_ms <= wire.HEX_PERIOD_MAX_MS
             if not fits or abs(self.rate_hz * period_ms / 1000.0 - 1.0) > 1e-3:
                 raise ValueError(
                     f"rate_hz {self.rate_hz:g} of a HEX is not 1000 divided by a whole number "
-                    f"from 1 to {HEX_PERIOD_MAX_MS}"
+                    f"from 1 to {wire.HEX_PERIOD_MAX_MS}"
                 )
         elif self.filter_code is not None or self.sensor is not None:
             raise ValueError("filter_code and sensor are options of the onrobot_hex only")
@@ -219,8 +204,8 @@ class WrenchRdt(WrenchDevice):
         model = f"{PRODUCTS[options.product]} at {options.host}"
         super().__init__("wrench_rdt", model, options.rate_hz, options)
         self._options = options
-        self._profile = PROFILES[options.product]
-        self._is_hex = self._profile is HEX
+        self._profile = wire.PROFILES[options.product]
+        self._is_hex = self._profile is wire.HEX
         self._port = UdpPort(options.host, options.port)
         self._patience_s = max(_PATIENCE_S, 5.0 / options.rate_hz)
         self._scale = RdtScale(1.0, 1.0)
@@ -271,12 +256,12 @@ class WrenchRdt(WrenchDevice):
         self._begin()
         serial = self._learn()
         self._port.open()
-        self._port.write(STOP_REQUEST)
+        self._port.write(wire.STOP_REQUEST)
         self._port.discard_input()
         if self._is_hex:
             if self._options.filter_code is not None:
-                self._port.write(hex_filter_request(self._options.filter_code))
-            self._port.write(hex_period_request(self._options.period_ms))
+                self._port.write(wire.hex_filter_request(self._options.filter_code))
+            self._port.write(wire.hex_period_request(self._options.period_ms))
         self._start()
         several = self._is_hex and self._early[0].raw.status & _SEVERAL_SENSORS
         if several and self._options.sensor is None:
@@ -317,7 +302,7 @@ class WrenchRdt(WrenchDevice):
 
     def _start(self) -> None:
         for _ in range(_STARTS):
-            self._port.write(START_REQUEST)
+            self._port.write(wire.START_REQUEST)
             with contextlib.suppress(DeviceTimeout):
                 self._early = self._fresh(self._port.receive(self._patience_s))
             if self._early:
@@ -330,7 +315,7 @@ class WrenchRdt(WrenchDevice):
 
     def _close(self) -> None:
         with contextlib.suppress(DeviceError):
-            self._port.write(STOP_REQUEST)
+            self._port.write(wire.STOP_REQUEST)
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
@@ -376,7 +361,7 @@ class WrenchRdt(WrenchDevice):
         if now_s - self._heard_s >= self._patience_s:
             self._heard_s = now_s
             self._counts["starts_repeated"] += 1
-            self._port.write(START_REQUEST)
+            self._port.write(wire.START_REQUEST)
 
     def _fresh(self, datagram: ReceivedBytes) -> list[_Record]:
         """Records of a datagram, without repeated and late ones."""
@@ -394,7 +379,7 @@ class WrenchRdt(WrenchDevice):
     def _overload(self, raw: RdtRecord) -> bool | None:
         """Whether the range is exceeded; None, and counted, if the record is not valid."""
         profile, status = self._profile, raw.status
-        if self._is_hex and self._options.sensor not in (None, hex_sensor_number(status)):
+        if self._is_hex and self._options.sensor not in (None, wire.hex_sensor_number(status)):
             self._counts["other_sensors"] += 1
             return None
         for name in profile.status_names(status):

@@ -28,7 +28,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
-from palpate.errors import RecordingError, WireError
+from palpate.errors import ConfigError, RecordingError, WireError
 
 FLUSH_S = 0.1
 """Messages reach the operating system after this time [s]; kill -9 costs no more than this."""
@@ -317,6 +317,35 @@ def _channel(
             remedy="read it with the palpate that wrote it, or upgrade palpate",
         )
     return channel.topic, parse_key(channel.topic), schema.name
+
+
+def only_name(path: Path, topic: str, what: str) -> str:
+    """The name under which a record holds a stream; empty if it does not hold it.
+
+    Args:
+        path: The record.
+        topic: Name of the stream.
+        what: What has the name, and the driver's option that chooses one.
+
+    Raises:
+        RecordingError: The file is not a record, or is damaged before the first message.
+        ConfigError: There are several names.
+    """
+    names: set[str] = set()
+    try:
+        for item in read_record(path):
+            if item.address.topic == topic:
+                names.add(item.address.sensor)
+    except RecordingError:
+        # The messages before the damage are delivered, and the error comes after them.
+        if not names:
+            raise
+    if len(names) > 1:
+        raise ConfigError(
+            f"{path} holds {len(names)} {what}s: {', '.join(sorted(names))}",
+            remedy=f"choose one with the option {what}",
+        )
+    return names.pop() if names else ""
 
 
 @dataclass(frozen=True, slots=True)

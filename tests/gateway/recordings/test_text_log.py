@@ -49,12 +49,13 @@ def test_reads_both_styles(
 
 
 def test_header(log: Callable[..., Any], tmp_path: Path) -> None:
-    with TextLog(TextLogOptions(path=log().write(tmp_path / "a.btd"))) as device:
-        header = device.header
+    path = log().write(tmp_path / "a.btd")
+    header = TextLogReader(path).header
+    with TextLog(TextLogOptions(path=path)) as device:
         assert device.identity.serial == "BT0123456789ABCD"  # cut at the stray bytes 00 10
         assert device.identity.start_wall_ns == 1_594_741_080_000_000_000
     assert header.lines == 13
-    assert header.flex_versions == ("", "", "1.0")
+    assert header.serial(4) == ""
     assert (header.sample_rate_hz, header.frames_in_batch) == (4400.0, 7)
 
 
