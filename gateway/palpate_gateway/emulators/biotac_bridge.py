@@ -53,21 +53,12 @@ class BiotacBridgeEmulator(SerialEmulator):
     * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
 
     Args:
-        fingers: Number of fingers that it samples.
-        counts: Counts of the fingers.
         serials: Serial numbers of the fingers; () = ``BT-EMU-1`` and so on.
         source: Source id.
-        baud: Speed [bit/s].
-        path: Name of the line; "" = a new one.
-        slot_rate_hz: Slots each second.
-        slots_per_packet: Slots of a packet, 22..44.
-        pac_first: Whether a round begins with PAC.
-        electrodes: 19, or 24 of the BioTac SP.
         hello_s: Time between two HELLOs [s].
         status_s: Time between two STATUSes [s].
         sequence: Number of the first packet after the start.
         clock_us: Its clock at the start [us].
-        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
     faults: ClassVar = FAULTS["biotac-bridge"]

@@ -38,18 +38,6 @@ class BiotacCanEmulator(Emulator):
     * ``silence``: nothing comes, while the sampling continues;
     * ``unplug``, ``restart``: nothing comes, then a new round begins;
     * ``clock_drift``: slots come at another rate.
-
-    Args:
-        interface: python-can's kind of bus.
-        channel: Name of the bus.
-        fingers: Words in each frame, 1..3.
-        counts: Counts of the fingers.
-        can_id: Identifier of the frames.
-        slot_rate_hz: Frames each second.
-        pac_first: Whether a round begins with PAC.
-        electrodes: 19, or 24 of the BioTac SP.
-        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
-        options: More options of python-can.
     """
 
     faults: ClassVar = FAULTS["biotac-can"]

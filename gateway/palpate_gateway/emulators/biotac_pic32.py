@@ -48,14 +48,8 @@ class BiotacPic32Emulator(SerialEmulator):
     * ``clock_drift``: the core timer runs at another speed.
 
     Args:
-        counts: Counts of the finger.
-        electrodes_first: Whether it has the older firmware.
-        baud: Speed [bit/s].
-        path: Name of the line; "" = a new one.
-        rate_hz: Polls of all channels each second.
         ticks: Its core timer at the start.
         load_g: Load cell and reference [g].
-        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
     faults: ClassVar = FAULTS["biotac-pic32"]

@@ -70,13 +70,9 @@ class BotaEmulator(SerialEmulator):
     * ``clock_drift``: its clock runs at another speed than its converter.
 
     Args:
-        source: The load.
-        baud: Speed [bit/s].
-        path: Name of the line; "" = a new one.
         runs_after_boot: Whether it streams after a start without a request.
         boot_s: Duration of a start [s].
         clock_us: Its clock at the first sample [us].
-        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
     faults: ClassVar = FAULTS["bota"]

@@ -28,6 +28,11 @@ class HostTimed:
 class Emulator(ABC):
     """Serves one device from a thread of its own until it is stopped.
 
+    Arguments of subclasses mean the same as the options of their commands (``palpate emulate``):
+    address, rates, ``drift_ppm`` of their clock during the fault ``clock_drift`` and so on; an
+    empty ``path`` or a ``port`` 0 is a new one. ``source``, ``counts`` or ``tip`` is what the
+    device measures.
+
     Args:
         rate_hz: Samples each second.
     """

@@ -55,12 +55,7 @@ class Kms40Emulator(Emulator):
     * ``clock_drift``: its clock, and with it the sampling, runs at another speed.
 
     Args:
-        source: The load.
-        host: Address to listen at.
-        port: Port to listen at; 0 = any free one.
-        serial: Serial number.
         stamped: Whether data lines end with the device's time.
-        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
     faults: ClassVar = FAULTS["kms40"]
@@ -91,17 +86,12 @@ class Kms40Emulator(Emulator):
         return f"{self._host}:{self._port}"
 
     @property
-    def streaming(self) -> bool:
-        """Whether it streams samples."""
-        return self._streaming
-
-    @property
     def divider(self) -> int:
         """Every n-th sample is sent."""
         return self._settings["LDIV"][0]
 
     def _power_up(self) -> None:
-        self._streaming = False
+        self.streaming = False
         self._settings = {"VL": [1], "LDIV": [1], "FLT": [0], "TARE": [0], "LMASK": [1] * 6}
         self._tare: np.ndarray | None = None
 
@@ -137,7 +127,7 @@ class Kms40Emulator(Emulator):
             if self._server is None:
                 self._listen()
             if self.faulty("stopped"):
-                self._streaming = False
+                self.streaming = False
             with contextlib.suppress(OSError):  # A lost client is noticed at the next tick.
                 self._serve_client()
 
@@ -156,7 +146,7 @@ class Kms40Emulator(Emulator):
             return
         try:
             self._take_requests(self._client)
-            if self._client is not None and self._streaming and self._ticks % self.divider == 0:
+            if self._client is not None and self.streaming and self._ticks % self.divider == 0:
                 self._stream(self._client)
         except OSError:
             self._drop_client()
@@ -217,7 +207,7 @@ class Kms40Emulator(Emulator):
 
     def _ask(self, name: str) -> str:
         if name in ("L0", "L1"):
-            self._streaming = name == "L1"
+            self.streaming = name == "L1"
             return name
         if name == "F":
             return self._data_line()
@@ -245,7 +235,7 @@ class Kms40Emulator(Emulator):
             return _error(_INVALID)
         if name == "TARE" and numbers:
             # The page advises to stop the stream first; this emulator requires it.
-            if self._streaming:
+            if self.streaming:
                 return _error(_ALREADY_RUNNING)
             self._tare = self._load() if numbers[0] else None
         if numbers:
@@ -270,7 +260,7 @@ class Kms40Emulator(Emulator):
             bits.add(_TARE_ON)
         if self._settings["FLT"] != [0]:
             bits.add(_FILTER_ON)
-        if self._streaming:
+        if self.streaming:
             bits.add(_RUNNING)
         bits.update(int(axis) + _OVERRANGE for axis in np.flatnonzero(abs(self._load()) > _RANGE))
         if self.faulty("overload"):

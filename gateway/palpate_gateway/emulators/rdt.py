@@ -181,17 +181,11 @@ class RdtEmulator(Emulator):
 
     Args:
         product: ``netft``, ``axia`` or ``hex``.
-        source: The load.
-        rate_hz: Records each second; 0 = the product's default.
         counter_hz: Rate of the internal counter; 0 = the product's.
-        host: Address to listen at.
-        port: Port for datagrams; 0 = any free one.
-        http_port: Port of the web page; 0 = any free one.
         counts_per: Counts per force unit and per torque unit; the HEX has its own.
         units: Force and torque unit on the page, each with its value [N] and [N m].
         together: Records in a datagram when the start request asks for several.
         first_counter: The internal counter at power-up.
-        drift_ppm: Excess speed of the counter during ``clock_drift`` [1e-6].
     """
 
     faults: ClassVar = FAULTS["rdt"]

@@ -61,15 +61,6 @@ class RobotEmulator(Emulator):
     * ``silence``: its program hangs; ``unplug``: it has left the bus;
     * ``restart``: its program ends; when the fault ends, program and clock start again;
     * ``clock_drift``: its clock, and with it its loop, runs at another speed.
-
-    Args:
-        tip: Pose of the tip of its indenter.
-        robot: Name on the bus.
-        rate_hz: Poses each second.
-        connect: Endpoint of the router; empty = run a router.
-        port: Port of its own router; 0 = any free one.
-        station: Station on which it publishes.
-        drift_ppm: Excess speed of its clock during ``clock_drift`` [1e-6].
     """
 
     faults: ClassVar = FAULTS["robot"]

@@ -65,12 +65,6 @@ class RobotousEmulator(Emulator):
     * ``overload``: the bit of Fx is set, and counted;
     * ``stuck``: samples repeat the load from its begin;
     * ``clock_drift``: samples come at another rate.
-
-    Args:
-        source: The load.
-        model: Its answer to the request for the model, one of ``TORQUE_DIVISORS``.
-        serial: Serial number.
-        drift_ppm: Excess rate of its samples during ``clock_drift`` [1e-6].
     """
 
     def __init__(
@@ -209,12 +203,6 @@ class RobotousSerialEmulator(SerialEmulator, RobotousEmulator):
 
     More faults: ``crc``: one bit of each frame is wrong; ``unplug``: the line is gone, while the
     sensor continues.
-
-    Args:
-        source: The load.
-        baud: Speed [bit/s].
-        path: Name of the line; "" = a new one.
-        more: Model, serial number, drift.
     """
 
     faults: ClassVar = FAULTS["robotous"]
@@ -267,12 +255,6 @@ class RobotousCanEmulator(RobotousEmulator):
     sent or received; at the end another one says that the controller was restarted, while the
     sensor has continued; ``unplug``: line and supply are gone, and it is silent until a start
     request.
-
-    Args:
-        source: The load.
-        interface: python-can's kind of bus.
-        channel: Name of the bus.
-        more: Model, serial number, drift.
     """
 
     faults: ClassVar = FAULTS["robotous on CAN"]

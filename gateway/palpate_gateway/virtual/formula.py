@@ -13,8 +13,6 @@ import numpy as np
 from palpate.errors import ConfigError
 from palpate.messages import PAC_SAMPLES
 from palpate.rigid import shortest_turn
-from palpate_gateway.protocols import channels as ch
-from palpate_gateway.readings import ElectrodeReading, PoseReading, WrenchReading
 from palpate_gateway.virtual.formula_physics import (
     INDENTER_RADII_M,
     FormulaContact,
@@ -29,10 +27,11 @@ from palpate_gateway.virtual.formula_physics import (
 from palpate_gateway.virtual.model import (
     BLOCK_FRAMES,
     UNTOUCHED_FRAMES,
-    WRENCH_SERIAL,
     Array,
     Group,
+    SampledFrames,
     VirtualOptions,
+    groups_of,
 )
 from palpate_gateway.virtual.sensor import (
     PAC_HIGH_PASS_S,
@@ -80,16 +79,8 @@ class FormulaModel:
             )
         self._radius_m = INDENTER_RADII_M[self._indenter]
         self._specimen = FormulaSpecimen.number(options.unit)
-
-    @property
-    def line(self) -> str:
-        """See ``FingerModel``."""
-        return f"virtual finger, {self._indenter}"
-
-    @property
-    def serial(self) -> str:
-        """See ``FingerModel``."""
-        return f"VIRTUAL-U{self._options.unit}-S{self._options.seed}"
+        self.line = f"virtual finger, {self._indenter}"
+        self.serial = f"VIRTUAL-U{options.unit}-S{options.seed}"
 
     def run(self) -> Iterator[list[Group]]:
         """See ``FingerModel``."""
@@ -120,14 +111,7 @@ class FormulaModel:
         """
         rate_hz = self._options.rate_hz
         ahead = contact(touch, np.arange(start, start + count + 2) / rate_hz, self._radius_m)
-        state = FormulaContact(
-            ahead.depth[:count],
-            ahead.tip[:count],
-            ahead.normal_force[:count],
-            ahead.traction[:count],
-            ahead.force[:count],
-            ahead.pressure[:count],
-        )
+        state = FormulaContact(*(part[:count] for part in ahead))
         times_s = np.arange(tick, tick + count) / rate_hz
         drift = 1.0 + 0.004 * _warmth(times_s) + 0.001 * np.sin(times_s * (2.0 * math.pi / 180.0))
 
@@ -136,37 +120,20 @@ class FormulaModel:
         moving = _pac(ahead.pressure, rate_hz)
         dynamic = converted(moving + random.normal(0.0, PAC_NOISE, moving.shape))
         slow = _slow_channels(state.pressure, self._specimen.pdc_rest, times_s)
-        pdc, tac, tdc = converted(slow + random.normal(0.0, SLOW_NOISE, slow.shape)).T.tolist()
+        slow_counts = converted(slow + random.normal(0.0, SLOW_NOISE, slow.shape))
         torque = np.cross(state.tip, state.force).astype(np.float32)
         force = state.force.astype(np.float32)
         in_contact = (state.depth > 0.0).tolist()
         orientation = shortest_turn(-touch.place.normal)
-        ticks, times = range(tick, tick + count), times_s.tolist()
-        return [
-            (
-                ElectrodeReading(
-                    ticks[k],
-                    times[k],
-                    0,
-                    electrodes[k],
-                    pdc[k],
-                    dynamic[k],
-                    tac[k],
-                    tdc[k],
-                    ch.ALL_VALID,
-                ),
-                WrenchReading(ticks[k], times[k], force[k], torque[k], WRENCH_SERIAL),
-                PoseReading(
-                    ticks[k],
-                    times[k],
-                    self._indenter,
-                    state.tip[k],
-                    orientation,
-                    in_contact[k],
-                ),
-            )
-            for k in range(count)
-        ]
+        return groups_of(
+            tick,
+            rate_hz,
+            SampledFrames(electrodes, dynamic, slow_counts),
+            wrench=(force, torque),
+            indenter=self._indenter,
+            poses=(state.tip, [orientation] * count),
+            in_contact=in_contact,
+        )
 
 
 def _warmth(time_s: Array) -> Array:

@@ -25,6 +25,7 @@ Sensor frame: x to the fingertip, z dorsal, so the ventral side faces -z.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -214,8 +215,7 @@ class FormulaSpecimen:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class FormulaContact:
+class FormulaContact(NamedTuple):
     """State of one indentation at N times.
 
     Attributes:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal, Protocol
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
 from palpate.config import StrictConfig
-from palpate_gateway.readings import Reading
+from palpate.messages import CountArray, FloatArray
+from palpate_gateway.protocols import channels as ch
+from palpate_gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
 from palpate_gateway.virtual.faults import VirtualFault
 
 Array = npt.NDArray[np.float64]
@@ -77,19 +79,65 @@ class VirtualOptions(StrictConfig):
 class FingerModel(Protocol):
     """Source of a virtual finger's readings; each run gives the same ones."""
 
-    @property
-    def line(self) -> str:
-        """Description in one line."""
-        ...
-
-    @property
-    def serial(self) -> str:
-        """Serial number where the options give none."""
-        ...
+    line: str
+    """Description in one line."""
+    serial: str
+    """Serial number where the options give none."""
 
     def run(self) -> Iterator[list[Group]]:
         """Groups of readings from the beginning, in blocks; tick and time count from 0."""
         ...
+
+
+class SampledFrames(NamedTuple):
+    """N frames of counts.
+
+    Attributes:
+        electrodes: Shape ``(N, 19)``.
+        pac: Shape ``(N, 22)``.
+        slow: PDC, TAC, TDC, shape ``(N, 3)``.
+    """
+
+    electrodes: CountArray
+    pac: CountArray
+    slow: CountArray
+
+
+def groups_of(
+    first: int,
+    rate_hz: float,
+    frames: SampledFrames,
+    *,
+    wrench: tuple[FloatArray, FloatArray],
+    indenter: str,
+    poses: tuple[Array, Sequence[Array] | Array],
+    in_contact: Sequence[bool],
+) -> list[Group]:
+    """Readings of N frames, of which the first has the tick ``first``.
+
+    Args:
+        first: Tick of the first frame.
+        rate_hz: Frames per second [Hz].
+        frames: Counts.
+        wrench: Force [N] and torque [N m] on the finger, shape ``(N, 3)`` each.
+        indenter: Name of the indenter.
+        poses: Its positions [m], shape ``(N, 3)``, and quaternions, shape ``(N, 4)``.
+        in_contact: Whether it touches the skin.
+    """
+    (force, torque), (position, quaternion) = wrench, poses
+    groups: list[Group] = []
+    for k, (pdc, tac, tdc) in enumerate(frames.slow.tolist()):
+        at = first + k
+        at_s = at / rate_hz
+        electrodes, pac = frames.electrodes[k], frames.pac[k]
+        groups.append(
+            (
+                ElectrodeReading(at, at_s, 0, electrodes, pdc, pac, tac, tdc, ch.ALL_VALID),
+                WrenchReading(at, at_s, force[k], torque[k], WRENCH_SERIAL),
+                PoseReading(at, at_s, indenter, position[k], quaternion[k], in_contact[k]),
+            )
+        )
+    return groups
 
 
 def ease(time_s: Array, start_s: float, end_s: float) -> Array:

@@ -16,14 +16,13 @@ offset errors in the small effect of temperature.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate.files.tape import TapeSpecimen
 from palpate.messages import COUNTS_MAX, PAC_SAMPLES, CountArray
-from palpate_gateway.virtual.model import Array
+from palpate_gateway.virtual.model import Array, SampledFrames
 
 PAC_NOISE = 2.0
 """Noise of PAC [counts], sd; idle sensors of public captures show about 5 counts peak."""
@@ -42,21 +41,6 @@ _KELVIN = 273.15
 _BETA_K, _UPPER, _LOWER = 4025.0, 155183.0, 46555.0
 _TAC_GAIN = 98.0
 _TAC_HIGH_PASS_S = 1.0 / (2.0 * math.pi * 0.45)
-
-
-@dataclass(frozen=True, slots=True)
-class SampledFrames:
-    """N frames of counts.
-
-    Attributes:
-        electrodes: Shape ``(N, 19)``.
-        pac: Shape ``(N, 22)``.
-        slow: PDC, TAC, TDC, shape ``(N, 3)``.
-    """
-
-    electrodes: CountArray
-    pac: CountArray
-    slow: CountArray
 
 
 def converted(values: Array) -> CountArray:

@@ -20,23 +20,16 @@ from palpate.errors import ConfigError
 from palpate.files.tape import Tape, TapeTrajectory, read_tape
 from palpate.messages import FloatArray
 from palpate.rigid import rotation_matrices
-from palpate_gateway.protocols import channels as ch
-from palpate_gateway.readings import (
-    ElectrodeReading,
-    FieldReading,
-    PoseReading,
-    Reading,
-    WrenchReading,
-)
+from palpate_gateway.readings import FieldReading
 from palpate_gateway.virtual.model import (
     BLOCK_FRAMES,
     CLEARANCE_M,
     UNTOUCHED_FRAMES,
-    WRENCH_SERIAL,
     Array,
     Group,
     VirtualOptions,
     ease,
+    groups_of,
 )
 from palpate_gateway.virtual.sensor import TwinSensor
 
@@ -182,20 +175,10 @@ class TapeModel:
         self._specimen = tape.specimens[self._at]
         self._played = _chosen(options, tape, path)
         self._modes = tape.scaled_modes()
-        self._line = (
-            f"digital twin {self._specimen.name}, {len(self._played)} presses of {path.stem}"
-        )
-
-    @property
-    def line(self) -> str:
-        """See ``FingerModel``."""
-        return self._line
-
-    @property
-    def serial(self) -> str:
-        """See ``FingerModel``."""
+        name = self._specimen.name
+        self.line = f"digital twin {name}, {len(self._played)} presses of {path.stem}"
         # A serial number has at most 64 characters on the wire.
-        return f"VIRTUAL-{self._specimen.name[:32]}-S{self._options.seed}"
+        self.serial = f"VIRTUAL-{name[:32]}-S{options.seed}"
 
     def run(self) -> Iterator[list[Group]]:
         """See ``FingerModel``."""
@@ -231,27 +214,19 @@ class TapeModel:
         sampled = sensor.sample(counts, pressure, tick)
         force = between(one.force.astype(np.float64), step).astype(np.float32)
         torque = between(one.torque.astype(np.float64), step).astype(np.float32)
-        position, quaternion = poses(one.poses, step, now.distance(time_s))
-        touching = [bool(one_force.any()) for one_force in force]
-        slow = sampled.slow.tolist()
-        groups: list[Group] = []
+        groups = groups_of(
+            tick,
+            rate_hz,
+            sampled,
+            wrench=(force, torque),
+            indenter=one.indenter,
+            poses=poses(one.poses, step, now.distance(time_s)),
+            in_contact=[bool(one_force.any()) for one_force in force],
+        )
         for k, at in enumerate(range(tick, tick + count)):
-            at_s = at / rate_hz
-            pdc, tac, tdc = slow[k]
-            readings: list[Reading] = [
-                ElectrodeReading(
-                    at, at_s, 0, sampled.electrodes[k], pdc, sampled.pac[k], tac, tdc, ch.ALL_VALID
-                ),
-                WrenchReading(at, at_s, force[k], torque[k], WRENCH_SERIAL),
-                PoseReading(at, at_s, one.indenter, position[k], quaternion[k], touching[k]),
-            ]
             if self._reads_field(at):
-                readings.append(
-                    FieldReading(
-                        at, at_s, self._tape.mesh_sha256, self._field(one, step[k : k + 1])
-                    )
-                )
-            groups.append(tuple(readings))
+                field = self._field(one, step[k : k + 1])
+                groups[k] += (FieldReading(at, at / rate_hz, self._tape.mesh_sha256, field),)
         return groups
 
     def _reads_field(self, tick: int) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -140,7 +139,7 @@ def test_shear_shows_in_the_electrodes() -> None:
     """Traction alone, at the same place and depth, moves the counts by far more than the noise."""
     sheared = next(e for e in (random_touch(0, k) for k in range(50)) if e.shear_m > 0.5e-3)
     state = contact(sheared, np.array([sheared.times_s[2]]), 7e-3)
-    without = replace(state, traction=np.zeros(1))
+    without = state._replace(traction=np.zeros(1))
     counts, plain = (
         electrode_counts(films(sheared, s, 7e-3), FormulaSpecimen.number(1), np.ones(1))
         for s in (state, without)
