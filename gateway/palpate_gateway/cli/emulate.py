@@ -27,28 +27,8 @@ MULTICAST = "239.74.163.2"
 """python-can's own group for its bus over UDP."""
 
 
-class Play(enum.StrEnum):
-    """What an emulated device measures."""
-
-    TWIN = "twin"
-    IDLE = "idle"
-    PRESS = "press"
-
-
-class ElectrodeCount(enum.StrEnum):
-    """Electrodes of a BioTac, and of a BioTac SP."""
-
-    BIOTAC = "19"
-    BIOTAC_SP = "24"
-
-
-class RdtProduct(enum.StrEnum):
-    """Sensors that speak RDT, by their names in the driver's options."""
-
-    NET_FT = "ati_net_ft"
-    AXIA = "ati_axia"
-    FTN = "schunk_ftn"
-    HEX = "onrobot_hex"
+RDT_PRODUCTS = ("ati_net_ft", "ati_axia", "schunk_ftn", "onrobot_hex")
+"""Sensors that speak RDT, by their names in the driver's options."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +57,11 @@ def _option(
     return Parameter(name, Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
 
 
+def _choice(name: str, help_: str, *values: str) -> Parameter:
+    """An option that is one of some values; the first is the default."""
+    return _option(name, next(iter(enum.StrEnum(name, [(one, one) for one in values]))), help_)
+
+
 def _many(name: str, metavar: str, help_: str) -> Parameter:
     """An option that can be repeated."""
     return _option(name, None, help_, f"--{name}", type_=list[str] | None, metavar=metavar)
@@ -100,10 +85,14 @@ _SLOT_RATE = _option(
 )
 _ROUND = (
     _option("pac_first", False, "A round begins with PAC, not with E1.", "--pac-first"),
-    _option("electrodes", ElectrodeCount.BIOTAC, "24 = BioTac SP, rounds of 54 slots."),
+    _choice("electrodes", "24 = BioTac SP, rounds of 54 slots.", "19", "24"),
 )
 _PLAY = (
-    _option("play", Play.TWIN, "The digital twin, nothing, or a slow press without physics."),
+    _choice(
+        "play",
+        "The digital twin, nothing, or a slow press without physics.",
+        *("twin", "idle", "press"),
+    ),
     _option("seed", 0, "Seed of the twin; finger N of a line has this one plus N - 1.", min=0),
 )
 _FINGER = _option(
@@ -141,7 +130,7 @@ COMMANDS = {
     "rdt": EmulateCommand(
         "An ATI Net F/T or Axia, a Schunk FTN or an OnRobot HEX over UDP.",
         (
-            _option("product", RdtProduct.NET_FT, "Which of them."),
+            _choice("product", "Which of them.", *RDT_PRODUCTS),
             _HOST,
             _PORT,
             _option("http_port", 0, "Port of its web page; 0 = any free one.", min=0, max=65535),

@@ -50,6 +50,8 @@ class EmulatedDevice(NamedTuple):
 class EmulatedScene:
     """What the emulated devices measure.
 
+    Its methods raise ``ConfigError`` if the twin has no such specimen or trajectory.
+
     Attributes:
         play: ``twin``, ``idle`` (no load), or ``press``: a slow one without physics.
         seed: Seed of the twin's first finger.
@@ -67,11 +69,7 @@ class EmulatedScene:
     finger: int = 1
 
     def counts(self, fingers: int) -> CountSource:
-        """Counts of BioTacs.
-
-        Raises:
-            ConfigError: The twin has no such specimen or trajectory.
-        """
+        """Counts of BioTacs."""
         from palpate_gateway.emulators.biotac_slots import idle_counts, press_counts
 
         if self.play != "twin":
@@ -81,11 +79,7 @@ class EmulatedScene:
         return TwinCounts([self._loop(finger, fingers) for finger in range(fingers)], self.epoch)
 
     def wrench(self) -> WrenchSource:
-        """The wrench on the finger.
-
-        Raises:
-            ConfigError: The twin has no such trajectory.
-        """
+        """The wrench on the finger."""
         if self.play != "twin":
             return no_load if self.play == "idle" else slow_press
         from palpate_gateway.emulators.twin import TwinWrench
@@ -93,11 +87,7 @@ class EmulatedScene:
         return TwinWrench(self._loop(self.finger - 1), self.epoch)
 
     def tip(self) -> tuple[TipSource, str]:
-        """The pose of the indenter on the finger, and the name of the first indenter.
-
-        Raises:
-            ConfigError: The twin has no such trajectory.
-        """
+        """The pose of the indenter on the finger, and the name of the first indenter."""
         from palpate_gateway.emulators.robot import above_the_pad, slow_approach
 
         if self.play != "twin":

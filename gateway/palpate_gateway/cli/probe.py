@@ -51,10 +51,6 @@ def probe_command(driver: str, pairs: Sequence[str], *, seconds: float, as_json:
 
     Returns:
         0, or 1 if it cannot be opened or gives no reading.
-
-    Raises:
-        ConfigError: Unknown driver, or an option is unknown or wrong.
-        MissingExtraError: The driver needs a package that is not installed.
     """
     device = device_of(driver, pairs)
     if not as_json:
@@ -174,8 +170,6 @@ def monitor_command(driver: str, pairs: Sequence[str], *, seconds: float, as_jso
     """Show a device until ``seconds`` have passed (0 = Ctrl-C) or it ends.
 
     Raises:
-        ConfigError: Unknown driver, or an option is unknown or wrong.
-        MissingExtraError: The driver needs a package that is not installed.
         DeviceError: It cannot be opened at the start.
     """
     monitor = DeviceMonitor(device_of(driver, pairs))

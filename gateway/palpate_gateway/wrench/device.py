@@ -112,14 +112,7 @@ class WrenchOptions(StrictConfig):
 
 
 class WrenchDevice(Device):
-    """A live force/torque sensor. Subclasses implement its protocol.
-
-    Args:
-        driver: Name in the driver table.
-        model: Description in one line.
-        rate_hz: Nominal rate [Hz].
-        options: Mount, serial, zero.
-    """
+    """A live force/torque sensor. Subclasses implement its protocol."""
 
     def __init__(self, driver: str, model: str, rate_hz: float, options: WrenchOptions) -> None:
         super().__init__(
