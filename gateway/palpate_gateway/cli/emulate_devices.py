@@ -119,10 +119,6 @@ class EmulatedScene:
 def make_emulated(name: str, values: Mapping[str, Any]) -> EmulatedDevice:
     """The device of a command.
 
-    Args:
-        name: Name of the command.
-        values: Its options, without fault plan and duration.
-
     Raises:
         ConfigError: An option is wrong.
         MissingExtraError: A package is not installed.

@@ -34,10 +34,6 @@ class ScheduledFault(NamedTuple):
 def parse_faults(texts: Iterable[str], known: Collection[str]) -> list[ScheduledFault]:
     """Faults in order of time.
 
-    Args:
-        texts: As typed.
-        known: Faults of the device.
-
     Raises:
         ConfigError: A text is not a fault, or the device has no such fault; names all faults.
     """

@@ -118,11 +118,7 @@ def counter_lines(counters: Mapping[str, int]) -> list[str]:
 
 
 class DeviceMonitor:
-    """Reads a device, and opens it again when it is lost.
-
-    Args:
-        device: The device, closed.
-    """
+    """Reads a device, and opens it again when it is lost."""
 
     def __init__(self, device: Device) -> None:
         self.device = device

@@ -157,12 +157,7 @@ def slow_press(t: float) -> Wrench:
 
 
 class SampleTicker:
-    """Ticks at a rate, without drift; after a pause of this process it continues from now.
-
-    Args:
-        rate_hz: Ticks each second.
-        stop: Event that ends a wait.
-    """
+    """Ticks at a rate, without drift; after a pause of this process it continues from now."""
 
     def __init__(self, rate_hz: float, stop: threading.Event) -> None:
         self._period_s, self._stop = 1.0 / rate_hz, stop

@@ -168,10 +168,6 @@ def error_frame(can: Any, kind: int) -> Any:
 
     Error frames never travel on a real bus: the receiver's own controller makes them. python-can's
     buses in software carry them like any frame.
-
-    Args:
-        can: The module python-can.
-        kind: Class of the error.
     """
     return can.Message(
         arbitration_id=kind, is_error_frame=True, is_extended_id=False, data=bytes(8)

@@ -106,13 +106,7 @@ def page(product: str, counts_per: tuple[float, float], units: tuple[str, str]) 
 
 
 class WebPage:
-    """The web server of a device: one page at one path. It keeps its port when it is opened again.
-
-    Args:
-        host: Address to listen at.
-        port: Port to listen at; 0 = any free one.
-        path: Path of the page, e.g. ``/netftapi2.xml``.
-    """
+    """The web server of a device: one page at one path. Opened again, it keeps its port."""
 
     def __init__(self, host: str, port: int, path: str) -> None:
         self.port = port

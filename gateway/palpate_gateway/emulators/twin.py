@@ -158,24 +158,14 @@ class _LoopPlayer(HostTimed):
         return self._since_epoch_s + self.lead_s
 
     def _between(self, t: float, frames: int) -> tuple[int, float]:
-        """The frame before a time of the emulator's own [s], and the share of the way to the next.
-
-        Args:
-            t: The time [s].
-            frames: Frames of the loop, with the repeated one at its end.
-        """
+        """The frame before time ``t`` [s], by the emulator's clock, and the share to the next."""
         at = (t + self._ahead_s) % ((frames - 1) / RATE_HZ) * RATE_HZ
         lower = min(int(at), frames - 2)
         return lower, at - lower
 
 
 class TwinCounts(CountTrack, _LoopPlayer):
-    """Counts of several fingers.
-
-    Args:
-        loops: The loop of each finger.
-        epoch_s: Host time at which every loop begins [s since 1970].
-    """
+    """Counts of several fingers."""
 
     def __init__(self, loops: Sequence[TwinLoop], epoch_s: float = 0.0) -> None:
         _LoopPlayer.__init__(self, epoch_s)
@@ -196,12 +186,7 @@ class TwinCounts(CountTrack, _LoopPlayer):
 
 
 class TwinWrench(_LoopPlayer):
-    """The wrench on one finger; a ``WrenchSource``.
-
-    Args:
-        loop: The loop of that finger.
-        epoch_s: Host time at which every loop begins [s since 1970].
-    """
+    """The wrench on one finger; a ``WrenchSource``."""
 
     def __init__(self, loop: TwinLoop, epoch_s: float = 0.0) -> None:
         super().__init__(epoch_s)
@@ -216,12 +201,7 @@ class TwinWrench(_LoopPlayer):
 
 
 class TwinTip(_LoopPlayer):
-    """The pose of the indenter on one finger, for an emulated robot; a ``TipSource``.
-
-    Args:
-        tips: Poses of that finger's loop.
-        epoch_s: Host time at which every loop begins [s since 1970].
-    """
+    """The pose of the indenter on one finger, for an emulated robot; a ``TipSource``."""
 
     def __init__(self, tips: Sequence[Pose], epoch_s: float = 0.0) -> None:
         super().__init__(epoch_s)

@@ -56,9 +56,6 @@ class PoseTable:
 
     ``counters``: ``repeated_poses``: dropped rows with the time of the row before.
 
-    Args:
-        path: The file.
-
     Raises:
         RecordingError: It cannot be read, is empty, or its header lacks or repeats a column.
     """

@@ -128,13 +128,7 @@ class _ActiveFault:
 
 
 class FaultPlan:
-    """All faults of one run; takes the readings in order of time.
-
-    Args:
-        faults: The faults; on one frame they act in this order.
-        rate_hz: Frames per second [Hz].
-        seed: Seed of their random numbers.
-    """
+    """All faults of one run, in the order in which they act on a frame; frames come in order."""
 
     def __init__(self, faults: Sequence[VirtualFault], rate_hz: float, seed: int) -> None:
         acting = [_ActiveFault(fault, rate_hz, [seed, 4, k]) for k, fault in enumerate(faults)]

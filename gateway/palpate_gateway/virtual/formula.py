@@ -57,9 +57,6 @@ _WARM_UP_S = 600.0
 class FormulaModel:
     """The finger by closed formulas; see ``FingerModel``.
 
-    Args:
-        options: Options of the driver.
-
     Raises:
         ConfigError: The formula has no such specimen or indenter.
     """

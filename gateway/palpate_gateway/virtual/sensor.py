@@ -60,8 +60,6 @@ class TwinSensor:
     how many frames are computed at once.
 
     Args:
-        unit: The specimen.
-        rate_hz: Frames per second [Hz].
         on_for_s: Time since power-on at its first frame [s].
         seed: Seed of noise and of the temperature gradient over the core.
     """

@@ -100,14 +100,7 @@ class TrajectoryPlayback:
 def playback(
     trajectory: TapeTrajectory, seed: int, number: int, *, wait_s: float = 0.0
 ) -> TrajectoryPlayback:
-    """Times for indentation ``number`` of the finger with this seed.
-
-    Args:
-        trajectory: The trajectory to play.
-        seed: Seed of the timing.
-        number: Number of the indentation.
-        wait_s: Shortest time before the indenter comes [s].
-    """
+    """Times for indentation ``number`` of this seed; the indenter waits ``wait_s`` or longer."""
     random = np.random.default_rng([seed, 5, number])
     travel_m = float(np.linalg.norm(np.diff(trajectory.poses[:, :3], axis=0), axis=1).sum())
     there, back = random.uniform(*_SPEED_M_S, 2).tolist()
@@ -158,10 +151,6 @@ def poses(values: Array, step: Array, distance: Array) -> tuple[Array, Array]:
 
 class TapeModel:
     """The finger of a tape; see ``FingerModel``.
-
-    Args:
-        options: Options of the driver.
-        path: The tape.
 
     Raises:
         ConfigError: There is no such tape, or it has no such specimen, trajectory or indenter.

@@ -216,10 +216,7 @@ class WrenchDevice(Device):
     ) -> Sequence[Sample]:
         """Samples of a sensor that streams by itself and does not report its restarts.
 
-        Args:
-            take: Reads samples within a time [s]; may give none, e.g. from half a frame.
-            timeout_s: How long to wait [s].
-            silence_s: Silence that is taken as a restart [s].
+        A silence of ``silence_s`` is taken as a restart.
 
         Raises:
             DeviceTimeout: None came yet.

@@ -36,12 +36,7 @@ _APART = 0.75
 
 
 class RobotousSerialLine:
-    """A serial line to one sensor: requests go out, the data bytes of answers come in.
-
-    Args:
-        port: Its name.
-        baud: Its rate [bit/s].
-    """
+    """A serial line to one sensor: requests go out, the data bytes of answers come in."""
 
     def __init__(self, port: str, baud: int) -> None:
         self.name = f"{port} at {baud} bit/s"
@@ -77,15 +72,7 @@ class RobotousSerialLine:
 
 
 class RobotousCanLine:
-    """A CAN bus to one sensor, as ``RobotousSerialLine``; other devices may use the bus, too.
-
-    Args:
-        bus: The bus, closed.
-        request_id: Identifier of requests.
-        first_id: Identifier of the first half of an answer.
-        second_id: Identifier of the second half.
-        period_s: Time between two samples [s].
-    """
+    """A CAN bus to one sensor, as ``RobotousSerialLine``; other devices may use the bus, too."""
 
     def __init__(
         self, bus: CanBus, *, request_id: int, first_id: int, second_id: int, period_s: float

@@ -33,12 +33,7 @@ class _ZeroRequest:
 
 
 class Zeroing:
-    """Serves requests for a zero, one after the other.
-
-    Args:
-        name: The sensor's name.
-        device: The sensor.
-    """
+    """Serves requests for a zero, one after the other."""
 
     def __init__(self, name: str, device: WrenchDevice) -> None:
         self._name, self._device = name, device
