@@ -81,7 +81,7 @@ def run_emulator(name: str, device: EmulatedDevice, faults: Sequence[str], secon
             _introduce(name, device)
             line = Live(console=console, auto_refresh=False) if console.is_terminal else None
             with line or nullcontext():
-                _serve(device, plan, seconds, line, crashes)
+                _serve(device, plan, seconds, console, line, crashes)
         finally:
             device.emulator.stop()
             typer.echo(f"{name}: {device.emulator.sent} samples sent", err=True)
@@ -116,6 +116,7 @@ def _serve(
     device: EmulatedDevice,
     plan: Sequence[ScheduledFault],
     seconds: float,
+    console: Console,
     live: Live | None,
     crashes: Sequence[BaseException],
 ) -> None:
@@ -133,7 +134,8 @@ def _serve(
             fault = waiting.pop(0)
             emulator.inject(fault.name, fault.duration_s)
             how = f"for {fault.duration_s:g} s" if fault.duration_s else "once"
-            _say(live, f"{elapsed_s:.1f} s: {fault.name} {how}")
+            said = Text(f"{elapsed_s:.1f} s: {fault.name} {how}")
+            console.print(said, soft_wrap=True)
         since_s = time.monotonic() - shown_s
         if live is not None and since_s >= _SHOW_S:
             rate_hz = (emulator.sent - shown) / since_s
@@ -141,10 +143,3 @@ def _serve(
             line = f"{emulator.address}  {elapsed_s:.0f} s  {shown} samples sent  {rate_hz:.0f}/s"
             live.update(Text(line), refresh=True)
         time.sleep(min(_TICK_S, until_s - elapsed_s))
-
-
-def _say(live: Live | None, text: str) -> None:
-    if live is None:
-        typer.echo(text, err=True)
-    else:
-        live.console.print(text, markup=False, highlight=False)

@@ -124,10 +124,8 @@ class BiotacCanEmulator(Emulator):
             self._slot, self._at, self._block = 0, 0, []
             self._block_s = now_s
         off, self._off = self._off, self.faulty("busoff")
-        if self._off and not off:
-            self._tell_error(BUS_OFF)
-        elif off and not self._off:
-            self._tell_error(RESTARTED)
+        if off != self._off:
+            self._bus.send(error_frame(self._can, BUS_OFF if self._off else RESTARTED))
 
     def _send(self, data: bytes) -> None:
         if self._off or not self.sound:
@@ -149,7 +147,7 @@ class BiotacCanEmulator(Emulator):
         if self.faulty("short"):
             data = data[:-1]
         if self.faulty("bus_error"):
-            self._tell_error(BUS_ERROR)
+            self._bus.send(error_frame(self._can, BUS_ERROR))
         if self.faulty("foreign"):
             self._put(b"\x12\x34")
         if self.faulty("repeated"):
@@ -159,6 +157,3 @@ class BiotacCanEmulator(Emulator):
     def _put(self, data: bytes) -> None:
         self._message.data, self._message.dlc = data, len(data)
         self._bus.send(self._message)
-
-    def _tell_error(self, kind: int) -> None:
-        self._bus.send(error_frame(self._can, kind))

@@ -60,15 +60,10 @@ class PoseZenoh(BusDevice):
     options_class = PoseZenohOptions
 
     def __init__(self, options: PoseZenohOptions) -> None:
+        model, rate_hz = f"robot {options.robot}, {options.indenter}", options.rate_hz
         super().__init__(
             DeviceInfo(
-                driver="pose_zenoh",
-                sensor_type=None,
-                model=f"robot {options.robot}, {options.indenter}",
-                rate_hz=options.rate_hz,
-                live=True,
-                finite=False,
-                origin=Origin.LIVE,
+                "pose_zenoh", None, model, rate_hz, live=True, finite=False, origin=Origin.LIVE
             )
         )
         self._options = options

@@ -141,7 +141,7 @@ class PoseTable:
         if len(cells) != self._width:
             raise self._wrong(f"{len(cells)} columns, the header has {self._width}")
         time_s = self._value(cells, self._time, _TIME)
-        x, y, z = (self._scale * self._length(cells, *column) for column in self._position)
+        x, y, z = (self._scale * self._value(cells, *column, _FAR) for column in self._position)
         w, qx, qy, qz = (self._value(cells, *column) for column in self._quaternion)
         if not is_rotation((w, qx, qy, qz)):
             raise self._wrong(
@@ -158,18 +158,14 @@ class PoseTable:
             self.start_wall_ns = int(text)
         return PoseRow(tick, time_s, Pose((x, y, z), (w, qx, qy, qz)))
 
-    def _length(self, cells: list[str], at: int, name: str) -> float:
-        value = self._value(cells, at, name)
-        if abs(value) > _FAR:
-            raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is out of any robot's reach")
-        return value
-
-    def _value(self, cells: list[str], at: int, name: str) -> float:
+    def _value(self, cells: list[str], at: int, name: str, most: float = math.inf) -> float:
         value = _number(cells[at])
         if value is None:
             raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is not a number")
         if not math.isfinite(value):
             raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is not finite")
+        if abs(value) > most:
+            raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is out of any robot's reach")
         return value
 
     def _cells(self) -> list[str] | None:

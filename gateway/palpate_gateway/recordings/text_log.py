@@ -69,6 +69,8 @@ class TextLogReader:
                 f"{path}: the file is empty", remedy="record or copy the log again"
             )
         self.header, offset = split_header(str(path), first)
+        self.slot_period_s = 1.0 / self.header.sample_rate_hz
+        """Time between two slots [s]."""
         self._line = 1 + self.header.lines
         rows = first[offset:]
         # The header may fill the first block, and the only row may lack its line end.
@@ -86,20 +88,11 @@ class TextLogReader:
             raise self.damage or RecordingError(
                 f"{path}: the log has no rows", remedy="record or copy it again"
             )
-        self._rebuild_time = len(self._pending) > 1 and not self._pending[:, 0].any()
+        self.timed = len(self._pending) == 1 or bool(self._pending[:, 0].any())
+        """Whether the log has times; else they are made from the number of slots."""
         self.port = self._choose_port(port)
         self.sensor_type = self._find_type()
         """Kind of sensor, from the sampled channels."""
-
-    @property
-    def slot_period_s(self) -> float:
-        """Time between two slots [s]."""
-        return 1.0 / self.header.sample_rate_hz
-
-    @property
-    def timed(self) -> bool:
-        """Whether the log has times; else they are made from the number of slots."""
-        return not self._rebuild_time
 
     def blocks(self) -> Iterator[SlotBlock]:
         """Slots in order; afterwards ``damage`` says whether the log was complete."""
@@ -144,7 +137,7 @@ class TextLogReader:
     def _slots(self, table: npt.NDArray[np.float64]) -> SlotBlock:
         frame = table[:, 2].astype(np.int64)
         time_s = table[:, 0]
-        if self._rebuild_time:
+        if not self.timed:
             time_s = self._rebuilt_time(frame)
         column = 4 + 2 * (self.port - 1)
         return SlotBlock(

@@ -335,12 +335,10 @@ def _parse_slow(name: str, data: bytes, columns: int, line_number: int) -> LogRo
             row = [float(field.replace(b"_", b"?")) for field in fields]
         except ValueError:
             shown = line[:40].decode("latin-1")
-            damage = _error(name, at, f"not a row of numbers: {shown!r}", _REMEDY)
+            damage = _error(name, at, f"not a row of numbers: {shown!r}")
             break
         if len(row) != columns:
-            damage = _error(
-                name, at, f"{len(row)} columns where the first row has {columns}", _REMEDY
-            )
+            damage = _error(name, at, f"{len(row)} columns where the first row has {columns}")
             break
         if _bad_rows(np.array([row]))[0]:
             damage = _row_error(name, at, np.array(row))
@@ -349,7 +347,6 @@ def _parse_slow(name: str, data: bytes, columns: int, line_number: int) -> LogRo
     return LogRows(np.array(rows, np.float64).reshape(-1, columns), damage)
 
 
-_REMEDY = "the line is damaged; copy or export the log again (rows before it were delivered)"
 _COUNTER_MAX = 2.0**53
 _KNOWN = np.array(sorted(ch.CHANNEL_NAMES), np.float64)
 
@@ -369,10 +366,10 @@ def _row_error(name: str, line: int, row: npt.NDArray[np.float64]) -> RecordingE
     """The error of a row that ``_bad_rows`` found."""
     numbers = row.tolist()
     if not all(math.isfinite(number) for number in numbers):
-        return _error(name, line, "a number is not finite", _REMEDY)
+        return _error(name, line, "a number is not finite")
     for what, counter in (("batch", numbers[1]), ("frame", numbers[2])):
         if not 0 <= counter <= _COUNTER_MAX or counter % 1:
-            return _error(name, line, f"{what} index {counter:g} is not a count", _REMEDY)
+            return _error(name, line, f"{what} index {counter:g} is not a count")
     if numbers[3] not in ch.CHANNEL_NAMES:
         return _error(
             name,
@@ -383,18 +380,18 @@ def _row_error(name: str, line: int, row: npt.NDArray[np.float64]) -> RecordingE
         )
     for port, (value, parity) in enumerate(zip(numbers[4::2], numbers[5::2], strict=True), 1):
         if not 0 <= value <= COUNTS_MAX or value % 1:
-            return _error(
-                name,
-                line,
-                f"value {value:g} at port {port} is not a 12-bit count (0..{COUNTS_MAX})",
-                _REMEDY,
-            )
+            problem = f"value {value:g} at port {port} is not a 12-bit count (0..{COUNTS_MAX})"
+            return _error(name, line, problem)
         if parity not in (0, 1):
-            return _error(
-                name, line, f"parity column of port {port} is {parity:g}, not 0 or 1", _REMEDY
-            )
-    return _error(name, line, "the row is damaged", _REMEDY)
+            return _error(name, line, f"parity column of port {port} is {parity:g}, not 0 or 1")
+    return _error(name, line, "the row is damaged")
 
 
-def _error(name: str, line: int, problem: str, remedy: str) -> RecordingError:
+def _error(
+    name: str,
+    line: int,
+    problem: str,
+    remedy: str = "the line is damaged; copy or export the log again (rows before it were "
+    "delivered)",
+) -> RecordingError:
     return RecordingError(f"{name}, line {line}: {problem}", remedy=remedy)
