@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.rigid import unit
 from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
@@ -17,7 +18,14 @@ from palpate_fem.mesh.parametric import biotac
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import Multifrontal
-from palpate_fem.trajectory import angled_path, normal_path, sample_targets
+from palpate_fem.trajectory import (
+    ANGLE_RAD,
+    ANGLED_DEPTH_M,
+    NORMAL_DEPTH_M,
+    angled_direction,
+    press_path,
+    sample_targets,
+)
 
 Metrics = dict[str, float | str]
 
@@ -73,11 +81,12 @@ def run(
     surface = OuterSurface(tip.nodes, mesh.outer_faces)
     targets, normals = sample_targets(surface, 1, seed=0)
     indenter = make_indenter(INDENTER)
-    paths = {
-        "normal": normal_path(indenter, targets[0], normals[0], surface),
-        "angled": angled_path(indenter, targets[0], normals[0], surface, azimuth_rad=0.0),
+    ways = {
+        "normal": (-unit(normals[0], "normal"), NORMAL_DEPTH_M),
+        "angled": (angled_direction(normals[0], ANGLE_RAD, 0.0), ANGLED_DEPTH_M),
     }
-    for name, path in paths.items():
+    for name, (way, depth) in ways.items():
+        path = press_path(indenter, targets[0], way, surface, depth_m=depth)
         best: IndentationResult | None = None
         parts: dict[str, float] = {}
         for attempt in range(repeats):

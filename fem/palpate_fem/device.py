@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -57,3 +58,8 @@ def vec3s(array: NDArray[np.float64]) -> wp.array:
 def mat33s(array: NDArray[np.float64]) -> wp.array:
     """An array of 3 x 3 matrices; the last two axes are the matrix."""
     return wp.array(array, dtype=wp.mat33d, device=DEVICE, copy=False)
+
+
+def launch(kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+    """Run a kernel with ``count`` threads; none = nothing happens."""
+    wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=DEVICE)

@@ -113,37 +113,6 @@ def press_path(
     return _straight_path(indenter, target, direction, surface, depth_m, steps, clearance_m)[0]
 
 
-def normal_path(
-    indenter: Indenter,
-    target: ArrayLike,
-    normal: ArrayLike,
-    surface: OuterSurface,
-    *,
-    depth_m: float = NORMAL_DEPTH_M,
-    steps: int = STEPS,
-) -> Floats:
-    """`press_path` against the outward normal of the skin."""
-    return press_path(
-        indenter, target, -unit(normal, "normal"), surface, depth_m=depth_m, steps=steps
-    )
-
-
-def angled_path(
-    indenter: Indenter,
-    target: ArrayLike,
-    normal: ArrayLike,
-    surface: OuterSurface,
-    *,
-    azimuth_rad: float,
-    angle_rad: float = ANGLE_RAD,
-    depth_m: float = ANGLED_DEPTH_M,
-    steps: int = STEPS,
-) -> Floats:
-    """`press_path` at an angle to the inward normal; see `angled_direction`."""
-    direction = angled_direction(normal, angle_rad, azimuth_rad)
-    return press_path(indenter, target, direction, surface, depth_m=depth_m, steps=steps)
-
-
 def angled_direction(normal: ArrayLike, angle_rad: float, azimuth_rad: float) -> Floats:
     """Direction at an angle to the inward normal, shape (3,), sensor frame.
 

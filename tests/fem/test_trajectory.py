@@ -16,12 +16,12 @@ from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import check_path
 from palpate_fem.trajectory import (
     ANGLE_RAD,
+    ANGLED_DEPTH_M,
     CLEARANCE_M,
+    NORMAL_DEPTH_M,
     Campaign,
     Region,
     angled_direction,
-    angled_path,
-    normal_path,
     press_path,
     sample_targets,
 )
@@ -56,7 +56,7 @@ FINGER = make_finger()
 
 def test_a_normal_path_starts_clear_and_goes_in_by_equal_steps_from_contact() -> None:
     target = np.array([-7.3e-3, 0.0, -8.3e-3])
-    path = normal_path(make_indenter("sphere_medium"), target, PAD, FINGER)
+    path = press_path(make_indenter("sphere_medium"), target, -PAD, FINGER, depth_m=NORMAL_DEPTH_M)
     assert path.shape == (21, 7)
     np.testing.assert_array_equal(path, check_path(path))
     np.testing.assert_allclose(path[:, :2], np.broadcast_to(target[:2], (21, 2)), atol=1e-18)
@@ -69,8 +69,9 @@ def test_a_normal_path_starts_clear_and_goes_in_by_equal_steps_from_contact() ->
 @pytest.mark.parametrize("azimuth", range(4))
 def test_an_angled_path_moves_at_30_degrees_and_faces_there(azimuth: int) -> None:
     target = np.array([-7.3e-3, 0.0, -8.3e-3])
-    path = angled_path(
-        make_indenter("sphere_medium"), target, PAD, FINGER, azimuth_rad=azimuth * math.pi / 2
+    direction = angled_direction(PAD, ANGLE_RAD, azimuth * math.pi / 2)
+    path = press_path(
+        make_indenter("sphere_medium"), target, direction, FINGER, depth_m=ANGLED_DEPTH_M
     )
     way = path[-1, :3] - path[1, :3]
     assert np.linalg.norm(path[-1, :3] - path[0, :3]) == pytest.approx(1.5e-3 + CLEARANCE_M)
@@ -110,7 +111,7 @@ def test_what_makes_no_path_is_refused(change: dict[str, object], problem: str) 
 
 def test_a_path_beside_the_finger_is_refused() -> None:
     with pytest.raises(SimulationError, match="passes the fingertip"):
-        normal_path(make_indenter("sphere_small"), [0.0, 0.03, 0.0], PAD, FINGER)
+        press_path(make_indenter("sphere_small"), [0.0, 0.03, 0.0], -PAD, FINGER, depth_m=3e-3)
 
 
 def test_targets_lie_on_the_region_with_outward_normals() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from palpate_fem.arrays import Floats
-from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
+from palpate_fem.device import launch, mat33s, scalars, vec3s
 from palpate_fem.indenter.kernels import indenter_distance
 from palpate_fem.indenter.shape import Indenter
 
@@ -36,12 +36,11 @@ def distances(
 def _evaluate(indenter: Indenter, points: Floats, sloped: int) -> tuple[Floats, Floats, Floats]:
     points = np.ascontiguousarray(points, np.float64)
     gap, normal, hessian = np.empty(len(points)), np.empty((sloped, 3)), np.empty((sloped, 3, 3))
-    wp.launch(
+    launch(
         distances,
-        dim=len(points),
-        inputs=[scalars(indenter.packed()), vec3s(points)],
-        outputs=[scalars(gap), vec3s(normal), mat33s(hessian)],
-        device=DEVICE,
+        len(points),
+        [scalars(indenter.packed()), vec3s(points)],
+        [scalars(gap), vec3s(normal), mat33s(hessian)],
     )
     return gap, normal, hessian
 

@@ -13,7 +13,7 @@ import warp as wp
 
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.device import DEVICE, scalars, vec3s
+from palpate_fem.device import DEVICE, launch, scalars, vec3s
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels
 from palpate_fem.mechanics.contact_kernels import ContactLaw
@@ -152,23 +152,20 @@ class ContactSurface:
 
     def add_tangent(self, blocks: wp.array) -> None:
         """Add the symmetric tangents of the touching points."""
-        if self.count:
-            wp.launch(
-                contact_kernels.point_tangent,
-                dim=self.count,
-                inputs=[self.shape, self.pairs, self.status, self.tangent],
-                outputs=[blocks],
-                device=DEVICE,
-            )
+        launch(
+            contact_kernels.point_tangent,
+            self.count,
+            [self.shape, self.pairs, self.status, self.tangent],
+            [blocks],
+        )
 
     def add_unsymmetric_product(self, change: wp.array, product: wp.array) -> None:
         """Add the frozen unsymmetric share of the tangent times a change of the nodes."""
-        wp.launch(
+        launch(
             contact_kernels.unsymmetric_product,
-            dim=len(self._sliding),
-            inputs=[self.faces, self.shape, self._sliding, self._frozen[3]],
-            outputs=[change, product],
-            device=DEVICE,
+            len(self._sliding),
+            [self.faces, self.shape, self._sliding, self._frozen[3]],
+            [change, product],
         )
 
     @property
@@ -204,35 +201,26 @@ class ContactSurface:
         """Pressures (F, Q) and tractions (F, Q, 3) after a change of the nodal positions [Pa]."""
         pressure = np.zeros(self.area_values.shape)
         traction = np.zeros((*pressure.shape, 3))
-        if self.count:
-            wp.launch(
-                contact_kernels.pressure_update,
-                dim=self.count,
-                inputs=[
-                    self.faces,
-                    self.shape,
-                    self.status,
-                    self.wanted_array,
-                    self._frozen[0],
-                    self.wanted_traction_array,
-                    self._frozen[1],
-                    moved,
-                ],
-                outputs=[scalars(pressure), vec3s(traction)],
-                device=DEVICE,
-            )
+        launch(
+            contact_kernels.pressure_update,
+            self.count,
+            [
+                self.faces,
+                self.shape,
+                self.status,
+                self.wanted_array,
+                self._frozen[0],
+                self.wanted_traction_array,
+                self._frozen[1],
+                moved,
+            ],
+            [scalars(pressure), vec3s(traction)],
+        )
         return pressure, traction
 
     def subtract_load(self, load: wp.array, force: wp.array) -> None:
         """Subtract a load at the points (F, Q) from nodal forces."""
-        if self.count:
-            wp.launch(
-                contact_kernels.subtract_load,
-                dim=self.count,
-                inputs=[self.faces, self.shape, load],
-                outputs=[force],
-                device=DEVICE,
-            )
+        launch(contact_kernels.subtract_load, self.count, [self.faces, self.shape, load], [force])
 
     def points_at(self, position: Floats) -> Floats:
         """Positions of the contact points [m], (F, Q, 3)."""
@@ -267,10 +255,10 @@ class IndenterContact:
         if indenter is None or not surface.count:
             surface.clear()
             return
-        wp.launch(
+        launch(
             contact_kernels.indenter_contact,
-            dim=surface.count,
-            inputs=[
+            surface.count,
+            [
                 *surface.model,
                 indenter.primitives,
                 self.settings.law(indenter.friction),
@@ -282,7 +270,7 @@ class IndenterContact:
                 vec3s(state.traction),
                 vec3s(state.anchor),
             ],
-            outputs=[
+            [
                 *surface.results,
                 surface.wanted_traction_array,
                 surface.traction_slope,
@@ -290,7 +278,6 @@ class IndenterContact:
                 surface.unsymmetric,
                 self._force,
             ],
-            device=DEVICE,
         )
 
 
@@ -316,10 +303,10 @@ class CoreContact:
         if core is None or not surface.count:
             surface.clear()
             return
-        wp.launch(
+        launch(
             contact_kernels.core_contact,
-            dim=surface.count,
-            inputs=[
+            surface.count,
+            [
                 *surface.model,
                 self._table,
                 wp.vec3d(*core.origin),
@@ -331,6 +318,5 @@ class CoreContact:
                 position,
                 scalars(state.core_pressure),
             ],
-            outputs=[*surface.results, self._force],
-            device=DEVICE,
+            [*surface.results, self._force],
         )

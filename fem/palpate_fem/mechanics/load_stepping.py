@@ -125,16 +125,8 @@ class LoadStepping:
     ) -> None:
         """Prepare an indentation; see `Fingertip.indent`.
 
-        Args:
-            newton: Solver of the fingertip's equations.
-            settings: Force limit, smallest increment, prediction.
-            rest: Pressurised, untouched state; stays as it is.
-            cavity_m3: Volume inside the skin, which the sealed fluid keeps [m^3].
-            indenter: What presses.
-            path: Poses (K, 7); the first does not touch the skin.
-            friction: Coulomb coefficient between indenter and skin.
-            on_step: Called with each converged step.
-            should_stop: Called at least once in each iteration; an outcome ends the indentation.
+        ``rest`` is the pressurised, untouched state, which stays as it is. The sealed fluid keeps
+        the volume ``cavity_m3`` inside the skin [m^3].
         """
         self.newton, self.settings, self.rest = newton, settings, rest
         self.cavity_m3, self.path = cavity_m3, np.asarray(path, np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
+from palpate_fem.device import DEVICE, launch, mat33s, scalars, vec3s
 from palpate_fem.mechanics import element_kernels
 from palpate_fem.mechanics.contact import ContactSurface
 from palpate_fem.mechanics.reference_element import rest_gradients, volume_form
@@ -25,14 +25,9 @@ class SkinElements:
         bulk_ratio: float,
         volume_barrier: float,
     ) -> None:
-        """Prepare the elements.
+        """Prepare the elements; see `EquilibriumSystem`.
 
-        Args:
-            mesh: The skin.
-            pairs: Block of each node pair of each element in the tangent, (E, n, n).
-            shear_modulus_pa: Neo-Hookean modulus [Pa].
-            bulk_ratio: Bulk over shear modulus.
-            volume_barrier: See `energy_density`.
+        ``pairs`` are the blocks of the node pairs of each element in the tangent, (E, n, n).
         """
         self.mu, self.volume_barrier = shear_modulus_pa, volume_barrier
         self.gradient_values, self.weight_values = rest_gradients(mesh)
@@ -55,29 +50,27 @@ class SkinElements:
         self, first: int, count: int, position: wp.array, pressure: wp.array, force: wp.array
     ) -> None:
         """Add the internal nodal forces of a range of elements."""
-        wp.launch(
+        launch(
             element_kernels.element_state,
-            dim=count,
-            inputs=[*self._model, first, position, pressure],
-            outputs=[self._volume, self._jacobian, self._volume_gradient, force],
-            device=DEVICE,
+            count,
+            [*self._model, first, position, pressure],
+            [self._volume, self._jacobian, self._volume_gradient, force],
         )
 
     def add_tangent(
         self, first: int, count: int, position: wp.array, pressure: wp.array, blocks: wp.array
     ) -> None:
         """Add the tangent of a range of elements; `add_forces` comes first, at the same state."""
-        wp.launch(
+        launch(
             element_kernels.point_state,
-            dim=count,
-            inputs=[*self._model, first, position, pressure],
-            outputs=self._parts,
-            device=DEVICE,
+            count,
+            [*self._model, first, position, pressure],
+            self._parts,
         )
-        wp.launch(
+        launch(
             element_kernels.element_tangent,
-            dim=count,
-            inputs=[
+            count,
+            [
                 self._pairs,
                 self._gradient,
                 self._bulk_over_volume,
@@ -85,8 +78,7 @@ class SkinElements:
                 *self._parts,
                 self._volume_gradient,
             ],
-            outputs=[blocks],
-            device=DEVICE,
+            [blocks],
         )
 
     def freeze(self) -> None:
@@ -96,34 +88,31 @@ class SkinElements:
     def updated_pressure(self, moved: wp.array) -> Floats:
         """Element pressures after a change of the nodes, to first order [Pa], (E,)."""
         pressure = np.zeros(self.count)
-        wp.launch(
+        launch(
             element_kernels.pressure_update,
-            dim=self.count,
-            inputs=[*self._condensed, moved],
-            outputs=[scalars(pressure)],
-            device=DEVICE,
+            self.count,
+            [*self._condensed, moved],
+            [scalars(pressure)],
         )
         return pressure
 
     def add_misfit(self, pressure: Floats, force: wp.array) -> None:
         """Add the load on the nodes by static condensation of the element pressures."""
-        wp.launch(
+        launch(
             element_kernels.pressure_misfit,
-            dim=self.count,
-            inputs=[*self._condensed, scalars(pressure)],
-            outputs=[force],
-            device=DEVICE,
+            self.count,
+            [*self._condensed, scalars(pressure)],
+            [force],
         )
 
     def stress(self, position: Floats, pressure: Floats) -> Floats:
         """Cauchy stress, mean over each element [Pa], (E, 3, 3)."""
         stress = np.zeros((self.count, 3, 3))
-        wp.launch(
+        launch(
             element_kernels.element_stress,
-            dim=self.count,
-            inputs=[*self._model, 0, vec3s(position), scalars(pressure)],
-            outputs=[mat33s(stress)],
-            device=DEVICE,
+            self.count,
+            [*self._model, 0, vec3s(position), scalars(pressure)],
+            [mat33s(stress)],
         )
         return stress
 
@@ -173,23 +162,19 @@ class FluidCavity:
         """Evaluate the volume and its gradient by the nodal positions."""
         self.gradient[:] = 0.0
         surface = self.surface
-        if surface.count:
-            wp.launch(
-                element_kernels.cavity_volume,
-                dim=surface.count,
-                inputs=[surface.faces, self._form, position],
-                outputs=[self._volumes, self._gradient],
-                device=DEVICE,
-            )
+        launch(
+            element_kernels.cavity_volume,
+            surface.count,
+            [surface.faces, self._form, position],
+            [self._volumes, self._gradient],
+        )
 
     def add_tangent(self, position: wp.array, pressure: float, blocks: wp.array) -> None:
         """Add the tangent of a fluid pressure [Pa], a follower load."""
         surface = self.surface
-        if surface.count:
-            wp.launch(
-                element_kernels.cavity_tangent,
-                dim=surface.count,
-                inputs=[surface.faces, self._form, surface.pairs, wp.float64(-pressure), position],
-                outputs=[blocks],
-                device=DEVICE,
-            )
+        launch(
+            element_kernels.cavity_tangent,
+            surface.count,
+            [surface.faces, self._form, surface.pairs, wp.float64(-pressure), position],
+            [blocks],
+        )

@@ -77,29 +77,25 @@ class DistanceGrid:
         last = np.array(self.coefficients.shape) - 2.0
         inside = np.clip(grid, 1.0, last)
         cell = np.minimum(np.floor(inside), last - 1).astype(np.int64)
-        value, slope, curvature = _weights(inside - cell)  # each (N, 3, 4)
+        weights = _weights(inside - cell)  # by order of the derivative, each (N, 3, 4)
         near = cell[:, :, None] + np.arange(-1, 3)
         block = self.coefficients[
             near[:, 0, :, None, None], near[:, 1, None, :, None], near[:, 2, None, None, :]
         ]
 
-        def contract(x: Floats, y: Floats, z: Floats) -> Floats:
-            return np.asarray(
-                np.einsum("nijk,ni,nj,nk->n", block, x[:, 0], y[:, 1], z[:, 2], optimize=True)
-            )
+        def derivative(x: int, y: int, z: int) -> Floats:
+            """Derivative of these orders along the axes, per cell."""
+            along = weights[x][:, 0], weights[y][:, 1], weights[z][:, 2]
+            return np.asarray(np.einsum("nijk,ni,nj,nk->n", block, *along, optimize=True))
 
-        distance = contract(value, value, value)
-        x = contract(slope, value, value)
-        y = contract(value, slope, value)
-        z = contract(value, value, slope)
-        gradient = np.stack([x, y, z], axis=1) / self.spacing
-        xx = contract(curvature, value, value)
-        yy = contract(value, curvature, value)
-        zz = contract(value, value, curvature)
-        yz = contract(value, slope, slope)
-        xz = contract(slope, value, slope)
-        xy = contract(slope, slope, value)
-        hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1) / self.spacing**2
+        distance = derivative(0, 0, 0)
+        axes = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+        gradient = np.stack([derivative(*axis) for axis in axes], axis=1) / self.spacing
+        upper = {
+            (i, j): derivative(*np.add(axes[i], axes[j])) for i in range(3) for j in range(i, 3)
+        }
+        second = [upper[min(i, j), max(i, j)] for i in range(3) for j in range(3)]
+        hessian = np.stack(second, axis=1) / self.spacing**2
         # Outside the grid: extrapolated by the distance to it, see above.
         away = np.linalg.norm(grid - inside, axis=1) * self.spacing
         hessian[away > 0] = 0.0

@@ -102,14 +102,7 @@ class VerificationBody:
     ) -> None:
         """Prepare the equations of a solid at rest.
 
-        Args:
-            mesh: The solid.
-            held: Prescribed components (V, 3); None = the mesh's fixed nodes.
-            core: Distance to a rigid core inside; None = no core.
-            mu: Shear modulus [Pa].
-            bulk_ratio: Bulk over shear modulus.
-            contact: Constants of the contact laws.
-            settings: Tolerances of an increment.
+        ``held`` are prescribed components (V, 3); None = the mesh's fixed nodes.
         """
         self.mesh, self.mu, self.bulk = mesh, mu, bulk_ratio * mu
         self.contact = contact or ContactSettings()
