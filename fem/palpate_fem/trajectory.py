@@ -11,8 +11,6 @@ leaves the following open; we chose:
   touches far from the point it aims at, as the paper reports;
 * a path starts just clear of the skin, not 3 mm away, and its 20 steps are equal parts of the depth
   from first contact on, the displacements to which the paper resamples.
-
-A point of the pad by where it lies along and across the finger.
 """
 
 from __future__ import annotations

@@ -116,26 +116,17 @@ class ContactSurface:
         self.tangent = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
         self.coupled = wp.zeros(size, dtype=wp.vec3d, device=DEVICE)
         self.unsymmetric = wp.zeros(size, dtype=wp.mat33d, device=DEVICE)
+        # First arguments and first outputs of each contact kernel; further ones of friction.
+        self.model = [self.faces, self.shape, self.area]
+        self.results = [
+            self.status, self.gap_array, self.wanted_array, self.slope, self.misfit, self.tangent,
+        ]  # fmt: skip
+        self.of_friction = [
+            self.wanted_traction_array, self.traction_slope, self.coupled, self.unsymmetric,
+        ]  # fmt: skip
         self._freezing = (self.slope, self.traction_slope, self.status, self.unsymmetric)
         self._frozen = [wp.clone(array) for array in self._freezing]
         self._sliding = wp.zeros(0, dtype=wp.int32, device=DEVICE)
-
-    @property
-    def model(self) -> list[wp.array]:
-        """First arguments of each contact kernel."""
-        return [self.faces, self.shape, self.area]
-
-    @property
-    def results(self) -> list[wp.array]:
-        """First outputs of each contact kernel."""
-        return [
-            self.status,
-            self.gap_array,
-            self.wanted_array,
-            self.slope,
-            self.misfit,
-            self.tangent,
-        ]
 
     def freeze(self) -> None:
         """Keep what belongs to the tangent that is being factorised."""
@@ -175,19 +166,9 @@ class ContactSurface:
 
     def clear(self) -> None:
         """Set the results of a surface that nothing is near to."""
-        self.gap[:] = np.inf
-        self._wanted[:] = 0.0
-        self._wanted_traction[:] = 0.0
-        for array in (
-            self.status,
-            self.slope,
-            self.traction_slope,
-            self.misfit,
-            self.tangent,
-            self.coupled,
-            self.unsymmetric,
-        ):
+        for array in (*self.results, *self.of_friction):
             array.zero_()
+        self.gap[:] = np.inf
 
     def pressure_misfit(self, pressure: Floats) -> float:
         """Largest difference between pressures and what the normal law demands [Pa]."""
@@ -272,10 +253,7 @@ class IndenterContact:
             ],
             [
                 *surface.results,
-                surface.wanted_traction_array,
-                surface.traction_slope,
-                surface.coupled,
-                surface.unsymmetric,
+                *surface.of_friction,
                 self._force,
             ],
         )

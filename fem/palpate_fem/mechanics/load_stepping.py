@@ -19,7 +19,6 @@ from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.material import VOLUME_BARRIER
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
-from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 
 CONTACT_SHARE = 1e-3
@@ -297,24 +296,18 @@ class LoadStepping:
             contact_area_m2=float(surface.current_area(state.position)[touching].sum()),
             centre_of_pressure=centre,
             stress=stress.reshape(-1, 9)[:, VOIGT],
-            convergence=_convergence(system, balance, self.cavity_m3, cost),
+            convergence=Convergence(
+                increments=cost.increments,
+                iterations=cost.iterations,
+                factorisations=cost.factorisations,
+                residual=balance.residual,
+                volume_error=abs(balance.volume - self.cavity_m3) / self.cavity_m3,
+                penetration_m=max(0.0, -float(surface.gap.min()), -float(system.inner.gap.min())),
+                seconds=time.perf_counter() - cost.started,
+            ),
         )
 
 
 def _force(balance: ForceBalance) -> float:
     """Size of the net force on the indenter [N]."""
     return float(np.linalg.norm(balance.indenter.sum(axis=0)))
-
-
-def _convergence(
-    system: EquilibriumSystem, balance: ForceBalance, cavity_m3: float, cost: _StepCost
-) -> Convergence:
-    return Convergence(
-        increments=cost.increments,
-        iterations=cost.iterations,
-        factorisations=cost.factorisations,
-        residual=balance.residual,
-        volume_error=abs(balance.volume - cavity_m3) / cavity_m3,
-        penetration_m=max(0.0, -float(system.outer.gap.min()), -float(system.inner.gap.min())),
-        seconds=time.perf_counter() - cost.started,
-    )

@@ -133,6 +133,7 @@ class NewtonSolver:
         self._border: tuple[Floats, Floats] | None = None
         self._has_elastic = False  # whether the tangent of skin and fluid was ever evaluated
 
+    @one_thread()
     def solve(
         self,
         state: SolutionState,
@@ -153,17 +154,6 @@ class NewtonSolver:
                 where the active set of plain Newton iterations cycles.
         """
         continuation = PseudoTransient() if pseudo_transient else None
-        with one_thread():
-            return self._iterate(state, indenter, volume, should_stop, continuation)
-
-    def _iterate(
-        self,
-        state: SolutionState,
-        indenter: PosedIndenter | None,
-        volume: float | None,
-        should_stop: Callable[[], bool] | None,
-        continuation: PseudoTransient | None,
-    ) -> tuple[NewtonReport, ForceBalance]:
         settings, system, report = self.settings, self.system, NewtonReport()
         balance = system.balance(state, indenter)
         fits, elastic = False, not (self._has_elastic and settings.keep_elastic)

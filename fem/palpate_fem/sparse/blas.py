@@ -7,8 +7,8 @@ addresses that ``scipy.linalg.cython_blas`` publishes for compiled code.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,15 @@ Array = NDArray[Any]
 _LIBRARIES = ThreadpoolController()
 
 
-def one_thread() -> AbstractContextManager[object]:
+@contextmanager
+def one_thread() -> Iterator[None]:
     """Keep BLAS, NumPy's too, on the calling thread.
 
     Its own threads would compete with the two that work on the halves of the tree, and starting
     them takes longer than our short vectors do.
     """
-    return _LIBRARIES.limit(limits=1, user_api="blas")  # type: ignore[no-any-return]
+    with _LIBRARIES.limit(limits=1, user_api="blas"):
+        yield
 
 
 _get_name = ctypes.pythonapi.PyCapsule_GetName
