@@ -63,15 +63,13 @@ class HandResult:
         lost: Frames missing by sequence numbers or by the devices' own counts, or with invalid
             channels.
         counters: The gateway's counters of losses that are not zero.
-        publish_p50_s: Median time from a reading in the gateway to its message on the bus: the
-            largest over sensors and the tenths of the run [s].
-        publish_p99_s: 99th percentile, likewise [s].
-        p50_s: Median time from the last sample of an electrode frame to the client [s].
-        p99_s: 99th percentile [s].
+        publish_p50_s: Time from a reading in the gateway to its message on the bus, with
+            ``publish_p99_s``: the largest over sensors and the tenths of the run [s].
+        p50_s: Time from the last sample of an electrode frame to the client, with ``p99_s`` [s].
         wrench_p99_s: The same of the wrenches [s].
         floor_core: Share of one core that the bare reader used.
-        floor_p50_s: Median time from the kernel's stamp of a slot to the bare reader [s].
-        floor_p99_s: 99th percentile [s].
+        floor_p50_s: Time from the kernel's stamp of a slot to the bare reader, with
+            ``floor_p99_s`` [s].
     """
 
     seconds: float

@@ -255,10 +255,7 @@ def measure(
     *,
     as_json: bool,
 ) -> int:
-    """Print the rate of a topic until ``seconds`` have passed (0 = Ctrl-C).
-
-    Returns:
-        0, or 1 if no message came.
+    """Print the rate of a topic until ``seconds`` have passed (0 = Ctrl-C); 1 if no message came.
 
     Raises:
         ConfigError: There is no such topic.
@@ -296,11 +293,7 @@ def measure(
 def print_rates(topic: Topic[object], rates: dict[str, StreamRate]) -> None:
     """Print one line for each source."""
     if not rates:
-        print(
-            f"no {topic.name} came; see what runs: palpate status",
-            file=sys.stderr,
-            flush=True,
-        )
+        print(f"no {topic.name} came; see what runs: palpate status", file=sys.stderr, flush=True)
     for source, rate in sorted(rates.items()):
         numbers = rate.summary()
         if numbers["rate_hz"] is None:

@@ -89,11 +89,6 @@ class Supervisor:
         return self.folder / "logs"
 
     @property
-    def pid(self) -> int:
-        """Process id of supervisord."""
-        return self._process.pid
-
-    @property
     def running(self) -> bool:
         """Whether supervisord itself runs."""
         return self._process.poll() is None

@@ -98,11 +98,10 @@ def _print_changes(
 
 def _finished(supervisor: Supervisor, processes: list[ProcessState]) -> int | None:
     """Exit status of a gateway that has come to the end of its recording; None otherwise."""
-    if not supervisor.profile.gateway.exit_at_end:
-        return None
-    for process in processes:
-        if process.service == "gateway" and process.state == "EXITED":
-            return process.exit_status
+    if supervisor.profile.gateway.exit_at_end:
+        for process in processes:
+            if process.service == "gateway" and process.state == "EXITED":
+                return process.exit_status
     return None
 
 

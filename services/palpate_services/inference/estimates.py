@@ -90,15 +90,10 @@ def tared_counts(frame: ElectrodeFrame, tare: Tare) -> FloatArray:
 def estimate(
     frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
 ) -> FeatureEstimate | EstimateRefusal:
-    """Estimate the features of one frame.
+    """Estimate the features of one frame, or say why there is no estimate; never from bad input.
 
-    Args:
-        frame: Raw counts of one sampling round.
-        tare: The tare that ``frame.tare_id`` names; None if it is not known.
-        runtime: A loaded bundle of the task ``features``.
-
-    Returns:
-        The estimate, or why there is none. Never an estimate from bad input.
+    ``tare`` is the one that ``frame.tare_id`` names, None if it is not known; ``runtime`` is a
+    bundle of the task ``features``.
     """
     outputs = _run_on_electrodes(frame, tare, runtime)
     if isinstance(outputs, EstimateRefusal):
