@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from palpate.errors import DatasetError, SimulationError
-from palpate_fem.calibration.alignment import AlignmentError, Floats
+from palpate_fem.calibration.alignment import AlignmentError, Floats, rms_n
 from palpate_fem.calibration.local import LocalModel, estimates, minimise
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.point import (
@@ -29,7 +29,7 @@ from palpate_fem.calibration.point import (
     failures_at,
     fit_modulus,
 )
-from palpate_fem.calibration.result import Calibration, Evaluation, axis_rms, trajectory_fits
+from palpate_fem.calibration.result import Calibration, Evaluation, TrajectoryFit, axis_rms
 from palpate_fem.calibration.runs import SimulatedRun, SimulationRuns, Simulator
 from palpate_fem.calibration.settings import (
     FRICTION,
@@ -283,8 +283,18 @@ class _Search:
             cost=fit.cost,
             axis_rms_n=axis_rms(fit.pairs),
             paper_axis_rms_n=axis_rms(paper_pairs),
-            trajectories=trajectory_fits(
-                [case.item for case in self.cases], fit.pairs, paper_pairs
+            trajectories=tuple(
+                TrajectoryFit(
+                    case.item.name,
+                    case.item.indenter,
+                    case.item.sensor,
+                    rms_n(pair),
+                    rms_n(paper_pair),
+                    pair.depth_offset_m,
+                    pair.coverage,
+                    pair,
+                )
+                for case, pair, paper_pair in zip(self.cases, fit.pairs, paper_pairs, strict=True)
             ),
             history=tuple(self.history),
             simulations=self.runs.count,

@@ -13,9 +13,8 @@ import numpy as np
 
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate_fem.calibration.alignment import AlignedCurves, axis_rms_n, rms_n
+from palpate_fem.calibration.alignment import AlignedCurves, axis_rms_n
 from palpate_fem.calibration.local import ParameterEstimate
-from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.config import FingertipParameters
 
 SCHEMA = "palpate.calibration"
@@ -139,27 +138,6 @@ def axis_rms(pairs: Sequence[AlignedCurves]) -> tuple[float, ...]:
     return tuple(axis_rms_n(pairs).tolist()) if pairs else (math.nan,) * 3
 
 
-def trajectory_fits(
-    items: Sequence[MeasuredIndentation],
-    pairs: Sequence[AlignedCurves],
-    paper_pairs: Sequence[AlignedCurves],
-) -> tuple[TrajectoryFit, ...]:
-    """Pair each compared trajectory with its curves."""
-    return tuple(
-        TrajectoryFit(
-            item.name,
-            item.indenter,
-            item.sensor,
-            rms_n(pair),
-            rms_n(paper_pair),
-            pair.depth_offset_m,
-            pair.coverage,
-            pair,
-        )
-        for item, pair, paper_pair in zip(items, pairs, paper_pairs, strict=True)
-    )
-
-
 def write_json(path: Path, content: object) -> None:
     """Write JSON with null for NaN and infinity; the file appears complete or not at all.
 
@@ -167,14 +145,17 @@ def write_json(path: Path, content: object) -> None:
         DatasetError: The disk refused.
     """
     with written_whole(path) as partial:
-        partial.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n", "utf-8")
+        partial.write_text(
+            json.dumps(without_nan(content), indent=1, allow_nan=False) + "\n", "utf-8"
+        )
 
 
-def _plain(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """A value for JSON: arrays as lists, None for NaN and infinity."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
+        return [without_nan(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

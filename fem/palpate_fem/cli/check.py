@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from palpate.errors import ConfigError
+from palpate_fem.calibration.result import without_nan
 from palpate_fem.cli.terminal import print_table, progress_bar
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as
     if not checks:
         raise ConfigError(f"no check has {only!r} in its name", remedy="leave out --only")
     if as_json:
-        typer.echo(json.dumps([_plain(check) for check in checks], indent=1))
+        typer.echo(json.dumps(without_nan([asdict(check) for check in checks]), indent=1))
     else:
         _show_checks(checks)
     return 0 if all(check.passed for check in checks) else 1
@@ -111,14 +111,6 @@ def _verdict(check: VerificationCheck) -> str:
     if check.skipped:
         return "[yellow]skipped[/]"
     return "[green]ok[/]" if check.passed else "[red]FAILED[/]"
-
-
-def _plain(check: VerificationCheck) -> dict[str, object]:
-    """For JSON, which has neither NaN nor infinity."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in asdict(check).items()
-    }
 
 
 def study_command(what: str, *, png: Path | None, as_json: bool) -> int:

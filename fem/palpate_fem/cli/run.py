@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 import typer
@@ -21,6 +22,7 @@ from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
 from palpate.process import typed_command
+from palpate_fem.calibration.result import without_nan
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import (
@@ -53,7 +55,9 @@ GOOD = ("complete", "force limit")
 
 EXPORT_SUFFIX = ".h5"
 _ROUTER_WAIT_S = 5.0
-_COLUMNS = ("pose", "force", "torque", "centre_of_pressure")
+_COLUMNS = (
+    "pose", "force", "torque", "centre_of_pressure", "fluid_pressure_pa", "contact_area_m2",
+)  # fmt: skip
 _SHOWN_EARLY = 40
 
 
@@ -393,19 +397,10 @@ def write_json(
     typer.echo(json.dumps(content, indent=1, allow_nan=False))
 
 
-def _step_json(step: IndentationStep) -> dict[str, object]:
-    """A step without its fields; None for NaN, which JSON does not have."""
-    return {
-        **{
-            name: [
-                value if math.isfinite(value) else None for value in getattr(step, name).tolist()
-            ]
-            for name in _COLUMNS
-        },
-        "fluid_pressure_pa": step.fluid_pressure_pa,
-        "contact_area_m2": step.contact_area_m2,
-        "convergence": asdict(step.convergence),
-    }
+def _step_json(step: IndentationStep) -> Any:
+    """A step without its fields."""
+    values = {name: getattr(step, name) for name in _COLUMNS}
+    return without_nan({**values, "convergence": asdict(step.convergence)})
 
 
 def _draw(

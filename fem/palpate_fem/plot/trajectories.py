@@ -124,13 +124,11 @@ def plot_overview(
     return outcomes
 
 
-def _peak(summary: TrajectorySummary) -> float:
-    return float(np.linalg.norm(summary.force, axis=1).max(initial=0.0))
-
-
 def _draw_range(axes: Any, names: list[str], groups: dict[str, list[TrajectorySummary]]) -> None:
     for row, name in enumerate(names):
-        peaks = np.array([_peak(summary) for summary in groups[name]])
+        peaks = np.array(
+            [np.linalg.norm(one.force, axis=1).max(initial=0.0) for one in groups[name]]
+        )
         axes.plot([peaks.min(), peaks.max()], [row, row], color="#b9bec7", lw=5, zorder=1)
         axes.plot(np.median(peaks), row, "|", color=INK, ms=14, mew=2, zorder=3)
         # Spread a little, so that equal forces do not cover each other.

@@ -51,7 +51,7 @@ def plot_calibration(result: Calibration, path: Path) -> None:
         for axis, panel in enumerate(row):
             _axis_panel(panel, fits, axis)
             label(panel, below, "", f"F{AXES[axis]} [N]" if at == 0 else "")
-        row[0].set_ylabel(_broken(name), color=INK, fontsize=8)
+        row[0].set_ylabel(name.replace("/", "\n"), color=INK, fontsize=8)
     panels[0][0].legend(frameon=False, fontsize=8)
     save(figure, path)
 
@@ -191,11 +191,6 @@ def _parameters(result: Calibration) -> str:
         f" friction {found.friction_coefficient:.3f},"
         f" fluid {result.fluid_volume_m3 * 1e9:.0f} mm³; RMS {rms:.3f} N"
     )
-
-
-def _broken(name: str) -> str:
-    """A trajectory's id over several lines."""
-    return name.replace("/", "\n")
 
 
 COLOURS = ("#2f6fb5", "#d1495b", "#2e8b57", "#e09f3e")

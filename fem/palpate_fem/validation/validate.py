@@ -11,7 +11,6 @@ table and figure says so.
 from __future__ import annotations
 
 import csv
-import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -349,9 +348,5 @@ def as_json(validation: Validation) -> dict[str, object]:
 
 
 def _write_csv(path: Path, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(headings)
-    writer.writerows(rows)
-    with written_whole(path) as partial:
-        partial.write_text(text.getvalue(), "utf-8")
+    with written_whole(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([headings, *rows])
