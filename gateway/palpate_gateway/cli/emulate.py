@@ -33,14 +33,7 @@ RDT_PRODUCTS = ("ati_net_ft", "ati_axia", "schunk_ftn", "onrobot_hex")
 
 @dataclass(frozen=True, slots=True)
 class EmulateCommand:
-    """One command.
-
-    Attributes:
-        help: Its help.
-        options: Its options, in the order of its help.
-        examples: Two lines for the end of its help.
-        faults: Remark on its faults.
-    """
+    """One command: help, options in their order, two lines of examples, a remark on its faults."""
 
     help: str
     options: tuple[Parameter, ...]

@@ -50,15 +50,8 @@ class EmulatedDevice(NamedTuple):
 class EmulatedScene:
     """What the emulated devices measure.
 
-    Its methods raise ``ConfigError`` if the twin has no such specimen or trajectory.
-
-    Attributes:
-        play: ``twin``, ``idle`` (no load), or ``press``: a slow one without physics.
-        seed: Seed of the twin's first finger.
-        trajectory: Ids of the twin's trajectories; None = all.
-        epoch: When the twin's loops begin [s since 1970].
-        unit: Specimen of the twin, by name or number; "" = another for each seed.
-        finger: The finger that a wrench sensor or a robot belongs to, from 1.
+    Its attributes are options of the commands. Its methods raise ``ConfigError`` if the twin has no
+    such specimen or trajectory.
     """
 
     play: str
@@ -84,7 +77,7 @@ class EmulatedScene:
             return no_load if self.play == "idle" else slow_press
         from palpate_gateway.emulators.twin import TwinWrench
 
-        return TwinWrench(self._loop(self.finger - 1), self.epoch)
+        return TwinWrench(self._loop(self.finger - 1).wrench, self.epoch)
 
     def tip(self) -> tuple[TipSource, str]:
         """The pose of the indenter on the finger, and the name of the first indenter."""

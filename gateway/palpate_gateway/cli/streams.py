@@ -142,9 +142,6 @@ class DeviceStream:
     """One kind of reading.
 
     Attributes:
-        first: The first reading.
-        last: The last reading.
-        readings: Number of readings.
         last_s: Time of the last reading, by the host's monotonic clock [s].
         shown_hz: Rate before the last ``restart`` [Hz]; None = not known.
     """

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,8 @@ UNTOUCHED_S = 2.0
 
 RATE_HZ = 100.0
 """Frames of a loop each second."""
+
+Row = TypeVar("Row")
 
 Progress = Callable[[float], None]
 """Takes the share of the work that is done."""
@@ -157,12 +160,6 @@ class _LoopPlayer(HostTimed):
         """Time since the epoch less the emulator's own time [s]."""
         return self._since_epoch_s + self.lead_s
 
-    def _between(self, t: float, frames: int) -> tuple[int, float]:
-        """The frame before time ``t`` [s], by the emulator's clock, and the share to the next."""
-        at = (t + self._ahead_s) % ((frames - 1) / RATE_HZ) * RATE_HZ
-        lower = min(int(at), frames - 2)
-        return lower, at - lower
-
 
 class TwinCounts(CountTrack, _LoopPlayer):
     """Counts of several fingers."""
@@ -185,32 +182,37 @@ class TwinCounts(CountTrack, _LoopPlayer):
         return np.where(dynamic, loop.pac[nearest], frame)
 
 
-class TwinWrench(_LoopPlayer):
-    """The wrench on one finger; a ``WrenchSource``."""
+class _LoopRows(_LoopPlayer, Generic[Row]):
+    """A source of one row for each frame of a loop, with the first row again at its end."""
 
-    def __init__(self, loop: TwinLoop, epoch_s: float = 0.0) -> None:
+    def __init__(self, rows: Sequence[Row], epoch_s: float = 0.0) -> None:
         super().__init__(epoch_s)
-        self._wrench = loop.wrench
+        self._rows = rows
+
+    def _around(self, t: float) -> tuple[Row, Row, float]:
+        """The rows before and after a time of the emulator's own [s], and the share of the way."""
+        frames = len(self._rows)
+        at = (t + self._ahead_s) % ((frames - 1) / RATE_HZ) * RATE_HZ
+        lower = min(int(at), frames - 2)
+        return self._rows[lower], self._rows[lower + 1], at - lower
+
+
+class TwinWrench(_LoopRows[Wrench]):
+    """The wrench on one finger; a ``WrenchSource``."""
 
     def __call__(self, t: float) -> Wrench:
         """The wrench at a time of the emulator's own [s]."""
-        lower, share = self._between(t, len(self._wrench))
-        a, b = self._wrench[lower], self._wrench[lower + 1]
+        a, b, share = self._around(t)
         mixed = [one + share * (other - one) for one, other in zip(a, b, strict=True)]
         return (mixed[0], mixed[1], mixed[2], mixed[3], mixed[4], mixed[5])
 
 
-class TwinTip(_LoopPlayer):
+class TwinTip(_LoopRows[Pose]):
     """The pose of the indenter on one finger, for an emulated robot; a ``TipSource``."""
-
-    def __init__(self, tips: Sequence[Pose], epoch_s: float = 0.0) -> None:
-        super().__init__(epoch_s)
-        self._tips = tips
 
     def __call__(self, t: float) -> Pose:
         """The pose in the sensor frame at a time of the emulator's own [s]."""
-        lower, share = self._between(t, len(self._tips))
-        a, b = self._tips[lower], self._tips[lower + 1]
+        a, b, share = self._around(t)
         ax, ay, az = a.position
         bx, by, bz = b.position
         position: Vector = (ax + share * (bx - ax), ay + share * (by - ay), az + share * (bz - az))

@@ -48,7 +48,7 @@ def test_the_same_seed_has_the_same_counts(loop: TwinLoop) -> None:
 
 def test_the_counts_are_those_of_the_virtual_finger(loop: TwinLoop) -> None:
     options = loop_options(seed=4).model_dump()
-    source, felt = TwinCounts([loop], begins_now()), TwinWrench(loop, begins_now())
+    source, felt = TwinCounts([loop], begins_now()), TwinWrench(loop.wrench, begins_now())
     frames, readings = 0, []
     with make_device("virtual", options) as finger:
         while got := finger.read(1.0):
@@ -86,7 +86,7 @@ def test_between_two_frames_it_runs_straight_and_after_the_last_anew(loop: TwinL
 def test_electrodes_and_wrench_are_of_one_instant_whatever_the_emulators_clocks(
     loop: TwinLoop,
 ) -> None:
-    source, felt = TwinCounts([loop]), TwinWrench(loop)
+    source, felt = TwinCounts([loop]), TwinWrench(loop.wrench)
     source.lead_s, felt.lead_s = 1000.0, -50.0
     now_s = time.monotonic()
     host_s = now_s + np.arange(0.0, loop.duration_s, 0.01)
@@ -106,7 +106,7 @@ def test_another_process_plays_the_same_scene(loop: TwinLoop) -> None:
     program = (
         "import json, sys, time\n"
         "from palpate_gateway.emulators.twin import TwinWrench, loop_options, make_loop\n"
-        "felt = TwinWrench(make_loop(loop_options(1, seed=3)))\n"
+        "felt = TwinWrench(make_loop(loop_options(1, seed=3)).wrench)\n"
         "ahead_s = time.time() - time.monotonic()\n"
         "print(json.dumps([felt(wall - ahead_s) for wall in json.loads(sys.argv[1])]))\n"
     )
@@ -118,14 +118,14 @@ def test_another_process_plays_the_same_scene(loop: TwinLoop) -> None:
         check=True,
     )
     ahead_s = time.time() - time.monotonic()
-    felt = TwinWrench(loop)
+    felt = TwinWrench(loop.wrench)
     here = [felt(wall - ahead_s) for wall in walls]
     assert any(any(one) for one in here)
     np.testing.assert_allclose(json.loads(ran.stdout), here, atol=0.02)
 
 
 def test_an_epoch_moves_the_scene(loop: TwinLoop) -> None:
-    here, later = TwinWrench(loop), TwinWrench(loop, 7.5)
+    here, later = TwinWrench(loop.wrench), TwinWrench(loop.wrench, 7.5)
     for t in np.arange(0.0, 20.0, 0.5).tolist():
         np.testing.assert_allclose(later(t + 7.5), here(t), atol=5e-3)
 
