@@ -79,12 +79,6 @@ def electrode_instants(frames: Sequence[ElectrodeFrame], clock: AlignmentClock) 
     return np.asarray(times_of(frames, clock)[:, None] + offsets)
 
 
-def frame_instants(frames: Sequence[ElectrodeFrame], clock: AlignmentClock) -> Times:
-    """Mean instant of each frame's electrodes [ns], int64, shape ``(N,)``."""
-    middles = np.array([sample_offsets(frame).middle_ns for frame in frames], np.int64)
-    return np.asarray(times_of(frames, clock) + middles)
-
-
 def linear(
     at_ns: Times, times_ns: Times, values: npt.ArrayLike, *, period_s: float | None = None
 ) -> tuple[Values, Known]:
@@ -115,18 +109,7 @@ def slerp(
 ) -> tuple[Values, Known]:
     """Orientations at other times, with constant speed along the shorter arc between neighbours.
 
-    Args:
-        at_ns: When [ns], of any shape.
-        times_ns: When they were taken [ns], shape ``(N,)``, in any order.
-        quaternions: Unit quaternions, shape ``(N, 4)``; either sign means the same.
-        period_s: Of the stream [s]; None = the median of its gaps.
-
-    Returns:
-        Unit quaternions of shape ``(*at_ns.shape, 4)``, NaN where unknown; and a mask of the known
-        ones.
-
-    Raises:
-        DatasetError: Times and quaternions have different lengths or wrong shapes.
+    Like ``linear``, of unit quaternions of shape ``(N, 4)``; either sign means the same.
     """
     around = _Around(at_ns, times_ns, quaternions, period_s)
     turned = rigid.slerp(around.before, around.after, around.share)
@@ -162,11 +145,9 @@ class _Around:
 
 
 def longest_gap_ns(times_ns: Times, period_s: float | None = None) -> float:
-    """How far apart two readings may be for a value between them [ns].
+    """How far apart two readings may be for a value between them [ns]; times in order.
 
-    Args:
-        times_ns: Of the stream, in order [ns].
-        period_s: Its period [s]; None = the median of its gaps.
+    The period of the stream [s] may be given; None = the median of its gaps.
     """
     if period_s is None:
         steps = np.diff(times_ns)

@@ -81,15 +81,12 @@ def quaternions_of(rotations: Floats) -> Floats:
 
 
 def facing(direction: ArrayLike) -> Floats:
-    """Quaternion of an indenter that presses along a direction, shape (4,).
+    """Quaternion of an indenter that presses along a direction (3,) of any length, shape (4,).
 
     An indenter presses along its own +z. The quaternion is the shortest turn from +z to the
     direction. It has no twist about +z, so an indenter that presses the pad keeps its x along the
     finger. For a direction of exactly -z, where all shortest turns are half turns, it turns about
     x.
-
-    Args:
-        direction: Where to press, shape (3,), of any length.
     """
     return shortest_turn(unit(direction))
 
@@ -109,12 +106,10 @@ def shortest_turn(direction: Floats) -> Floats:
 
 
 def slerp(first: Floats, second: Floats, share: ArrayLike) -> Floats:
-    """Unit quaternions between pairs, with constant speed along the shorter arc.
+    """Unit quaternions between pairs (..., 4), with constant speed along the shorter arc.
 
-    Args:
-        first: Unit quaternions, shape (..., 4); either sign means the same rotation.
-        second: Unit quaternions, shape (..., 4).
-        share: How far from the first to the second, 0 to 1, shape (...).
+    ``share`` says how far from the first to the second, 0 to 1, shape (...). Either sign of a
+    quaternion means the same rotation.
     """
     share = np.asarray(share, np.float64)[..., None]
     cosine = np.vecdot(first, second)[..., None]
@@ -134,12 +129,7 @@ def interpolate_pose(first: Floats, second: Floats, share: float) -> Floats:
 
 
 def to_local(pose: Floats, points: Floats) -> Floats:
-    """Points in the frame whose pose is given [m], shape (N, 3).
-
-    Args:
-        pose: Of that frame in the frame of the points, shape (7,).
-        points: Positions [m], shape (N, 3).
-    """
+    """Points (N, 3) in the frame whose pose (7,) in the frame of the points is given [m]."""
     return np.asarray((points - pose[:3]) @ rotation_matrices(pose[3:]))
 
 

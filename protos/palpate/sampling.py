@@ -20,13 +20,10 @@ Times = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class SampleTimes:
-    """Instants of one frame's channels, on the monotonic or the wall clock, or since its stamp.
+    """Instants of one frame's channels [ns], by the monotonic or wall clock, or since its stamp.
 
     Attributes:
         electrodes: Of E1, E2, ... [ns], int64, shape ``(E,)``.
-        pdc: [ns].
-        tac: [ns].
-        tdc: [ns].
         pac: In order of sampling [ns], int64, shape ``(P,)``.
     """
 
@@ -55,9 +52,7 @@ class SampleTimes:
 def slots_of(layout: FrameLayout, *, pac_first: bool = False) -> Times:
     """Slot of each channel in order of the validity bits, int64, shape ``(slots,)``.
 
-    Args:
-        layout: Of the sensor's type.
-        pac_first: The round begins with PAC instead of E1.
+    With ``pac_first`` the round begins with PAC instead of E1.
     """
     others = 2 * np.arange(layout.first_pac_bit) + pac_first
     pac = 2 * np.arange(layout.pac_samples) + (not pac_first)
@@ -75,10 +70,6 @@ def sample_offsets(frame: ElectrodeFrame, *, pac_first: bool = False) -> SampleT
 
     A polled frame has offsets of 0: when in its 10 ms each channel was polled is not known. So have
     the electrodes, PDC, TAC and TDC of a simulated one, which are computed for its stamp.
-
-    Args:
-        frame: Any.
-        pac_first: The round begins with PAC instead of E1.
     """
     layout = frame.sensor_type.layout
     offsets = slots_of(layout, pac_first=pac_first) * frame.slot_period_ns

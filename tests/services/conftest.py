@@ -167,9 +167,9 @@ def make_frame() -> Callable[..., ElectrodeFrame]:
         taken_ns = now_ns - round(age_s * 1e9) if monotonic_ns is None else monotonic_ns
         rng = np.random.default_rng(sequence)
         press = 300 * np.sin(sequence / 40) ** 2
-        shape = sensor_type.electrode_count
+        shape = sensor_type.layout.electrodes
         counts = BASELINE_COUNTS - press * np.linspace(0, 1, shape) + rng.normal(0, 1, shape)
-        everything = (1 << sensor_type.validity_bits) - 1
+        everything = (1 << sensor_type.layout.slots) - 1
         return ElectrodeFrame(
             Stamp(sequence, sequence, taken_ns, wall_ns, clock.CLOCK_ID, origin),
             "BT-TEST",
@@ -190,7 +190,7 @@ def make_frame() -> Callable[..., ElectrodeFrame]:
 @pytest.fixture
 def make_tare(make_frame: Callable[..., ElectrodeFrame]) -> Callable[..., Tare]:
     def make(tare_id: int = 5, *, sensor_type: SensorType = SensorType.BIOTAC) -> Tare:
-        count = sensor_type.electrode_count
+        count = sensor_type.layout.electrodes
         return Tare(
             tare_id,
             make_frame().stamp,

@@ -141,7 +141,7 @@ def frame(stamp: Stamp, counts: npt.NDArray[np.uint16]) -> ElectrodeFrame:
         pac=np.full(22, 2000, dtype=np.uint16),
         tac=2000,
         tdc=2000,
-        validity=(1 << SensorType.BIOTAC.validity_bits) - 1,
+        validity=(1 << SensorType.BIOTAC.layout.slots) - 1,
         slot_period_ns=227_000,
     )
 

@@ -22,8 +22,6 @@ class Endpoint(Generic[Q, R]):
 
     Attributes:
         name: Last chunk of its key.
-        request: Codec of the question.
-        reply: Codec of a reply.
         doc: One line for people.
         per_service: Whether its key names a service instead of a sensor.
     """

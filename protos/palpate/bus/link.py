@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import threading
@@ -349,10 +350,8 @@ class Session(Closing):
     def close(self) -> None:
         """Leave the bus."""
         for close in reversed(self._closing):
-            try:
+            with contextlib.suppress(zenoh.ZError):  # already undeclared, or the session is gone
                 close()
-            except zenoh.ZError:  # already undeclared, or the session is gone
-                continue
         self._closing.clear()
         self._raw.close()
 

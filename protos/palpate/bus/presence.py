@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -66,6 +67,7 @@ def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> li
         if reply.ok is None:
             continue
         *_, where, service, instance, what = str(reply.ok.key_expr).split("/")
+        # Two tokens of a process come in any order, and "alive" comes alone until it serves.
         name = (where, service, instance)
         found[name] = found.get(name, False) or what == "ready"
     return [AliveService(*name, ready) for name, ready in sorted(found.items())]
@@ -79,10 +81,8 @@ class CallerToken(Closing):
 
     def close(self) -> None:
         """Withdraw the token."""
-        try:
+        with contextlib.suppress(zenoh.ZError):  # the session is gone, and the token with it
             self._token.undeclare()
-        except zenoh.ZError:  # the session is gone, and the token with it
-            return
 
 
 class CallerWatch(Closing):

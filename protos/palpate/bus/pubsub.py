@@ -43,10 +43,8 @@ class Delivery(Enum):
 class NewestQueue(Generic[T]):
     """Keeps the newest items of each key; serves keys in the order of their oldest waiting item.
 
-    Args:
-        counters: Where dropped items are counted.
-        depth: Items that may wait per key. With more than one, a consumer that was delayed for a
-            moment catches up without loss; it has to check the age of items itself.
+    ``depth`` items may wait per key. With more than one, a consumer that was delayed for a moment
+    catches up without loss; it has to check the age of items itself.
     """
 
     def __init__(self, counters: Counter[str], depth: int) -> None:
@@ -204,7 +202,6 @@ class ReceivedMessage(Generic[M]):
     """A valid message, where it came from and when.
 
     Attributes:
-        message: The message.
         payload: Its bytes as they arrived.
         station: Station that published it.
         sensor: Sensor, or ``service/instance`` for a service's topic.
@@ -263,6 +260,8 @@ class Subscriber(Generic[M], Closing):
         )
         self._newest: dict[str, tuple[zenoh.Sample, int]] = {}
         self._addresses: dict[str, StreamAddress] = {}
+        # Of the last delivered message of each source: sequence, monotonic time, and how many of
+        # its key this process's queue had dropped before it.
         self._last: dict[str, tuple[int, int, int]] = {}
         self._subscriber = session.declare_subscriber(key, self._on_sample)
 
@@ -304,13 +303,10 @@ class Subscriber(Generic[M], Closing):
                 return received
 
     def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
-        """The newest message, if it is young enough; nothing is consumed.
+        """The newest message (of a sensor), if it is not older than ``max_age_s``.
 
-        The age counts from the stamp (when the sensor was read), not from arrival.
-
-        Args:
-            max_age_s: The oldest that may be returned [s].
-            sensor: Which sensor, where the subscription covers several.
+        Nothing is consumed. The age counts from the stamp (when the sensor was read), not from
+        arrival.
 
         Raises:
             StaleError: It is older, invalid, or none ever came.

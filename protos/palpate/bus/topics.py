@@ -138,23 +138,18 @@ SCHEMAS: dict[str, Codec[Any]] = {item.schema: item for item in codec.CODECS}
 
 def sensor_key(station: str, sensor: str, stream: str) -> str:
     """Key of a sensor's stream or endpoint; ``"*"`` for any station or sensor."""
-    return f"{ROOT}/{_chunk(station, 'station')}/{_chunk(sensor, 'sensor')}/{stream}"
+    return f"{ROOT}/{_chunks(station=station, sensor=sensor)}/{stream}"
 
 
 def service_key(station: str, service: str, instance: str, endpoint: str) -> str:
     """Key of a stream or endpoint of a process; ``"*"`` for any."""
-    return (
-        f"{ROOT}/{_chunk(station, 'station')}/@service/"
-        f"{_chunk(service, 'service')}/{_chunk(instance, 'instance')}/{endpoint}"
-    )
+    process = _chunks(service=service, instance=instance)
+    return f"{ROOT}/{_chunks(station=station)}/@service/{process}/{endpoint}"
 
 
 def live_key(station: str, service: str, instance: str, what: str) -> str:
     """Key of a liveliness token; ``"*"`` for any."""
-    return (
-        f"{LIVE_ROOT}/{_chunk(station, 'station')}/"
-        f"{_chunk(service, 'service')}/{_chunk(instance, 'instance')}/{what}"
-    )
+    return f"{LIVE_ROOT}/{_chunks(station=station, service=service, instance=instance)}/{what}"
 
 
 def caller_key(station: str, request_id: str) -> str:
@@ -163,11 +158,12 @@ def caller_key(station: str, request_id: str) -> str:
     The id may be any text, so its digest stands in the key.
     """
     digest = "*" if request_id == "*" else hashlib.sha256(request_id.encode()).hexdigest()[:32]
-    return f"{ASKING_ROOT}/{_chunk(station, 'station')}/{digest}"
+    return f"{ASKING_ROOT}/{_chunks(station=station)}/{digest}"
 
 
-def _chunk(name: str, what: str) -> str:
-    return name if name == "*" else check_name(name, what)
+def _chunks(**names: str) -> str:
+    """Names in a key, each checked; ``"*"`` for any."""
+    return "/".join(name if name == "*" else check_name(name, what) for what, name in names.items())
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,6 +49,9 @@ M = TypeVar("M")
 class Client(Closing):
     """A robot's view of a station.
 
+    Methods take the name of a ``sensor``, and as ``timeout_s`` how long an answer may take [s];
+    None = the client's timeout.
+
     Args:
         connect: Endpoint of the router.
         station: Name of the station.
@@ -76,11 +79,8 @@ class Client(Closing):
     def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
         """Contact location and force of one finger now.
 
-        The first call subscribes and waits up to the client's timeout for a first estimate.
-
-        Args:
-            sensor: Name of the sensor.
-            max_age_s: The oldest reading that may be used [s], by the time it was taken.
+        The first call subscribes and waits up to the client's timeout for a first estimate. The
+        oldest reading that may be used was taken ``max_age_s`` ago.
 
         Raises:
             StaleError: There is none, or the newest is older.
@@ -104,10 +104,7 @@ class Client(Closing):
     ) -> FieldEstimate:
         """Ask for the displacement of each skin node of one frame, however old it is.
 
-        Args:
-            sensor: Name of the sensor.
-            frame: The frame; None = the sensor's newest, see ``electrodes``.
-            timeout_s: How long it may take [s]; None = the client's timeout.
+        Without a frame it is the sensor's newest, see ``electrodes``.
 
         Raises:
             LinkError: No field service runs.
@@ -124,11 +121,7 @@ class Client(Closing):
     def synthesise(
         self, field: FieldFrame | FieldEstimate, *, timeout_s: float | None = None
     ) -> SynthesisEstimate:
-        """Ask for the tared counts that go with a field.
-
-        Args:
-            field: Known or estimated, on the mesh of the served bundle.
-            timeout_s: How long it may take [s]; None = the client's timeout.
+        """Ask for the tared counts of a field, known or estimated, on the served bundle's mesh.
 
         Raises:
             LinkError: No synthesis service runs.
@@ -154,10 +147,8 @@ class Client(Closing):
     def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
         """A publisher of the poses of a robot's flange: call ``put`` from the control loop.
 
-        A gateway with the driver ``pose_zenoh`` turns them into poses of the indenter.
-
-        Args:
-            robot: Name of the robot, as the gateway's option ``robot`` has it.
+        A gateway with the driver ``pose_zenoh``, whose option ``robot`` has the same name, turns
+        them into poses of the indenter.
         """
         self._publishers.append(RobotPosePublisher(self.session, robot))
         return self._publishers[-1]
@@ -165,10 +156,7 @@ class Client(Closing):
     def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
         """Tare: take the present counts of the untouched finger as its baseline.
 
-        Args:
-            sensor: Name of the sensor.
-            frames: Frames to average; 0 = the gateway's own number.
-            timeout_s: How long it may take [s].
+        So many ``frames`` are averaged; 0 = the gateway's own number.
 
         Raises:
             RemoteError: The gateway refuses, e.g. because the finger is touched.
@@ -180,10 +168,7 @@ class Client(Closing):
     def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
         """Take the present load of a force/torque sensor as zero.
 
-        Args:
-            sensor: Name of the sensor.
-            readings: How many to average before and after; 0 = the gateway's own number.
-            timeout_s: How long it may take [s].
+        So many ``readings`` are averaged before and after; 0 = the gateway's own number.
 
         Raises:
             LinkError: No gateway serves a force/torque sensor of this name.

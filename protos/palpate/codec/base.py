@@ -154,6 +154,11 @@ def vector3_to_wire(
         reject("non_finite", f"{what} = ({x}, {y}, {z}) exceeds float32")
 
 
+def pose_numbers(msg: common_pb2.Pose, what: str) -> tuple[float, ...]:
+    """Check a pose of the wire: px py pz qw qx qy qz."""
+    return pose_values((msg.px, msg.py, msg.pz, msg.qw, msg.qx, msg.qy, msg.qz), what)
+
+
 def pose_values(values: Iterable[float], what: str) -> tuple[float, ...]:
     """Check px py pz qw qx qy qz: finite and a unit quaternion."""
     pose = tuple(float(value) for value in values)
@@ -169,7 +174,7 @@ def pose_values(values: Iterable[float], what: str) -> tuple[float, ...]:
 
 def pose_from_wire(msg: common_pb2.Pose, what: str) -> Pose:
     """Check and convert a pose."""
-    p = pose_values((msg.px, msg.py, msg.pz, msg.qw, msg.qx, msg.qy, msg.qz), what)
+    p = pose_numbers(msg, what)
     return Pose((p[0], p[1], p[2]), (p[3], p[4], p[5], p[6]))
 
 
@@ -220,7 +225,8 @@ def check_electrodes(array: FloatArray, what: str) -> FloatArray:
 def splice(number: int, array: FloatArray) -> bytes:
     """A packed ``repeated float`` field as the official encoder writes it, a hundred times faster.
 
-    The wire format of a packed float field *is* tag, length, little-endian array.
+    The wire format of a packed float field *is* tag, length, little-endian array. Protobuf allows
+    fields in any order and messages to be concatenated, so a field may follow an encoded message.
     """
     if array.size == 0:
         return b""

@@ -11,6 +11,7 @@ from palpate.codec.base import (
     codec_of,
     field_from_wire,
     pose_from_wire,
+    pose_numbers,
     pose_to_wire,
     pose_values,
     reject,
@@ -133,10 +134,7 @@ def _wrench_encode(frame: WrenchFrame) -> bytes:
 
 
 def _pose_from_wire(msg: frames_pb2.IndenterPoseFrame) -> IndenterPoseFrame:
-    pose = msg.pose_sensor_indenter
-    values = pose_values(
-        (pose.px, pose.py, pose.pz, pose.qw, pose.qx, pose.qy, pose.qz), "pose_sensor_indenter"
-    )
+    values = pose_numbers(msg.pose_sensor_indenter, "pose_sensor_indenter")
     if msg.in_contact and msg.contact_unknown:
         reject("contact", "in_contact is true and contact_unknown too")
     return IndenterPoseFrame(

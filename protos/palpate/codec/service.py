@@ -190,12 +190,13 @@ def _error_from_wire(msg: service_pb2.Error) -> ErrorReply:
     )
 
 
-def _fill_error(error: ErrorReply, msg: service_pb2.Error) -> service_pb2.Error:
-    msg.code = int(error.code)  # type: ignore[assignment]
-    msg.message = error.message[:_TEXT_MAX]
-    msg.remedy = error.remedy[:_TEXT_MAX]
-    msg.retry_after_ms = max(0, round(error.retry_after_s * 1e3))
-    return msg
+def _error_to_wire(error: ErrorReply) -> service_pb2.Error:
+    return service_pb2.Error(
+        code=int(error.code),  # type: ignore[arg-type]
+        message=error.message[:_TEXT_MAX],
+        remedy=error.remedy[:_TEXT_MAX],
+        retry_after_ms=max(0, round(error.retry_after_s * 1e3)),
+    )
 
 
 def _status_from_wire(msg: service_pb2.Status) -> Status:
@@ -220,7 +221,7 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
 
 
 def _status_encode(status: Status) -> bytes:
-    msg = service_pb2.Status(
+    return service_pb2.Status(
         service=check_serial(status.service, "service"),
         instance=check_serial(status.instance, "instance"),
         state=int(status.state),  # type: ignore[arg-type]
@@ -232,11 +233,9 @@ def _status_encode(status: Status) -> bytes:
         gauges=dict(status.gauges),
         sensors=list(status.sensors),
         message=status.message[:_TEXT_MAX],
+        last_error=None if status.last_error is None else _error_to_wire(status.last_error),
         sensor_states=sensor_states_to_wire(status.sensor_states),
-    )
-    if status.last_error is not None:
-        _fill_error(status.last_error, msg.last_error)
-    return msg.SerializeToString()
+    ).SerializeToString()
 
 
 def _metadata_from_wire(msg: service_pb2.ModelMetadata) -> ModelMetadata:
@@ -305,6 +304,6 @@ STATUS = codec_of(service_pb2.Status, _status_encode, _status_from_wire)
 MODEL_METADATA = codec_of(service_pb2.ModelMetadata, _metadata_encode, _metadata_from_wire)
 ERROR: Codec[ErrorReply] = codec_of(
     service_pb2.Error,
-    lambda error: _fill_error(error, service_pb2.Error()).SerializeToString(),
+    lambda error: _error_to_wire(error).SerializeToString(),
     _error_from_wire,
 )

@@ -225,11 +225,8 @@ def _step_encode(step: SimulationStep, what: str) -> bytes:
         centre = _doubles(step.centre_of_pressure, 3, f"{what}.centre_of_pressure")  # type: ignore[arg-type]
         tail.centre_of_pressure.extend(centre.tolist())
     if step.convergence is not None:
-        tail.convergence.CopyFrom(
-            _convergence(
-                step.convergence, simulation_pb2.SimulationConvergence, f"{what}.convergence"
-            )
-        )
+        to_wire = simulation_pb2.SimulationConvergence
+        tail.convergence.CopyFrom(_convergence(step.convergence, to_wire, f"{what}.convergence"))
     return payload + tail.SerializeToString()
 
 
@@ -267,9 +264,10 @@ def _reply_encode(reply: SimulationReply) -> bytes:
         first_step=reply.first_step,
         outcome=int(reply.outcome),  # type: ignore[arg-type]
         travel_m=check_positive(reply.travel_m, "travel_m"),
+        progress=None if reply.progress is None else progress_to_wire(reply.progress),
     )
-    if reply.progress is not None:
-        tail.progress.CopyFrom(progress_to_wire(reply.progress))
+    # A reply is head, steps (field 3) and tail: the steps' packed floats are spliced, so they are
+    # not part of a message that protobuf would encode once more.
     steps = (delimited(3, _step_encode(step, f"steps[{i}]")) for i, step in enumerate(reply.steps))
     return head.SerializeToString() + b"".join(steps) + tail.SerializeToString()
 

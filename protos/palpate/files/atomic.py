@@ -14,8 +14,7 @@ from palpate.errors import DatasetError
 def written_whole(path: Path) -> Iterator[Path]:
     """A temporary path beside a file; renamed to the file when the block ends without an error.
 
-    Args:
-        path: The file; its folder is made. One that is there stays until then.
+    The file's folder is made. A file that is there stays until then.
 
     Raises:
         DatasetError: The disk is full, or the folder cannot be written.

@@ -35,11 +35,8 @@ class Manifest:
     """Description of a bundle: what the model is, and digests of its files.
 
     Attributes:
-        name: Name of the bundle.
-        version: Its version, from 1.
+        version: From 1.
         task: A key of ``TASKS``.
-        inputs: Inputs of the model.
-        outputs: Outputs of the model.
         sensor_type: Name of the sensor type it takes.
         contact_threshold_n: Below this estimated force [N] there is no contact.
         training_data_sha256: Digest of the data set, hex.
@@ -101,11 +98,7 @@ def _tensor_info(values: Mapping[str, Any]) -> TensorInfo:
 
 
 def parse_manifest(text: bytes, where: Path) -> Manifest:
-    """Read a manifest.
-
-    Args:
-        text: Bytes of ``manifest.json``.
-        where: Its path, for the error.
+    """Read the bytes of ``manifest.json``.
 
     Raises:
         BundleError: It is no manifest, or one of a future contract.
@@ -169,37 +162,27 @@ class FieldMesh:
 def check_mesh(mesh: FieldMesh, where: str) -> None:
     """Check shapes, types and ranges of a mesh.
 
-    Args:
-        mesh: What to check.
-        where: Where it stands, for the error.
-
     Raises:
         BundleError: Names ``where``, the array and what is wrong.
     """
+    if problem := _mesh_problem(mesh):
+        raise BundleError(f"{where}: {problem}", remedy=_MESH_REMEDY)
+
+
+def _mesh_problem(mesh: FieldMesh) -> str:
     nodes = mesh.nodes
     if nodes.dtype != np.float32 or nodes.ndim != 2 or nodes.shape[1] != 3 or not len(nodes):
-        raise BundleError(
-            f"{where}: nodes are {nodes.dtype}{list(nodes.shape)}, not float32[V, 3]",
-            remedy=_MESH_REMEDY,
-        )
+        return f"nodes are {nodes.dtype}{list(nodes.shape)}, not float32[V, 3]"
     if not np.isfinite(nodes).all():
-        raise BundleError(f"{where}: nodes hold NaN or infinity", remedy=_MESH_REMEDY)
+        return "nodes hold NaN or infinity"
     for name, faces in (("outer_faces", mesh.outer_faces), ("inner_faces", mesh.inner_faces)):
         if faces.dtype != np.int32 or faces.ndim != 2 or faces.shape[1] != 3:
-            raise BundleError(
-                f"{where}: {name} are {faces.dtype}{list(faces.shape)}, not int32[F, 3]",
-                remedy=_MESH_REMEDY,
-            )
+            return f"{name} are {faces.dtype}{list(faces.shape)}, not int32[F, 3]"
         if faces.size and not 0 <= int(faces.min()) <= int(faces.max()) < len(nodes):
-            raise BundleError(
-                f"{where}: {name} name nodes {faces.min()}..{faces.max()}, there are 0.."
-                f"{len(nodes) - 1}",
-                remedy=_MESH_REMEDY,
-            )
+            return f"{name} name nodes {faces.min()}..{faces.max()}, there are 0..{len(nodes) - 1}"
     if len(mesh.sha256) != 32:
-        raise BundleError(
-            f"{where}: sha256 has {len(mesh.sha256)} bytes, a SHA-256 has 32", remedy=_MESH_REMEDY
-        )
+        return f"sha256 has {len(mesh.sha256)} bytes, a SHA-256 has 32"
+    return ""
 
 
 def mesh_to_bytes(mesh: FieldMesh) -> bytes:
@@ -217,10 +200,6 @@ def mesh_to_bytes(mesh: FieldMesh) -> bytes:
 
 def mesh_from_bytes(data: bytes, where: str) -> FieldMesh:
     """Read and check ``mesh.npz``.
-
-    Args:
-        data: Its bytes.
-        where: Where it stands, for the error.
 
     Raises:
         BundleError: It is no NumPy archive, lacks an array, or an array is not what it must be.
@@ -248,7 +227,6 @@ class Bundle:
     """A bundle in memory, its digests checked.
 
     Attributes:
-        manifest: Its description.
         model: ONNX bytes.
         golden: Inputs and expected outputs by name, batch first.
         sha256: Digest of the manifest, 32 bytes.
@@ -272,11 +250,6 @@ def sha256_hex(data: bytes) -> str:
 def check_bundle_mesh(mesh: FieldMesh | None, manifest: Manifest, where: str) -> None:
     """Check that a task of fields has its mesh, and that others have none.
 
-    Args:
-        mesh: What the bundle holds.
-        manifest: Its description.
-        where: Names it, for the error.
-
     Raises:
         BundleError: No mesh, one too many, or not the one that manifest and tensors mean.
     """
@@ -289,15 +262,17 @@ def check_bundle_mesh(mesh: FieldMesh | None, manifest: Manifest, where: str) ->
         )
     if mesh is None:
         return
+    problem = ""
     if len(mesh.nodes) != nodes:
-        raise BundleError(
-            f"{where}: the mesh has {len(mesh.nodes)} nodes, the tensors are for {nodes}",
-            remedy="export the model again with the mesh it was trained on",
+        problem = f"the mesh has {len(mesh.nodes)} nodes, the tensors are for {nodes}"
+    elif manifest.mesh_sha256 != mesh.sha256.hex():
+        problem = (
+            f"the manifest is for mesh {manifest.mesh_sha256[:12]!r}, {MESH} holds "
+            f"{mesh.sha256.hex()[:12]!r}"
         )
-    if manifest.mesh_sha256 != mesh.sha256.hex():
+    if problem:
         raise BundleError(
-            f"{where}: the manifest is for mesh {manifest.mesh_sha256[:12]!r}, {MESH} holds "
-            f"{mesh.sha256.hex()[:12]!r}",
+            f"{where}: {problem}",
             remedy="export the model again with the mesh it was trained on",
         )
 
@@ -310,14 +285,9 @@ def write_bundle(
     manifest: Manifest,
     mesh: FieldMesh | None = None,
 ) -> bytes:
-    """Write a bundle; the folder appears complete or not at all.
+    """Write a bundle; the folder appears complete or not at all, and is never overwritten.
 
-    Args:
-        folder: Created; a bundle already there is refused, bundles are immutable.
-        model: ONNX bytes.
-        golden: Inputs and outputs by name.
-        manifest: Its digests are filled in here.
-        mesh: Mesh of its fields, for a task that has some.
+    ``golden`` holds an array for each input and output; digests of the manifest are filled in here.
 
     Returns:
         The bundle's digest, 32 bytes.

@@ -51,10 +51,6 @@ class Hdf5Schema:
     def check(self, where: object, file: h5py.File) -> None:
         """Check the header of an open file.
 
-        Args:
-            where: Path of the file, for the error.
-            file: The file.
-
         Raises:
             DatasetError: Another schema, version or frame.
         """
@@ -91,16 +87,11 @@ def h5py_module(extra: str) -> ModuleType:
 def opened(
     path: Path, *, extra: str, missing: str = "check the path, or make the file"
 ) -> Iterator[h5py.File]:
-    """An HDF5 file to read from.
-
-    Args:
-        path: The file.
-        extra: Extra of palpate that installs h5py.
-        missing: What to do if there is no such file.
+    """An HDF5 file to read from; ``missing`` says what to do if there is no such file.
 
     Raises:
         DatasetError: It is missing, truncated or damaged.
-        MissingExtraError: h5py is not installed.
+        MissingExtraError: h5py is not installed; ``extra`` of palpate installs it.
     """
     h5 = h5py_module(extra)
     if not path.is_file():
@@ -145,14 +136,7 @@ def read_array(
     unit: str,
     dtype: npt.DTypeLike | None = None,
 ) -> npt.NDArray[Any]:
-    """Read an array and check its unit and, where given, its type.
-
-    Args:
-        where: Path of the file or name of the group, for the error.
-        group: What holds the array.
-        name: Of the array.
-        unit: Expected value of its attribute ``unit``.
-        dtype: Expected type; ``str`` = an array of texts.
+    """Read an array; check its attribute ``unit`` and, where given, its type (``str`` = texts).
 
     Raises:
         DatasetError: It is missing, or has another unit or type.

@@ -7,11 +7,13 @@ replay can be bit-identical.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import itertools
 import os
 import struct
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,6 +130,8 @@ class RecordWriter:
         except OSError as error:
             raise self._failed(error) from error
         self.counts[key] = self.counts.get(key, 0) + 1
+        # MCAP gathers messages in a chunk and writes it when it is full, which at a low rate takes
+        # minutes. Flushing by time bounds what a killed recorder loses.
         if time.monotonic() - self._last_flush >= FLUSH_S:
             self.flush()
 
@@ -185,10 +189,8 @@ class RecordWriter:
     def abandon(self) -> None:
         """Close without finishing; the ``.part`` keeps what was flushed and can be recovered."""
         self._closed = True
-        try:
+        with contextlib.suppress(OSError):  # the disk that failed the writer fails the closing too
             self._file.close()
-        except OSError:  # the disk that failed the writer fails the closing too
-            return
 
     def _failed(self, error: OSError) -> RecordingError:
         return RecordingError(
@@ -252,9 +254,7 @@ class RecordItem:
 def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordItem]:
     """Messages of a record in order of writing.
 
-    Args:
-        path: ``NAME.mcap``, or with ``allow_partial`` a ``NAME.mcap.part``.
-        allow_partial: Accept a file whose end is missing; its whole messages come.
+    With ``allow_partial`` the end may be missing, as of ``NAME.mcap.part``; whole messages come.
 
     Raises:
         RecordingError: Not a record of palpate, or damaged (after the messages before the damage).
@@ -374,10 +374,10 @@ def summarise(path: Path) -> RecordSummary:
         RecordingError: Not a record.
     """
     complete = path.suffix != ".part"
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     start = end = 0
     for item in read_record(path, allow_partial=not complete):
-        counts[item.key] = counts.get(item.key, 0) + 1
+        counts[item.key] += 1
         start = start or item.log_time_ns
         end = item.log_time_ns
     return RecordSummary(metadata_of(path), counts, start, end, complete)

@@ -53,12 +53,6 @@ class SimulationFiles:
     HDF5 does not survive a crash while a file is open for writing, so each trajectory of a folder
     is a file of its own that appears, complete, by renaming.
 
-    Args:
-        path: Folder or file.
-
-    Attributes:
-        path: The same.
-
     Raises:
         MissingExtraError: h5py is not installed.
     """
@@ -70,10 +64,7 @@ class SimulationFiles:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open a store.
-
-        Args:
-            path: A folder ``NAME.sim`` or a file in the same schema.
+        """Open a store: a folder ``NAME.sim``, or a file in the same schema.
 
         Raises:
             DatasetError: It does not exist, is damaged, or has another schema or version.
@@ -222,12 +213,9 @@ def is_simulation_store(path: Path) -> bool:
 
 
 def choose_trajectories(ids: Sequence[str], patterns: Sequence[str], most: int) -> list[str]:
-    """Which trajectories to show.
+    """Which of the sorted ids to show: those that fit a pattern, e.g. ``sphere_*/03/*``, or all.
 
-    Args:
-        ids: All there are, sorted.
-        patterns: As in a shell, e.g. ``sphere_*/03/*``; none = all.
-        most: How many at most; from more, evenly spaced ones, so that all indenters have a chance.
+    From more than ``most``, evenly spaced ones are taken, so that all indenters have a chance.
 
     Raises:
         DatasetError: A pattern matches no id, or the store is empty.

@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.atomic import written_whole
 from palpate.messages import FloatArray
 
 Array = npt.NDArray[np.float64]
@@ -99,8 +100,6 @@ class TapeTrajectory:
     """One press: K settled states, the first untouched. Sensor frame.
 
     Attributes:
-        id: Name of the trajectory.
-        indenter: Name of the indenter.
         poses: Tip [m] and unit quaternion w x y z of the indenter, which presses along its +z,
             float64, shape ``(K, 7)``.
         force: Force on the BioTac [N], float32, shape ``(K, 3)``; step 0 is zero.
@@ -167,10 +166,6 @@ class Tape:
 
 def check_tape(tape: Tape, *, where: str = "the tape") -> None:
     """Check shapes, types and meaning.
-
-    Args:
-        tape: The tape.
-        where: File or object, for the error.
 
     Raises:
         DatasetError: Names ``where``, the trajectory or specimen, the field, and what is wrong.
@@ -326,10 +321,6 @@ Arrays = dict[str, npt.NDArray[Any]]
 def write_tape(path: Path, tape: Tape) -> bytes:
     """Write a tape, whole or not at all; a file that is there is replaced.
 
-    Args:
-        path: ``NAME.npz``.
-        tape: The tape.
-
     Returns:
         Digest of the content, 32 bytes.
 
@@ -344,27 +335,19 @@ def write_tape(path: Path, tape: Tape) -> bytes:
     header["sha256"] = _digest(header, arrays).hex()
     text = json.dumps(header, indent=1, allow_nan=False).encode("ascii")
     members: Arrays = {_HEADER: np.frombuffer(text, np.uint8), **arrays}
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-                for name, array in members.items():
-                    member = zipfile.ZipInfo(
-                        f"{name}.npy"
-                    )  # of a fixed date: same tape, same bytes
-                    member.compress_type = zipfile.ZIP_DEFLATED
-                    buffer = io.BytesIO()
-                    np.lib.format.write_array(buffer, array, allow_pickle=False)
-                    archive.writestr(member, buffer.getvalue())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise DatasetError(
-            f"cannot write {path}: {error.strerror or error}",
-            remedy="check that its folder is there, and the disk",
-        ) from error
+    if not path.parent.is_dir():  # a misspelled folder is not made
+        raise DatasetError(f"cannot write {path}", remedy="check that its folder is there")
+    with written_whole(path) as part, part.open("wb") as file:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+            for name, array in members.items():
+                # ZipInfo has a fixed date, unlike a file that is added: same tape, same bytes.
+                member = zipfile.ZipInfo(f"{name}.npy")
+                member.compress_type = zipfile.ZIP_DEFLATED
+                buffer = io.BytesIO()
+                np.lib.format.write_array(buffer, array, allow_pickle=False)
+                archive.writestr(member, buffer.getvalue())
+        file.flush()
+        os.fsync(file.fileno())
     return bytes.fromhex(header["sha256"])
 
 
@@ -450,11 +433,12 @@ def _header(array: npt.NDArray[Any] | None, path: Path) -> dict[str, Any]:
 
 
 def _digest(header: dict[str, Any], arrays: Arrays) -> bytes:
-    """SHA-256 of all that a tape says."""
+    """SHA-256 of all that a tape says: independent of the packing of the archive."""
     known = {key: value for key, value in header.items() if key != "sha256"}
     digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode("ascii"))
     for name in UNITS:
         array = arrays[name]
+        # Type and shape go in with the bytes, which alone would allow another reading of them.
         digest.update(f"{name} {array.dtype.str} {array.shape};".encode("ascii"))
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.digest()

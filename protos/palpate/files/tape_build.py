@@ -36,17 +36,11 @@ _INT16 = 32767
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TapePress:
-    """One press as a simulation leaves it; the first step untouched. Sensor frame, SI.
+    """One press as a simulation leaves it: a ``TapeTrajectory`` with arrays of any float type.
 
     Attributes:
-        id: Name of the trajectory.
-        indenter: Name of the indenter.
-        poses: Tip [m] and unit quaternion w x y z, shape ``(K, 7)``.
-        force: Force on the BioTac [N], shape ``(K, 3)``.
-        torque: Torque about the sensor frame's origin [N m], shape ``(K, 3)``.
-        fluid_pressure_pa: Above ambient [Pa], shape ``(K,)``.
-        counts: Ideal counts by specimen, shape ``(U, K, 19)``.
-        displacement: From the pressurised state [m], shape ``(K, V, 3)``.
+        displacement: Of each node from the pressurised state [m], shape ``(K, V, 3)``; the tape
+            keeps its coefficients instead.
     """
 
     id: str
@@ -60,12 +54,9 @@ class TapePress:
 
 
 def tape_specimen(name: str, parameters: str, rest_counts: npt.ArrayLike) -> TapeSpecimen:
-    """A specimen from the JSON of its electrical parameters.
+    """A specimen from the JSON of its electrical parameters, and its counts at rest, ``(19,)``.
 
-    Args:
-        name: Of the sensor.
-        parameters: JSON object that has a number for each of ``SPECIMEN_NUMBERS``; kept as it is.
-        rest_counts: Ideal counts of the untouched sensor, shape ``(19,)``.
+    The JSON object has a number for each of ``SPECIMEN_NUMBERS`` and is kept as it is.
 
     Raises:
         DatasetError: No JSON object, or a number is missing; names specimen and key.
@@ -106,19 +97,10 @@ def build_tape(
     modes: int = MODES,
     step_m: float = STEP_M,
 ) -> Tape:
-    """A tape, checked.
+    """A tape, checked; ``Tape`` explains the arguments.
 
-    Args:
-        specimens: The BioTacs, in the order of the presses' counts.
-        presses: The trajectories.
-        rest_pressure_pa: Fluid pressure of the untouched finger above ambient [Pa].
-        nodes: Nodes of the pressurised, untouched skin [m], shape ``(V, 3)``.
-        outer_faces: Triangles of the outer surface, shape ``(F, 3)``.
-        inner_faces: Triangles of the inner surface, shape ``(G, 3)``.
-        mesh_sha256: Content hash of the mesh, 32 bytes.
-        source: Where it comes from and its licence, for people.
-        modes: Modes kept at most.
-        step_m: Rounding of the modes [m].
+    Specimens stand in the order of the presses' counts. At most ``modes`` modes are kept, rounded
+    to steps of ``step_m`` of displacement.
 
     Raises:
         DatasetError: The arrays make no tape; names the trajectory and the field.
@@ -174,7 +156,8 @@ def _basis(
     fields: FloatArray, modes: int, step_m: float
 ) -> tuple[npt.NDArray[np.int16], FloatArray, FloatArray]:
     """Rounded modes (C, 3V), their scales (C,), and coefficients (S, C) of fields (S, 3V)."""
-    gram = (fields @ fields.T).astype(np.float64)  # few fields, many nodes
+    # The left singular vectors come from the small Gram matrix: few fields, many nodes.
+    gram = (fields @ fields.T).astype(np.float64)
     values, vectors = np.linalg.eigh(gram)
     # Modes below the rounding of float32 fields are noise.
     kept = np.flatnonzero(values > 1e-10 * max(float(values[-1]), 1e-30))[::-1][: max(modes, 1)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from palpate.errors import BundleError
 from palpate.messages import SensorType, TensorInfo
@@ -20,8 +20,6 @@ class TaskContract:
     """Inputs and outputs of a model of this task.
 
     Attributes:
-        inputs: Tensors it takes.
-        outputs: Tensors it gives.
         optional: Outputs that may be absent together.
         per_node: Values per node of the tensors whose width is ``BY_MESH``; empty for a task
             without a mesh. A field's tensor is flat: x y z of node 0, x y z of node 1, ...
@@ -43,10 +41,7 @@ TASKS: dict[str, TaskContract] = {
     "features": TaskContract(
         inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
         outputs=(_tensor("force", 3, "N"), _tensor("force_sd", 3, "N")),
-        optional=(
-            _tensor("contact_location", 3, "m"),
-            _tensor("contact_location_sd", 3, "m"),
-        ),
+        optional=(_tensor("contact_location", 3, "m"), _tensor("contact_location_sd", 3, "m")),
     ),
     "field": TaskContract(
         inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
@@ -71,29 +66,17 @@ def tensors_of(
 ) -> tuple[tuple[TensorInfo, ...], tuple[TensorInfo, ...]]:
     """Inputs and outputs of a task on a mesh of so many nodes, for a manifest.
 
-    Args:
-        task: A key of ``TASKS``.
-        nodes: Number of nodes V of the mesh.
-        optional: Whether the optional outputs are given.
+    With ``optional`` its optional outputs are given, too.
     """
     contract = TASKS[task]
     outputs = contract.outputs + (contract.optional if optional else ())
-    return (
-        tuple(_sized(tensor, contract, nodes) for tensor in contract.inputs),
-        tuple(_sized(tensor, contract, nodes) for tensor in outputs),
-    )
+    return _sized(contract.inputs, contract, nodes), _sized(outputs, contract, nodes)
 
 
 def check_tensors(
     task: str, inputs: tuple[TensorInfo, ...], outputs: tuple[TensorInfo, ...], where: str
 ) -> tuple[TaskContract, int | None]:
-    """Check that inputs and outputs are those of a task.
-
-    Args:
-        task: What the manifest says.
-        inputs: Inputs by the manifest.
-        outputs: Outputs by the manifest.
-        where: Whose manifest, for the error.
+    """Check that inputs and outputs of a manifest are those of its task.
 
     Returns:
         The task's contract, and the number of nodes that the widths of its fields mean; None for
@@ -109,21 +92,17 @@ def check_tensors(
             remedy="upgrade palpate, or train a bundle for one of these tasks",
         )
     nodes = _nodes(contract, (*inputs, *outputs))
-    sized = {
-        side: tuple(_sized(tensor, contract, nodes) for tensor in tensors)
-        for side, tensors in (
-            ("inputs", contract.inputs),
-            ("outputs", contract.outputs),
-            ("all", contract.outputs + contract.optional),
-        )
-    }
-    fits = inputs == sized["inputs"] and outputs in (sized["outputs"], sized["all"])
+    fits = inputs == _sized(contract.inputs, contract, nodes) and outputs in (
+        _sized(contract.outputs, contract, nodes),
+        _sized(contract.outputs + contract.optional, contract, nodes),
+    )
     if not fits or (contract.per_node and not nodes):
+        widths = ", ".join(f"{name} {each}V" for name, each in contract.per_node.items())
         raise BundleError(
             f"{where}: inputs {_names(inputs)} and outputs {_names(outputs)} are not those of "
             f"task {task!r}: {_names(contract.inputs)} -> "
             f"{_names(contract.outputs + contract.optional)}"
-            + (f", {BY_MESH} = {_widths(contract)} with V nodes" if contract.per_node else ""),
+            + (f", {BY_MESH} = {widths} with V nodes" if contract.per_node else ""),
             remedy="export the model again with palpate train",
         )
     return contract, nodes
@@ -138,15 +117,16 @@ def _nodes(contract: TaskContract, tensors: tuple[TensorInfo, ...]) -> int | Non
     return None
 
 
-def _sized(tensor: TensorInfo, contract: TaskContract, nodes: int | None) -> TensorInfo:
-    each = contract.per_node.get(tensor.name)
-    if each is None or nodes is None:
-        return tensor
-    return TensorInfo(tensor.name, tensor.dtype, (-1, each * nodes), tensor.unit)
-
-
-def _widths(contract: TaskContract) -> str:
-    return ", ".join(f"{name} {each}V" for name, each in contract.per_node.items())
+def _sized(
+    tensors: tuple[TensorInfo, ...], contract: TaskContract, nodes: int | None
+) -> tuple[TensorInfo, ...]:
+    """The tensors with the widths that this number of nodes gives."""
+    return tuple(
+        replace(tensor, shape=(-1, contract.per_node[tensor.name] * nodes))
+        if nodes is not None and tensor.name in contract.per_node
+        else tensor
+        for tensor in tensors
+    )
 
 
 def _names(tensors: tuple[TensorInfo, ...]) -> str:

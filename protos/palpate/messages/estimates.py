@@ -1,4 +1,8 @@
-"""Estimates: pure functions of a frame, its tare and a bundle."""
+"""Estimates: pure functions of a frame, its tare and a bundle.
+
+``source`` is the stamp of the frame that an estimate was made from, ``sensor_serial`` names that
+frame's sensor, and ``bundle_sha256`` is the digest of the bundle's manifest, 32 bytes.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,9 @@ from palpate.messages.frames import FieldFrame, FloatArray, Stamp
 
 @dataclass(frozen=True, slots=True)
 class FeatureEstimate:
-    """Electrodes -> features; a pure function of frame, tare and bundle.
+    """Electrodes -> features.
 
     Attributes:
-        source: Stamp of the frame it was made from.
-        sensor_serial: Serial number of that frame's sensor.
-        bundle_sha256: Digest of the bundle's manifest, 32 bytes.
         tare_id: Tare that was subtracted.
         in_contact: False below the bundle's contact threshold.
         force: Net force on the BioTac [N], shape ``(3,)``.
@@ -40,9 +41,6 @@ class FieldEstimate:
     """Electrodes -> fields.
 
     Attributes:
-        source: Stamp of the frame it was made from.
-        sensor_serial: Serial number of that frame's sensor.
-        bundle_sha256: Digest of the bundle's manifest, 32 bytes.
         tare_id: Tare that was subtracted.
         mesh_sha256: Content hash of the mesh, 32 bytes.
         displacement: Nodal displacement from the pressurised state [m], shape ``(V, 3)``.
@@ -67,7 +65,6 @@ class SynthesisEstimate:
     Attributes:
         source: Stamp of the field's source.
         sensor_serial: Serial number of the sensor that is imitated.
-        bundle_sha256: Digest of the bundle's manifest, 32 bytes.
         mesh_sha256: Content hash of the mesh, 32 bytes.
         tared_counts: E1..E19 minus baseline [counts], shape ``(19,)`` (SP: 24).
         tared_counts_sd: One standard deviation [counts], the same shape, or None.

@@ -111,16 +111,6 @@ class SensorType(IntEnum):
         """Electrodes, PAC samples and validity bits of its frames."""
         return BIOTAC_LAYOUT if self is SensorType.BIOTAC else BIOTAC_SP_LAYOUT
 
-    @property
-    def electrode_count(self) -> int:
-        """Number of sensing electrodes."""
-        return self.layout.electrodes
-
-    @property
-    def validity_bits(self) -> int:
-        """Number of channels with a validity bit: electrodes, PDC, TAC, TDC, PAC samples."""
-        return self.layout.slots
-
 
 @dataclass(frozen=True, slots=True)
 class Pose:
@@ -158,8 +148,6 @@ class ElectrodeFrame:
     """One sampling round of a BioTac: raw 12-bit counts, nothing subtracted.
 
     Attributes:
-        stamp: When.
-        sensor_serial: Serial number of the sensor.
         sensor_type: Fixes the numbers of electrodes and PAC samples.
         electrodes: Raw counts E1..E19, uint16, shape ``(19,)`` (SP: E1..E24, 24).
         pdc: Raw static pressure [counts].
@@ -197,7 +185,6 @@ class WrenchFrame:
     """One reading of a force/torque sensor.
 
     Attributes:
-        stamp: When.
         sensor_serial: Serial number of the force/torque sensor.
         force: Force on the BioTac [N], sensor frame, float32, shape ``(3,)``.
         torque: Torque on the BioTac about the sensor frame's origin [N m], shape ``(3,)``.
@@ -216,7 +203,6 @@ class IndenterPoseFrame:
     """Where the indenter is.
 
     Attributes:
-        stamp: When.
         indenter: Standard name, e.g. ``"sphere_3-5mm"``.
         position: Tip of the indenter [m], sensor frame, float64, shape ``(3,)``.
         orientation: Unit quaternion w x y z of the indenter in the sensor frame, shape ``(4,)``.
@@ -235,7 +221,6 @@ class FieldFrame:
     """A displacement field that is known, not estimated: of a simulation, or other ground truth.
 
     Attributes:
-        stamp: When.
         sensor_serial: Serial number of the BioTac whose skin is meant.
         mesh_sha256: Content hash of the mesh, 32 bytes.
         displacement: Nodal displacement from the pressurised state [m], sensor frame, float32,

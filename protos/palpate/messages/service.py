@@ -34,12 +34,7 @@ class FaultKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ChannelFault:
-    """Channels of a sensor that have the same fault.
-
-    Attributes:
-        kind: See ``FaultKind``.
-        channels: Their names, e.g. ``E7`` or ``PAC``.
-    """
+    """Channels of a sensor that have the same fault, by name, e.g. ``E7`` or ``PAC``."""
 
     kind: FaultKind
     channels: Sequence[str]
@@ -51,7 +46,6 @@ class SensorStatus:
 
     Attributes:
         name: Its name in keys.
-        state: See ``SensorState``.
         since_monotonic_ns: Host monotonic clock when it came into this state [ns].
         faults: Channels that must not be used; empty = none.
         message: One line for people; empty = none.
@@ -68,8 +62,7 @@ class SensorStatus:
 class WrenchZeroRequest:
     """Take the present load of a force/torque sensor as zero.
 
-    Attributes:
-        readings: How many to average before and after; 0 = the gateway's own number.
+    ``readings`` are averaged before it and after it; 0 = the gateway's own number.
     """
 
     readings: int = 0
@@ -84,10 +77,8 @@ class WrenchZero:
         device: One line for people: model and address.
         monotonic_ns: Host monotonic clock when it was taken [ns].
         wall_ns: Host wall clock when it was taken [ns since the Unix epoch].
-        force_before: Mean force before it [N], shape ``(3,)``.
-        torque_before: Mean torque before it [N m], shape ``(3,)``.
-        force_after: Mean force after it [N], shape ``(3,)``.
-        torque_after: Mean torque after it [N m], shape ``(3,)``.
+        force_before: Mean force before it [N], shape ``(3,)``; ``force_after`` likewise.
+        torque_before: Mean torque before it [N m], shape ``(3,)``; ``torque_after`` likewise.
         readings_averaged: How many readings each mean is of.
     """
 
@@ -109,13 +100,9 @@ class Tare:
     Attributes:
         tare_id: Unique per gateway run and sensor, never ``NO_TARE``.
         stamp: Stamp of the last frame averaged.
-        sensor_serial: Serial number of the sensor.
         electrodes: Mean raw counts (the baseline), float32, shape ``(19,)`` (SP: 24).
         electrodes_sd: Standard deviation of the averaged frames [counts], the same shape.
-        pdc: Mean raw PDC [counts].
-        pac: Mean raw PAC [counts].
-        tac: Mean raw TAC [counts].
-        tdc: Mean raw TDC [counts].
+        pdc: Mean raw PDC [counts]; ``pac``, ``tac`` and ``tdc`` likewise.
         frames_averaged: How many frames went in.
     """
 
@@ -169,14 +156,7 @@ class ServiceState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ErrorReply:
-    """A typed error as a message.
-
-    Attributes:
-        code: What kind.
-        message: What was wrong, naming the thing.
-        remedy: What to do.
-        retry_after_s: Ask again after this time [s]; 0 = do not.
-    """
+    """A ``PalpateError`` as a message: its code, problem, remedy and ``retry_after_s``."""
 
     code: ErrorCode
     message: str
@@ -191,7 +171,6 @@ class Status:
     Attributes:
         service: ``gateway``, ``features``, ``recorder``, ...
         instance: Name of this process among several of its kind.
-        state: See ``ServiceState``.
         monotonic_ns: Host monotonic clock [ns].
         wall_ns: Host wall clock [ns since the Unix epoch].
         uptime_s: Since the process was ready to count [s].
@@ -200,7 +179,6 @@ class Status:
         gauges: Present values; the name ends in the unit.
         sensors: Sensors it serves.
         message: One line for people.
-        last_error: The last thing that went wrong, if any.
         sensor_states: Of a gateway: each of its sensors.
     """
 
@@ -235,12 +213,9 @@ class ModelMetadata:
 
     Attributes:
         name: Name of the bundle.
-        version: Its version.
         task: ``"features"``, ``"field"`` or ``"synthesis"``.
         bundle_sha256: Digest of its manifest, 32 bytes.
         contract_version: Version of the bundle contract it was written for.
-        inputs: Inputs of the model.
-        outputs: Outputs of the model.
         training_data_sha256: Digest of the data set it was trained on, hex.
         metrics: Held-out results; the name ends in the unit.
         trained_on: One line for people.

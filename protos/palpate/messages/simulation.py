@@ -29,7 +29,6 @@ class SimulationRequest:
         request_id: Chosen by the caller; no two that run at once may share it.
         indenter: Standard name, e.g. ``"sphere_3-5mm"``.
         path: Poses of the indenter, in order; the first does not touch the skin.
-        parameters: Of the fingertip.
         deadline_s: How long it may take, time in the queue included [s]; 0 = the server's limit.
         want_displacement: Whether steps carry the nodal displacement.
         want_contact_force: Whether steps carry the nodal forces of the indenter.
@@ -69,11 +68,9 @@ class SimulationProgress:
     """How far a running simulation is.
 
     Attributes:
-        request_id: Of which request.
         steps_done: Converged steps.
         steps_total: Steps of the path, one less than its poses.
         elapsed_s: Since the request was accepted [s].
-        phase: What it is at.
         waiting_before: Requests that will be served before this one.
     """
 
@@ -103,7 +100,6 @@ class SimulationStep:
     """One converged step, sensor frame.
 
     Attributes:
-        pose_sensor_indenter: Of the indenter.
         force: Net force on the BioTac, friction included [N], float64, shape ``(3,)``.
         torque: Its moment about the origin [N m], float64, shape ``(3,)``.
         fluid_pressure_pa: Above ambient [Pa].
@@ -132,14 +128,12 @@ class SimulationReply:
     """Part of an answer, or all of it (``palpate.client.simulations`` joins the parts).
 
     Attributes:
-        request_id: Of which request.
         mesh_sha256: Digest of the mesh of the fields, 32 bytes; empty only without steps.
         steps: Converged steps, in order of the path.
         stopped_because: Why it ended before the end of the path, if it did.
         elapsed_s: Since the request was accepted [s].
         more: Another part follows, or an error.
         first_step: Number of the first of ``steps``; step k ends at pose k + 1 of the path.
-        progress: How far it is.
         outcome: In the last part: how it ended.
         travel_m: In the last part: path length of the indenter up to the last converged
             increment, which may lie between two poses [m].

@@ -119,7 +119,7 @@ def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any
 
     finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
     signals = rrb.Vertical(
-        plot("electrodes", f"Electrodes E1-E{kind.electrode_count} [counts]"),
+        plot("electrodes", f"Electrodes E1-E{kind.layout.electrodes} [counts]"),
         rrb.Horizontal(
             plot("pdc", "PDC, static pressure [counts]"),
             plot("pac", "PAC, vibration [counts]"),
@@ -189,7 +189,10 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
     def line(names: str | list[str], colours: Sequence[Any], width: float) -> Any:
         return rr.SeriesLines(names=names, colors=colours, widths=[width] * len(colours))
 
-    names, wheel = electrode_names(kind.electrode_count), electrode_colours(kind.electrode_count)
+    names, wheel = (
+        electrode_names(kind.layout.electrodes),
+        electrode_colours(kind.layout.electrodes),
+    )
     yield "electrodes/raw", line(names, wheel, 1.2)
     yield "electrodes/tared", line(names, wheel, 1.2)
     yield "synthesised", line(names, wheel, 1.2)

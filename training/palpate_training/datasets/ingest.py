@@ -219,8 +219,8 @@ def refuse_other_types(path: Path, name: str, streams: SensorStreams) -> None:
     if others:
         raise DatasetError(
             f"{path}: {len(others)} of {len(streams.frames)} frames of {name!r} are of a "
-            f"{others[0].name} with {others[0].electrode_count} electrodes; a data set has "
-            f"{SensorType.BIOTAC.electrode_count}",
+            f"{others[0].name} with {others[0].layout.electrodes} electrodes; a data set has "
+            f"{SensorType.BIOTAC.layout.electrodes}",
             remedy="record BioTacs with 19 electrodes alone; models are trained for no other",
         )
 
