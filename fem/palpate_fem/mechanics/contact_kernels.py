@@ -112,21 +112,18 @@ def friction_law(
 
 @wp.kernel
 def indenter_contact(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     area: wp.array2d(dtype=wp.float64),
     primitives: wp.array2d(dtype=wp.float64),
     law: ContactLaw,
     margin: wp.float64,
-    # State in:
     tip: wp.vec3d,
     rotation: wp.mat33d,
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array2d(dtype=wp.float64),
     traction_in: wp.array2d(dtype=wp.vec3d),
     anchor_in: wp.array2d(dtype=wp.vec3d),
-    # Out:
     status_out: wp.array2d(dtype=wp.int32),
     gap_out: wp.array2d(dtype=wp.float64),
     wanted_out: wp.array2d(dtype=wp.float64),
@@ -206,13 +203,10 @@ def indenter_contact(
 
 @wp.kernel
 def point_tangent(
-    # Model:
     shape: wp.array2d(dtype=wp.float64),
     pair: wp.array3d(dtype=wp.int32),
-    # State in:
     status_in: wp.array2d(dtype=wp.int32),
     tangent_in: wp.array2d(dtype=wp.mat33d),
-    # Out:
     block_out: wp.array(dtype=wp.mat33d),
 ):
     """Add the tangents of the touching points to the upper node-pair blocks."""
@@ -228,14 +222,11 @@ def point_tangent(
 
 @wp.kernel
 def unsymmetric_product(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
-    # State in:
     sliding_in: wp.array(dtype=wp.int32),
     unsymmetric_in: wp.array2d(dtype=wp.mat33d),
     vector_in: wp.array(dtype=wp.vec3d),
-    # Out:
     product_out: wp.array(dtype=wp.vec3d),
 ):
     """Add (tangent - its symmetric approximation) times a nodal vector, over the listed faces."""
@@ -252,12 +243,9 @@ def unsymmetric_product(
 
 @wp.kernel
 def subtract_load(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
-    # State in:
     load_in: wp.array2d(dtype=wp.vec3d),
-    # Out:
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """Subtract a load at the contact points from nodal forces."""
@@ -271,17 +259,14 @@ def subtract_load(
 
 @wp.kernel
 def pressure_update(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
-    # State in:
     status_in: wp.array2d(dtype=wp.int32),
     wanted_in: wp.array2d(dtype=wp.float64),
     slope_in: wp.array2d(dtype=wp.vec3d),
     wanted_traction_in: wp.array2d(dtype=wp.vec3d),
     traction_slope_in: wp.array2d(dtype=wp.mat33d),
     change_in: wp.array(dtype=wp.vec3d),
-    # Out:
     pressure_out: wp.array2d(dtype=wp.float64),
     traction_out: wp.array2d(dtype=wp.vec3d),
 ):
@@ -333,7 +318,6 @@ def bspline(t: wp.float64, order: int) -> wp.vec4d:
 
 @wp.kernel
 def core_contact(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     area: wp.array2d(dtype=wp.float64),
@@ -342,10 +326,8 @@ def core_contact(
     spacing: wp.float64,
     law: ContactLaw,
     margin: wp.float64,
-    # State in:
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array2d(dtype=wp.float64),
-    # Out:
     status_out: wp.array2d(dtype=wp.int32),
     gap_out: wp.array2d(dtype=wp.float64),
     wanted_out: wp.array2d(dtype=wp.float64),

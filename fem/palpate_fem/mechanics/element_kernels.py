@@ -16,7 +16,8 @@ The fluid's volume is a third of the integral of x . n over the closed inner sur
 and second derivative are exact for bilinear faces (``reference_element.volume_form``).
 
 One Warp thread handles one element or face. Two host threads may run two ranges of elements at
-once, so each adds into arrays of its own. NumPy twins: ``tests/fem/numpy_mechanics.py``.
+once, so each adds into arrays of its own. Arrays named ``_in`` hold the state, those named ``_out``
+take the results. NumPy twins: ``tests/fem/numpy_mechanics.py``.
 """
 
 from __future__ import annotations
@@ -39,17 +40,14 @@ def beyond(j: wp.float64):
 
 @wp.kernel
 def element_state(
-    # Model:
     elements: wp.array2d(dtype=wp.int32),
     gradient: wp.array3d(dtype=wp.vec3d),
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
-    # State in:
     first: int,
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
-    # Out:
     volume_out: wp.array(dtype=wp.float64),
     smallest_jacobian_out: wp.array(dtype=wp.float64),
     volume_gradient_out: wp.array2d(dtype=wp.vec3d),
@@ -89,17 +87,14 @@ def element_state(
 
 @wp.kernel
 def point_state(
-    # Model:
     elements: wp.array2d(dtype=wp.int32),
     gradient: wp.array3d(dtype=wp.vec3d),
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
-    # State in:
     first: int,
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
-    # Out:
     spatial_out: wp.array3d(dtype=wp.vec3d),
     left_out: wp.array3d(dtype=wp.vec3d),
     right_out: wp.array3d(dtype=wp.vec3d),
@@ -139,18 +134,15 @@ def point_state(
 
 @wp.kernel
 def element_tangent(
-    # Model:
     pair: wp.array3d(dtype=wp.int32),
     gradient: wp.array3d(dtype=wp.vec3d),
     bulk_over_volume: wp.array(dtype=wp.float64),
-    # State in:
     first: int,
     spatial_in: wp.array3d(dtype=wp.vec3d),
     left_in: wp.array3d(dtype=wp.vec3d),
     right_in: wp.array3d(dtype=wp.vec3d),
     scale_in: wp.array2d(dtype=wp.vec2d),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
-    # Out:
     block_out: wp.array(dtype=wp.mat33d),
 ):
     """Add the condensed tangent to the upper node-pair blocks; ``pair`` < 0 is below the diagonal.
@@ -182,15 +174,12 @@ def element_tangent(
 
 @wp.kernel
 def pressure_update(
-    # Model:
     elements: wp.array2d(dtype=wp.int32),
     rest_volume: wp.array(dtype=wp.float64),
     bulk_over_volume: wp.array(dtype=wp.float64),
-    # State in:
     volume_in: wp.array(dtype=wp.float64),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     change_in: wp.array(dtype=wp.vec3d),
-    # Out:
     pressure_out: wp.array(dtype=wp.float64),
 ):
     """Element pressures after a change of the nodal positions, to first order.
@@ -207,15 +196,12 @@ def pressure_update(
 
 @wp.kernel
 def pressure_misfit(
-    # Model:
     elements: wp.array2d(dtype=wp.int32),
     rest_volume: wp.array(dtype=wp.float64),
     bulk_over_volume: wp.array(dtype=wp.float64),
-    # State in:
     volume_in: wp.array(dtype=wp.float64),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
-    # Out:
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """Add the load on the nodes by static condensation of the element pressures."""
@@ -227,17 +213,14 @@ def pressure_misfit(
 
 @wp.kernel
 def element_stress(
-    # Model:
     elements: wp.array2d(dtype=wp.int32),
     gradient: wp.array3d(dtype=wp.vec3d),
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
-    # State in:
     first: int,
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
-    # Out:
     stress_out: wp.array(dtype=wp.mat33d),
 ):
     """Cauchy stress, mean over the current volume of each element."""
@@ -262,12 +245,9 @@ def element_stress(
 
 @wp.kernel
 def cavity_volume(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     form: wp.array3d(dtype=wp.float64),
-    # State in:
     position_in: wp.array(dtype=wp.vec3d),
-    # Out:
     volume_out: wp.array(dtype=wp.float64),
     gradient_out: wp.array(dtype=wp.vec3d),
 ):
@@ -289,14 +269,11 @@ def cavity_volume(
 
 @wp.kernel
 def cavity_tangent(
-    # Model:
     faces: wp.array2d(dtype=wp.int32),
     form: wp.array3d(dtype=wp.float64),
     pair: wp.array3d(dtype=wp.int32),
-    # State in:
     factor: wp.float64,
     position_in: wp.array(dtype=wp.vec3d),
-    # Out:
     block_out: wp.array(dtype=wp.mat33d),
 ):
     """Add ``factor`` times the second derivative of the volume to the upper node-pair blocks."""

@@ -225,11 +225,7 @@ def round_finger(
 ) -> TouchedFingertip:
     """A hollow ball of skin around a ball, its upper part held, filled with fluid.
 
-    Args:
-        friction: Of the indenter.
-        scale: Factor on all lengths.
-        mu: Modulus of the skin [Pa].
-        stiffness: Factor on the constants of contact.
+    ``scale`` is a factor on all lengths, ``stiffness`` one on the constants of contact.
     """
     mesh = hollow_sphere(6, INNER_M, OUTER_M, 1)
     fixed = np.flatnonzero(mesh.nodes[:, 2] > 0.2e-3).astype(np.int32)

@@ -100,12 +100,7 @@ def octant(
 ) -> SolidMesh:
     """An eighth of a hollow sphere: x, y, z >= 0; three patches on the faces of a cube, projected.
 
-    Args:
-        edges: Quads along a side of each of the three patches.
-        inner: Inner radius [m].
-        outer: Outer radius [m].
-        layers: Elements through the wall.
-        wedges: Whether each quad is split into two triangles.
+    ``edges`` are the quads along a side of each patch, ``layers`` the elements through the wall.
     """
     side = np.tan(np.linspace(0.0, np.pi / 4, edges + 1))
     flat, quads = rectangle(side, side)

@@ -29,13 +29,8 @@ SETTINGS = replace(TIGHT, tolerance=1e-8, volume_tolerance=1e-8, largest_move_m=
 def filled(folder: Path, layers: int, bulk_ratio: float) -> tuple[float, float]:
     """Fluid pressure [kPa] and thickness [mm] at the last of `FILLED_M3`.
 
-    Args:
-        folder: Holds ``meshes/biotac``.
-        layers: Wedges through the skin.
-        bulk_ratio: kappa / mu.
-
     Raises:
-        Absent: The public files are not there.
+        MissingDataError: The public files are not there.
     """
     if not (folder / SKIN).is_file():
         raise MissingDataError(
