@@ -212,39 +212,28 @@ class Campaign:
         return len(self.indenters) * self.points * (1 + self.angled)
 
     def __iter__(self) -> Iterator[PlannedIndentation]:
+        ways = [("normal", 0.0, 0.0, NORMAL_DEPTH_M)] + [
+            (f"angled-{k}", ANGLE_RAD, 2.0 * math.pi * k / AZIMUTHS, ANGLED_DEPTH_M)
+            for k in range(self.angled)
+        ]
         for name in self.indenters:
             indenter = make_indenter(name)
             key = [self.seed, *indenter.name.encode()]
-            targets, normals = sample_targets(
-                self.surface, self.points, seed=key, region=self.region
-            )
-            for point, (target, normal) in enumerate(zip(targets, normals, strict=True)):
-                at = f"{indenter.name}/{point:02d}"
-                inward = angled_direction(normal, 0.0, 0.0)
-                yield self._plan(f"{at}/normal", indenter, target, normal, inward, NORMAL_DEPTH_M)
-                for k in range(self.angled):
-                    towards = angled_direction(normal, ANGLE_RAD, 2.0 * math.pi * k / AZIMUTHS)
-                    yield self._plan(
-                        f"{at}/angled-{k}", indenter, target, normal, towards, ANGLED_DEPTH_M
+            aims = sample_targets(self.surface, self.points, seed=key, region=self.region)
+            for point, (target, normal) in enumerate(zip(*aims, strict=True)):
+                for way, angle, azimuth, paper_depth_m in ways:
+                    direction = angled_direction(normal, angle, azimuth)
+                    depth_m = paper_depth_m + self.overtravel_m
+                    steps = self.steps
+                    if self.increment_m is not None:
+                        steps = round(depth_m / self.increment_m)
+                    path, contact_m = _straight_path(
+                        indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
                     )
-
-    def _plan(
-        self,
-        name: str,
-        indenter: Indenter,
-        target: Floats,
-        normal: Floats,
-        direction: Floats,
-        depth_m: float,
-    ) -> PlannedIndentation:
-        depth_m += self.overtravel_m
-        steps = self.steps if self.increment_m is None else round(depth_m / self.increment_m)
-        path, contact_m = _straight_path(
-            indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
-        )
-        return PlannedIndentation(
-            name, indenter.name, target, normal, direction, contact_m, depth_m, path
-        )
+                    at = f"{indenter.name}/{point:02d}/{way}"
+                    yield PlannedIndentation(
+                        at, indenter.name, target, normal, direction, contact_m, depth_m, path
+                    )
 
 
 def _straight_path(
