@@ -5,7 +5,7 @@ Sequence numbers, the host's clocks and tares are added later, by the gateway.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -30,12 +30,26 @@ class ClockObservation(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class ElectrodeReading:
-    """One sampling round of a BioTac, raw.
+class DeviceReading:
+    """What all readings of a device have.
 
     Attributes:
-        tick: The device's own unwrapped frame counter.
-        time_s: The device's time at the first slot [s]; the origin is the device's own.
+        tick: The device's own unwrapped counter.
+        time_s: The device's time [s]; the origin is the device's own.
+        observed: The newest observation of the device's clock; None = this reading's own time and
+            arrival.
+    """
+
+    tick: int
+    time_s: float
+    observed: ClockObservation | None = field(default=None, kw_only=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ElectrodeReading(DeviceReading):
+    """One sampling round of a BioTac, raw; its time is that of its first slot.
+
+    Attributes:
         missed_before: Frames that the device lost directly before this one, as far as is known.
         electrodes: Raw counts E1..E19, uint16, shape ``(19,)`` (SP: 24).
         pdc: Raw static pressure [counts].
@@ -44,12 +58,8 @@ class ElectrodeReading:
         tac: Raw dynamic temperature [counts].
         tdc: Raw static temperature [counts].
         validity: Bit set = channel good; the order is that of ``ElectrodeFrame.validity``.
-        observed: The newest observation of the device's clock; None = this reading's own time and
-            arrival.
     """
 
-    tick: int
-    time_s: float
     missed_before: int
     electrodes: CountArray
     pdc: int
@@ -57,78 +67,56 @@ class ElectrodeReading:
     tac: int
     tdc: int
     validity: int
-    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class WrenchReading:
+class WrenchReading(DeviceReading):
     """One reading of a force/torque sensor.
 
     Attributes:
-        tick: The device's own unwrapped counter.
-        time_s: The device's time [s].
         force: Force on the BioTac [N], sensor frame, float32, shape ``(3,)``.
         torque: Torque on the BioTac about the sensor frame's origin [N m], shape ``(3,)``.
         serial: Serial number of the force/torque sensor.
         overload: The device reports that its range is exceeded.
-        observed: The newest observation of the device's clock; None = this reading's own time and
-            arrival.
     """
 
-    tick: int
-    time_s: float
     force: FloatArray
     torque: FloatArray
     serial: str
     overload: bool = False
-    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class PoseReading:
+class PoseReading(DeviceReading):
     """Position and orientation of the indenter.
 
     Attributes:
-        tick: The device's own unwrapped counter.
-        time_s: The device's time [s].
         indenter: Standard name, e.g. ``"sphere_14mm"``.
         position: Tip of the indenter [m], sensor frame, float64, shape ``(3,)``.
         orientation: Unit quaternion w x y z of the indenter in the sensor frame, shape ``(4,)``.
         in_contact: Whether it touches the skin; None = the source does not measure that.
         missed_before: Poses lost directly before this one, as far as is known.
-        observed: The newest observation of the device's clock; None = this reading's own time and
-            arrival.
     """
 
-    tick: int
-    time_s: float
     indenter: str
     position: npt.NDArray[np.float64]
     orientation: npt.NDArray[np.float64]
     in_contact: bool | None
     missed_before: int = 0
-    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class FieldReading:
+class FieldReading(DeviceReading):
     """The displacement of the skin, from a source that computes it.
 
     Attributes:
-        tick: The device's own unwrapped counter.
-        time_s: The device's time [s].
         mesh_sha256: Content hash of the mesh, 32 bytes.
         displacement: Nodal displacement from the pressurised state [m], sensor frame, float32,
             shape ``(V, 3)``.
-        observed: The newest observation of the device's clock; None = this reading's own time and
-            arrival.
     """
 
-    tick: int
-    time_s: float
     mesh_sha256: bytes
     displacement: FloatArray
-    observed: ClockObservation | None = None
 
 
 @dataclass(frozen=True, slots=True)

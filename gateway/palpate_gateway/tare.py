@@ -245,10 +245,10 @@ class TareAttempts:
             _answer(future, result)
         return tares
 
-    def finish(self, why: str) -> None:
-        """No further frame will come."""
+    def finish(self) -> None:
+        """The recording has ended: no further frame will come."""
         with self._lock:
-            self._over = why
+            self._over = why = "the recording has ended"
             requested, self._requested = self._requested, []
         error = DeviceError(f"not tared: {why}", remedy="tare while the sensor delivers")
         for _, future in requested:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from palpate import clock
 from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, WRENCH
@@ -65,19 +66,15 @@ class ClockQuality(IntEnum):
     """Followed, but wrong by more than any quartz: a rate may be configured wrong."""
 
 
-class ClockMap(Protocol):
+class ClockMap(ABC):
     """Maps the device's time to the host's."""
 
-    @property
-    def clock_id(self) -> int:
-        """Identifies the monotonic clock of the mapped times."""
-        ...
+    clock_id = clock.CLOCK_ID
+    """Identifies the monotonic clock of the mapped times."""
+    paced = False
+    """Whether a frame must wait until its mapped time before it is published."""
 
-    @property
-    def paced(self) -> bool:
-        """Whether a frame must wait until its mapped time before it is published."""
-        ...
-
+    @abstractmethod
     def map(
         self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
     ) -> HostTime:
@@ -88,14 +85,13 @@ class ClockMap(Protocol):
             arrival_ns: Host monotonic clock when the reading arrived [ns].
             observed: Newest observation of the device's clock; None = this reading is the newest.
         """
-        ...
 
     def gauges(self) -> Mapping[str, float]:
-        """Gauges of the status; may be called from any thread."""
-        ...
+        """Gauges of the status, none for a recording; may be called from any thread."""
+        return {}
 
 
-class LiveClock:
+class LiveClock(ClockMap):
     """Follows the clock of a live device by offset and drift; see ``ClockEnvelope``.
 
     Mapped times keep the order of the device's times and are never later than the arrival.
@@ -103,9 +99,6 @@ class LiveClock:
     Args:
         wall: The wall clock; None = a new one.
     """
-
-    clock_id = clock.CLOCK_ID
-    paced = False
 
     def __init__(self, wall: WallClock | None = None) -> None:
         self._wall = wall or WallClock()
@@ -158,15 +151,12 @@ class LiveClock:
         return gauges
 
 
-class ArrivalClock:
+class ArrivalClock(ClockMap):
     """For a live device that sends no time: its readings carry host times of arrival already.
 
     Args:
         wall: The wall clock; None = a new one.
     """
-
-    clock_id = clock.CLOCK_ID
-    paced = False
 
     def __init__(self, wall: WallClock | None = None) -> None:
         self._wall = wall or WallClock()
@@ -184,7 +174,7 @@ class ArrivalClock:
         return {"clock_quality": float(ClockQuality.ARRIVAL)}
 
 
-class _RecordedClock:
+class _RecordedClock(ClockMap):
     """Shared by both maps of recordings: device time since the first reading.
 
     Recorded times can step back, where a log was joined from several; time then stands still.
@@ -202,15 +192,10 @@ class _RecordedClock:
         self._last_s = time_s + self._shift_s
         return round(self._last_s * 1e9)
 
-    def gauges(self) -> Mapping[str, float]:
-        """None: its times are as good as the recording's."""
-        return {}
-
 
 class PacedClock(_RecordedClock):
     """A recording at its own pace: its first reading is now."""
 
-    clock_id = clock.CLOCK_ID
     paced = True
 
     def __init__(self) -> None:
@@ -235,8 +220,6 @@ class FileClock(_RecordedClock):
         start_wall_ns: Wall clock at the first reading [ns]; None = not recorded, then the Unix
             epoch.
     """
-
-    paced = False
 
     def __init__(self, serial: str, start_wall_ns: int | None) -> None:
         super().__init__()

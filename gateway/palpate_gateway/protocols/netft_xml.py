@@ -55,8 +55,6 @@ class NetftSettings:
     Attributes:
         product: Name of the product; empty if the device gives none.
         serial: Serial number of the calibration in use; empty where the device gives none.
-        force_unit: Unit of force as the device writes it.
-        torque_unit: Unit of torque as the device writes it.
         scale: What a count is worth in N and N m.
         sample_rate_hz: Rate at which the device samples [Hz]; None where it does not say.
         rdt_rate_hz: Rate at which it sends records [Hz]; None where it does not say.
@@ -64,8 +62,6 @@ class NetftSettings:
 
     product: str
     serial: str
-    force_unit: str
-    torque_unit: str
     scale: RdtScale
     sample_rate_hz: float | None
     rdt_rate_hz: float | None
@@ -86,12 +82,9 @@ def parse_netft_xml(document: bytes) -> NetftSettings:
         raise DeviceError(
             f"netftapi2.xml: nothing in the tags {', '.join(missing)}", remedy=_BROWSER_REMEDY
         )
-    force_unit, torque_unit = tags["scfgfu"], tags["scfgtu"]
     return NetftSettings(
         product=tags.get("prodname", ""),
         serial=tags.get("cfgcalsn", ""),
-        force_unit=force_unit,
-        torque_unit=torque_unit,
         scale=RdtScale(
             counts_per_n=_per_si_unit(tags, "cfgcpf", "scfgfu", FORCE_UNITS_N),
             counts_per_n_m=_per_si_unit(tags, "cfgcpt", "scfgtu", TORQUE_UNITS_N_M),

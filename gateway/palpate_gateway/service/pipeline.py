@@ -147,9 +147,9 @@ class Pipeline:
                 self._pass(item, out)
         return out
 
-    def finish(self, why: str = "the recording has ended") -> list[DueMessage]:
+    def finish(self) -> list[DueMessage]:
         """The source has ended: what is still held goes out untared."""
-        self._tares.finish(why)
+        self._tares.finish()
         if self._held_frames and self.tare_error is None:
             self._tares.error = DeviceError(
                 f"{self._serial} delivered {self._held_frames} frames, a tare needs "

@@ -23,8 +23,6 @@ def check(data: bytes) -> None:
         assert counts > 0
     for rate in (settings.sample_rate_hz, settings.rdt_rate_hz):
         assert rate is None or (math.isfinite(rate) and rate > 0)
-    assert settings.force_unit
-    assert settings.torque_unit
     assert parse_netft_xml(data) == settings
 
 

@@ -29,7 +29,6 @@ def document(**tags: str | None) -> bytes:
 def test_settings_in_si_units() -> None:
     settings = parse_netft_xml(document())
     assert (settings.product, settings.serial) == ("Net F/T", "FT01234")
-    assert (settings.force_unit, settings.torque_unit) == ("N", "Nm")
     assert (settings.scale.counts_per_n, settings.scale.counts_per_n_m) == (1e6, 1e6)
     assert (settings.sample_rate_hz, settings.rdt_rate_hz) == (7000.0, 1000.0)
 
