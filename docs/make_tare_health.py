@@ -231,7 +231,7 @@ def alarms(name: str, frames: Iterable[ElectrodeFrame]) -> str:
         if tare is not None:
             condition.tared(tare)
             collector = None
-    found = {k.removeprefix("channels_"): v for k, v in condition.counters.items() if v}
+    found = {k.removeprefix("channels_"): v for k, v in condition.channels.counters.items() if v}
     told = ", ".join(f"{number} {kind}" for kind, number in found.items()) or "none"
     return f"| {name} | {count:,} | {told} |\n"
 

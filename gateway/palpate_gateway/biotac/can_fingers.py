@@ -84,8 +84,8 @@ class CanSource(SlotSource):
     def read(self, timeout_s: float) -> LineSlots | None:
         """See ``SlotSource``."""
         batch = self._bus.read(timeout_s, gather_s=self._until_the_end_s())
-        data, size, arrival_ns = batch.data, batch.size, batch.arrival_ns
-        ours = self._decoder.ours(batch.can_id)
+        data, size, arrival_ns = batch.frames.data, batch.frames.size, batch.arrival_ns
+        ours = self._decoder.ours(batch.frames.can_id)
         if ours is not None:
             data, size, arrival_ns = data[ours], size[ours], arrival_ns[ours]
         words = self._decoder.decode(data, size)

@@ -22,7 +22,8 @@ from palpate.messages import COUNTS_MAX, PAC_SAMPLES, Origin, SensorType
 from palpate_gateway.biotac.finger import TypeOption
 from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
-from palpate_gateway.ports.serial_port import SerialPort, settle
+from palpate_gateway.ports.port import settle
+from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.protocols import pic32 as ask
 from palpate_gateway.protocols.pic32 import Pic32Decoder, Pic32Layout, Pic32Record, Pic32Sample

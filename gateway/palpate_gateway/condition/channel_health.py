@@ -57,11 +57,7 @@ _Flags = npt.NDArray[np.bool_]
 
 
 class ChannelHealth:
-    """Finds the faulty channels of one sensor.
-
-    Args:
-        electrodes: Number of electrodes.
-    """
+    """Finds the faulty channels of one sensor."""
 
     def __init__(self, electrodes: int) -> None:
         self._electrodes = electrodes

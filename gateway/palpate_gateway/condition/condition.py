@@ -49,26 +49,17 @@ class TouchState(Enum):
 
 
 class UntouchedLevel:
-    """The level of the untouched sensor, and how far it has drifted from the tare.
+    """The level of the untouched sensor, and how far it has drifted from the tare."""
 
-    Args:
-        electrodes: Number of electrodes.
-    """
-
-    def __init__(self, electrodes: int) -> None:
+    def __init__(self) -> None:
         self.touch = TouchState.UNKNOWN
-        self._electrodes = electrodes
+        """Whether the sensor is touched, as far as is known."""
         self._level: tuple[Floats, float] | None = None
         self._tare: tuple[Floats, float] | None = None
         self.drift_counts = 0.0
         """Largest difference of an electrode from the tare, when last untouched [counts]."""
         self.drift_electrode = 0
         """That electrode, from 0."""
-
-    @property
-    def known(self) -> bool:
-        """Whether there is a tare to compare with."""
-        return self._tare is not None
 
     def tared(self, tare: Tare) -> None:
         """A tare was taken: the present level is that of the untouched sensor."""
@@ -77,7 +68,7 @@ class UntouchedLevel:
 
     def moved(self) -> None:
         """The sensor is not still."""
-        if self.touch is not TouchState.UNKNOWN or self.known:
+        if self.touch is not TouchState.UNKNOWN or self._tare is not None:
             self.touch = TouchState.MOVING
 
     def rests_at(self, electrodes: Floats, pdc: float, usable: _Usable) -> None:
@@ -157,12 +148,7 @@ class WarmUp:
         self._sum, self._count, self._since_s = 0.0, 0, None
 
     def add(self, time_s: float, tdc: float) -> None:
-        """Take the mean of a block.
-
-        Args:
-            time_s: When [s].
-            tdc: Mean raw TDC [counts].
-        """
+        """Take the time [s] and the mean raw TDC [counts] of a block."""
         if self._since_s is None or not 0.0 <= time_s - self._since_s < WINDOW_S:
             self.begin()
             self._since_s = time_s
@@ -228,9 +214,9 @@ class Condition:
         self._limits, self._retare = limits, retare
         self._blocks = FrameBlocks(layout, rate_hz)
         self._recent: deque[FrameBlock] = deque(maxlen=WINDOW_BLOCKS)
-        self._level = UntouchedLevel(layout.electrodes)
-        self._channels = ChannelHealth(layout.electrodes)
-        self._warm_up = WarmUp()
+        self.level = UntouchedLevel()
+        self.channels = ChannelHealth(layout.electrodes)
+        self.warm_up = WarmUp()
         self._untouched_since_s: float | None = None
         self._now_s = 0.0
         self._tared_s: float | None = None
@@ -239,29 +225,14 @@ class Condition:
         """Why the sensor does not count as still; empty = it is still."""
 
     @property
-    def touch(self) -> TouchState:
-        """Whether the sensor is touched, as far as is known."""
-        return self._level.touch
-
-    @property
-    def warming(self) -> bool:
-        """Whether the core is warming up."""
-        return self._warm_up.warming
-
-    @property
     def faults(self) -> tuple[ChannelFault, ...]:
         """Channels whose counts are not to be used."""
-        return self._channels.faults
+        return self.channels.faults
 
     @property
     def has_wrong_channel(self) -> bool:
         """Whether a channel delivers wrong counts."""
         return any(fault.kind in _WRONG for fault in self.faults)
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """How often channels became faulty."""
-        return dict(self._channels.counters)
 
     @property
     def wants_tare(self) -> bool:
@@ -271,7 +242,7 @@ class Condition:
             return False
         return (
             self._now_s - since_s >= rules.after_s
-            and self._level.drift_counts > rules.drift_counts
+            and self.level.drift_counts > rules.drift_counts
             and not self.faults
         )
 
@@ -279,9 +250,9 @@ class Condition:
     def message(self) -> str:
         """One line for the status; empty = all is well."""
         parts = [describe(self.faults)] if self.faults else []
-        if self.warming and self._warm_up.slope_counts_per_min is not None:
+        if self.warm_up.warming and self.warm_up.slope_counts_per_min is not None:
             parts.append("warming up, so the baseline drifts: tare before you measure")
-        level = self._level
+        level = self.level
         if level.touch is TouchState.UNTOUCHED and level.drift_counts > DRIFT_COUNTS:
             parts.append(f"E{level.drift_electrode + 1} has drifted from the tare: tare again")
         elif level.touch is TouchState.HELD:
@@ -296,13 +267,13 @@ class Condition:
         """The device was opened, or opened again: what happened in between is unknown."""
         self._blocks.begin()
         self._recent.clear()
-        self._channels.begin()
-        self._warm_up.begin()
+        self.channels.begin()
+        self.warm_up.begin()
         self._moved("not enough frames yet")
 
     def tared(self, tare: Tare) -> None:
         """A tare was taken; its time is that of its last frame."""
-        self._level.tared(tare)
+        self.level.tared(tare)
         self._tared_s = tare.stamp.monotonic_ns * 1e-9
         self._untouched_since_s = None
         self._tell()
@@ -315,18 +286,18 @@ class Condition:
         self._now_s = block.time_s
         self._recent.append(block)
         self._judge_rest(block)
-        untouched = self._level.touch is TouchState.UNTOUCHED
-        self._channels.add(block, untouched=untouched)
-        if untouched or (self._level.touch is TouchState.UNKNOWN and not self.motion):
+        untouched = self.level.touch is TouchState.UNTOUCHED
+        self.channels.add(block, untouched=untouched)
+        if untouched or (self.level.touch is TouchState.UNKNOWN and not self.motion):
             if block.slow_seen[2]:
-                self._warm_up.add(block.time_s, block.tdc_mean)
+                self.warm_up.add(block.time_s, block.tdc_mean)
         else:
-            self._warm_up.begin()
+            self.warm_up.begin()
         self._tell()
         return True
 
     def _judge_rest(self, block: FrameBlock) -> None:
-        usable = self._channels.usable
+        usable = self.channels.usable
         if len(self._recent) < WINDOW_BLOCKS or not usable.any():
             self._moved(self.motion)
             return
@@ -337,23 +308,23 @@ class Condition:
         self.motion = ""
         count = len(self._recent)
         mean = np.add.reduce([one.mean for one in self._recent]) / count
-        self._level.rests_at(mean, sum(one.pdc_mean for one in self._recent) / count, usable)
-        if self._level.touch is not TouchState.UNTOUCHED:
+        self.level.rests_at(mean, sum(one.pdc_mean for one in self._recent) / count, usable)
+        if self.level.touch is not TouchState.UNTOUCHED:
             self._untouched_since_s = None
         elif self._untouched_since_s is None:
             self._untouched_since_s = block.time_s
 
     def _moved(self, motion: str) -> None:
         self.motion = motion
-        self._level.moved()
+        self.level.moved()
         self._untouched_since_s = None
 
     def _tell(self) -> None:
-        gauges = self._channels.gauges()
-        gauges["warm_up"] = float(self._warm_up.warming)
-        if self._warm_up.slope_counts_per_min is not None:
-            gauges["tdc_slope_counts_per_min"] = self._warm_up.slope_counts_per_min
+        gauges = self.channels.gauges()
+        gauges["warm_up"] = float(self.warm_up.warming)
+        if self.warm_up.slope_counts_per_min is not None:
+            gauges["tdc_slope_counts_per_min"] = self.warm_up.slope_counts_per_min
         if self._tared_s is not None:
             gauges["tare_age_s"] = max(self._now_s - self._tared_s, 0.0)
-            gauges["tare_drift_counts"] = self._level.drift_counts
+            gauges["tare_drift_counts"] = self.level.drift_counts
         self._gauges = gauges

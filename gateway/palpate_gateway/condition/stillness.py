@@ -28,7 +28,6 @@ FRAMES_MIN = 10
 Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.int64]
 _NONE = np.uint16(0xFFFF)
-_Valid = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +72,7 @@ class FrameBlock:
 
 
 class FrameBlocks:
-    """Collects frames of one sensor.
-
-    Args:
-        layout: Layout of its frames.
-        rate_hz: Frames per second [Hz].
-    """
+    """Collects frames of one sensor, which come at ``rate_hz``."""
 
     def __init__(self, layout: FrameLayout, rate_hz: float) -> None:
         self._layout = layout
@@ -119,7 +113,8 @@ class FrameBlocks:
             variance = np.add.reduce(rows, axis=0) / frames
             low, high = np.minimum.reduce(self._rows), np.maximum.reduce(self._rows)
         else:
-            valid = self._valid()
+            words = np.array(self._validity, np.uint64)
+            valid = (words[:, None] >> self._bits & np.uint64(1)).astype(np.bool_)
             seen = np.count_nonzero(valid, axis=0)
             some = np.maximum(seen, 1)
             mean = np.where(valid, self._rows, 0.0).sum(axis=0) / some
@@ -150,11 +145,6 @@ class FrameBlocks:
             pdc_variance=float(variance[e]),
             tdc_mean=float(mean[p - 1]),
         )
-
-    def _valid(self) -> _Valid:
-        words = np.array(self._validity, np.uint64)
-        valid: _Valid = (words[:, None] >> self._bits & np.uint64(1)).astype(np.bool_)
-        return valid
 
 
 MAX_SD_COUNTS = 25.0

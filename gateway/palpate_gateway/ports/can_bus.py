@@ -13,8 +13,7 @@ import select
 import socket
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -40,30 +39,23 @@ _BUFFER = 4 << 20
 BioTacs."""
 
 
-@dataclass(frozen=True, slots=True)
-class CanBatch:
-    """Data frames in order of arrival, as arrays.
+class CanBatch(NamedTuple):
+    """Data frames, and their times of arrival by the host's monotonic clock [ns].
 
     Attributes:
-        can_id: Identifiers, int64, shape ``(N,)``.
-        size: Bytes of data, int64, shape ``(N,)``.
-        data: Data, padded with zeros, uint8, shape ``(N, 8)``.
-        arrival_ns: Times of arrival by the host's monotonic clock [ns], int64, shape ``(N,)``.
+        frames: N frames in order of arrival.
+        arrival_ns: int64, shape ``(N,)``.
     """
 
-    can_id: npt.NDArray[np.int64]
-    size: npt.NDArray[np.int64]
-    data: npt.NDArray[np.uint8]
+    frames: CanFrames
     arrival_ns: npt.NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.can_id)
 
     def messages(self) -> Iterator[tuple[int, bytes, int]]:
         """Identifier, data and time of arrival [ns] of each."""
-        rows = zip(self.data, self.size.tolist(), strict=True)
+        frames = self.frames
+        rows = zip(frames.data, frames.size.tolist(), strict=True)
         data = [row[:size].tobytes() for row, size in rows]
-        return zip(self.can_id.tolist(), data, self.arrival_ns.tolist(), strict=True)
+        return zip(frames.can_id.tolist(), data, self.arrival_ns.tolist(), strict=True)
 
 
 class CanBus:
@@ -172,25 +164,25 @@ class CanBus:
                 self._note(frames)
                 frames, arrivals_ns = frames.those(kept), arrivals_ns[kept]
             if len(arrivals_ns):
-                return CanBatch(frames.can_id, frames.size, frames.data, arrivals_ns)
+                return CanBatch(frames, arrivals_ns)
             if self._end is not None:
                 raise self._end
             if time.monotonic() >= until:
                 raise silent(self.name, timeout_s)
 
-    def _frames(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
-        """Frames of any kind that have arrived, with their times of arrival; may be none."""
+    def _frames(self, wait_s: float) -> CanBatch:
+        """Frames of any kind that have arrived; may be none."""
         if self._direct is None:
             return self._frames_by_python_can(wait_s)
         datagrams, reader = self._direct
         ready, _, _ = select.select([datagrams], [], [], wait_s)
         if not ready:
-            return CanFrames.of([]), np.zeros(0, np.int64)
+            return CanBatch(CanFrames.of([]), np.zeros(0, np.int64))
         batch = datagrams.take()
         now_ns = time.monotonic_ns()
-        return reader(batch), self._stamps.monotonic_of_all(batch.stamp_ns, now_ns)
+        return CanBatch(reader(batch), self._stamps.monotonic_of_all(batch.stamp_ns, now_ns))
 
-    def _frames_by_python_can(self, wait_s: float) -> tuple[CanFrames, npt.NDArray[np.int64]]:
+    def _frames_by_python_can(self, wait_s: float) -> CanBatch:
         frames: list[CanFrame] = []
         arrivals_ns: list[int] = []
         while len(frames) < BATCH:
@@ -207,7 +199,7 @@ class CanBus:
             now_ns = time.monotonic_ns()
             arrivals_ns.append(self._stamps.monotonic_ns(message.timestamp, now_ns))
             frames.append(from_message(message))
-        return CanFrames.of(frames), np.array(arrivals_ns, np.int64)
+        return CanBatch(CanFrames.of(frames), np.array(arrivals_ns, np.int64))
 
     def _note(self, frames: CanFrames) -> None:
         """Count frames that hold no data."""

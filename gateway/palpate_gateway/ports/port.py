@@ -9,6 +9,7 @@ Rules of ``read``, the same for serial lines and sockets:
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from typing import Self
 
@@ -53,15 +54,6 @@ class Port(ABC):
             DeviceLost: The port is gone.
         """
 
-    def discard_input(self) -> int:
-        """Throw away unread input; returns the number of bytes."""
-        count = 0
-        while True:
-            try:
-                count += len(self.read(0.0))
-            except DeviceTimeout:
-                return count
-
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -76,3 +68,23 @@ def silent(name: str, timeout_s: float) -> DeviceTimeout:
         f"{name}: nothing came within {timeout_s:g} s",
         remedy="check power and cable; reading goes on by itself",
     )
+
+
+def settle(port: Port, quiet_s: float, longest_s: float) -> int:
+    """Throw away input until the line is quiet; returns the number of bytes.
+
+    Args:
+        port: Open.
+        quiet_s: The line is quiet when nothing came for this long [s].
+        longest_s: Give up after this long [s].
+
+    Raises:
+        DeviceLost: The port is gone.
+    """
+    count, until = 0, time.monotonic() + longest_s
+    while time.monotonic() < until:
+        try:
+            count += len(port.read(quiet_s))
+        except DeviceTimeout:
+            return count
+    return count

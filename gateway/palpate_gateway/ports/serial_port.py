@@ -6,7 +6,6 @@ import contextlib
 import errno
 import os
 import select
-import time
 from typing import Any
 
 from palpate.errors import DeviceError, DeviceLost
@@ -120,23 +119,3 @@ class SerialPort(Port):
             f"{self.name} is gone: {error}",
             remedy="plug it in again; it is opened again by itself",
         )
-
-
-def settle(port: Port, quiet_s: float, longest_s: float) -> int:
-    """Throw away input until the line is quiet; returns the number of bytes.
-
-    Args:
-        port: Open.
-        quiet_s: The line is quiet when nothing came for this long [s].
-        longest_s: Give up after this long [s].
-
-    Raises:
-        DeviceLost: The port is gone.
-    """
-    count, until = 0, time.monotonic() + longest_s
-    while time.monotonic() < until:
-        try:
-            count += len(port.read(quiet_s))
-        except TimeoutError:
-            return count
-    return count

@@ -78,7 +78,7 @@ class Pipeline:
     @property
     def counters(self) -> dict[str, int]:
         """Frames published, lost and untared; tares; faults of channels."""
-        condition = {} if self.condition is None else self.condition.counters
+        condition = {} if self.condition is None else self.condition.channels.counters
         return {**self._counts, **self._tares.counters, **condition}
 
     @property

@@ -59,7 +59,7 @@ class SensorReport:
         if zero_lost:
             state = SensorState.ZERO_LOST
             message = "it was opened again: the zero that it had may be gone"
-        elif condition is not None and condition.warming:
+        elif condition is not None and condition.warm_up.warming:
             state = SensorState.WARMING
         else:
             state = SensorState.LIVE

@@ -16,7 +16,8 @@ from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
-from palpate_gateway.ports.serial_port import SerialPort, settle
+from palpate_gateway.ports.port import settle
+from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import bota as wire
 from palpate_gateway.protocols.bota import BotaDecoder, BotaFrame
 from palpate_gateway.readings import WrenchReading

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
-from palpate_gateway.ports.port import silent
+from palpate_gateway.ports.port import settle, silent
 from palpate_gateway.ports.sockets import ReceivedBytes, UdpPort, read_page
 from palpate_gateway.protocols import rdt as wire
 from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
@@ -257,7 +258,7 @@ class WrenchRdt(WrenchDevice):
         serial = self._learn()
         self._port.open()
         self._port.write(wire.STOP_REQUEST)
-        self._port.discard_input()
+        settle(self._port, quiet_s=0.0, longest_s=math.inf)
         if self._is_hex:
             if self._options.filter_code is not None:
                 self._port.write(wire.hex_filter_request(self._options.filter_code))

@@ -14,6 +14,7 @@ from palpate_gateway.biotac.frames import FrameAssembler
 from palpate_gateway.clock.stamps import LiveClock
 from palpate_gateway.emulators.biotac_slots import SlotBlocks, idle_counts, round_of
 from palpate_gateway.ports.can_bus import CanBatch
+from palpate_gateway.ports.can_frames import CanFrames
 
 SLOT_S = 1.0 / 4400.0
 START_S = 100.0
@@ -50,7 +51,9 @@ class LateBus:
         end = int(np.searchsorted(self._arrivals_ns, self._arrivals_ns[self._at], "right"))
         cut, self._at = slice(self._at, end), end
         ones = np.ones(cut.stop - cut.start, np.int64)
-        return CanBatch(ones, self._sizes[cut], self._data[cut], self._arrivals_ns[cut])
+        kind = np.zeros(len(ones), np.uint8)
+        frames = CanFrames(kind, ones, self._sizes[cut], self._data[cut])
+        return CanBatch(frames, self._arrivals_ns[cut])
 
 
 def stamps_of(bus: LateBus, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, LiveClock]:

@@ -26,12 +26,12 @@ def condition(retare: RetareRules | None = None) -> Condition:
 
 def touch(made: Condition) -> TouchState:
     """What is known now; it changes, which a type checker does not see."""
-    return made.touch
+    return made.level.touch
 
 
 def feed(made: Condition, frames: Iterable[ElectrodeFrame]) -> set[TouchState]:
     """What it says of touches on the way."""
-    return {made.touch for frame in frames if made.add(frame)}
+    return {made.level.touch for frame in frames if made.add(frame)}
 
 
 def test_a_press_and_its_release() -> None:
@@ -125,7 +125,7 @@ def test_warm_up_is_told() -> None:
     for frame in finger.frames(20.0):
         finger.tdc += 0.01  # 60 counts a minute
         made.add(frame)
-    assert made.warming
+    assert made.warm_up.warming
     assert made.gauges()["warm_up"] == 1.0
     assert made.gauges()["tdc_slope_counts_per_min"] == pytest.approx(60.0, abs=5.0)
     assert "warming up, so the baseline drifts" in made.message
@@ -168,11 +168,11 @@ def test_a_hand_that_holds_a_real_sensor_is_seen(capture: list[ElectrodeFrame]) 
         if tare is not None:
             made.tared(tare)
             collector = None
-        states.append(made.touch)
+        states.append(made.level.touch)
     assert set(states[120:640]) == {TouchState.UNTOUCHED}
     assert TouchState.UNTOUCHED not in states[720:1990]
     assert states[-1] is TouchState.UNTOUCHED
-    assert made.counters == dict.fromkeys(made.counters, 0)
+    assert made.channels.counters == dict.fromkeys(made.channels.counters, 0)
     assert made.gauges()["tare_drift_counts"] < 40.0
 
 
@@ -214,7 +214,7 @@ def test_real_sensors_idle_and_pressed(shared_data: Path, idle: str, pressed: st
     made = condition(RetareRules(after_s=1.0))
     made.tared(finger.tare())
     assert TouchState.UNTOUCHED not in feed(made, _play(finger, held[:6000]))
-    assert not any(made.counters.values())
+    assert not any(made.channels.counters.values())
 
 
 def _play(finger: Any, electrodes: np.ndarray) -> Iterable[ElectrodeFrame]:

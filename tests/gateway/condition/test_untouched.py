@@ -17,17 +17,16 @@ def touch(level: UntouchedLevel) -> TouchState:
 
 
 def tared() -> UntouchedLevel:
-    level = UntouchedLevel(19)
+    level = UntouchedLevel()
     level.tared(fakes.Finger().tare())
     return level
 
 
 def test_before_the_first_tare_nothing_is_known() -> None:
-    level = UntouchedLevel(19)
+    level = UntouchedLevel()
     level.moved()
     level.rests_at(fakes.LEVELS, 2400.0, ALL)
     assert touch(level) is TouchState.UNKNOWN
-    assert not level.known
 
 
 def test_drift_is_followed_however_far_it_goes() -> None:

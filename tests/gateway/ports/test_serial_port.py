@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
-from palpate_gateway.ports.serial_port import SerialPort, settle
+from palpate_gateway.ports.port import settle
+from palpate_gateway.ports.serial_port import SerialPort
 
 pytest.importorskip("serial")
 
