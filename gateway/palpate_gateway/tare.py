@@ -25,12 +25,7 @@ _STILL = StillLimits()
 
 
 class TareCollector:
-    """Averages consecutive good frames: every channel is valid, of PAC at least one sample.
-
-    Args:
-        frames: How many.
-        limits: Noise up to which a sensor counts as still.
-    """
+    """Averages consecutive good frames: every channel is valid, of PAC at least one sample."""
 
     def __init__(self, frames: int, limits: StillLimits = _STILL) -> None:
         self._wanted = frames
@@ -206,7 +201,7 @@ class TareAttempts:
 
         Args:
             frames: How many.
-            sensor: Name of the sensor for errors.
+            sensor: Its name, for errors.
             never: Why it can never be tared; empty = it can.
 
         Raises:

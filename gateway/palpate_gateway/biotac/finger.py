@@ -89,13 +89,7 @@ class FingerOptions(StrictConfig):
 
 
 class FingerDevice(Device):
-    """A live BioTac whose slots come over a shared line. Subclasses open the line.
-
-    Args:
-        driver: Name in the driver table.
-        model: One line that names the device.
-        options: Port and serial.
-    """
+    """A live BioTac whose slots come over a shared line. Subclasses open the line."""
 
     def __init__(self, driver: str, model: str, options: FingerOptions) -> None:
         wanted = options.sensor_type

@@ -216,10 +216,13 @@ class BiotacPic32(Device):
         if verdict is SampleVerdict.NEW:
             # The reading waited for this record, whose arrival is the newest observation.
             self._release(readings, ClockObservation(self._clock.time_s, time.monotonic_ns()))
-            self._absent = _is_absent(record.sample)
+            values = _values(record.sample)
+            # Words of an absent finger are 00 00, and the board ignores their parity.
+            self._absent = not any(values)
             self._counts["absent"] += self._absent
             if not self._absent:
-                self._counts["saturated_samples"] += _saturated(record.sample)
+                saturated = sum(value in (0, COUNTS_MAX) for value in values)
+                self._counts["saturated_samples"] += saturated
                 self._held = (record.sample, self._clock.tick, self._clock.time_s)
         if not self._absent:
             self._arrived_s = now_s
@@ -252,13 +255,3 @@ class BiotacPic32(Device):
 
 def _values(sample: Pic32Sample) -> tuple[int, ...]:
     return (sample.pac, sample.pdc, sample.tac, sample.tdc, *sample.electrodes)
-
-
-def _is_absent(sample: Pic32Sample) -> bool:
-    """Whether no finger answered: its words are then 00 00, and the board ignores their parity."""
-    return not any(_values(sample))
-
-
-def _saturated(sample: Pic32Sample) -> int:
-    """How many channels are at an end of their range."""
-    return sum(value in (0, COUNTS_MAX) for value in _values(sample))

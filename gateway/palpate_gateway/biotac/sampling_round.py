@@ -95,10 +95,7 @@ def _places_by_time(
 ) -> list[int]:
     """Place of each slot by its time, on the grid of the anchors; empty if they form no grid.
 
-    Args:
-        anchors: Slots with a known place, and their places.
-        times_s: Times of all slots [s]; None = unknown.
-        slot_period_s: Time between two slots [s].
+    Anchors are slots with a known place, and their places; the times are those of all slots.
     """
     if times_s is None or not anchors:
         return []
@@ -112,10 +109,7 @@ def _places_by_time(
 class PacNumbers:
     """Numbers PAC samples by the order of sampling, which it learns from whole frames.
 
-    Args:
-        layout: What a frame holds.
-        slot_period_s: Time between two slots [s].
-        timed: The slots have times of the device's clock.
+    With ``timed`` the slots have times of the device's clock.
     """
 
     def __init__(self, layout: FrameLayout, slot_period_s: float, *, timed: bool) -> None:
@@ -129,11 +123,9 @@ class PacNumbers:
         """The order of the last whole frame; None before the first."""
 
     def of(self, slots: SlotBlock, starts: Ints) -> Ints:
-        """Number of the PAC sample in each slot; of other slots ``NOT_PAC``.
+        """Number of the PAC sample in each slot of the frames that start at ``starts``.
 
-        Args:
-            slots: Slots of frames.
-            starts: Index of the first slot of each frame.
+        Of other slots ``NOT_PAC``.
         """
         ends = [*starts[1:].tolist(), len(slots)]
         frames = [slots.part(start, stop) for start, stop in zip(starts, ends, strict=True)]

@@ -98,11 +98,9 @@ class FingerQueue:
         )
 
     def put(self, slots: LineSlots, *, all_there: bool) -> None:
-        """Keep the finger's part. Called by the link, which holds its lock.
+        """Keep the finger's part of the slots of all fingers.
 
-        Args:
-            slots: Of all fingers.
-            all_there: No word of any finger is absent.
+        Called by the link, which holds its lock. ``all_there``: no word of any finger is absent.
         """
         self.absent = 0 if all_there else self._absent_behind(slots)
         self._blocks.append(slots.of(self.index))

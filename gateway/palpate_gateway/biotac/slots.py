@@ -108,13 +108,7 @@ class LineSlots:
 
     @classmethod
     def placed(cls, words: SlotWords, places: SlotPlaces, size: int) -> Self | None:
-        """Words that have a place; None if none has.
-
-        Args:
-            words: Of all slots.
-            places: Of some of them.
-            size: Slots of a frame.
-        """
+        """Those of the words that have a place, in frames of ``size`` slots; None if none has."""
         if not len(places):
             return None
         kept = places.kept

@@ -124,10 +124,7 @@ def middle_slope(points: Sequence[EnvelopePoint]) -> float:
     """Slope of the lower convex hull at the middle of the points [ns/s].
 
     Of all lines with no point below them, it is the one with the smallest sum of distances, if the
-    points are evenly spread.
-
-    Args:
-        points: In order of device time, of at least two different times.
+    points are evenly spread. They are in order of device time, of at least two different times.
     """
     hull: list[EnvelopePoint] = []
     for point in points:

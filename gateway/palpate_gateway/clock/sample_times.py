@@ -17,9 +17,6 @@ class ArrivalTimes:
     A sample that is read at once was taken now. One that waited, because this process or its host
     stood still, must not look as fresh: buffers keep the oldest samples, so it follows the last
     sample before the pause.
-
-    Args:
-        period_s: Time between two samples [s].
     """
 
     def __init__(self, period_s: float) -> None:
@@ -103,12 +100,7 @@ class SampleClock:
         self._suspect_us = None
 
     def take(self, stamp_us: int, now_s: float) -> SampleVerdict:
-        """Judge the next sample.
-
-        Args:
-            stamp_us: Its time as sent [us].
-            now_s: The host's monotonic time [s].
-        """
+        """Judge the next sample, by its time as sent [us] and the host's monotonic time [s]."""
         if self._stamp_us is None:
             return self._accept(stamp_us, now_s, stamp_us, 1)
         ahead_us = (stamp_us - self._stamp_us) % self._wrap_us

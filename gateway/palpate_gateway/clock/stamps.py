@@ -95,9 +95,6 @@ class LiveClock(ClockMap):
     """Follows the clock of a live device by offset and drift; see ``ClockEnvelope``.
 
     Mapped times keep the order of the device's times and are never later than the arrival.
-
-    Args:
-        wall: The wall clock; None = a new one.
     """
 
     def __init__(self, wall: WallClock | None = None) -> None:
@@ -152,11 +149,7 @@ class LiveClock(ClockMap):
 
 
 class ArrivalClock(ClockMap):
-    """For a live device that sends no time: its readings carry host times of arrival already.
-
-    Args:
-        wall: The wall clock; None = a new one.
-    """
+    """For a live device that sends no time: its readings carry host times of arrival already."""
 
     def __init__(self, wall: WallClock | None = None) -> None:
         self._wall = wall or WallClock()
@@ -255,9 +248,6 @@ class Stamper:
     """Turns readings into frames: each stream has its sequence, each frame its stamp.
 
     Belongs to one thread.
-
-    Args:
-        origin: Where the readings come from.
     """
 
     def __init__(self, origin: Origin) -> None:
@@ -278,11 +268,7 @@ class Stamper:
     ) -> None:
         """The device was opened, or opened again: its clock is a new one, the sequences go on.
 
-        Args:
-            clock_map: Maps the times of its readings.
-            serial: Serial number of the sensor.
-            sensor_type: Kind of tactile sensor; None = it has no electrodes.
-            slot_period_s: Time between two slots of a frame [s].
+        Without a ``sensor_type`` it has no electrodes.
         """
         self._clock = clock_map
         self._serial, self._sensor_type = serial, sensor_type

@@ -63,9 +63,6 @@ class WallClock:
 
     Linux slews both clocks alike, so the difference between them changes only when the wall clock
     is set: a step. Wall times follow it within ``LOOK_NS``; monotonic times do not change.
-
-    Args:
-        read: Reads both clocks.
     """
 
     def __init__(self, read: Callable[[], ClockPair] = read_pair) -> None:
@@ -81,12 +78,7 @@ class WallClock:
         """Monotonic time of the last look [ns]."""
 
     def at(self, monotonic_ns: int, *, now_ns: int) -> int:
-        """Wall time of a monotonic time [ns].
-
-        Args:
-            monotonic_ns: The instant [ns].
-            now_ns: The monotonic clock about now [ns]; if the last look is old, it looks again.
-        """
+        """Wall time of a monotonic time [ns]; looks again if the last look is old at ``now_ns``."""
         if now_ns - self.looked_ns > LOOK_NS:
             self.look()
         return monotonic_ns + self.offset_ns
@@ -126,9 +118,6 @@ class KernelStamps:
     more than a second old (of another clock, or another host), and any within a second of a step of
     the wall clock, since it may be from before or after the step. After a pause of this process,
     stamps may be older by the length of the pause.
-
-    Args:
-        wall: The wall clock; None = a new one.
     """
 
     def __init__(self, wall: WallClock | None = None) -> None:

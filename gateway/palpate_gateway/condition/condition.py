@@ -199,7 +199,7 @@ class Condition:
 
     Args:
         layout: Layout of its frames.
-        rate_hz: Frames per second [Hz].
+        rate_hz: Frames per second.
         limits: Noise up to which the sensor counts as still.
         retare: When to tare again without a request; None = never.
     """

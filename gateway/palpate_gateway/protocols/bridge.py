@@ -266,14 +266,9 @@ class BridgePacketTrack:
         return hello and sequence == 0 and step != 1 and time_us < self.time_us % _TIMES
 
     def follow(self, sequence: int, time_us: int) -> int | None:
-        """Advance to the next packet.
+        """Advance to the next packet, by its number modulo 65536 and its time modulo 2**32 [us].
 
-        Args:
-            sequence: Its number, modulo 65536.
-            time_us: Its device time, modulo 2**32 [us].
-
-        Returns:
-            How many packets are missing before it; None if it repeats the last.
+        Returns how many packets are missing before it; None if it repeats the last.
         """
         lost = (sequence - self.sequence - 1) % _SEQUENCES
         if lost == _SEQUENCES - 1:

@@ -192,11 +192,7 @@ class KmsDecoder:
 
 
 def parse_line(line: bytes) -> KmsRecord | KmsLineFault:
-    """Read one line; blanks and a CR around it do not matter.
-
-    Args:
-        line: The line without its LF.
-    """
+    """Read one line without its LF; blanks and a CR around it do not matter."""
     if len(line) > LINE_MAX:
         return KmsLineFault.OVERLONG
     line = line.strip()
@@ -338,14 +334,7 @@ def rate_of_divider(divider: int) -> float:
 
 
 def divider_of_rate(rate_hz: float) -> int:
-    """Largest divider whose rate is not below the one asked for.
-
-    Args:
-        rate_hz: Lines per second, 1..500 [Hz].
-
-    Raises:
-        ValueError: The device cannot deliver at this rate.
-    """
+    """Largest divider whose rate is not below the one asked for, 1..500 Hz; else ValueError."""
     slowest = BASE_RATE_HZ / DIVIDER_MAX
     if not slowest <= rate_hz <= BASE_RATE_HZ:
         raise ValueError(f"rate {rate_hz} Hz is not in {slowest:g}..{BASE_RATE_HZ:g} Hz")

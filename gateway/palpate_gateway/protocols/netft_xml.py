@@ -68,10 +68,7 @@ class NetftSettings:
 
 
 def parse_netft_xml(document: bytes) -> NetftSettings:
-    """Read ``netftapi2.xml``.
-
-    Args:
-        document: The document as the device's web server sends it.
+    """Read ``netftapi2.xml`` as the device's web server sends it.
 
     Raises:
         DeviceError: It is no such document, or it lacks the counts per unit.

@@ -72,11 +72,7 @@ class RdtScale:
                 raise ValueError(f"{name} {value} is not a positive finite number")
 
     def wrench(self, counts: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Force [N] and torque [N m], shape ``(..., 6)``.
-
-        Args:
-            counts: Counts of a record, or of many, shape ``(..., 6)``.
-        """
+        """Force [N] and torque [N m] of the counts of a record or of many, shapes ``(..., 6)``."""
         per_unit = np.repeat([self.counts_per_n, self.counts_per_n_m], 3)
         wrench: npt.NDArray[np.float64] = np.asarray(counts, np.float64) / per_unit
         return wrench
@@ -182,12 +178,7 @@ class RdtSequence:
 
 
 def unwrap(raw: int, previous: int) -> int:
-    """Value nearest to the previous one that equals a 32-bit counter modulo 2^32.
-
-    Args:
-        raw: The counter as sent.
-        previous: The value before, unwrapped; any value for the first.
-    """
+    """Value nearest to the previous one, unwrapped, that equals a 32-bit counter modulo 2^32."""
     return previous + (raw - previous + U32 // 2) % U32 - U32 // 2
 
 
@@ -358,13 +349,9 @@ def hex_filter_request(code: int) -> bytes:
 
 
 def hex_period_request(period_ms: int) -> bytes:
-    """Choose how often a HEX sends; the factory setting is 10 ms.
+    """Choose the time between two records of a HEX, 1..255 [ms]; the factory setting is 10 ms.
 
-    Args:
-        period_ms: Time from record to record, 1..255 [ms]. The device would take 0 as a stop.
-
-    Raises:
-        ValueError: The period is out of range.
+    Raises ValueError outside that range: the device would take 0 as a stop.
     """
     if not 1 <= period_ms <= HEX_PERIOD_MAX_MS:
         raise ValueError(f"period {period_ms} ms is not in 1..{HEX_PERIOD_MAX_MS} ms")

@@ -172,26 +172,25 @@ def overloaded_axes(overload: int) -> tuple[str, ...]:
     return tuple(axis for at, axis in enumerate(AXES) if overload & 0x20 >> at)
 
 
+FORCE_DIVISOR = 50.0
+"""Counts per newton."""
+
+
 @dataclass(frozen=True, slots=True)
 class RobotousScale:
     """Counts per unit of one model.
 
     Attributes:
-        force_divisor: Counts per newton.
-        torque_divisor: Counts per newton metre.
+        torque_divisor: Counts per newton metre; those per newton are the same for all models.
     """
 
-    force_divisor: float
     torque_divisor: float
 
     def wrench(self, counts: Sequence[int]) -> tuple[float, ...]:
         """Fx Fy Fz [N] Tx Ty Tz [N m] of the six counts."""
-        force = tuple(count / self.force_divisor for count in counts[:3])
+        force = tuple(count / FORCE_DIVISOR for count in counts[:3])
         return force + tuple(count / self.torque_divisor for count in counts[3:])
 
-
-FORCE_DIVISOR = 50.0
-"""Counts per newton, the same for all models."""
 
 TORQUE_DIVISORS: dict[str, float] = {
     "RFT40-SA01": 2000.0,
@@ -224,7 +223,7 @@ def scale_of(model: str, *, torque_divisor: float | None = None) -> RobotousScal
         torque_divisor = TORQUE_DIVISORS[known[0]]
     if not 0 < torque_divisor < float("inf"):
         raise ValueError(f"torque divisor {torque_divisor} is not above 0")
-    return RobotousScale(FORCE_DIVISOR, torque_divisor)
+    return RobotousScale(torque_divisor)
 
 
 def request(command: RobotousCommand, *parameters: int) -> bytes:
@@ -286,11 +285,7 @@ _HALF_BYTES = REPLY_BYTES // 2
 
 
 def serial_frame(data: bytes) -> bytes:
-    """Frame of a request (8 data bytes: 11 bytes) or of an answer (16: 19 bytes).
-
-    Raises:
-        ValueError: There are neither 8 nor 16 data bytes.
-    """
+    """Frame of a request (8 data bytes: 11 bytes) or of an answer (16: 19); else ValueError."""
     if len(data) not in (REQUEST_BYTES, REPLY_BYTES):
         raise ValueError(f"{len(data)} data bytes are neither {REQUEST_BYTES} nor {REPLY_BYTES}")
     return _HEAD + data + bytes((sum8(data), _END))

@@ -213,9 +213,7 @@ class SlotClock:
     def place_all(self, channels: Ints, stamps_s: Floats) -> SlotPlaces:
         """Place many slots, without those that get no place; the same result as ``place``, faster.
 
-        Args:
-            channels: Their channel indices, int64, shape ``(N,)``.
-            stamps_s: When they came [s], shape ``(N,)``.
+        Both arrays have shape ``(N,)``.
         """
         if len(channels) and (steady := self._steady(channels, stamps_s)) is not None:
             return steady

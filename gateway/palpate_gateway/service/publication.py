@@ -67,11 +67,9 @@ class MessagePublisher:
         return {"publish_p50_s": float(p50), "publish_p99_s": float(p99)}
 
     def put_read(self, items: list[DueMessage], read_ns: int) -> None:
-        """Publish the messages of one read, and note their latency.
+        """Publish the messages of one read, and note their latency since ``read_ns``.
 
-        Args:
-            items: The messages.
-            read_ns: When the device's ``read`` had brought the readings, host monotonic clock [ns].
+        That is when the device's ``read`` had returned, by the host's monotonic clock [ns].
         """
         # A recorded message waits until it is due: its latency would be that of the recording.
         if self.put(items) and not items[0].due_ns:

@@ -23,12 +23,7 @@ _ZERO_REMEDY = "when nothing touches the BioTac, take its zero again: palpate ta
 
 
 class SensorReport:
-    """Reports the state of a sensor to ``Health``, each event once; belongs to one thread.
-
-    Args:
-        name: The sensor's name.
-        health: Receives the reports.
-    """
+    """Reports the state of a sensor to ``Health``, each event once; belongs to one thread."""
 
     def __init__(self, name: str, health: Health) -> None:
         self._name, self._health = name, health

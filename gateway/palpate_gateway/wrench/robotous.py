@@ -203,7 +203,7 @@ class WrenchRobotous(WrenchDevice):
         self._options = options
         self._has_clock = False
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
-        self._scale = wire.RobotousScale(1.0, 1.0)
+        self._scale = wire.RobotousScale(1.0)
         self._arrivals = ArrivalTimes(1.0 / options.rate_hz)
 
     def zero(self) -> None:

@@ -113,7 +113,7 @@ def test_what_cannot_be_read_is_kept(payload: bytes) -> None:
     ],
 )  # fmt: skip
 def test_scales(model: str, divisor: int) -> None:
-    assert rft.scale_of(model) == rft.RobotousScale(50, divisor)
+    assert rft.scale_of(model) == rft.RobotousScale(divisor)
 
 
 def test_scale_is_a_setting() -> None:
