@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,7 +29,7 @@ from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.population.members import Member, read_population
 from palpate_fem.population.responses import Population, clear_steps
-from palpate_fem.result import IndentationResult, IndentationStep
+from palpate_fem.result import IndentationResult
 from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.service.config import DEFAULT_FACTORY
@@ -41,10 +41,11 @@ from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
 from palpate_fem.trajectory import CLEARANCE_M, Campaign, PlannedIndentation
 from palpate_training.experiment.generate.simulator import (
+    ElectrodeStream,
     ExperimentSpec,
     OnProgress,
+    PressedSpecimens,
     SimulatedFingertip,
-    SimulatedStep,
     SimulatedTrajectory,
     Specimen,
 )
@@ -74,56 +75,37 @@ def _mesh_options(spec: ExperimentSpec) -> dict[str, object]:
     return {"layers": 2, "edge_m": spec.edge_m, "solver": dict(SOLVER)}
 
 
-@dataclass(frozen=True, slots=True)
-class FemSpecimen:
-    """A member of a population, as the experiment presses it."""
-
-    member: Member
-
-    @property
-    def name(self) -> str:
-        """E.g. ``biotac-1``."""
-        return self.member.specimen.name
-
-    @property
-    def overtravel_m(self) -> float:
-        """How much deeper it is pressed than planned [m]."""
-        return self.member.overtravel_m
-
-    @property
-    def temperature_coefficient(self) -> float:
-        """Change of ln conductivity with temperature [1/K]."""
-        return self.member.specimen.temperature_coefficient
-
-    def pressed_with(self, indenter: str) -> bool:
-        """Whether it meets an indenter."""
-        return self.member.published.pressed_with(indenter)
-
-    def content(self) -> dict[str, Any]:
-        """All that decides its rows, as plain values."""
-        return self.member.to_dict()
-
-    def to_json(self) -> str:
-        """Its electrical parameters."""
-        return self.member.specimen.to_json()
-
-    def stream(self, rest: Floats, seed: int) -> FemElectrodeStream:
-        """Its electrodes over time, from the untouched state."""
-        return FemElectrodeStream(ElectrodeSignals(self.member.specimen, rest, seed))
-
-    def warming(self, age_s: Floats) -> Floats:
-        """Return ln of the conductivity at ages since power-on [s], shape (T,)."""
-        unit = self.member.specimen
-        core = [core_temperature_c(float(age), AMBIENT_C, unit) for age in age_s]
-        return np.array([log_sigma(temperature_c, unit) for temperature_c in core])
-
-
-def specimens_of(members: Iterable[Member]) -> tuple[FemSpecimen, ...]:
+def specimens_of(members: Iterable[Member]) -> tuple[Specimen, ...]:
     """Members of a population as specimens."""
-    return tuple(FemSpecimen(member) for member in members)
+    return tuple(
+        Specimen(
+            name=member.specimen.name,
+            overtravel_m=member.overtravel_m,
+            temperature_coefficient=member.specimen.temperature_coefficient,
+            parameters=member.specimen,
+            parameters_json=member.specimen.to_json(),
+            content=member.to_dict(),
+            pressed_with=member.published.pressed_with,
+            stream=partial(_stream, member.specimen),
+            warming=partial(_warming, member.specimen),
+        )
+        for member in members
+    )
 
 
-def read_specimens(population: Path | None) -> tuple[FemSpecimen, ...]:
+def _stream(unit: SpecimenParameters, rest: Floats, seed: int) -> ElectrodeStream:
+    signals = ElectrodeSignals(unit, rest, seed)
+    return lambda ideal, time_s, elapsed_s, warmth: signals.stream(
+        skewed(ideal, time_s), elapsed_s, log_sigma=warmth
+    )
+
+
+def _warming(unit: SpecimenParameters, age_s: Floats) -> Floats:
+    core = [core_temperature_c(float(age), AMBIENT_C, unit) for age in age_s]
+    return np.array([log_sigma(temperature_c, unit) for temperature_c in core])
+
+
+def read_specimens(population: Path | None) -> tuple[Specimen, ...]:
     """Specimens of a population's file; None = the three that come with palpate.
 
     Raises:
@@ -133,79 +115,16 @@ def read_specimens(population: Path | None) -> tuple[FemSpecimen, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class FemElectrodeStream:
-    """The electrodes of one specimen over time."""
+class FilmFactory:
+    """Makes the electrodes of specimens in a worker, which keeps them; equal by what it makes."""
 
-    signals: ElectrodeSignals
+    key: str
+    units: tuple[SpecimenParameters, ...]
+    fingertip: StoredFingertip = field(compare=False)
 
-    def read(
-        self, ideal: Floats, time_s: Floats, elapsed_s: Floats, log_sigma: Floats
-    ) -> NDArray[np.uint16]:
-        """Counts of ideal counts, each electrode at its own instant of the frame."""
-        return self.signals.stream(skewed(ideal, time_s), elapsed_s, log_sigma=log_sigma)
-
-
-class FemSpecimens:
-    """Electrodes of specimens on one fingertip."""
-
-    def __init__(self, fingertip: StoredFingertip, units: Sequence[SpecimenParameters]) -> None:
-        self._population = Population(fingertip, units)
-        self._held = fingertip.mesh.fixed
-
-    @property
-    def rest_counts(self) -> Mapping[str, Floats]:
-        """Ideal counts of each untouched specimen."""
-        return self._population.rest_counts
-
-    def clear_steps(self, indentation: SimulatedTrajectory) -> int:
-        """How many steps there are before the indenter bears on what holds the finger."""
-        return clear_steps(cast("IndentationResult", indentation), self._held)
-
-    def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
-        """Ideal counts of each specimen at each step."""
-        return self._population.counts(cast("Sequence[IndentationStep]", steps))
-
-
-class FemSpecimensOf:
-    """Makes `FemSpecimens` in a worker, which keeps them: equal factories make equal ones."""
-
-    def __init__(self, fingertip: StoredFingertip, units: tuple[SpecimenParameters, ...]) -> None:
-        self._fingertip, self._units = fingertip, units
-        self._key = (fingertip.key, units)
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, FemSpecimensOf) and self._key == other._key
-
-    def __call__(self) -> FemSpecimens:
+    def __call__(self) -> PressedSpecimens:
         """Prepare the films; takes seconds."""
-        return FemSpecimens(self._fingertip, self._units)
-
-
-class FemStore:
-    """A simulation store, as the experiment reads it."""
-
-    def __init__(self, path: Path) -> None:
-        self._store = SimulationStore.open(path)
-        self.path = path
-
-    def ids(self) -> Sequence[str]:
-        """Ids of the trajectories that are there."""
-        return self._store.ids()
-
-    def fingertip(self) -> StoredFingertip:
-        """What was pressed."""
-        return self._store.fingertip()
-
-    def indentation(self, name: str) -> IndentationResult:
-        """A trajectory with its fields."""
-        return self._store.trajectory(name)
-
-    def start_pose(self, name: str) -> Floats:
-        """First pose of a trajectory's path."""
-        return np.asarray(self._store.summary(name).path[0])
+        return cast("PressedSpecimens", Population(self.fingertip, self.units))
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,11 +143,13 @@ def _simulate(task: _MechanicsTask) -> IndentationResult:
     return _fingertip(task.spec).indent(task.indenter, task.path, friction_coefficient=friction)
 
 
-@lru_cache(maxsize=1)
-def _fingertip(spec: ExperimentSpec) -> BiotacTip:
+def _build(spec: ExperimentSpec) -> BiotacTip:
     build: Callable[..., Any] = biotac(**_mesh_options(spec))  # type: ignore[arg-type]
     tip: BiotacTip = build(parameters_of(spec), lambda _: None)
     return tip
+
+
+_fingertip = lru_cache(maxsize=1)(_build)
 
 
 class FemSimulator:
@@ -238,9 +159,7 @@ class FemSimulator:
 
     def fingertip(self, spec: ExperimentSpec) -> StoredFingertip:
         """Pressurise the fingertip of an experiment, in this process."""
-        build: Callable[..., Any] = biotac(**_mesh_options(spec))  # type: ignore[arg-type]
-        described: StoredFingertip = build(parameters_of(spec), lambda _: None).describe()
-        return described
+        return _build(spec).describe()
 
     def plans(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
@@ -331,16 +250,16 @@ class FemSimulator:
                     place.close()
         return True
 
-    def open_store(self, path: Path) -> FemStore:
+    def open_store(self, path: Path) -> SimulationStore:
         """Open a simulation store."""
-        return FemStore(path)
+        return SimulationStore.open(path)
 
     def make_specimens(
         self, fingertip: SimulatedFingertip, specimens: Iterable[Specimen]
-    ) -> FemSpecimensOf:
+    ) -> FilmFactory:
         """What makes the specimens' electrodes in a worker process."""
-        units = tuple(cast("FemSpecimen", specimen).member.specimen for specimen in specimens)
-        return FemSpecimensOf(cast("StoredFingertip", fingertip), units)
+        tip = cast("StoredFingertip", fingertip)
+        return FilmFactory(tip.key, tuple(one.parameters for one in specimens), tip)
 
     def clear_steps(self, indentation: SimulatedTrajectory, fingertip: SimulatedFingertip) -> int:
         """How many steps there are before the indenter bears on what holds the finger."""

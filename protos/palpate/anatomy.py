@@ -88,3 +88,15 @@ SP_ELECTRODE_MIRROR: NDArray[np.int32] = (
     np.array([*range(11, 21), *range(1, 11), 21, 23, 22, 24], np.int32) - 1
 )
 """Index of the electrode at the mirror image (y -> -y) of each of E1..E24, shape (24,)."""
+
+CORE_RADIUS_M = 5.08e-3
+"""Radius of the core's half-cylinder about the x axis and of its spherical tip about the origin
+[m]. The flat tip with E7..E10 lies up to 0.56 mm deeper."""
+
+
+def core_normal(points: NDArray[np.floating]) -> Floats:
+    """Outward unit normal of the core below points [m], shape (N, 3); zero on its axis."""
+    radial = np.array(points, np.float64)
+    radial[:, 0] = np.maximum(radial[:, 0], 0.0)
+    length = np.linalg.norm(radial, axis=1, keepdims=True)
+    return np.asarray(radial / np.where(length > 0, length, 1.0))

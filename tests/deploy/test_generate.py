@@ -16,7 +16,7 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError, LinkError
 from palpate.files.tape import read_tape
-from palpate_deploy.experiment import FemSimulator, FemSpecimen, specimens_of
+from palpate_deploy.experiment import FemSimulator, specimens_of
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.population.members import PAPER, Member
 from palpate_fem.store.read import SimulationStore
@@ -32,7 +32,7 @@ from palpate_training.experiment.generate.pipeline import (
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
 from palpate_training.experiment.generate.sample import make_sample
-from palpate_training.experiment.generate.simulator import ExperimentSpec
+from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
 from palpate_training.experiment.generate.workers import (
     RayCluster,
     WorkerLostError,
@@ -44,7 +44,7 @@ SPEC = ExperimentSpec(
 )
 
 
-def specimens() -> tuple[FemSpecimen, ...]:
+def specimens() -> tuple[Specimen, ...]:
     """Two units, one of which was pressed deeper than planned."""
     unit = replace(SpecimenParameters(), noise_counts=1.0)
     return specimens_of(

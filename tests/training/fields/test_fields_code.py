@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.anatomy import CORE_RADIUS_M, core_normal
 from palpate.errors import DatasetError
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning.field_code import (
-    CORE_RADIUS_M,
     RADII_M,
     SITES,
     FieldCode,
-    core_normal,
     fit_code,
     pooling,
 )

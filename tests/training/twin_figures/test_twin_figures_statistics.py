@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from palpate.anatomy import CORE_RADIUS_M, core_normal
 from palpate.errors import DatasetError
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
 from palpate_training.figures.boxes import box_of
-from palpate_training.figures.outline import CORE_RADIUS_M, core_normal, unwrap
+from palpate_training.figures.outline import unwrap
 from palpate_training.figures.page import group_table, size_table, unit_table
 from palpate_training.figures.skin import final_rows, motion_share
 from palpate_training.figures.statistics import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -20,7 +19,7 @@ from palpate import __version__
 from palpate.errors import ConfigError
 from palpate.process import typed_command
 from palpate.rigid import Transform
-from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.container import Provenance, sha256_of
 from palpate_training.datasets.trials import TrialsContents, read_contents, write_trials
 from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import ARMS
@@ -136,10 +135,10 @@ def data_ingest(
             Provenance(
                 source=f"record {record.name} of {sensor}, plan {plan.name}",
                 command=typed_command(),
-                input_sha256=_sha256(record),
+                input_sha256=sha256_of(record),
                 licence=licence,
                 palpate_version=__version__,
-                notes=f"input_sha256 is of the record; sha256 of the plan: {_sha256(plan)}",
+                notes=f"input_sha256 is of the record; sha256 of the plan: {sha256_of(plan)}",
             ),
         )
     console.print(trials_table(read_contents(out), str(out)))
@@ -293,8 +292,3 @@ def _times(path: Path) -> dict[str, int]:
 
 def _named(arms: Mapping[str, object]) -> str:
     return " and ".join(sorted(arms)) or "none"
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,34 @@ class StoredTables:
         for name, value in sorted(self.numbers.items()):
             digest.update(f"{name}={value!r}".encode())
         return digest.hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_archive(
+    path: Path, names: Callable[[Sequence[str]], Iterable[str]], *, remedy: str
+) -> dict[str, npt.NDArray[Any]]:
+    """Arrays of a NumPy archive (``.npz``).
+
+    Args:
+        path: The archive.
+        names: Names that it holds -> names of the arrays to read.
+        remedy: What to do where it cannot be read.
+
+    Raises:
+        DatasetError: It is missing or damaged, or lacks an array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in names(archive.files)}
+    except KeyError as error:
+        raise DatasetError(f"{path}: {error.args[0]}", remedy=remedy) from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path}: not a readable NumPy archive: {error}", remedy=remedy) from error
 
 
 def write_tables(

@@ -15,7 +15,6 @@ changes neither magnitudes nor angles.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -40,7 +39,7 @@ from palpate.messages import (
     WrenchFrame,
 )
 from palpate.sampling import sample_offsets
-from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.container import Provenance, read_archive, sha256_of
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 
 _log = logging.getLogger(__name__)
@@ -102,8 +101,6 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
         for part in parts:
             part.pop("contact_location", None)
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     return FeatureDataset(
         **columns,
         block=columns["group"].copy(),
@@ -111,7 +108,7 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
         provenance=Provenance(
             source=f"record of {', '.join(names)}",
             command=command,
-            input_sha256=digest,
+            input_sha256=sha256_of(path),
             licence=licence,
             palpate_version=__version__,
             notes="wrench and pose at the middle of each frame; group = press",
@@ -291,28 +288,17 @@ def ingest_lasa(
     Raises:
         DatasetError: The archive is missing, damaged, or not this one.
     """
-    try:
-        content = path.read_bytes()
-        with np.load(path, allow_pickle=False) as archive:
-            parts = [
-                (
-                    archive[f"finger{finger}_electrodes_raw"][lag_rows:],
-                    archive[f"finger{finger}_baseline_mean"],
-                    _without_last(archive[f"finger{finger}_force_N"], lag_rows),
-                )
-                for finger in FINGERS
-            ]
-    except KeyError as error:
-        raise DatasetError(
-            f"{path}: {error.args[0]}",
-            remedy="give the archive force_calibration.npz of the LASA force calibration",
-        ) from error
-    except (OSError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: not a readable NumPy archive: {error}",
-            remedy="give the archive force_calibration.npz of the LASA force calibration",
-        ) from error
-
+    names = [
+        f"finger{finger}_{what}"
+        for finger in FINGERS
+        for what in ("electrodes_raw", "baseline_mean", "force_N")
+    ]
+    remedy = "give the archive force_calibration.npz of the LASA force calibration"
+    arrays = iter(read_archive(path, lambda _: names, remedy=remedy).values())
+    parts = [
+        (electrodes[lag_rows:], baseline, theirs[: len(theirs) - lag_rows])
+        for electrodes, baseline, theirs in zip(arrays, arrays, arrays, strict=True)
+    ]
     rows = [len(electrodes) for electrodes, _, _ in parts]
     force = np.concatenate([theirs for _, _, theirs in parts]).astype(np.float32)
     return FeatureDataset(
@@ -334,14 +320,10 @@ def ingest_lasa(
         provenance=Provenance(
             source="LASA force calibration (MiaoLi/syntouchcontact), two real BioTacs",
             command=command,
-            input_sha256=hashlib.sha256(content).hexdigest(),
+            input_sha256=sha256_of(path),
             licence="none stated by the authors: measure, do not redistribute",
             palpate_version=__version__,
             notes=f"{_NOTES}; electrodes paired with the force {lag_rows} rows before",
         ),
         name=str(path),
     )
-
-
-def _without_last(rows: npt.NDArray[np.float32], count: int) -> npt.NDArray[np.float32]:
-    return rows[: len(rows) - count]

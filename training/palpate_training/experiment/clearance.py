@@ -34,9 +34,6 @@ HOLE_CIRCLE_M = 0.076
 HOLE_ANGLES_DEG = (35.0, 115.0, 215.0, 305.0)
 """Unevenly spaced, so that no two holes can be swapped unseen (see `register`)."""
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-"""Of the error that `RegistrationErrors.quantiles_m` gives."""
-
 
 @dataclass(frozen=True, slots=True)
 class RegistrationErrorModel:
@@ -83,11 +80,6 @@ class RegistrationErrors:
     def constant(self) -> Floats:
         """Part of the error that all poses share [m], shape (D, 3): an arm's constant offset."""
         return np.asarray(self.error.mean(axis=1))
-
-    def quantiles_m(self) -> dict[float, float]:
-        """Quantiles of the length of the error over all registrations and poses [m]."""
-        values = np.quantile(np.linalg.norm(self.error, axis=-1), QUANTILES)
-        return {q: float(v) for q, v in zip(QUANTILES, values, strict=True)}
 
 
 def plate_holes() -> Floats:

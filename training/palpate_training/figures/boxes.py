@@ -25,12 +25,10 @@ from palpate_training.figures.style import (
     INK,
     MM,
     SKIN_LIGHT,
-    caption,
+    finish,
     grid,
-    heading,
     label,
     new_figure,
-    save,
     unit_colour,
     unit_legend,
 )
@@ -128,13 +126,6 @@ FORCE_NAMES = ("$F_x$ (distal)", "$F_y$ (lateral)", "$F_z$ (dorsal)", "$|F|$")
 def draw_force_boxes(path: Path, data: ExperimentDataset) -> str:
     """Draw the three components of force, and the magnitude, for each unit.
 
-    Args:
-        path: PNG to write.
-        data: What to draw.
-
-    Returns:
-        The caption.
-
     Raises:
         DatasetError: A unit has no rows, or the disk refused.
     """
@@ -158,10 +149,7 @@ def draw_force_boxes(path: Path, data: ExperimentDataset) -> str:
     axes.tick_params(axis="x", labelsize=10, length=0)
     grid(axes, "y")
     unit_legend(figure, data.unit_names, loc="outside upper right", ncols=len(data.unit_names))
-    heading(figure, "Force values, sensor frame")
-    caption(figure, text)
-    save(figure, path)
-    return text
+    return finish(figure, path, "Force values, sensor frame", text)
 
 
 ELECTRODE_NAMES = tuple(f"E{i}" for i in range(1, len(ELECTRODE_POSITIONS) + 1))
@@ -173,13 +161,6 @@ _ELECTRODE = "#2563a6"
 
 def draw_electrode_boxes(path: Path, data: ExperimentDataset) -> str:
     """Draw the tared values of each electrode and unit, and where the electrodes are.
-
-    Args:
-        path: PNG to write.
-        data: What to draw.
-
-    Returns:
-        The caption.
 
     Raises:
         DatasetError: A unit has no rows, or the disk refused.
@@ -208,10 +189,7 @@ def draw_electrode_boxes(path: Path, data: ExperimentDataset) -> str:
     low, high = left.get_ylim()
     left.set_ylim(low, high + 0.1 * (high - low))  # the legend's line
     draw_map(right)
-    heading(figure, "Electrode values")
-    caption(figure, text)
-    save(figure, path)
-    return text
+    return finish(figure, path, "Electrode values", text)
 
 
 def draw_map(axes: Any) -> None:

@@ -9,7 +9,6 @@ Drift and noise of untouched electrodes: spectra, and change over minutes.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,20 +19,19 @@ import numpy.typing as npt
 
 from palpate.errors import DatasetError
 from palpate.process import require
+from palpate_training.datasets.container import read_archive
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.figures.style import (
     INK,
     REAL_COLOURS,
-    caption,
+    finish,
     grid,
-    heading,
     label,
     new_figure,
-    save,
     unit_colour,
 )
 
-Counts = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float64]
 
 FORCE_CALIBRATION = Path("lasa_force_calibration") / "force_calibration.npz"
 """Where the idle real sensors are, in the folder of public data."""
@@ -63,7 +61,7 @@ class IdleStream:
 
     name: str
     rate_hz: float
-    counts: Counts
+    counts: Floats
     real: bool
 
 
@@ -75,7 +73,7 @@ def read_idle_twin(path: Path) -> tuple[IdleStream, ...]:
             lasts less than a minute.
     """
     remedy = f"write {_RATE} and an array (T, {ELECTRODES}) for each unit with numpy.savez"
-    arrays = _load(path, remedy=remedy)
+    arrays = read_archive(path, lambda held: held, remedy=remedy)
     rate = arrays.pop(_RATE, None)
     if rate is None or rate.size != 1 or not float(rate.reshape(-1)[0]) > 0:
         raise DatasetError(f"{path}: {_RATE} is missing or not one positive number", remedy=remedy)
@@ -83,7 +81,7 @@ def read_idle_twin(path: Path) -> tuple[IdleStream, ...]:
         raise DatasetError(f"{path}: there is no stream in it", remedy=remedy)
     hertz = float(rate.reshape(-1)[0])
     return tuple(
-        _checked(path, name, IdleStream(name, hertz, counts, real=False))
+        _checked(path, name, IdleStream(name, hertz, counts.astype(np.float64), real=False))
         for name, counts in arrays.items()
     )
 
@@ -100,21 +98,12 @@ def read_idle_real(folder: Path) -> tuple[IdleStream, ...]:
     path = folder / FORCE_CALIBRATION
     if not path.is_file():
         return ()
-    arrays = _load(path, remedy="give the archive of the LASA force calibration", only=tuple(_REAL))
+    remedy = "give the archive of the LASA force calibration"
+    arrays = read_archive(path, lambda _: _REAL, remedy=remedy)
     return tuple(
-        _checked(path, key, IdleStream(name, REAL_RATE_HZ, arrays[key], real=True))
+        _checked(path, key, IdleStream(name, REAL_RATE_HZ, arrays[key].astype(float), real=True))
         for key, name in _REAL.items()
     )
-
-
-def _load(path: Path, *, remedy: str, only: tuple[str, ...] = ()) -> dict[str, Counts]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key].astype(np.float64) for key in only or archive.files}
-    except KeyError as error:
-        raise DatasetError(f"{path}: {error.args[0]}", remedy=remedy) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: not a readable archive: {error}", remedy=remedy) from error
 
 
 def _checked(path: Path, key: str, stream: IdleStream) -> IdleStream:
@@ -130,8 +119,6 @@ def _checked(path: Path, key: str, stream: IdleStream) -> IdleStream:
         )
     return stream
 
-
-Floats = npt.NDArray[np.float64]
 
 NOISE_ABOVE_HZ = 1.0
 """Faster than this is called noise, slower drift [Hz]."""
@@ -243,13 +230,6 @@ def drift(counts: Floats, rate_hz: float, *, mean_s: float = 1.0) -> ElectrodeDr
 def draw_noise(path: Path, streams: Sequence[IdleStream]) -> str:
     """Draw spectra and drift of the twin beside those of real sensors.
 
-    Args:
-        path: PNG to write.
-        streams: Of the twin, of real sensors, or both.
-
-    Returns:
-        The caption.
-
     Raises:
         DatasetError: A stream is too short, or the disk refused.
     """
@@ -279,10 +259,7 @@ def draw_noise(path: Path, streams: Sequence[IdleStream]) -> str:
     figure.legend(
         handles, names, loc="outside right upper", frameon=False, fontsize=9, labelcolor=INK
     )
-    heading(figure, "Untouched electrodes")
-    caption(figure, text)
-    save(figure, path)
-    return text
+    return finish(figure, path, "Untouched electrodes", text)
 
 
 def _about_real(streams: Sequence[IdleStream]) -> str:

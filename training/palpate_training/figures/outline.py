@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from palpate.anatomy import CORE_RADIUS_M
 
-CORE_RADIUS_M = 5.08e-3
-"""Radius of the core's cylinder and of its spherical tip about the origin [m]."""
+Floats = npt.NDArray[np.float64]
 
 _BACK, _SKIN_TIP, _SKIN_SIDE = -20e-3, 6.65e-3, 7.11e-3
 _SKIN_BELOW = -8.14e-3
@@ -73,15 +72,3 @@ def unwrapped() -> Floats:
     turn = np.linspace(-np.pi / 2, np.pi / 2, 90)
     bow = half * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return np.vstack([[_BACK, -half], bow, [_BACK, half]])
-
-
-def core_normal(points: Floats) -> Floats:
-    """Outward direction from the core's axis, at the tip from its centre; shape (N, 3), unit.
-
-    Args:
-        points: Points on or outside the core [m], shape (N, 3), sensor frame.
-    """
-    away = np.array(points, np.float64)
-    away[:, 0] = np.clip(away[:, 0], 0.0, None)
-    length = np.linalg.norm(away, axis=1, keepdims=True)
-    return np.asarray(away / np.where(length > 0, length, 1.0))

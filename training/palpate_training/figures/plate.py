@@ -11,7 +11,6 @@ Which electrodes rise and fall under a ventral plate: the real sensor beside the
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import DatasetError
 from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.container import read_archive
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.figures.boxes import ELECTRODE_NAMES
 from palpate_training.figures.skin import final_rows
@@ -28,12 +27,10 @@ from palpate_training.figures.style import (
     GRID,
     INK,
     REAL_COLOURS,
-    caption,
+    finish,
     grid,
-    heading,
     label,
     new_figure,
-    save,
     unit_colour,
 )
 
@@ -94,23 +91,18 @@ def read_plate_logs(folder: Path) -> tuple[PlateLog, ...]:
     path = folder / CONTACT_NORMAL
     if not path.is_file():
         return ()
+    parts = ("pdc_raw", "electrodes_raw", "contact_normal")
+
+    def wanted(held: Sequence[str]) -> list[str]:
+        logs = sorted({key.partition("_")[0] for key in held})
+        return [f"{log}_{part}" for log in logs for part in parts]
+
     remedy = "give the archive of the LASA contact-normal logs"
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            names = sorted({key.partition("_")[0] for key in archive.files})
-            return tuple(
-                PlateLog(
-                    *(
-                        archive[f"{name}_{part}"].astype(np.float64)
-                        for part in ("pdc_raw", "electrodes_raw", "contact_normal")
-                    )
-                )
-                for name in names
-            )
-    except KeyError as error:
-        raise DatasetError(f"{path}: {error.args[0]}", remedy=remedy) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: not a readable archive: {error}", remedy=remedy) from error
+    arrays = iter(read_archive(path, wanted, remedy=remedy).values())
+    return tuple(
+        PlateLog(*(values.astype(np.float64) for values in log))
+        for log in zip(arrays, arrays, arrays, strict=True)
+    )
 
 
 def plate_response(logs: Sequence[PlateLog]) -> PlateResponse | None:
@@ -208,19 +200,7 @@ def agreement(real: Floats, twin: Floats) -> tuple[int, int]:
 
 
 def draw_signs(path: Path, real: PlateResponse, presses: Sequence[FlatPress]) -> str:
-    """Draw the mean tared value of each electrode, real and of each unit.
-
-    Args:
-        path: PNG to write.
-        real: The real sensor under its plate.
-        presses: Of the twin's units.
-
-    Returns:
-        The caption.
-
-    Raises:
-        DatasetError: The disk refused.
-    """
+    """Draw the mean tared value of each electrode, real and of each unit; returns the caption."""
     counted = [f"{press.name} {_of(agreement(real.tared, press.tared))}" for press in presses]
     text = (
         "Mean tared value of each electrode while something flat presses the pad from below, within"
@@ -251,10 +231,7 @@ def draw_signs(path: Path, real: PlateResponse, presses: Sequence[FlatPress]) ->
     figure.legend(
         loc="outside upper right", ncols=len(series), frameon=False, fontsize=9, labelcolor=INK
     )
-    heading(figure, "Rise and fall under a flat ventral press")
-    caption(figure, text)
-    save(figure, path)
-    return text
+    return finish(figure, path, "Rise and fall under a flat ventral press", text)
 
 
 def _of(counts: tuple[int, int]) -> str:

@@ -22,11 +22,9 @@ from palpate_training.figures.style import (
     MM,
     SKIN_DARK,
     SKIN_LIGHT,
-    caption,
-    heading,
+    finish,
     label,
     new_figure,
-    save,
 )
 
 _VIEWS = (
@@ -55,9 +53,6 @@ def draw_contacts(path: Path, data: ExperimentDataset, mesh: SkinMesh | None) ->
 
     Returns:
         The caption.
-
-    Raises:
-        DatasetError: The disk refused.
     """
     last = final_rows(data)
     units = len(data.unit_names)
@@ -96,10 +91,7 @@ def draw_contacts(path: Path, data: ExperimentDataset, mesh: SkinMesh | None) ->
             )
             axes.set(aspect="equal", xlim=bounds[:, across], ylim=bounds[:, up])
     panels[0, 0].invert_yaxis()  # seen from below with x to the right, y points down
-    heading(figure, "Contact locations")
-    caption(figure, text)
-    save(figure, path)
-    return text
+    return finish(figure, path, "Contact locations", text)
 
 
 def _bounds(points: npt.NDArray[np.float32], mesh: SkinMesh | None) -> npt.NDArray[np.float64]:
@@ -193,9 +185,6 @@ def draw_motion(path: Path, mesh: SkinMesh, share: Floats, rows: int) -> str:
 
     Returns:
         The caption.
-
-    Raises:
-        DatasetError: The disk refused.
     """
     outer = share[np.unique(mesh.outer_faces)]
     text = (
@@ -230,7 +219,4 @@ def draw_motion(path: Path, mesh: SkinMesh, share: Floats, rows: int) -> str:
     bar = figure.colorbar(drawn, ax=panels, shrink=0.8, pad=0.02)
     bar.set_label("rows with motion > 0.1 mm [%]", color=INK, fontsize=9)
     bar.ax.tick_params(colors=INK, labelsize=8)
-    heading(figure, "Frequency of skin motion")
-    caption(figure, text)
-    save(figure, path)
-    return text
+    return finish(figure, path, "Frequency of skin motion", text)

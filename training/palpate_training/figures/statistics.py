@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from palpate.anatomy import core_normal
 from palpate_training.datasets.experiment import ExperimentDataset
-from palpate_training.figures.outline import core_normal
 from palpate_training.figures.skin import final_rows
 
 Floats = npt.NDArray[np.float64]

@@ -65,17 +65,19 @@ def grid(axes: Any, axis: str = "both") -> None:
     axes.grid(visible=True, axis=axis, color=GRID, lw=0.7)
 
 
-def heading(figure: Any, text: str) -> None:
-    """What the figure shows, above it."""
-    figure.suptitle(text, x=0.01, ha="left", color=INK, fontsize=11)
+def finish(figure: Any, path: Path, heading: str, caption: str) -> str:
+    """Put a heading above and a caption, wrapped, below a figure, write it, return the caption.
 
-
-def caption(figure: Any, text: str) -> None:
-    """A caption below the figure, wrapped to its width."""
+    Raises:
+        DatasetError: The disk refused.
+    """
+    figure.suptitle(heading, x=0.01, ha="left", color=INK, fontsize=11)
     letters = int(_LETTERS_PER_INCH * figure.get_figwidth())
     figure.supxlabel(
-        textwrap.fill(text, letters), x=0.01, ha="left", color=INK, fontsize=_CAPTION_POINTS
+        textwrap.fill(caption, letters), x=0.01, ha="left", color=INK, fontsize=_CAPTION_POINTS
     )
+    save(figure, path)
+    return caption
 
 
 def unit_legend(where: Any, names: Sequence[str], **options: Any) -> None:

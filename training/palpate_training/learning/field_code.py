@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from palpate.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
+from palpate.anatomy import CORE_RADIUS_M, ELECTRODE_POSITIONS, EXCITATION_POSITIONS, core_normal
 from palpate.errors import DatasetError
 from palpate_training.datasets.experiment import MixedDataset, SkinMesh
 from palpate_training.learning.splits import Rows
@@ -166,10 +166,6 @@ SITES: Floats = np.vstack([ELECTRODE_POSITIONS, EXCITATION_POSITIONS])
 RADII_M = (1.25e-3, 2.5e-3, 5e-3)
 """Radius of an electrode's disc, its diameter, and what surrounds it [m] (learning notes, 6.5)."""
 
-CORE_RADIUS_M = 5.08e-3
-"""Distance of the electrodes from the core's axis or tip centre [m]; the flat tip with E7..E10 lies
-up to 0.56 mm deeper, so its film is taken for thinner than it is."""
-
 _THINNEST_REST_M = 5e-5
 """Film of a coarse mesh that touches the core at rest; keeps its relative thickness finite [m]."""
 
@@ -198,17 +194,6 @@ class FilmPooling:
         """
         change = np.sum(displacement[:, self.nodes] * self.normals, axis=2)
         return np.asarray(change @ self.weights, np.float32)
-
-
-def core_normal(points: npt.NDArray[np.floating]) -> Floats:
-    """Outward unit normal of the core below points of the film, shape (N, 3).
-
-    Args:
-        points: Positions [m], shape (N, 3), sensor frame.
-    """
-    radial = points.astype(np.float64)
-    radial[:, 0] = np.maximum(radial[:, 0], 0.0)
-    return np.asarray(radial / np.linalg.norm(radial, axis=1, keepdims=True))
 
 
 def pooling(mesh: SkinMesh) -> FilmPooling:

@@ -84,11 +84,6 @@ class Mlp(nn.Module):
             spread = np.maximum(values.std(axis=0, dtype=np.float64), _SMALLEST_SD)
             sd.copy_(torch.from_numpy(spread))
 
-    @property
-    def parameter_count(self) -> int:
-        """Number of trained parameters; the paper's network has 54,915."""
-        return sum(parameter.numel() for parameter in self.parameters())
-
 
 def predict(
     net: nn.Module, inputs: npt.NDArray[np.float32], *, batch_rows: int = 8192

@@ -83,7 +83,7 @@ def assemble(
         if done.rows:
             rows[name] = done.rows
             simulated[name] = simulated_trial(
-                name, store.indentation(name), done.believed, clearance_m
+                name, store.trajectory(name), done.believed, clearance_m
             )
         on_progress(k + 1, len(names), "read")
     every = [one for some in rows.values() for one in some]

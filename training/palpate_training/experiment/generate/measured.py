@@ -180,7 +180,7 @@ def _mix(
     believable: list[TrialRows] = []
     names = sorted({one.header.trajectory for one in common})
     for k, name in enumerate(names):
-        trajectory = store.indentation(name)
+        trajectory = store.trajectory(name)
         believed = simulator.clear_steps(trajectory, fingertip)
         for one in (one for one in common if one.header.trajectory == name):
             if not believed:

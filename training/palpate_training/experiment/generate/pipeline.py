@@ -193,7 +193,7 @@ def provenance_sha256(spec: ExperimentSpec, specimens: Sequence[Specimen], finge
     """Digest, hex, of all that decides the rows: spec, specimens and the fingertip's own digest."""
     content = {
         "spec": asdict(spec),
-        "members": [specimen.content() for specimen in specimens],
+        "members": [specimen.content for specimen in specimens],
         "fingertip": fingertip,
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -208,7 +208,7 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
     wanted: dict[str, Any] = {
         "schema": SPEC_SCHEMA,
         "spec": asdict(spec),
-        "members": [specimen.content() for specimen in specimens],
+        "members": [specimen.content for specimen in specimens],
     }
     wanted = json.loads(json.dumps(wanted))  # tuples become lists, as in the file
     path = folder / SPEC
@@ -264,7 +264,7 @@ def write_idle(
         ideal = np.repeat(rest[None], len(time_s), axis=0)
         stream = specimen.stream(rest, seed + number)
         elapsed_s = np.full(len(time_s), 1.0 / IDLE_RATE_HZ)
-        arrays[specimen.name] = stream.read(ideal, time_s, elapsed_s, warmed - warmed[0])
+        arrays[specimen.name] = stream(ideal, time_s, elapsed_s, warmed - warmed[0])
     with written_whole(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     return path

@@ -120,7 +120,7 @@ def _check_same(plans: Sequence[IndentationPlan], store: IndentationStore) -> No
     for plan in plans:
         if plan.name not in there:
             continue
-        off = float(np.abs(store.start_pose(plan.name) - plan.path[0]).max())
+        off = float(np.abs(store.summary(plan.name).path[0] - plan.path[0]).max())
         if off > SAME_PATH:
             raise ConfigError(
                 f"{store.path}: {plan.name} starts {off:.3g} m from this plan's",

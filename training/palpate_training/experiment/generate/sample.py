@@ -141,9 +141,11 @@ def _write_tape(
         rests.update({unit: rows[0] for unit, rows in done.counts.items()})
         counts = np.stack([done.counts[one.name] for one in specimens])
         rest_pa = fingertip.fluid_pressure_pa
-        presses.append(_press(name, store.indentation(name), counts, rest_pa))
+        presses.append(_press(name, store.trajectory(name), counts, rest_pa))
     build = build_tape(
-        specimens=[tape_specimen(one.name, one.to_json(), rests[one.name]) for one in specimens],
+        specimens=[
+            tape_specimen(one.name, one.parameters_json, rests[one.name]) for one in specimens
+        ],
         presses=presses,
         rest_pressure_pa=fingertip.fluid_pressure_pa,
         nodes=mesh.nodes,

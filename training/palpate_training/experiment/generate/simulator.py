@@ -113,8 +113,8 @@ class SimulatedStep(Protocol):
         """Above ambient [Pa]."""
 
 
-class SimulatedTrajectory(Protocol):
-    """A simulated trajectory; what converged of it."""
+class SimulatedPath(Protocol):
+    """What was asked of a simulated trajectory."""
 
     @property
     def indenter(self) -> str:
@@ -123,6 +123,10 @@ class SimulatedTrajectory(Protocol):
     @property
     def path(self) -> Floats:
         """Requested poses, the first one clear of the skin, shape (K + 1, 7)."""
+
+
+class SimulatedTrajectory(SimulatedPath, Protocol):
+    """A simulated trajectory; what converged of it."""
 
     @property
     def steps(self) -> Sequence[SimulatedStep]:
@@ -182,72 +186,53 @@ class IndentationStore(Protocol):
     def fingertip(self) -> SimulatedFingertip:
         """What was pressed."""
 
-    def indentation(self, name: str) -> SimulatedTrajectory:
+    def trajectory(self, trajectory: str, /) -> SimulatedTrajectory:
         """A trajectory with its fields."""
 
-    def start_pose(self, name: str) -> Floats:
-        """First pose of a trajectory's path, shape (7,)."""
+    def summary(self, trajectory: str, /) -> SimulatedPath:
+        """A trajectory without its fields."""
 
 
-class ElectrodeStream(Protocol):
-    """The electrodes of one specimen over time: creep, noise, rounding."""
-
-    def read(self, ideal: Floats, time_s: Floats, elapsed_s: Floats, log_sigma: Floats) -> Counts:
-        """Counts that are read, each electrode at its own instant of the frame.
-
-        Args:
-            ideal: Ideal counts at the starts of frames, shape (T, 19).
-            time_s: Those starts [s], shape (T,).
-            elapsed_s: Since the frame before [s], shape (T,).
-            log_sigma: ln of the fluid's conductivity over that of the ideal counts, shape (T,).
-        """
+ElectrodeStream = Callable[[Floats, Floats, Floats, Floats], Counts]
+"""The electrodes of one specimen over time, with creep, noise and rounding: counts that are read,
+each electrode at its own instant of the frame. Takes the ideal counts at the starts of frames,
+shape (T, 19), those starts [s], the time since the frame before [s], and ln of the fluid's
+conductivity over that of the ideal counts, each shape (T,)."""
 
 
-class Specimen(Protocol):
-    """One simulated BioTac; can be pickled."""
+@dataclass(frozen=True, slots=True)
+class Specimen:
+    """One simulated BioTac; can be pickled.
 
-    @property
-    def name(self) -> str:
-        """E.g. ``biotac-1``."""
+    Attributes:
+        name: E.g. ``biotac-1``.
+        overtravel_m: How much deeper it is pressed than planned [m].
+        temperature_coefficient: Change of ln conductivity with temperature [1/K].
+        parameters: Its electrical parameters, of the simulator's own type.
+        parameters_json: The same as text, as a tape holds them.
+        content: All that decides its rows, as plain values; kept in the experiment's file.
+        pressed_with: Whether it meets an indenter, by name.
+        stream: Its electrodes over time, from the ideal counts of the untouched state, shape (19,),
+            and a seed: same seed, same noise.
+        warming: Ln of the conductivity at ages since power-on [s], shape (T,).
+    """
 
-    @property
-    def overtravel_m(self) -> float:
-        """How much deeper it is pressed than planned [m]."""
-
-    @property
-    def temperature_coefficient(self) -> float:
-        """Change of ln conductivity with temperature [1/K]."""
-
-    def pressed_with(self, indenter: str) -> bool:
-        """Whether it meets an indenter."""
-
-    def content(self) -> dict[str, Any]:
-        """All that decides its rows, as plain values; kept in the experiment's file."""
-
-    def to_json(self) -> str:
-        """Its electrical parameters, as a tape holds them."""
-
-    def stream(self, rest: Floats, seed: int) -> ElectrodeStream:
-        """Its electrodes over time, from the untouched state; same seed, same noise.
-
-        Args:
-            rest: Ideal counts of the untouched specimen, shape (19,).
-            seed: Of the noise.
-        """
-
-    def warming(self, age_s: Floats) -> Floats:
-        """Ln of the conductivity at ages since power-on [s], shape (T,)."""
+    name: str
+    overtravel_m: float
+    temperature_coefficient: float
+    parameters: Any
+    parameters_json: str
+    content: Mapping[str, Any]
+    pressed_with: Callable[[str], bool]
+    stream: Callable[[Floats, int], ElectrodeStream]
+    warming: Callable[[Floats], Floats]
 
 
 class PressedSpecimens(Protocol):
     """Electrodes of specimens of one fingertip: expensive to make, so a process makes them once."""
 
-    @property
-    def rest_counts(self) -> Mapping[str, Floats]:
-        """Ideal counts of each untouched specimen, by name, shape (19,)."""
-
-    def clear_steps(self, indentation: SimulatedTrajectory) -> int:
-        """How many steps there are before the indenter bears on what holds the finger."""
+    rest_counts: Mapping[str, Floats]
+    """Ideal counts of each untouched specimen, by name, shape (19,)."""
 
     def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
         """Ideal counts of each specimen at each step, by name, shape (S, 19)."""
@@ -305,4 +290,4 @@ class TwinSimulator(Protocol):
         """What makes the specimens' electrodes in a worker process."""
 
     def clear_steps(self, indentation: SimulatedTrajectory, fingertip: SimulatedFingertip) -> int:
-        """As `PressedSpecimens.clear_steps`, without any electrodes."""
+        """How many steps there are before the indenter bears on what holds the finger."""

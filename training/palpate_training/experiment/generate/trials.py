@@ -10,7 +10,7 @@ import io
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,7 @@ TEMPERATURE_WALK_K = 0.03
 """Random walk of the core's temperature: standard deviation of what it gains in one minute [K]."""
 
 SUFFIX = ".npz"
+ROW_ARRAYS = ("rest", "travel_m", "tared", "force", "location")
 
 
 def make_trials(
@@ -85,7 +86,7 @@ def make_trials(
         return
     make = simulator.make_specimens(fingertip, specimens)
     work: Callable[[TrialTask], bytes] = partial(_work, make)
-    tasks = _tasks(spec, store, specimens, left, simulator.clearance_m)
+    tasks = _tasks(spec, store, specimens, left, simulator)
     for task, data in runner.run(work, tasks):
         with written_whole(file_of(folder, task.name)) as part:
             part.write_bytes(data)
@@ -146,6 +147,7 @@ class TrialTask:
         direction: Where it moves, shape (3,).
         planned_m: Planned travel past first contact [m].
         trajectory: The simulation.
+        clear_steps: Its steps before the indenter bears on what holds the finger.
         specimens: Those that execute it.
         errors_m: Registration error of that arm for each of them [m], shape (U, 3).
         clearance_m: How far from the skin its path starts [m].
@@ -157,6 +159,7 @@ class TrialTask:
     direction: Floats
     planned_m: float
     trajectory: SimulatedTrajectory
+    clear_steps: int
     specimens: tuple[Specimen, ...]
     errors_m: Floats
     clearance_m: float
@@ -184,28 +187,21 @@ class TrialsDone:
     believed: int
 
 
-class TrialMaker:
-    """Executes trajectories on the specimens of one fingertip; one in each process."""
-
-    def __init__(self, pressed: PressedSpecimens) -> None:
-        self._pressed = pressed
-
-    def __call__(self, task: TrialTask) -> TrialsDone:
-        """Perform and process the trials of one trajectory."""
-        steps = task.trajectory.steps[: self._pressed.clear_steps(task.trajectory)]
-        answers = self._pressed.counts(steps)
-        counts = {
-            name: np.concatenate([rest[None], answers[name]])
-            for name, rest in self._pressed.rest_counts.items()
-        }
-        kept, dropped = [], []
-        for specimen, error in zip(task.specimens, task.errors_m, strict=True):
-            name = specimen.name
-            try:
-                kept.append(_perform(task, steps, specimen, error, counts[name]))
-            except DatasetError as failure:
-                dropped.append((name, str(failure)))
-        return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
+def execute(pressed: PressedSpecimens, task: TrialTask) -> TrialsDone:
+    """Perform and process the trials of one trajectory."""
+    steps = task.trajectory.steps[: task.clear_steps]
+    answers = pressed.counts(steps)
+    counts = {
+        name: np.concatenate([rest[None], answers[name]])
+        for name, rest in pressed.rest_counts.items()
+    }
+    kept, dropped = [], []
+    for specimen, error in zip(task.specimens, task.errors_m, strict=True):
+        try:
+            kept.append(_perform(task, steps, specimen, error, counts[specimen.name]))
+        except DatasetError as failure:
+            dropped.append((specimen.name, str(failure)))
+    return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
 
 
 def _perform(
@@ -237,7 +233,7 @@ def _perform(
         elapsed = np.diff(time_s, prepend=time_s[0])
         walk = np.cumsum(random.standard_normal(len(time_s)) * np.sqrt(elapsed / 60.0))
         drift = specimen.temperature_coefficient * TEMPERATURE_WALK_K * walk
-        return stream.read(ideal, time_s, elapsed, drift)
+        return stream(ideal, time_s, elapsed, drift)
 
     raw = perform(
         TrialHeader(specimen.name, task.name, task.trajectory.indenter, task.arm),
@@ -260,11 +256,13 @@ def pack(done: TrialsDone) -> bytes:
     arrays: dict[str, Any] = {"name": np.array(done.name), "units": np.array(list(done.counts))}
     arrays["believed"] = np.array(done.believed)
     arrays["dropped"] = np.array(done.dropped, dtype=str).reshape(-1, 2)
-    arrays["rows"] = np.array([list(_header(rows)) for rows in done.rows], dtype=str).reshape(-1, 4)
+    arrays["rows"] = np.array(
+        [list(astuple(rows.header)) for rows in done.rows], dtype=str
+    ).reshape(-1, 4)
     for unit, counts in done.counts.items():
         arrays[f"counts/{unit}"] = counts
     for i, rows in enumerate(done.rows):
-        for key in ("rest", "travel_m", "tared", "force", "location"):
+        for key in ROW_ARRAYS:
             arrays[f"{i}/{key}"] = getattr(rows, key)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -277,11 +275,7 @@ def unpack(data: bytes) -> TrialsDone:
         rows = tuple(
             TrialRows(
                 header=TrialHeader(*(str(word) for word in header)),
-                rest=file[f"{i}/rest"],
-                travel_m=file[f"{i}/travel_m"],
-                tared=file[f"{i}/tared"],
-                force=file[f"{i}/force"],
-                location=file[f"{i}/location"],
+                **{key: file[f"{i}/{key}"] for key in ROW_ARRAYS},
             )
             for i, header in enumerate(file["rows"])
         )
@@ -294,41 +288,39 @@ def unpack(data: bytes) -> TrialsDone:
         )
 
 
-def _header(rows: TrialRows) -> tuple[str, str, str, str]:
-    header = rows.header
-    return header.unit, header.trajectory, header.indenter, header.arm
-
-
 def _tasks(
     spec: ExperimentSpec,
     store: IndentationStore,
     specimens: Sequence[Specimen],
     plans: Sequence[IndentationPlan],
-    clearance_m: float,
+    simulator: TwinSimulator,
 ) -> Iterator[TrialTask]:
+    fingertip = store.fingertip()
     errors = registration_errors(specimens, spec.seed)
     for plan in plans:
         who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
         if not who:
             continue
         arm = assign_arm(plan.target)
+        trajectory = store.trajectory(plan.name)
         yield TrialTask(
             name=plan.name,
             arm=arm,
             direction=plan.direction,
             planned_m=plan.depth_m - spec.overtravel_m,
-            trajectory=store.indentation(plan.name),
+            trajectory=trajectory,
+            clear_steps=simulator.clear_steps(trajectory, fingertip),
             specimens=tuple(specimens[i] for i in who),
             errors_m=errors[arm][np.array(who)],
-            clearance_m=clearance_m,
+            clearance_m=simulator.clearance_m,
             seed=spec.seed,
         )
 
 
 @lru_cache(maxsize=1)
-def _maker(make: MakeSpecimens) -> TrialMaker:
-    return TrialMaker(make())
+def _pressed(make: MakeSpecimens) -> PressedSpecimens:
+    return make()
 
 
 def _work(make: MakeSpecimens, task: TrialTask) -> bytes:
-    return pack(_maker(make)(task))
+    return pack(execute(_pressed(make), task))
