@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -44,7 +45,7 @@ def test_training_learns_repeats_and_uses_train_rows_only(press_data: MakeData) 
             (x[split.validation], y[split.validation]),
             config=QUICK,
             seed=seed,
-        ).net
+        )
 
     net = run(0)
     np.testing.assert_allclose(net.input_mean.numpy(), x[split.train].mean(axis=0), rtol=1e-4)
@@ -55,17 +56,21 @@ def test_training_learns_repeats_and_uses_train_rows_only(press_data: MakeData) 
     assert not np.array_equal(predict(run(1), x), predict(net, x))
 
 
-def test_patience_stops_and_the_best_weights_are_kept(press_data: MakeData) -> None:
+def test_patience_stops_and_the_best_weights_are_kept(
+    press_data: MakeData, caplog: pytest.LogCaptureFixture
+) -> None:
     data = press_data(presses=4)
     x, y = data.tared_counts, data.force
     shuffled = np.random.default_rng(0).permutation(y)  # nothing to learn
     config = FeaturesFitConfig(widths=(16,), epochs=60, patience=3, batch_rows=64)
-    trained = fit_quantity(x, shuffled, (x, y), config=config)
-    outcome = trained.outcome
-    assert outcome.epochs < 60
-    assert outcome.best_epoch <= outcome.epochs - 3
-    error = np.median(np.linalg.norm(predict(trained.net, x) - y, axis=1))
-    assert error == pytest.approx(outcome.score, rel=1e-5)
+    epochs: list[None] = []
+    with caplog.at_level("DEBUG", "palpate_training.learning.fit"):
+        net = fit_quantity(x, shuffled, (x, y), config=config, on_epoch=lambda: epochs.append(None))
+    best, last, score = map(float, re.findall(r"[0-9][0-9.]*", caplog.messages[-1]))
+    assert last == len(epochs) < 60
+    assert best <= last - 3
+    error = np.median(np.linalg.norm(predict(net, x) - y, axis=1))
+    assert error == pytest.approx(score, rel=1e-3)
 
 
 def test_drift_is_a_common_factor_of_the_impedances() -> None:

@@ -18,7 +18,7 @@ from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import export
 from palpate_training.learning.export import onnx_bytes
 from palpate_training.learning.networks import FieldGraph, SynthesisGraph
-from palpate_training.learning.splits import HeldOut, by_trajectory, of_units
+from palpate_training.learning.splits import RowSplit, by_trajectory, of_units
 from palpate_training.tasks.fields import (
     FieldFitConfig,
     FieldModel,
@@ -30,22 +30,22 @@ from palpate_training.tasks.synthesis import fit_synthesis, synthesis_bundle, sy
 
 
 @pytest.fixture(scope="module")
-def held(mixed: MixedDataset) -> HeldOut:
+def held(mixed: MixedDataset) -> RowSplit:
     return of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-1"])
 
 
 @pytest.fixture(scope="module")
-def model(mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig) -> FieldModel:
+def model(mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig) -> FieldModel:
     return fit_field(mixed, held, config=quick)
 
 
 def test_field_network_beats_the_mean_and_repeats(
-    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig, model: FieldModel
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, model: FieldModel
 ) -> None:
-    counts, test = tared_counts(mixed), held.split.test
+    counts, test = tared_counts(mixed), held.test
     truth = mixed.displacement(test)
     error = np.linalg.norm(model.code.decode(model.coefficients(counts[test])) - truth, axis=2)
-    mean = np.linalg.norm(mixed.displacement(held.split.train).mean(axis=0) - truth, axis=2)
+    mean = np.linalg.norm(mixed.displacement(held.train).mean(axis=0) - truth, axis=2)
     assert error.mean() < 0.6 * mean.mean()
     again = fit_field(mixed, held, config=quick)
     np.testing.assert_array_equal(again.coefficients(counts), model.coefficients(counts))
@@ -54,39 +54,39 @@ def test_field_network_beats_the_mean_and_repeats(
 
 
 def test_untouched_electrodes_give_no_field(
-    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig, model: FieldModel
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, model: FieldModel
 ) -> None:
     def untouched(fitted: FieldModel) -> float:
         field = fitted.code.decode(fitted.coefficients(np.zeros((1, 19), np.float32)))
         return float(np.linalg.norm(field, axis=2).mean())
 
-    moved = np.linalg.norm(mixed.displacement(held.split.test), axis=2).mean()
+    moved = np.linalg.norm(mixed.displacement(held.test), axis=2).mean()
     without = fit_field(mixed, held, config=replace(quick, rest_share=0.0))
     assert untouched(model) < 0.1 * moved
     assert untouched(model) < untouched(without)
 
 
 def test_standardisation_comes_from_the_training_rows(
-    mixed: MixedDataset, held: HeldOut, model: FieldModel
+    mixed: MixedDataset, held: RowSplit, model: FieldModel
 ) -> None:
-    counts = tared_counts(mixed)[held.split.train]
+    counts = tared_counts(mixed)[held.train]
     np.testing.assert_allclose(model.net.input_mean.numpy(), counts.mean(axis=0), rtol=1e-4)
     assert np.abs(counts).max() > 500, "counts, not parts of full scale"
 
 
 def test_synthesis_follows_the_film(
-    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig
 ) -> None:
     fitted = fit_synthesis(mixed, held, config=quick)
     x, y = synthesis_features(mixed, fitted.code, fitted.pooling), tared_counts(mixed)
-    test, train = held.split.test, held.split.train
+    test, train = held.test, held.train
     residual = fitted.counts(x[test]) - y[test]
     rival = y[train].mean(axis=0) - y[test]
     assert np.sqrt(np.mean(residual**2)) < 0.5 * np.sqrt(np.mean(rival**2))
 
 
 def test_small_modes_are_not_blown_up(
-    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig
 ) -> None:
     net = fit_synthesis(mixed, held, config=replace(quick, epochs=1)).net
     sd = net.mlp.input_sd.numpy()
@@ -96,9 +96,9 @@ def test_small_modes_are_not_blown_up(
 
 
 def test_graphs_compute_what_the_models_do(
-    mixed: MixedDataset, held: HeldOut, quick: FieldFitConfig, model: FieldModel
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, model: FieldModel
 ) -> None:
-    counts, rows = tared_counts(mixed), held.split.test[:5]
+    counts, rows = tared_counts(mixed), held.test[:5]
     sd = np.arange(len(mixed.mesh.nodes), dtype=np.float32)
     with torch.inference_mode():
         field, spread = FieldGraph(model.net, model.code, sd)(torch.from_numpy(counts[rows]))
@@ -152,7 +152,7 @@ def test_synthesis_bundle_is_of_one_unit(
     assert metrics["skill_rmse"] > 0.5
     assert metrics["untouched_max_counts"] < 100
     split = by_trajectory(mixed.experiment)
-    rows = of_units(mixed.experiment, split, ["biotac-2"]).split
+    rows = of_units(mixed.experiment, split, ["biotac-2"])
     session = onnxruntime.InferenceSession(bundle.model, providers=["CPUExecutionProvider"])
     residual = {}
     for side, chosen in (("test", rows.test), ("validation", rows.validation)):
@@ -213,9 +213,9 @@ def test_a_test_row_is_never_trained_on(
     data = make_mixed(units=1, trajectories=10, steps=5)
     held = of_units(data.experiment, by_trajectory(data.experiment), ["biotac-1"])
     tared = data.experiment.tared.copy()
-    tared[held.split.test] *= -3
+    tared[held.test] *= -3
     coefficients = data.coefficients.copy()
-    coefficients[held.split.test] += 1
+    coefficients[held.test] += 1
     changed = replace(
         data, experiment=replace(data.experiment, tared=tared), coefficients=coefficients
     )

@@ -98,7 +98,7 @@ def test_numbers_hang_together(reports: list[TaskReport], mixed: MixedDataset) -
 def test_zero_is_the_motion_itself(reports: list[TaskReport], mixed: MixedDataset) -> None:
     from palpate_training.learning.splits import by_trajectory, of_units
 
-    rows = of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-2"]).split.test
+    rows = of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-2"]).test
     truth = np.linalg.norm(mixed.displacement(rows), axis=2)
     zero_row = by_model(reports[0], "biotac-2")[ZERO].metrics
     assert zero_row["nodal_all_m"] == pytest.approx(truth.mean(), rel=1e-5)

@@ -28,10 +28,10 @@ def test_a_trajectory_is_on_one_side_on_every_unit(mixed: MixedDataset, seed: in
 def test_rows_of_a_unit_keep_their_side(mixed: MixedDataset) -> None:
     data = mixed.experiment
     split = by_trajectory(data)
-    one = of_units(data, split, ["biotac-2"]).split
+    one = of_units(data, split, ["biotac-2"])
     assert set(one.test) <= set(split.test)
     assert set(data.row_unit[np.concatenate([one.train, one.validation, one.test])]) == {1}
-    both = of_units(data, split, ["biotac-1", "biotac-2"]).split
+    both = of_units(data, split, ["biotac-1", "biotac-2"])
     np.testing.assert_array_equal(both.train, split.train)
     assert unit_sets(data) == [("biotac-1",), ("biotac-2",), ("biotac-1", "biotac-2")]
 

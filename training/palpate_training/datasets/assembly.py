@@ -41,12 +41,7 @@ INCREMENTS = 20
 def common_trajectories(
     trials: Iterable[TrialRows], simulated: Collection[str]
 ) -> tuple[list[TrialRows], list[DroppedTrial]]:
-    """Trials whose trajectory was simulated, and the others with the reason (paper, step 1).
-
-    Args:
-        trials: Processed trials.
-        simulated: Ids of the trajectories that were simulated.
-    """
+    """Trials whose trajectory was simulated, and the others with the reason (paper, step 1)."""
     both, dropped = [], []
     for rows in trials:
         if rows.header.trajectory in simulated:

@@ -118,7 +118,9 @@ def read_archive(
     except KeyError as error:
         raise DatasetError(f"{path}: {error.args[0]}", remedy=remedy) from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: not a readable NumPy archive: {error}", remedy=remedy) from error
+        raise DatasetError(
+            f"{path}: not a readable NumPy archive: {error}", remedy=remedy
+        ) from error
 
 
 def write_tables(

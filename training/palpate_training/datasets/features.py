@@ -106,10 +106,6 @@ class FeatureDataset:
 def cut_into_blocks(rows: int, blocks: int) -> IndexArray:
     """Number the contiguous pieces of one recording, of equal length to within a row.
 
-    Args:
-        rows: Rows of the recording.
-        blocks: How many pieces.
-
     Returns:
         Block of every row, ``0 .. blocks - 1``, shape ``(rows,)``.
     """

@@ -385,9 +385,6 @@ def name_trajectories(units: list[list[PublishedRun]]) -> list[list[str]]:
     each BioTac has a trajectory once, so they are assigned one to one. What is on one side only, or
     too short to compare, gets an id of its own.
 
-    Args:
-        units: Runs of each BioTac.
-
     Returns:
         Ids ``<indenter>/<number>``, in the same order.
     """

@@ -203,10 +203,6 @@ def make_plan(
 ) -> tuple[RobotPlan, list[EliminatedTrajectory]]:
     """Turn trajectories into motions of the arms; eliminate what an arm cannot follow.
 
-    Args:
-        trajectories: In order of execution.
-        bases: By arm.
-
     Returns:
         The plan, and what was eliminated from it (nothing where no kinematics are given).
 

@@ -83,13 +83,7 @@ def box_of(values: Floats) -> BoxStatistics:
 
 
 def draw_boxes(axes: Any, groups: Sequence[Sequence[BoxStatistics]], names: Sequence[str]) -> None:
-    """Groups of boxes side by side, one colour for each unit.
-
-    Args:
-        axes: Where to.
-        groups: For each place on the x axis the boxes of all units.
-        names: Of the places.
-    """
+    """Groups of boxes side by side, one colour for each unit."""
     units = len(groups[0])
     width = 0.78 / units
     for unit in range(units):

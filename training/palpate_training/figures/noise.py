@@ -89,9 +89,6 @@ def read_idle_twin(path: Path) -> tuple[IdleStream, ...]:
 def read_idle_real(folder: Path) -> tuple[IdleStream, ...]:
     """The idle sensors beside the pressed ones, LASA force calibration; empty where absent.
 
-    Args:
-        folder: Folder of public data.
-
     Raises:
         DatasetError: The archive is there but damaged or another one.
     """

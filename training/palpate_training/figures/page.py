@@ -71,12 +71,6 @@ def write_page(
 ) -> DatasetStatistics:
     """Write ``statistics.md`` and its pictures.
 
-    Args:
-        folder: Where to; made if it is not there.
-        sources: What to show.
-        command: The command line that made it.
-        on_step: Called with a word before each part.
-
     Returns:
         The statistics.
 

@@ -82,9 +82,6 @@ class PlateResponse:
 def read_plate_logs(folder: Path) -> tuple[PlateLog, ...]:
     """All logs, in order of name; empty where the archive is absent.
 
-    Args:
-        folder: Folder of public data.
-
     Raises:
         DatasetError: The archive is there but damaged or another one.
     """

@@ -40,6 +40,18 @@ GOLDEN_ROWS = 4
 _RANDOM_ROWS = 512
 
 
+def refuse_existing(folder: Path) -> None:
+    """Refuse to train for a bundle that cannot be written.
+
+    Raises:
+        BundleError: The folder exists.
+    """
+    if folder.exists():  # refuse before minutes of training, not after
+        raise BundleError(
+            f"{folder} exists and bundles are immutable", remedy="write the next version"
+        )
+
+
 def export_features(
     folder: Path,
     graph: FeaturesGraph,
@@ -163,26 +175,7 @@ def _export(
     contact_threshold_n: float = 0.0,
     mesh: FieldMesh | None = None,
 ) -> bytes:
-    """Export, compare, write.
-
-    Args:
-        folder: Folder of the bundle; must not exist.
-        graph: Takes one tensor, gives the task's outputs in order.
-        task: Its name.
-        takes: Inputs of the contract, one.
-        gives: Outputs of the contract.
-        inputs: Rows of the parity check.
-        golden_inputs: Rows that are shipped with their answers.
-        allowed: What differences are divided by.
-        name: Name of the bundle.
-        version: Its version, from 1.
-        training_data_sha256: Content of the data set, hex.
-        trained_on: One line for people.
-        metrics: Held-out results.
-        normalisation: For people; the graph does it.
-        contact_threshold_n: Below this estimated force there is no contact [N].
-        mesh: Whose nodes move, where fields are in or out.
-    """
+    """Export, compare, write."""
     names = [tensor.name for tensor in gives]
     input_name = takes[0].name
     model = onnx_bytes(graph, input_name, torch.zeros(4, takes[0].shape[1]), names)
@@ -217,12 +210,6 @@ def onnx_bytes(
     graph: nn.Module, input_name: str, example: Tensor, output_names: Sequence[str]
 ) -> bytes:
     """Export with a free batch axis, everything in one file, the same bytes each time.
-
-    Args:
-        graph: Takes one tensor, batch first.
-        input_name: Name of the input.
-        example: An input of more than one row.
-        output_names: Names of the outputs, in order.
 
     Raises:
         MissingExtraError: onnx or onnxscript is not installed.

@@ -201,9 +201,6 @@ def pooling(mesh: SkinMesh) -> FilmPooling:
 
     A site with no inner node within the radius takes the nearest one.
 
-    Args:
-        mesh: The skin, in its pressurised state.
-
     Raises:
         DatasetError: The mesh has no inner surface.
     """

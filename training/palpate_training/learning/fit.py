@@ -52,21 +52,6 @@ class FitConfig:
     threads: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class FitOutcome:
-    """How a training went.
-
-    Attributes:
-        best_epoch: Epoch whose weights the network has, from 1.
-        epochs: How many were run.
-        score: Validation score of the best epoch; NaN without validation rows.
-    """
-
-    best_epoch: int
-    epochs: int
-    score: float
-
-
 def fit(
     net: nn.Module,
     inputs: FloatArray,
@@ -77,7 +62,7 @@ def fit(
     config: FitConfig,
     augment: Callable[[Tensor, Tensor], Tensor] = lambda batch, rows: batch,
     on_epoch: OnEpoch | None = None,
-) -> FitOutcome:
+) -> None:
     """Train a network in place.
 
     The caller seeds torch before it makes the network: weights, order of rows and augmentation all
@@ -104,7 +89,6 @@ def fit(
         optimiser, T_max=config.epochs * steps_per_epoch, eta_min=config.learning_rate_end
     )
     best_score, best_epoch, weights = math.inf, 0, copy.deepcopy(net.state_dict())
-    epoch = 0
     for epoch in range(1, config.epochs + 1):
         net.train()
         for rows in torch.split(torch.randperm(len(x)), config.batch_rows):
@@ -124,11 +108,9 @@ def fit(
         if epoch - best_epoch >= config.patience:
             break
     net.eval()
-    if score_of is None:
-        return FitOutcome(epoch, epoch, math.nan)
-    net.load_state_dict(weights)
-    _log.debug("best epoch %d of %d, score %.4g", best_epoch, epoch, best_score)
-    return FitOutcome(best_epoch, epoch, best_score)
+    if score_of is not None:
+        net.load_state_dict(weights)
+        _log.debug("best epoch %d of %d, score %.4g", best_epoch, epoch, best_score)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,14 +129,6 @@ class FeaturesFitConfig(FitConfig):
     drift_sd: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class FittedMlp:
-    """A trained network, and how its training went; the score is the median error's norm."""
-
-    net: Mlp
-    outcome: FitOutcome
-
-
 def fit_quantity(
     inputs: FloatArray,
     targets: FloatArray,
@@ -164,8 +138,10 @@ def fit_quantity(
     config: FeaturesFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
-) -> FittedMlp:
+) -> Mlp:
     """Fit the paper's network to one quantity: smooth-L1 on standardised targets.
+
+    The validation score is the median of the error's norm.
 
     Args:
         inputs: Tared counts [counts], shape ``(N, 19)``.
@@ -201,7 +177,7 @@ def fit_quantity(
     def warm(batch: Tensor, rows: Tensor) -> Tensor:
         return batch if rest is None else drift(batch, rest[rows], config.drift_sd)
 
-    outcome = fit(
+    fit(
         net,
         inputs,
         targets,
@@ -211,7 +187,7 @@ def fit_quantity(
         augment=warm,
         on_epoch=on_epoch,
     )
-    return FittedMlp(net, outcome)
+    return net
 
 
 def drift(tared: Tensor, baseline: Tensor, sd: float) -> Tensor:

@@ -36,12 +36,6 @@ class Mlp(nn.Module):
 
     Standardisation of the inputs and of the outputs are constants of the graph, so that
     it runs without any knowledge of the training data.
-
-    Args:
-        widths: Hidden layers.
-        inputs: Number of input channels.
-        activation: After each hidden layer.
-        outputs: Number of output channels.
     """
 
     input_mean: Tensor

@@ -154,19 +154,6 @@ def _near(mask: Mask, recording: Labels, distance: int) -> Mask:
     return near
 
 
-@dataclass(frozen=True, slots=True)
-class HeldOut:
-    """Rows of some units, dealt by trajectory.
-
-    Attributes:
-        units: Their names.
-        split: Rows of train, validation and test.
-    """
-
-    units: tuple[str, ...]
-    split: RowSplit
-
-
 def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> RowSplit:
     """Deal 70, 20 and 10 % of the unique trajectories to train, test and validation.
 
@@ -174,23 +161,14 @@ def by_trajectory(data: ExperimentDataset, *, seed: int = 0) -> RowSplit:
     it, on whatever unit, is also on the same side, so that no network has seen the same trajectory
     on another specimen.
 
-    Args:
-        data: Rows with their unique trajectories.
-        seed: Seed of the deal.
-
     Raises:
         DatasetError: There are fewer than three trajectories.
     """
     return by_group(data.row_trajectory, test_share=0.2, validation_share=0.1, seed=seed)
 
 
-def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> HeldOut:
+def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> RowSplit:
     """The rows of a split that belong to some units.
-
-    Args:
-        data: Rows with their units.
-        split: Rows of all units.
-        units: Names of units.
 
     Raises:
         DatasetError: A unit is not in the data set, or one side of the split has no row of them.
@@ -203,20 +181,22 @@ def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> 
         )
     wanted = np.isin(data.row_unit, [data.unit_names.index(unit) for unit in units])
 
-    def keep(rows: Rows) -> npt.NDArray[np.int64]:
-        return rows[wanted[rows]]
-
-    sides = {side: keep(getattr(split, side)) for side in ("train", "validation", "test")}
-    for side, rows in sides.items():
-        if not rows.size:
+    sides = {
+        name: rows[wanted[rows]]
+        for name, rows in (
+            ("train", split.train),
+            ("validation", split.validation),
+            ("test", split.test),
+            ("guard", split.guard),
+        )
+    }
+    for side in ("train", "validation", "test"):
+        if not sides[side].size:
             raise DatasetError(
                 f"no {side} row of {', '.join(units)} is left after holding trajectories out",
                 remedy="use a data set with more trajectories of these units, or another seed",
             )
-    guard = keep(split.guard)
-    return HeldOut(
-        tuple(units), RowSplit(sides["train"], sides["validation"], sides["test"], guard)
-    )
+    return RowSplit(**sides)
 
 
 def unit_sets(data: ExperimentDataset) -> list[tuple[str, ...]]:

@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import BundleError, DatasetError
+from palpate.errors import DatasetError
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.datasets.features import FeatureDataset, open_dataset
 from palpate_training.learning import baselines
-from palpate_training.learning.export import export_features
-from palpate_training.learning.fit import FeaturesFitConfig, FittedMlp, fit_quantity
+from palpate_training.learning.export import export_features, refuse_existing
+from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.metrics import (
     cluster_bootstrap,
     force_errors,
@@ -117,15 +117,12 @@ def train_features(
         DatasetError: The data set breaks its schema or has too few presses.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
-    if bundle_dir.exists():  # refuse before minutes of training, not after
-        raise BundleError(
-            f"{bundle_dir} exists and bundles are immutable", remedy="write the next version"
-        )
+    refuse_existing(bundle_dir)
     data = open_dataset(dataset_path)
     split = by_group(data.group, seed=seed)
     x = data.tared_counts
 
-    def fit(quantity: str, targets: FloatArray, fit_on: Rows, stop_on: Rows) -> FittedMlp:
+    def fit(quantity: str, targets: FloatArray, fit_on: Rows, stop_on: Rows) -> Mlp:
         done = 0
 
         def tick() -> None:
@@ -145,9 +142,10 @@ def train_features(
         )
 
     force = fit("force", data.force, split.train, split.validation)
-    force_sd = _residual_sd(predict(force.net, x[split.validation]), data.force[split.validation])
-    threshold = _contact_threshold(data, predict(force.net, x[split.validation]), split)
-    metrics = _force_report(data, x, predict(force.net, x[split.test]), split, threshold)
+    validated = predict(force, x[split.validation])
+    force_sd = _residual_sd(validated, data.force[split.validation])
+    threshold = _contact_threshold(data, validated, split)
+    metrics = _force_report(data, x, predict(force, x[split.test]), split, threshold)
 
     location, location_sd = None, None
     if data.contact_location is not None and data.in_contact is not None:
@@ -160,12 +158,11 @@ def train_features(
                 f"{dataset_path}: a side of the split has no row in contact",
                 remedy="record more presses",
             )
-        trained = fit("contact location", where, fit_on, stop_on)
-        location = trained.net
+        location = fit("contact location", where, fit_on, stop_on)
         location_sd = _residual_sd(predict(location, x[stop_on]), where[stop_on])
         metrics |= _location_report(data, x, where, predict(location, x[test_on]), fit_on, test_on)
 
-    graph = FeaturesGraph(force.net, force_sd, location, location_sd)
+    graph = FeaturesGraph(force, force_sd, location, location_sd)
     digest = export_features(
         bundle_dir,
         graph,
@@ -291,14 +288,6 @@ def evaluate_features(
 ) -> list[TaskReport]:
     """Force and contact location, every unit and all units.
 
-    Args:
-        data: The purely experimental data set.
-        seeds: Networks of each kind; they share the split.
-        split_seed: Seed of the split.
-        config: Settings of every training.
-        draws: Draws of the bootstrap over trajectories.
-        on_network: Called after each training.
-
     Returns:
         Task ``force`` and task ``location``.
     """
@@ -310,12 +299,12 @@ def evaluate_features(
         y: FloatArray = getattr(data, quantity)
         results: list[ModelResult] = []
         nets: dict[tuple[str, ...], list[Mlp]] = {}
-        held = {units: of_units(data, split, units).split for units in sets}
+        held = {units: of_units(data, split, units) for units in sets}
         for units, fold in held.items():
             nets[units] = []
             for seed in range(seeds):
                 sides = x[fold.train], y[fold.train], (x[fold.validation], y[fold.validation])
-                nets[units].append(fit_quantity(*sides, config=config, seed=seed).net)
+                nets[units].append(fit_quantity(*sides, config=config, seed=seed))
                 tick(on_network)
         for units, fold in held.items():
             seen, test = x[fold.train], x[fold.test]

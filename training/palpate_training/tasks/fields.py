@@ -22,17 +22,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from palpate.errors import BundleError
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
-from palpate_training.learning.export import export_fields
+from palpate_training.learning.export import export_fields, refuse_existing
 from palpate_training.learning.field_code import FieldCode, fit_code
 from palpate_training.learning.fit import FitConfig, OnEpoch, fit
 from palpate_training.learning.metrics import field_errors, field_summary, join
 from palpate_training.learning.networks import FieldGraph, Mlp, predict
-from palpate_training.learning.splits import HeldOut, Rows, by_trajectory, of_units, unit_sets
+from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.results import (
     ALL,
     MEAN,
@@ -106,7 +105,7 @@ def tared_counts(data: MixedDataset) -> FloatArray:
 
 def fit_field(
     data: MixedDataset,
-    held: HeldOut,
+    split: RowSplit,
     *,
     code: FieldCode | None = None,
     config: FieldFitConfig | None = None,
@@ -117,14 +116,13 @@ def fit_field(
 
     Args:
         data: The mixed data set.
-        held: Rows to train and to stop on.
+        split: Rows to train and to stop on.
         code: Modes to use; None = those of the training rows.
         config: Settings.
         seed: Seed of weights, order of rows and noise of the untouched rows.
         on_epoch: Called after each epoch.
     """
     config = config or FieldFitConfig()
-    split = held.split
     code = code or fit_code(data, split.train, split.validation)
     x, y = tared_counts(data), code.encode(data.coefficients)
     zero = code.project(np.zeros((1, len(code.mean)), np.float32))
@@ -193,16 +191,7 @@ def evaluate_field(
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> TaskReport:
-    """Electrodes -> field, every unit and all units.
-
-    Args:
-        data: The mixed data set.
-        seeds: Networks of each kind; they share the split.
-        split_seed: Seed of the split.
-        config: Settings of every training.
-        draws: Draws of the bootstrap over trajectories.
-        on_network: Called after each training.
-    """
+    """Electrodes -> field, every unit and all units."""
     split = by_trajectory(data.experiment, seed=split_seed)
     counts = tared_counts(data)
     sets = unit_sets(data.experiment)
@@ -210,7 +199,7 @@ def evaluate_field(
     fitted: dict[tuple[str, ...], dict[str, list[Estimate]]] = {}
     modes: dict[str, object] = {}
     for units in sets:
-        fold = held[units].split
+        fold = held[units]
         code = fit_code(data, fold.train, fold.validation)
         modes[label_of(units)] = {
             "modes": code.size,
@@ -222,7 +211,7 @@ def evaluate_field(
         still = baselines.constant(*sides[:2])
         nets = []
         for seed in range(seeds):
-            nets.append(fit_field(data, held[units], code=code, config=config, seed=seed))
+            nets.append(fit_field(data, fold, code=code, config=config, seed=seed))
             tick(on_network)
         fitted[units] = {
             MEAN: [_estimate(still.predict, code, counts)],
@@ -234,7 +223,7 @@ def evaluate_field(
     force_n, error = {}, {}
     picture = None
     for units in sets:
-        rows = held[units].split.test
+        rows = held[units].test
         models = {ZERO: [_still(data)], **fitted[units]}
         if len(units) == 1 and len(sets) > 1:
             models[ALL] = fitted[sets[-1]][OWN]
@@ -326,22 +315,13 @@ def field_bundle(
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
     refuse_existing(folder)
-    split = by_trajectory(data.experiment, seed=seed)
-    held = of_units(data.experiment, split, units or unit_sets(data.experiment)[-1])
-    model = fit_field(data, held, config=config, seed=seed, on_epoch=on_epoch)
+    units = units or unit_sets(data.experiment)[-1]
+    split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), units)
+    model = fit_field(data, split, config=config, seed=seed, on_epoch=on_epoch)
     code, counts = model.code, tared_counts(data)
 
-    def estimate(rows: Rows) -> FloatArray:
-        return code.decode(model.coefficients(counts[rows]))
-
-    errors = field_row_errors(
-        data,
-        held.split.test,
-        {
-            "zero": [lambda rows: np.zeros((len(rows), *data.mesh.nodes.shape), np.float32)],
-            "net": [estimate],
-        },
-    )
+    estimate = _estimate(model.coefficients, code, counts)
+    errors = field_row_errors(data, split.test, {"zero": [_still(data)], "net": [estimate]})
     metrics = field_summary(errors["net"][0], errors["zero"][0])
     metrics["zero_nodal_subset_m"] = float(errors["zero"][0]["subset_m"].mean())
     untouched = code.decode(model.coefficients(np.zeros((1, counts.shape[1]), np.float32)))
@@ -349,13 +329,13 @@ def field_bundle(
     metrics |= truncation_metrics(code)
     export_fields(
         folder,
-        FieldGraph(model.net, code, _node_sd(data, held.split.validation, estimate)),
-        counts[spread_rows(held.split.test)],
+        FieldGraph(model.net, code, _node_sd(data, split.validation, estimate)),
+        counts[spread_rows(split.test)],
         data.mesh,
         name=name,
         version=version,
         training_data_sha256=content_sha256(data),
-        trained_on=trained_on_line(data, held),
+        trained_on=trained_on_line(data, units, split),
         metrics=metrics,
         normalisation={
             "electrodes": "standardised by the training rows, inside the graph",
@@ -364,18 +344,6 @@ def field_bundle(
         },
     )
     return metrics
-
-
-def refuse_existing(folder: Path) -> None:
-    """Refuse to train for a bundle that cannot be written.
-
-    Raises:
-        BundleError: The folder exists.
-    """
-    if folder.exists():  # refuse before minutes of training, not after
-        raise BundleError(
-            f"{folder} exists and bundles are immutable", remedy="write the next version"
-        )
 
 
 def truncation_metrics(code: FieldCode) -> dict[str, float]:
@@ -397,14 +365,13 @@ def _node_sd(data: MixedDataset, rows: Rows, estimate: Callable[[Rows], FloatArr
     return np.asarray(np.sqrt(total / len(rows)), np.float32)
 
 
-def trained_on_line(data: MixedDataset, held: HeldOut) -> str:
+def trained_on_line(data: MixedDataset, units: Sequence[str], split: RowSplit) -> str:
     """What a network was trained and tested on, one line for people."""
 
     def presses(rows: Rows) -> int:
         return len(np.unique(data.experiment.row_trajectory[rows]))
 
-    split = held.split
     return (
-        f"{data.experiment.provenance.source}: {', '.join(held.units)}; {len(split.train)} rows of"
+        f"{data.experiment.provenance.source}: {', '.join(units)}; {len(split.train)} rows of"
         f" {presses(split.train)} trajectories, tested on {presses(split.test)} others"
     )

@@ -10,7 +10,7 @@ trained on the other finger. Longer and shorter blocks are reported beside.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,14 @@ from palpate_training.learning import baselines
 from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.networks import predict
 from palpate_training.learning.splits import RowSplit, contiguous_folds, unseen_sensor
-from palpate_training.tasks.results import ModelResult, force_result, force_table, write_json
+from palpate_training.tasks.results import (
+    ModelResult,
+    OnNetwork,
+    force_result,
+    force_table,
+    tick,
+    write_json,
+)
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -67,7 +74,7 @@ def run_force_real(
     unseen: bool = True,
     other_blocks: Sequence[int] = OTHER_BLOCKS,
     draws: int = 2000,
-    on_network: Callable[[], None] | None = None,
+    on_network: OnNetwork | None = None,
 ) -> ForceReport:
     """Train and test everything.
 
@@ -130,7 +137,7 @@ def _compare(
     networks: int,
     config: FeaturesFitConfig,
     draws: int,
-    on_network: Callable[[], None] | None,
+    on_network: OnNetwork | None,
 ) -> tuple[list[ModelResult], ForcePanel]:
     """Constant, line, single networks and their mean on the pooled test rows of all folds."""
     x, y = data.tared_counts, data.force
@@ -146,12 +153,11 @@ def _compare(
         constant[split.test] = baselines.constant(x[known], y[known]).predict(x[split.test])
         linear[split.test] = baselines.linear(x[known], y[known]).predict(x[split.test])
         for seed in range(networks):
-            trained = fit_quantity(
+            net = fit_quantity(
                 x[known], y[known], baseline=data.baseline[known], config=config, seed=seed
             )
-            estimates[seed, split.test] = predict(trained.net, x[split.test])
-            if on_network is not None:
-                on_network()
+            estimates[seed, split.test] = predict(net, x[split.test])
+            tick(on_network)
 
     truth, block = y[tested], data.block[tested]
     mean = np.mean(estimates, axis=0)[tested]
@@ -217,13 +223,7 @@ chosen on validation blocks and then kept; all models learn from all blocks that
 
 
 def write_report(folder: Path, report: ForceReport, *, command: str) -> None:
-    """Write ``force-real.md``, ``.json`` and ``.png``: numbers and a figure, no rows.
-
-    Args:
-        folder: Where to.
-        report: What to write.
-        command: The command line that made it.
-    """
+    """Write ``force-real.md``, ``.json`` and ``.png``: numbers and a figure, no rows."""
     folder.mkdir(parents=True, exist_ok=True)
     draw_force(folder / "force-real.png", report.panels)
     write_json(folder / "force-real.json", report.results, {"command": command, **report.facts})

@@ -129,13 +129,6 @@ def write_report(
 ) -> list[Path]:
     """Write ``twin.md``, a JSON for each task and a PNG for field and synthesis.
 
-    Args:
-        folder: Where to; made if it is missing.
-        reports: Results of the tasks.
-        mesh: The skin that fields are drawn on.
-        command: The command line that made them.
-        seeds: Networks of each kind.
-
     Returns:
         What was written; every file appears whole or not at all.
     """

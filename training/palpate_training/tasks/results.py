@@ -260,18 +260,7 @@ def result_of(
     draws: int,
     summary: Callable[[Errors, Errors], dict[str, float]],
 ) -> ModelResult:
-    """One row of the table, averaged over seeds.
-
-    Args:
-        test: What was held out.
-        model: Name of the model.
-        errors: Errors of every row, one for each seed.
-        zero: Those of predicting zero.
-        data: Rows with their trajectories.
-        rows: The held-out rows.
-        draws: Draws of the bootstrap.
-        summary: Metrics of one seed, from its errors and those of predicting zero.
-    """
+    """One row of the table, averaged over seeds."""
     interval = interval_of(errors, data.experiment.row_trajectory[rows], draws)
     return averaged(test, model, [summary(one, zero) for one in errors], interval)
 
@@ -282,14 +271,7 @@ def averaged(
     seeds: Sequence[dict[str, float]],
     interval: dict[str, tuple[float, float]],
 ) -> ModelResult:
-    """Metrics averaged over seeds, with their standard deviation where there are several.
-
-    Args:
-        test: What was held out.
-        model: Name of the model.
-        seeds: Metrics of each seed.
-        interval: 95 % intervals by name.
-    """
+    """Metrics averaged over seeds, with their standard deviation where there are several."""
     values = {name: [one[name] for one in seeds] for name in seeds[0]}
     return ModelResult(
         test,

@@ -18,16 +18,15 @@ import torch
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
-from palpate_training.learning.export import export_fields
+from palpate_training.learning.export import export_fields, refuse_existing
 from palpate_training.learning.field_code import FieldCode, FilmPooling, fit_code, pooling
 from palpate_training.learning.fit import OnEpoch
 from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
 from palpate_training.learning.networks import FilmNet, Mlp, SynthesisGraph, predict
-from palpate_training.learning.splits import HeldOut, by_trajectory, of_units, unit_sets
+from palpate_training.learning.splits import RowSplit, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.fields import (
     FieldFitConfig,
     fit_on_norms,
-    refuse_existing,
     spread_rows,
     tared_counts,
     trained_on_line,
@@ -77,11 +76,6 @@ def synthesis_features(data: MixedDataset, code: FieldCode, film: FilmPooling) -
     Projection and pooling are linear in the field and the field is linear in the data set's
     coefficients, so two small matrices do.
 
-    Args:
-        data: Rows with the coefficients of their fields.
-        code: Modes to project on.
-        film: How the film is pooled.
-
     Returns:
         Coefficients and pooled change of the film [m], shape (N, K + P).
     """
@@ -97,7 +91,7 @@ def _features(displacement: FloatArray, code: FieldCode, film: FilmPooling) -> F
 
 def fit_synthesis(
     data: MixedDataset,
-    held: HeldOut,
+    split: RowSplit,
     *,
     code: FieldCode | None = None,
     config: FieldFitConfig | None = None,
@@ -106,7 +100,6 @@ def fit_synthesis(
 ) -> SynthesisModel:
     """Train field -> electrodes; the arguments are those of ``fit_field``."""
     config = config or FieldFitConfig()
-    split = held.split
     code = code or fit_code(data, split.train, split.validation)
     film = pooling(data.mesh)
     x, y = synthesis_features(data, code, film), tared_counts(data)
@@ -149,8 +142,8 @@ def evaluate_synthesis(
     for units in unit_sets(data.experiment):
         if len(units) > 1:
             continue
-        held = of_units(data.experiment, split, units)
-        fold, rows = held.split, held.split.test
+        fold = of_units(data.experiment, split, units)
+        rows = fold.test
         code = fit_code(data, fold.train, fold.validation)
         x = synthesis_features(data, code, film)
         sides = (x[fold.train], counts[fold.train], x[fold.validation], counts[fold.validation])
@@ -161,7 +154,7 @@ def evaluate_synthesis(
             OWN: [],
         }
         for seed in range(seeds):
-            model = fit_synthesis(data, held, code=code, config=config, seed=seed)
+            model = fit_synthesis(data, fold, code=code, config=config, seed=seed)
             estimates[OWN].append(model.counts(x[rows]))
             tick(on_network)
         errors = {
@@ -204,11 +197,11 @@ def synthesis_bundle(
 ) -> dict[str, float]:
     """Field -> electrodes of one unit, as a bundle; the arguments are those of ``field_bundle``."""
     refuse_existing(folder)
-    held = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), [unit])
-    model = fit_synthesis(data, held, config=config, seed=seed, on_epoch=on_epoch)
+    split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), [unit])
+    model = fit_synthesis(data, split, config=config, seed=seed, on_epoch=on_epoch)
     counts = tared_counts(data)
     features = synthesis_features(data, model.code, model.pooling)
-    test, validation = held.split.test, held.split.validation
+    test, validation = split.test, split.validation
     zero = electrode_errors(np.zeros_like(counts[test]), counts[test])
     metrics = electrode_summary(electrode_errors(model.counts(features[test]), counts[test]), zero)
     residual = model.counts(features[validation]) - counts[validation]
@@ -227,7 +220,7 @@ def synthesis_bundle(
         name=name,
         version=version,
         training_data_sha256=content_sha256(data),
-        trained_on=trained_on_line(data, held),
+        trained_on=trained_on_line(data, [unit], split),
         metrics=metrics,
         normalisation={
             "displacement": f"projected on {model.code.size} modes and pooled near 23 electrodes,"

@@ -112,15 +112,6 @@ def join(
 ) -> MixedDataset:
     """Make the mixed data set of trials, real ones or the twin's, and their simulations.
 
-    Args:
-        rows: Trials whose trajectories were simulated.
-        simulated: By trajectory.
-        dropped: Gets trial and reason of each that cannot be mixed.
-        fingertip: What was simulated.
-        provenance: Of the data set.
-        unit_names: Specimens, in order.
-        on_progress: Called before each part of the work.
-
     Raises:
         DatasetError: Nothing is left.
     """

@@ -246,12 +246,6 @@ def write_idle(
 
     Their noise and drift are compared with those of real sensors.
 
-    Args:
-        folder: Of the experiment.
-        specimens: Simulated BioTacs.
-        pressed: Their electrodes.
-        seed: Of the noise.
-
     Returns:
         The file: ``rate_hz`` and, for each specimen, counts of shape (T, 19).
     """
