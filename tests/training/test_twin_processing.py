@@ -13,14 +13,12 @@ from hypothesis import strategies as st
 from palpate.errors import DatasetError
 from palpate_training.datasets.processing import (
     Floats,
-    above_threshold,
     crossing,
     filter_force,
     from_half_newton,
     from_threshold,
     last_of_increments,
     onset,
-    prepend_threshold_row,
     process,
     process_all,
     tare,
@@ -235,15 +233,15 @@ def test_contact_is_the_first_crossing_that_stays() -> None:
 
 
 def test_rows_below_half_a_newton_go_wherever_they_are() -> None:
-    kept = above_threshold(rows_of(along_z(0, 0.6, 0.3, 0.7, 0.8, 0.9, 0.45, 2.0)))
-    np.testing.assert_array_equal(kept.location[:, 0], [3, 4, 5, 7])
-    np.testing.assert_array_equal(kept.force[:, 2], [0.7, 0.8, 0.9, 2.0])
-    np.testing.assert_allclose(kept.travel_m, [3e-4, 4e-4, 5e-4, 7e-4])
+    kept = from_half_newton(rows_of(along_z(0, 0.6, 0.3, 0.7, 0.8, 0.9, 0.45, 2.0)))
+    np.testing.assert_array_equal(kept.location[1:, 0], [3, 4, 5, 7])
+    np.testing.assert_array_equal(kept.force[1:, 2], [0.7, 0.8, 0.9, 2.0])
+    np.testing.assert_allclose(kept.travel_m, [0, 0.5e-4, 1.5e-4, 2.5e-4, 4.5e-4])
 
 
 def test_threshold_row_has_all_quantities_where_the_force_is_half_a_newton() -> None:
     rows = rows_of(along_z(0, 0.1, 0.9, 1.2, 1.5))
-    found = prepend_threshold_row(above_threshold(rows), rows)
+    found = from_half_newton(rows)
     assert len(found.force) == 4
     np.testing.assert_allclose(found.force[:, 2], [0.5, 0.9, 1.2, 1.5])
     np.testing.assert_allclose(found.location[0], [1.5, 3.0, -1.5])

@@ -7,8 +7,10 @@ finite elements.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,9 +23,20 @@ from palpate_deploy.cli.options import JsonOption, show_left_out
 if TYPE_CHECKING:
     from palpate_training.experiment.generate.measured import Dropped, ProcessedExperiment
     from palpate_training.experiment.generate.pipeline import GeneratedExperiment
+    from palpate_training.experiment.generate.simulator import OnProgress
     from palpate_training.experiment.plan import EliminatedTrajectory, RobotPlan
 
 twin_app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+PointsOption = Annotated[int, typer.Option(min=1, help="Points for each indenter.")]
+AngledOption = Annotated[int, typer.Option(min=0, max=4, help="Angled paths at each.")]
+IndenterOption = Annotated[
+    list[str] | None, typer.Option("--indenter", help="May be repeated; none = all nine.")
+]
+UnitsOption = Annotated[
+    Path | None,
+    typer.Option("--units", metavar="FILE.json", help="Specimens; none = the three that ship."),
+]
 
 EXTRA_MODULES = ("torch", "onnx", "h5py", "matplotlib")
 """What ``palpate[training]`` installs and a bare palpate has not."""
@@ -104,16 +117,11 @@ def _app(room: str) -> typer.Typer:
 )
 def data_generate(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="Takes all; goes on if begun.")],
-    points: Annotated[int, typer.Option(min=1, help="Points for each indenter.")] = 10,
-    angled: Annotated[int, typer.Option(min=0, max=4, help="Angled paths at each.")] = 4,
+    points: PointsOption = 10,
+    angled: AngledOption = 4,
     seed: Annotated[int, typer.Option(min=0, help="Of points, registration and noise.")] = 0,
-    indenter: Annotated[
-        list[str] | None, typer.Option("--indenter", help="May be repeated; none = all nine.")
-    ] = None,
-    units: Annotated[
-        Path | None,
-        typer.Option("--units", metavar="FILE.json", help="Specimens; none = the three that ship."),
-    ] = None,
+    indenter: IndenterOption = None,
+    units: UnitsOption = None,
     edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
     fill_ml: Annotated[float, typer.Option(help="Fluid under the skin [ml].")] = 0.6,
     workers: Annotated[
@@ -187,19 +195,19 @@ def data_sample(
         Path | None,
         typer.Option(metavar="FOLDER", help="Takes both data sets without what the tape plays."),
     ] = None,
-    units: Annotated[
-        Path | None,
-        typer.Option("--units", metavar="FILE.json", help="Specimens; none = the three that ship."),
-    ] = None,
+    units: UnitsOption = None,
 ) -> None:
     """Take a small part of an experiment: a data set for tests, a tape for the virtual finger."""
     from palpate_deploy.experiment import FemSimulator, read_specimens
     from palpate_training.experiment.generate.sample import make_sample
 
-    done = make_sample(folder, read_specimens(units), FemSimulator(), dataset, tape, rest)
+    trajectories, trials = make_sample(
+        folder, read_specimens(units), FemSimulator(), dataset, tape, rest
+    )
+    sizes = [path.stat().st_size / 1e6 for path in (dataset, tape)]
     typer.echo(
-        f"{len(done.trajectories)} trajectories; {dataset}: {done.trials} trials,"
-        f" {done.dataset_bytes / 1e6:.2f} MB; {tape}: {done.tape_bytes / 1e6:.2f} MB"
+        f"{len(trajectories)} trajectories; {dataset}: {trials} trials,"
+        f" {sizes[0]:.2f} MB; {tape}: {sizes[1]:.2f} MB"
     )
 
 
@@ -233,6 +241,16 @@ def _show_generated(result: GeneratedExperiment) -> None:
     typer.echo(f"look at it: palpate data inspect {result.folder / 'mixed.h5'}")
 
 
+@contextlib.contextmanager
+def _progress(what: str) -> Iterator[OnProgress]:
+    """A progress bar of one task."""
+    from palpate_fem.cli.terminal import progress_bar
+
+    with progress_bar() as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total, word: bar.update(task, completed=done, total=total, info=word)
+
+
 @twin_app.command(
     "plan",
     epilog="Example: palpate data plan plan.jsonl --store runs/twin/mechanics.sim --registration"
@@ -250,12 +268,10 @@ def data_plan(
     fill_ml: Annotated[
         float | None, typer.Option(help="Instead of a store: fluid under the skin [ml].")
     ] = None,
-    points: Annotated[int, typer.Option(min=1, help="Points for each indenter.")] = 10,
-    angled: Annotated[int, typer.Option(min=0, max=4, help="Angled paths at each.")] = 4,
+    points: PointsOption = 10,
+    angled: AngledOption = 4,
     seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
-    indenter: Annotated[
-        list[str] | None, typer.Option("--indenter", help="May be repeated; none = all nine.")
-    ] = None,
+    indenter: IndenterOption = None,
     registration: Annotated[
         Path | None,
         typer.Option(metavar="FILE.json", help="Of palpate data register; none = stand-in arms."),
@@ -274,7 +290,7 @@ def data_plan(
 ) -> None:
     """Plan nine indenters x ten points x (one normal, four angled presses) for one or two arms."""
     from palpate_deploy.experiment import FemSimulator
-    from palpate_fem.cli.terminal import console, progress_bar
+    from palpate_fem.cli.terminal import console
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_training.cli.experiment import arms_of, by_arm
     from palpate_training.experiment.generate.planning import bases_of, plan_experiment
@@ -307,12 +323,7 @@ def data_plan(
     opened = None if store is None else simulator.open_store(store)
     with console.status("pressurising the fingertip" if opened is None else "reading the store"):
         fingertip = simulator.fingertip(spec) if opened is None else opened.fingertip()
-    with progress_bar() as bar:
-        task = bar.add_task("planning", total=None)
-
-        def on_progress(done: int, total: int, word: str) -> None:
-            bar.update(task, completed=done, total=total, info=word)
-
+    with _progress("planning") as on_progress:
         found, eliminated = plan_experiment(
             spec, fingertip, bases, simulator, store=opened, on_progress=on_progress
         )
@@ -371,15 +382,9 @@ def data_process(
 ) -> None:
     """Process raw trials as the paper does: experimental data set, and mixed with a simulation."""
     from palpate_deploy.experiment import FemSimulator
-    from palpate_fem.cli.terminal import progress_bar
     from palpate_training.experiment.generate.measured import process_files
 
-    with progress_bar() as bar:
-        task = bar.add_task("processing", total=None)
-
-        def on_progress(done: int, total: int, word: str) -> None:
-            bar.update(task, completed=done, total=total, info=word)
-
+    with _progress("processing") as on_progress:
         done = process_files(
             trials,
             out,

@@ -19,8 +19,8 @@ from palpate_training.cli.experiment import print_trials
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
 from palpate_training.datasets.features import (
+    FEATURE_COLUMNS,
     FEATURES_SCHEMA,
-    UNITS,
     FeatureDataset,
     open_dataset,
     write_dataset,
@@ -213,7 +213,11 @@ def _features_summary(data: FeatureDataset) -> dict[str, Any]:
         "blocks": len(np.unique(data.block)),
         "units": list(data.sensor_names),
         "arrays": {
-            name: {"type": str(array.dtype), "shape": list(array.shape), "unit": UNITS[name]}
+            name: {
+                "type": str(array.dtype),
+                "shape": list(array.shape),
+                "unit": FEATURE_COLUMNS[name].unit,
+            }
             for name, array in data.arrays().items()
         },
         "content_sha256": data.content_sha256(),
@@ -244,7 +248,7 @@ def contents(data: FeatureDataset, title: str) -> Table:
             name,
             str(array.dtype),
             str(array.shape),
-            UNITS[name],
+            FEATURE_COLUMNS[name].unit,
             *(f"{value:.6g}" for value in (low, middle, high)),
         )
     return table

@@ -85,9 +85,7 @@ class StoredTables:
                     encoded = str(text).encode()
                     digest.update(f"{len(encoded)}:".encode() + encoded)
                 continue
-            little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
-            digest.update(f"{name}:{little.dtype.str}:{little.shape}".encode())
-            digest.update(little.tobytes())
+            add_array(digest, name, array)
         for name, value in sorted(self.numbers.items()):
             digest.update(f"{name}={value!r}".encode())
         return digest.hexdigest()
@@ -121,6 +119,13 @@ def read_archive(
         raise DatasetError(
             f"{path}: not a readable NumPy archive: {error}", remedy=remedy
         ) from error
+
+
+def add_array(digest: hashlib._Hash, name: str, array: npt.NDArray[Any]) -> None:
+    """Add name, type, shape and values of an array to a digest; little-endian on every machine."""
+    little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
+    digest.update(f"{name}:{little.dtype.str}:{little.shape}".encode())
+    digest.update(little.tobytes())
 
 
 def write_tables(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -333,23 +334,21 @@ def read_mixed(path: Path) -> MixedDataset:
     arrays, numbers = tables.arrays, tables.numbers
 
     def build() -> MixedDataset:
+        def part(group: str) -> dict[str, Any]:
+            """Arrays of a group, by their own names."""
+            prefix = f"{group}/"
+            return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
         return MixedDataset(
             experiment=_experiment(tables),
             simulated_force=arrays["simulated_force"],
             coefficients=arrays["coefficients"],
             basis=FieldBasis(
-                arrays["basis/mean"],
-                arrays["basis/modes"],
-                float(numbers["loss_mean_m"]),
-                float(numbers["loss_max_m"]),
+                **part("basis"),
+                loss_mean_m=float(numbers["loss_mean_m"]),
+                loss_max_m=float(numbers["loss_max_m"]),
             ),
-            mesh=SkinMesh(
-                arrays["mesh/nodes"],
-                arrays["mesh/outer_faces"],
-                arrays["mesh/inner_faces"],
-                arrays["mesh/subset"],
-                str(numbers["mesh_sha256"]),
-            ),
+            mesh=SkinMesh(**part("mesh"), sha256=str(numbers["mesh_sha256"])),
         )
 
     return _named(path, build)
@@ -390,14 +389,10 @@ def _mixed_tables(data: MixedDataset) -> StoredTables:
     return StoredTables(
         {
             **experiment.arrays,
-            "simulated_force": data.simulated_force,
-            "coefficients": data.coefficients,
-            "basis/mean": data.basis.mean,
-            "basis/modes": data.basis.modes,
-            "mesh/nodes": data.mesh.nodes,
-            "mesh/outer_faces": data.mesh.outer_faces,
-            "mesh/inner_faces": data.mesh.inner_faces,
-            "mesh/subset": data.mesh.subset,
+            **{
+                name: attrgetter(name.replace("/", "."))(data)
+                for name in MIXED_COLUMNS.keys() - EXPERIMENT_COLUMNS.keys()
+            },
         },
         {
             "loss_mean_m": data.basis.loss_mean_m,

@@ -16,7 +16,13 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
-from palpate_training.datasets.container import Provenance, read_provenance, write_provenance
+from palpate_training.datasets.container import (
+    Provenance,
+    StoredColumn,
+    add_array,
+    read_provenance,
+    write_provenance,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -79,27 +85,14 @@ class FeatureDataset:
 
     def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
         """The arrays that are present, by name, in the order of the schema."""
-        named: dict[str, npt.NDArray[np.generic] | None] = {
-            "electrodes": self.electrodes,
-            "baseline": self.baseline,
-            "force": self.force,
-            "group": self.group,
-            "block": self.block,
-            "sensor": self.sensor,
-            "contact_location": self.contact_location,
-            "in_contact": self.in_contact,
-            "time_ns": self.time_ns,
-        }
+        named = {name: getattr(self, name) for name in FEATURE_COLUMNS}
         return {name: array for name, array in named.items() if array is not None}
 
     def content_sha256(self) -> str:
         """SHA-256 of names, shapes and values, hex; does not depend on how the file is laid out."""
-        digest = hashlib.sha256()
-        digest.update("\n".join(self.sensor_names).encode())
+        digest = hashlib.sha256("\n".join(self.sensor_names).encode())
         for name, array in self.arrays().items():
-            little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
-            digest.update(f"{name}:{little.dtype.str}:{little.shape}".encode())
-            digest.update(little.tobytes())
+            add_array(digest, name, array)
         return digest.hexdigest()
 
 
@@ -112,18 +105,25 @@ def cut_into_blocks(rows: int, blocks: int) -> IndexArray:
     return (np.arange(rows, dtype=np.int64) * blocks // rows).astype(np.int32)
 
 
-SHAPES: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
-    "electrodes": ((ELECTRODES,), np.uint16),
-    "baseline": ((ELECTRODES,), np.float32),
-    "force": ((3,), np.float32),
-    "group": ((), np.int32),
-    "block": ((), np.int32),
-    "sensor": ((), np.int32),
-    "contact_location": ((3,), np.float32),
-    "in_contact": ((), np.bool_),
-    "time_ns": ((), np.int64),
+@dataclass(frozen=True, slots=True)
+class FeatureColumn(StoredColumn):
+    """An array of a data set of features: also the shape of one row, and whether it may lack."""
+
+    shape: tuple[int, ...] = ()
+    optional: bool = False
+
+
+FEATURE_COLUMNS: dict[str, FeatureColumn] = {
+    "electrodes": FeatureColumn("counts", np.uint16, (ELECTRODES,)),
+    "baseline": FeatureColumn("counts", np.float32, (ELECTRODES,)),
+    "force": FeatureColumn("N", np.float32, (3,)),
+    "group": FeatureColumn("1", np.int32),
+    "block": FeatureColumn("1", np.int32),
+    "sensor": FeatureColumn("1", np.int32),
+    "contact_location": FeatureColumn("m", np.float32, (3,), optional=True),
+    "in_contact": FeatureColumn("1", np.bool_, optional=True),
+    "time_ns": FeatureColumn("ns", np.int64, optional=True),
 }
-"""Shape of one row and type of every array."""
 
 
 def _check_shapes(data: FeatureDataset) -> None:
@@ -131,20 +131,21 @@ def _check_shapes(data: FeatureDataset) -> None:
     if rows == 0:
         raise DatasetError(f"{data.name}: no rows", remedy="record or ingest at least one press")
     for name, array in data.arrays().items():
-        row_shape, dtype = SHAPES[name]
+        column = FEATURE_COLUMNS[name]
+        expected = (rows, *column.shape)
         if name == "electrodes" and array.ndim == 2 and array.shape[1] != ELECTRODES:
             raise DatasetError(
                 f"{data.name}: electrodes has {array.shape[1]} columns, a BioTac has {ELECTRODES}",
                 remedy="write one column for each of E1..E19; a BioTac SP needs another schema",
             )
-        if array.shape != (rows, *row_shape):
+        if array.shape != expected:
             raise DatasetError(
-                f"{data.name}: {name} has shape {array.shape}, expected {(rows, *row_shape)}",
+                f"{data.name}: {name} has shape {array.shape}, expected {expected}",
                 remedy="write one row of every array for each row of electrodes",
             )
-        if array.dtype != dtype:
+        if array.dtype != column.dtype:
             raise DatasetError(
-                f"{data.name}: {name} is {array.dtype}, expected {np.dtype(dtype)}",
+                f"{data.name}: {name} is {array.dtype}, expected {np.dtype(column.dtype)}",
                 remedy=f"convert {name} before writing; see training/README.md",
             )
 
@@ -189,21 +190,6 @@ def _check_values(data: FeatureDataset) -> None:
 
 FEATURES_SCHEMA = Hdf5Schema("palpate.features", 1, "use a file made by `palpate data ingest-...`")
 
-UNITS: dict[str, str] = {
-    "electrodes": "counts",
-    "baseline": "counts",
-    "force": "N",
-    "group": "1",
-    "block": "1",
-    "sensor": "1",
-    "contact_location": "m",
-    "in_contact": "1",
-    "time_ns": "ns",
-}
-
-OPTIONAL = ("contact_location", "in_contact", "time_ns")
-"""Datasets a file may lack."""
-
 _CHUNK_ROWS = 4096
 """One chunk of electrodes is 150 KiB: small enough to stream, large enough to compress."""
 
@@ -235,7 +221,7 @@ def write_dataset(path: Path, data: FeatureDataset) -> str:
                 compression_opts=4,
                 shuffle=True,
             )
-            dataset.attrs["unit"] = UNITS[name]
+            dataset.attrs["unit"] = FEATURE_COLUMNS[name].unit
     _log.info("wrote %s: %d rows, content %s", path, len(data), digest[:12])
     return digest
 
@@ -260,9 +246,9 @@ def open_dataset(path: Path) -> FeatureDataset:
                 f"{path}: attribute sensor_names is missing", remedy="name every sensor, in order"
             )
         arrays = {
-            name: read_array(path, file, name, UNITS[name])
-            for name in SHAPES
-            if name in file or name not in OPTIONAL
+            name: read_array(path, file, name, column.unit)
+            for name, column in FEATURE_COLUMNS.items()
+            if name in file or not column.optional
         }
         attributes = dict(file.attrs)
     data = FeatureDataset(

@@ -34,7 +34,6 @@ from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,
     SensorType,
-    Stamp,
     Tare,
     WrenchFrame,
 )
@@ -143,12 +142,7 @@ def read_streams(path: Path) -> dict[str, SensorStreams]:
 
 
 def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArray[Any]]:
-    if not streams.wrenches:
-        raise DatasetError(
-            f"{path}: sensor {name!r} has no wrench stream",
-            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
-        )
-    refuse_other_types(path, name, streams)
+    check_streams(path, name, streams)
     frames = [
         frame
         for frame in streams.frames
@@ -163,24 +157,21 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
             " frame",
             remedy="tare before recording, and record the stream tare",
         )
-    frames.sort(key=lambda frame: time_of(frame.stamp, streams))
-    times = np.array([time_of(frame.stamp, streams) for frame in frames], dtype=np.int64)
+    times = times_of(frames, streams)
+    order = np.argsort(times, kind="stable")
+    frames, times = [frames[i] for i in order], times[order]
     at = times + middles(frames)
 
-    force, has_force = linear(
-        at,
-        np.array([time_of(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
-        np.array([w.force for w in streams.wrenches], dtype=np.float64),
-    )
-    kept = has_force
+    force, kept = force_at(at, streams)
     location = None
     touching = np.linalg.norm(force, axis=1) > TOUCH_N
     if streams.poses:
-        pose_times = np.array([time_of(p.stamp, streams) for p in streams.poses], dtype=np.int64)
         positions = np.array([p.position for p in streams.poses], dtype=np.float64)
         # NaN = not known, and so is what lies between a known and an unknown one
         contact = np.array([[p.in_contact] for p in streams.poses], dtype=np.float64)
-        both, has_pose = linear(at, pose_times, np.hstack([positions, contact]))
+        both, has_pose = linear(
+            at, times_of(streams.poses, streams), np.hstack([positions, contact])
+        )
         location = both[:, :3]
         touching = np.where(np.isnan(both[:, 3]), touching, both[:, 3] >= 0.5)
         kept = kept & has_pose
@@ -206,12 +197,17 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
     return columns
 
 
-def refuse_other_types(path: Path, name: str, streams: SensorStreams) -> None:
-    """Refuse frames of a sensor that has other electrodes than a data set.
+def check_streams(path: Path, name: str, streams: SensorStreams) -> None:
+    """Refuse a sensor without a wrench, or with other electrodes than a data set has.
 
     Raises:
-        DatasetError: There are such; none is left out in silence.
+        DatasetError: It is such; no frame is left out in silence.
     """
+    if not streams.wrenches:
+        raise DatasetError(
+            f"{path}: sensor {name!r} has no wrench stream",
+            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
+        )
     others = [f.sensor_type for f in streams.frames if f.sensor_type is not SensorType.BIOTAC]
     if others:
         raise DatasetError(
@@ -222,14 +218,23 @@ def refuse_other_types(path: Path, name: str, streams: SensorStreams) -> None:
         )
 
 
-def time_of(stamp: Stamp, streams: SensorStreams) -> int:
-    """Monotonic time [ns] where the streams' first readings share the clock, else wall time."""
+def times_of(
+    frames: Sequence[ElectrodeFrame | WrenchFrame | IndenterPoseFrame], streams: SensorStreams
+) -> Times:
+    """Monotonic times [ns] where the streams' first readings share the clock, else wall times."""
     shared = all(
         stamps[0].stamp.clock_id == streams.frames[0].stamp.clock_id
         for stamps in (streams.wrenches, streams.poses)
         if stamps
     )
-    return stamp.monotonic_ns if shared else stamp.wall_ns
+    stamps = [frame.stamp for frame in frames]
+    return np.array([s.monotonic_ns if shared else s.wall_ns for s in stamps], dtype=np.int64)
+
+
+def force_at(times: Times, streams: SensorStreams) -> tuple[Values, npt.NDArray[np.bool_]]:
+    """Force at times [N], shape (T, 3), and where it is known."""
+    forces = np.array([w.force for w in streams.wrenches], dtype=np.float64)
+    return linear(times, times_of(streams.wrenches, streams), forces)
 
 
 def middles(frames: Sequence[ElectrodeFrame]) -> Times:

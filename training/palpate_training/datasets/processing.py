@@ -183,60 +183,25 @@ def tare(raw: RawTrial) -> TrialRows:
     )
 
 
-def above_threshold(rows: TrialRows) -> TrialRows:
-    """Drop the rows below 0.5 N (paper, step 3).
+def from_half_newton(rows: TrialRows) -> TrialRows:
+    """Keep what is at 0.5 N or more, and begin at exactly 0.5 N (paper, step 3).
 
-    Dropped is everything before the first crossing that stays (``threshold.onset``: a noisy row in
-    free motion is no contact), and after it each row below.
+    Dropped is everything before the first crossing that stays (`onset`: a noisy row in free motion
+    is no contact), and after it each row below. The first row is interpolated linearly in all
+    quantities, unless a row is at 0.5 N already; travel counts from it.
 
     Raises:
         DatasetError: The trial begins above 0.5 N, or no row is left.
-    """
-    kept = _onset(rows).kept
-    return replace(
-        rows,
-        travel_m=rows.travel_m[kept],
-        tared=rows.tared[kept],
-        force=rows.force[kept],
-        location=rows.location[kept],
-    )
-
-
-def prepend_threshold_row(kept: TrialRows, rows: TrialRows) -> TrialRows:
-    """Begin at exactly 0.5 N, by linear interpolation of all quantities (paper, step 3).
-
-    Args:
-        kept: What ``above_threshold`` left of ``rows``.
-        rows: All rows of the trial.
-
-    Returns:
-        One row more, unless the first is at 0.5 N already; travel counts from that row.
-
-    Raises:
-        DatasetError: The trial begins above 0.5 N, or nothing stays above.
     """
     start = _onset(rows)
-
-    def joined(of_all: Floats, of_kept: Floats) -> Floats:
-        return np.concatenate([start.row(of_all), of_kept[int(start.exact) :]])
-
-    travel_m = joined(rows.travel_m, kept.travel_m)
+    travel_m = start.rows(rows.travel_m)
     return replace(
-        kept,
+        rows,
         travel_m=travel_m - travel_m[0],
-        tared=joined(rows.tared, kept.tared),
-        force=joined(rows.force, kept.force),
-        location=joined(rows.location, kept.location),
+        tared=start.rows(rows.tared),
+        force=start.rows(rows.force),
+        location=start.rows(rows.location),
     )
-
-
-def from_half_newton(rows: TrialRows) -> TrialRows:
-    """Threshold and interpolated row together.
-
-    Raises:
-        DatasetError: The trial begins above 0.5 N, or no row is left.
-    """
-    return prepend_threshold_row(above_threshold(rows), rows)
 
 
 def _onset(rows: TrialRows) -> ForceOnset:

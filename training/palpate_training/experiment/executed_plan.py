@@ -23,10 +23,11 @@ from palpate.errors import ConfigError, DatasetError
 from palpate.rigid import Floats, Transform
 from palpate_training.datasets.ingest import (
     SensorStreams,
+    check_streams,
+    force_at,
     middles,
     read_streams,
-    refuse_other_types,
-    time_of,
+    times_of,
 )
 from palpate_training.datasets.trials import RawTrial, TrialHeader
 from palpate_training.experiment.kinematics import ArmKinematics
@@ -118,29 +119,17 @@ def ingest_experiment(
 
 
 def _samples(record: Path, sensor: str, streams: SensorStreams) -> _AlignedSamples:
-    if not streams.wrenches:
-        raise DatasetError(
-            f"{record}: sensor {sensor!r} has no wrench stream",
-            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
-        )
-    refuse_other_types(record, sensor, streams)
+    check_streams(record, sensor, streams)
     frames = [frame for frame in streams.frames if frame.electrodes_valid]
     if not frames:
         raise DatasetError(
             f"{record}: sensor {sensor!r} has no valid BioTac frame",
             remedy="record the stream electrodes of the finger",
         )
-    times, first = np.unique(
-        np.array([time_of(frame.stamp, streams) for frame in frames], dtype=np.int64),
-        return_index=True,
-    )
+    times, first = np.unique(times_of(frames, streams), return_index=True)
     frames = [frames[i] for i in first]
     at = times + middles(frames)
-    force, known = linear(
-        at,
-        np.array([time_of(w.stamp, streams) for w in streams.wrenches], dtype=np.int64),
-        np.array([w.force for w in streams.wrenches], dtype=np.float64),
-    )
+    force, known = force_at(at, streams)
     walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
     return _AlignedSamples(
         at[known],
@@ -160,7 +149,7 @@ def _tip_of_poses(
         )
     return linear(
         samples.time_ns,
-        np.array([time_of(p.stamp, streams) for p in streams.poses], dtype=np.int64),
+        times_of(streams.poses, streams),
         np.array([p.position for p in streams.poses], dtype=np.float64),
     )
 

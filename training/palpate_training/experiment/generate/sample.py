@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from palpate.files.tape_build import TapePress, build_tape, tape_specimen
 from palpate_training.datasets.basis import encode, fit_basis, subset
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
-    FloatArray,
     MixedDataset,
     read_experiment,
     read_mixed,
@@ -41,23 +40,6 @@ TAPE_STEPS = 16
 """Steps of a press on tape; between them a player interpolates."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExperimentSample:
-    """What was written.
-
-    Attributes:
-        trajectories: Ids of both.
-        trials: In the data set.
-        dataset_bytes: Its size.
-        tape_bytes: Size of the tape.
-    """
-
-    trajectories: tuple[str, ...]
-    trials: int
-    dataset_bytes: int
-    tape_bytes: int
-
-
 def make_sample(
     folder: Path,
     specimens: Sequence[Specimen],
@@ -65,7 +47,7 @@ def make_sample(
     dataset: Path,
     tape: Path,
     rest: Path | None = None,
-) -> ExperimentSample:
+) -> tuple[tuple[str, ...], int]:
     """Take one normal and one angled trajectory of each indenter.
 
     Args:
@@ -76,6 +58,9 @@ def make_sample(
         tape: Tape to write.
         rest: Folder that takes both data sets without these trajectories; None = none. Who plays
             the tape to a network must have trained it on these.
+
+    Returns:
+        Ids of the trajectories of both, and the number of trials in the data set.
 
     Raises:
         DatasetError: The folder is no finished experiment, or damaged.
@@ -92,7 +77,7 @@ def make_sample(
     small = _fewer_modes(subset(mixed, trials))
     write_mixed(dataset, small)
     _write_tape(folder, specimens, simulator.open_store(folder / STORE), wanted, tape)
-    return ExperimentSample(wanted, len(trials), dataset.stat().st_size, tape.stat().st_size)
+    return wanted, len(trials)
 
 
 def _picked(mixed: MixedDataset) -> tuple[str, ...]:
@@ -118,11 +103,7 @@ def _trials(data: ExperimentDataset, names: Sequence[str], *, inside: bool) -> l
 
 def _fewer_modes(mixed: MixedDataset) -> MixedDataset:
     fields = mixed.displacement(slice(0, len(mixed)))
-
-    def blocks() -> list[FloatArray]:
-        return [fields]
-
-    basis = fit_basis(blocks, count=DATASET_MODES)
+    basis = fit_basis(lambda: [fields], count=DATASET_MODES)
     return replace(mixed, basis=basis, coefficients=encode(basis, fields))
 
 

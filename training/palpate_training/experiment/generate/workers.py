@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from multiprocessing import get_context, parent_process
 from typing import Any, Protocol, TypeVar
 
@@ -35,11 +36,9 @@ class TaskRunner(Protocol):
         self, function: Callable[[Task], Answer], tasks: Iterable[Task]
     ) -> Iterator[tuple[Task, Answer]]:
         """Yield each task with its answer as it is done, in any order."""
-        ...
 
     def close(self) -> None:
         """End the workers."""
-        ...
 
 
 def _end_with_parent() -> None:
@@ -74,16 +73,12 @@ class WorkerProcesses:
         """
         pending: dict[Future[Answer], Task] = {}
         more = iter(tasks)
-        ended = False
         try:
-            while pending or not ended:
-                while not ended and len(pending) < AHEAD * self._workers:
-                    try:
-                        task = next(more)
-                    except StopIteration:
-                        ended = True
-                        break
+            while True:
+                for task in islice(more, AHEAD * self._workers - len(pending)):
                     pending[self._pool.submit(function, task)] = task
+                if not pending:
+                    return
                 done, _ = wait(pending, return_when=FIRST_COMPLETED)
                 for future in done:
                     task = pending.pop(future)
@@ -168,14 +163,8 @@ class RayCluster:
         most = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
         pending: dict[Any, Task] = {}
         more = iter(tasks)
-        ended = False
-        while pending or not ended:
-            while not ended and len(pending) < most:
-                try:
-                    task = next(more)
-                except StopIteration:
-                    ended = True
-                    break
+        while True:
+            for task in islice(more, most - len(pending)):
                 pending[remote.remote(task)] = task
             if not pending:
                 return
