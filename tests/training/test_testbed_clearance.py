@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +61,43 @@ def test_poses_on_the_pad_are_on_the_side_of_their_arm() -> None:
     assert (left[:, 2] < 0).all()
 
 
+def wrong_urdf(link_errors: Floats) -> str:
+    """URDF of a left arm whose links are off at their far ends, each in the frame of its joint.
+
+    Args:
+        link_errors: Displacement [m] and rotation vector [rad] of each link, shape (7, 6).
+    """
+    off = iter(np.vstack([np.zeros(6), link_errors]))  # the base link has none
+
+    def moved(origin: re.Match[str]) -> str:
+        return _origin(next(off), np.array([float(word) for word in origin[1].split()]))
+
+    text = re.sub(r'  <origin xyz="([^"]*)".*/>', moved, stand_in.arm_urdf("left"))
+    assert next(off, None) is None
+    return text
+
+
+def _origin(off: Floats, xyz: Floats) -> str:
+    """Origin element of a joint at ``xyz`` in a link whose far end is off."""
+    rotation = _rotation(off[3:])
+    x, y, z = rotation @ xyz + off[:3]
+    pitch = math.asin(-rotation[2, 0])
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    return f'  <origin xyz="{x:.15g} {y:.15g} {z:.15g}" rpy="{roll:.15g} {pitch:.15g} {yaw:.15g}"/>'
+
+
+def _rotation(vector: Floats) -> Floats:
+    """Matrix of a rotation vector [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return np.asarray(turned)
+
+
 def test_without_errors_there_is_none(left: ArmKinematics) -> None:
     found = simulate(left, NONE, draws=3)
     assert np.abs(found.error).max() < 1e-9
@@ -70,7 +109,7 @@ def test_links_move_the_tip_as_a_wrong_urdf_does(left: ArmKinematics, tmp_path: 
     random = np.random.default_rng(0)
     errors = random.normal(size=(7, 6)) * ([0.2e-3] * 3 + [1e-3] * 3)
     path = tmp_path / "wrong.urdf"
-    path.write_text(stand_in.arm_urdf("left", errors))
+    path.write_text(wrong_urdf(errors))
     wrong = ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
     joints = random.uniform(left.lower, left.upper, (6, 7))
     moved = wrong.tip(joints)[0] - left.tip(joints)[0]
@@ -90,7 +129,7 @@ def test_a_wrong_arm_that_is_led_into_the_holes_is_off_as_the_model_says(
         7, 6
     )
     path = tmp_path / "wrong.urdf"
-    path.write_text(stand_in.arm_urdf("left", errors))
+    path.write_text(wrong_urdf(errors))
     wrong = ArmKinematics.from_urdf(path, stand_in.FLANGE, stand_in.tool())
     truth = stand_in.sensor_robot("left")
 

@@ -102,8 +102,8 @@ def test_common_trajectories_account_for_the_others(rows: TrialRows) -> None:
     other = replace(rows, header=replace(HEADER, trajectory="ring/00/normal"))
     both, dropped = common_trajectories([rows, other], {HEADER.trajectory})
     assert [one.header.trajectory for one in both] == [HEADER.trajectory]
-    assert [one.header.trajectory for one in dropped] == ["ring/00/normal"]
-    assert "not simulated" in dropped[0].reason
+    assert [name for name, _ in dropped] == [f"{HEADER.unit} ring/00/normal"]
+    assert "not simulated" in dropped[0][1]
 
 
 def test_interpolation_is_numpys_along_the_first_axis() -> None:

@@ -337,8 +337,8 @@ def test_every_dropped_trial_is_listed_with_its_reason(raw: RawTrial) -> None:
     missed = replace(raw, force=np.zeros_like(raw.force), header=replace(HEADER, unit="biotac-2"))
     kept, dropped = process_all([raw, missed])
     assert [rows.header for rows in kept] == [HEADER]
-    assert [one.header.unit for one in dropped] == ["biotac-2"]
-    assert "never stays at 0.5 N" in dropped[0].reason
+    assert [name for name, _ in dropped] == [f"biotac-2 {HEADER.trajectory}"]
+    assert "never stays at 0.5 N" in dropped[0][1]
 
 
 def test_a_trial_that_begins_in_contact_is_refused() -> None:

@@ -2,14 +2,13 @@
 
 Paper, section "Experimental and simulation data processing".
 
-
 Trials put together to the data sets, in an order that does not depend on who finished first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,6 @@ from palpate_training.datasets.experiment import (
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.datasets.processing import (
     THRESHOLD_N,
-    DroppedTrial,
     Floats,
     Values,
     from_threshold,
@@ -40,14 +38,14 @@ INCREMENTS = 20
 
 def common_trajectories(
     trials: Iterable[TrialRows], simulated: Collection[str]
-) -> tuple[list[TrialRows], list[DroppedTrial]]:
-    """Trials whose trajectory was simulated, and the others with the reason (paper, step 1)."""
+) -> tuple[list[TrialRows], list[tuple[str, str]]]:
+    """Trials whose trajectory was simulated; names and reasons of the others (paper, step 1)."""
     both, dropped = [], []
     for rows in trials:
         if rows.header.trajectory in simulated:
             both.append(rows)
         else:
-            dropped.append(DroppedTrial(rows.header, "its trajectory was not simulated"))
+            dropped.append((trial_name(rows.header), "its trajectory was not simulated"))
     return both, dropped
 
 
@@ -185,44 +183,34 @@ def assemble_mixed(
         DatasetError: As in ``assemble_experiment``, or a field is of another mesh.
     """
     found = [_compress(one, basis, mesh) for one in mixed]
-    experiment, order = _experiment([one.rows for one in found], provenance, unit_names)
+    experiment, order = _experiment([rows for rows, _, _ in found], provenance, unit_names)
     return MixedDataset(
         experiment=experiment,
-        simulated_force=np.concatenate([found[i].simulated_force for i in order]),
-        coefficients=np.concatenate([found[i].coefficients for i in order]),
+        simulated_force=np.concatenate([found[i][1] for i in order]),
+        coefficients=np.concatenate([found[i][2] for i in order]),
         basis=basis,
         mesh=mesh,
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _CompressedTrial:
-    rows: TrialRows
-    simulated_force: FloatArray
-    coefficients: FloatArray
-
-
-def _compress(mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh) -> _CompressedTrial:
+def _compress(
+    mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh
+) -> tuple[TrialRows, FloatArray, FloatArray]:
+    """Rows, simulated force and coefficients of a trial, after checking it."""
     count = len(mixed.rows.travel_m)
-    for what, shape, expected in (
-        ("displacement", mixed.displacement.shape, (count, *mesh.nodes.shape)),
-        ("simulated force", mixed.simulated_force.shape, (count, 3)),
+    for what, values, expected in (
+        ("displacement", mixed.displacement, (count, *mesh.nodes.shape)),
+        ("simulated force", mixed.simulated_force, (count, 3)),
     ):
-        if shape != expected:
+        if values.shape != expected:
             raise DatasetError(
-                f"{trial_name(mixed.rows.header)}: {what} has shape {shape}, expected {expected}",
+                f"{trial_name(mixed.rows.header)}: {what} has shape {values.shape}, expected"
+                f" {expected}",
                 remedy="simulate with the mesh that the data set names",
             )
-    for what, values in (
-        ("displacement", mixed.displacement),
-        ("simulated force", mixed.simulated_force),
-    ):
         _check_finite(mixed.rows, what, values)
-    return _CompressedTrial(
-        mixed.rows,
-        mixed.simulated_force.astype(np.float32),
-        encode(basis, mixed.displacement),
-    )
+    force = mixed.simulated_force.astype(np.float32)
+    return mixed.rows, force, encode(basis, mixed.displacement)
 
 
 def _experiment(

@@ -6,7 +6,6 @@ Review 53, 2011), in float64 as squares of small modes would be lost in float32.
 measured, on every row and with the float32 numbers that are stored, not inferred from singular
 values.
 
-
 A few trials of a data set, as a data set: a sample small enough to ship.
 """
 
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -169,26 +168,15 @@ def _centred(blocks: Blocks, mean: Floats) -> Iterable[Floats]:
         yield block.reshape(len(block), -1).astype(np.float64) - mean
 
 
-@overload
-def subset(data: ExperimentDataset, trials: Sequence[int]) -> ExperimentDataset: ...
-@overload
-def subset(
-    data: MixedDataset, trials: Sequence[int], *, loss_mean_m: float | None = None
-) -> MixedDataset: ...
-def subset(
-    data: ExperimentDataset | MixedDataset,
-    trials: Sequence[int],
-    *,
-    loss_mean_m: float | None = None,
-) -> ExperimentDataset | MixedDataset:
+Data = TypeVar("Data", ExperimentDataset, MixedDataset)
+
+
+def subset(data: Data, trials: Sequence[int]) -> Data:
     """Keep some trials, and only the units and trajectories that they are of.
 
     Args:
         data: A data set.
         trials: Indices of the trials to keep; the order stays that of the data set.
-        loss_mean_m: Of a mixed data set: find new modes for what is left, which loses that much
-            more on average [m]; the basis then states the sum of both losses, an upper bound. None
-            keeps the modes.
 
     Raises:
         DatasetError: A trial does not exist, or none is given.
@@ -196,24 +184,11 @@ def subset(
     if isinstance(data, ExperimentDataset):
         return _experiment(data, trials)
     rows = _rows(data.experiment, trials)
-    kept = replace(
+    return replace(
         data,
         experiment=_experiment(data.experiment, trials),
         simulated_force=data.simulated_force[rows],
         coefficients=data.coefficients[rows],
-    )
-    if loss_mean_m is None:
-        return kept
-    fields = [kept.displacement(kept.experiment.rows_of(i)) for i in range(kept.experiment.trials)]
-    basis = fit_basis(lambda: fields, loss_mean_m=loss_mean_m)
-    return replace(
-        kept,
-        coefficients=np.concatenate([encode(basis, field) for field in fields]),
-        basis=replace(
-            basis,
-            loss_mean_m=basis.loss_mean_m + data.basis.loss_mean_m,
-            loss_max_m=basis.loss_max_m + data.basis.loss_max_m,
-        ),
     )
 
 

@@ -5,7 +5,6 @@ third; it is linear, so it commutes with the tare, but not with the subsampling:
 is one sample every 5 s (0.2 Hz), for which a cutoff of 5 Hz means nothing. So it runs on the
 stream as recorded. Each step is a pure function; none changes what it is given.
 
-
 Where a press begins: 0.5 N, in the experiment and in the simulation alike.
 
 Paper, sections "Experimental data processing" (step 3) and "Experimental and simulation data
@@ -25,7 +24,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.messages import COUNTS_MAX
 from palpate.process import require
-from palpate_training.datasets.trials import RawTrial, TrialHeader, TrialRows, trial_name
+from palpate_training.datasets.trials import RawTrial, TrialRows, trial_name
 
 CUTOFF_HZ = 5.0
 """Of the first-order Butterworth low-pass (paper)."""
@@ -37,19 +36,6 @@ LONGEST_GAP_S = 0.5
 """A tenth of the dwell. The force stands still in a dwell, so a short gap shifts nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class DroppedTrial:
-    """A trial that gave no rows.
-
-    Attributes:
-        header: Which.
-        reason: Why, with what to do.
-    """
-
-    header: TrialHeader
-    reason: str
-
-
 def process(raw: RawTrial) -> TrialRows:
     """All steps: filter, last sample of each increment, tare, threshold, row at exactly 0.5 N.
 
@@ -59,18 +45,18 @@ def process(raw: RawTrial) -> TrialRows:
     return from_half_newton(tare(last_of_increments(filter_force(raw))))
 
 
-def process_all(trials: Iterable[RawTrial]) -> tuple[list[TrialRows], list[DroppedTrial]]:
+def process_all(trials: Iterable[RawTrial]) -> tuple[list[TrialRows], list[tuple[str, str]]]:
     """Process trial by trial, and account for each.
 
     Returns:
-        Rows of the trials that gave some, and every other trial with its reason.
+        Rows of the trials that gave some, and name and reason of every other trial.
     """
     kept, dropped = [], []
     for raw in trials:
         try:
             kept.append(process(raw))
         except DatasetError as error:
-            dropped.append(DroppedTrial(raw.header, str(error)))
+            dropped.append((trial_name(raw.header), str(error)))
     return kept, dropped
 
 

@@ -5,7 +5,6 @@ with an array ``data``, and rows in order of trajectories (as the ACROSS framewo
 Their frame and their side of the force are not written down, so both can be given, and are checked:
 the pad looks to -z, and what presses it pushes towards +z.
 
-
 Trajectories in published rows, which name none: where each begins, and which are the same.
 
 A published file holds the rows of one BioTac, trajectory after trajectory, each beginning with a

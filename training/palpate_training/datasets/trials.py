@@ -3,7 +3,6 @@
 Everything is in the sensor frame (x distal, y lateral, z dorsal), SI; force is the force on the
 BioTac. A *trajectory* is planned once and has an id; a *trial* is its execution on one unit.
 
-
 Raw trials on disk: schema ``palpate.trials``, version 1, one trial in memory at a time.
 
 A group ``trials/00000``, ``trials/00001``... for each trial, in order of writing, with what the

@@ -114,12 +114,11 @@ class ArmKinematics:
         tool = Transform.identity() if tool_transform is None else tool_transform
         return cls(model, model.getFrameId(tip_frame), tool, name=str(path))
 
-    def tip(self, joints: npt.ArrayLike, *, check_limits: bool = True) -> tuple[Floats, Floats]:
+    def tip(self, joints: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Tip of the tool by forward kinematics, robot frame.
 
         Args:
             joints: Joint positions [rad or m], shape (T, n).
-            check_limits: Refuse joints outside their limits.
 
         Returns:
             Positions [m], shape (T, 3), and unit quaternions w x y z, shape (T, 4).
@@ -127,7 +126,7 @@ class ArmKinematics:
         Raises:
             ConfigError: Another number of joints, NaN, or outside the limits.
         """
-        rows = self._checked(joints, check_limits)
+        rows = self._checked(joints)
         positions, rotations = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
         for i, row in enumerate(rows):
             tip = self._tip(row)
@@ -146,7 +145,7 @@ class ArmKinematics:
         Raises:
             ConfigError: As `tip`.
         """
-        rows = self._checked(joints, True)
+        rows = self._checked(joints)
         n = len(self.joint_names)
         origins, rotations = np.empty((len(rows), n, 3)), np.empty((len(rows), n, 3, 3))
         for i, row in enumerate(rows):
@@ -179,7 +178,7 @@ class ArmKinematics:
         targets = [self._se3(pose, f"pose {i}") for i, pose in enumerate(poses)]
         random = np.random.default_rng(seed)
         middle = (self.lower + self.upper) / 2
-        first = middle if start is None else self._checked(np.atleast_2d(start), True)[0]
+        first = middle if start is None else self._checked(np.atleast_2d(start))[0]
         best: JointSolution | None = None
         for _ in range(1 + _RESTARTS):
             found = self._follow(targets, first)
@@ -245,7 +244,7 @@ class ArmKinematics:
         transform = Transform.from_pose(pose, what)
         return self._pin.SE3(transform.rotation, transform.translation)
 
-    def _checked(self, joints: npt.ArrayLike, check_limits: bool) -> Floats:
+    def _checked(self, joints: npt.ArrayLike) -> Floats:
         rows = np.asarray(joints, np.float64)
         n = len(self.joint_names)
         if rows.ndim != 2 or rows.shape[1] != n:
@@ -260,15 +259,12 @@ class ArmKinematics:
                 f"{self.joint_names[column]} is {rows[row, column]} in row {row}",
                 remedy="leave such rows out of the joint log",
             )
-        if check_limits:
-            out = np.argwhere(
-                (rows < self.lower - LIMIT_MARGIN) | (rows > self.upper + LIMIT_MARGIN)
+        out = np.argwhere((rows < self.lower - LIMIT_MARGIN) | (rows > self.upper + LIMIT_MARGIN))
+        if len(out):
+            row, column = out[0]
+            raise ConfigError(
+                f"{self.joint_names[column]} is {rows[row, column]:.4f} in row {row}, outside"
+                f" {self.lower[column]:.4f} to {self.upper[column]:.4f} of {self.name}",
+                remedy="check unit (rad, m), order of the joints, and that the URDF is the arm",
             )
-            if len(out):
-                row, column = out[0]
-                raise ConfigError(
-                    f"{self.joint_names[column]} is {rows[row, column]:.4f} in row {row}, outside"
-                    f" {self.lower[column]:.4f} to {self.upper[column]:.4f} of {self.name}",
-                    remedy="check unit (rad, m), order of the joints, and that the URDF is the arm",
-                )
         return rows

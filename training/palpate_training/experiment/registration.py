@@ -8,7 +8,6 @@ every three of the holes and the transforms are averaged: translations by their 
 ``scipy.spatial.transform.Rotation.mean``, the rotation whose summed squared (chordal) distance to
 all is least; the paper names no formula for that average.
 
-
 Registrations on disk: measured holes as a CSV file in, registrations of the arms as JSON out.
 """
 

@@ -12,17 +12,15 @@ towards them and its origin 150 mm above the bench; the plate with the holes is 
 
 from __future__ import annotations
 
-import math
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate.rigid import Floats, Transform
+from palpate.rigid import Transform
 from palpate_training.experiment.kinematics import ArmKinematics
 
 SIDES = ("left", "right")
@@ -52,28 +50,20 @@ _JOINTS = (
     _ArmJoint((0.025, 0.0, 0.05), (0, 0, 1), (-3.1, 3.1)),
 )
 _FLANGE_M = 0.03  # from the last joint to the flange
-JOINTS = len(_JOINTS)
 
 HOME = np.array([0.0, 0.45, 0.0, 1.45, 0.0, 1.25, 0.0])
 """Posture over the finger that inverse kinematics starts from [rad], of both arms."""
 
 
-def arm_urdf(side: str, link_errors: npt.ArrayLike | None = None) -> str:
-    """URDF of an arm.
-
-    Args:
-        side: ``left`` or ``right``.
-        link_errors: How the far end of each link is off, in the frame that moves with its joint:
-            displacement [m] and rotation vector [rad], shape (7, 6). None = the drawing.
+def arm_urdf(side: str) -> str:
+    """URDF of the ``left`` or ``right`` arm.
 
     Raises:
         ConfigError: Another side.
     """
     mirror = -1.0 if _checked_side(side) == "left" else 1.0
-    errors = np.zeros((JOINTS, 6)) if link_errors is None else np.asarray(link_errors, np.float64)
     lines = ['<?xml version="1.0"?>', f'<robot name="palpate_stand_in_{side}">', _link("base")]
     parent = "base"
-    off = np.zeros(6)  # the base link has none: registration would take it up
     for number, joint in enumerate(_JOINTS, 1):
         # Mirrored in the plane y = 0: turns about x and z change sign, about y not.
         axis = (mirror * joint.axis[0], float(joint.axis[1]), mirror * joint.axis[2])
@@ -82,18 +72,18 @@ def arm_urdf(side: str, link_errors: npt.ArrayLike | None = None) -> str:
             _link(child),
             f'<joint name="{side}_joint{number}" type="revolute">',
             f'  <parent link="{parent}"/><child link="{child}"/>',
-            _origin(off, np.array(joint.origin)),
+            _origin(joint.origin),
             f'  <axis xyz="{axis[0]:g} {axis[1]:g} {axis[2]:g}"/>',
             f'  <limit lower="{joint.limits[0]}" upper="{joint.limits[1]}" effort="50"'
             ' velocity="3"/>',
             "</joint>",
         ]
-        parent, off = child, errors[number - 1]
+        parent = child
     lines += [
         _link(FLANGE),
         f'<joint name="{side}_{FLANGE}" type="fixed">',
         f'  <parent link="{parent}"/><child link="{FLANGE}"/>',
-        _origin(off, np.array([0.0, 0.0, _FLANGE_M])),
+        _origin((0.0, 0.0, _FLANGE_M)),
         "</joint>",
         "</robot>",
     ]
@@ -148,22 +138,6 @@ def _link(name: str) -> str:
     return f'<link name="{name}"/>'
 
 
-def _origin(off: Floats, xyz: Floats) -> str:
-    """Origin element of a joint at ``xyz`` in a link whose far end is off."""
-    rotation = _rotation(off[3:])
-    x, y, z = rotation @ xyz + off[:3]
-    pitch = math.asin(-rotation[2, 0])
-    roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-    return f'  <origin xyz="{x:.15g} {y:.15g} {z:.15g}" rpy="{roll:.15g} {pitch:.15g} {yaw:.15g}"/>'
-
-
-def _rotation(vector: Floats) -> Floats:
-    """Matrix of a rotation vector [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return np.asarray(turned)
+def _origin(xyz: tuple[float, float, float]) -> str:
+    x, y, z = xyz
+    return f'  <origin xyz="{x:.15g} {y:.15g} {z:.15g}" rpy="0 -0 0"/>'

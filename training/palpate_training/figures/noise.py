@@ -3,7 +3,6 @@
 The file of an idle twin is a NumPy archive with ``rate_hz``, one number, and for each unit an array
 by its name: counts [counts], shape (T, 19).
 
-
 Drift and noise of untouched electrodes: spectra, and change over minutes.
 """
 

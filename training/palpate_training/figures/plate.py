@@ -5,7 +5,6 @@ within a count or two, in contact it spreads over hundreds); a sample within 10 
 untouched, one more than 30 counts (about 1 kPa) above it is touched. The plate is ventral when its
 normal is within 20 degrees of the pad's.
 
-
 Which electrodes rise and fall under a ventral plate: the real sensor beside the twin.
 """
 

@@ -4,7 +4,6 @@ The data set's own basis was fitted to all its rows, held-out ones included. Its
 orthonormal, so the principal components of the *training* rows' coefficients are exactly the POD
 modes of the training rows' fields; nothing of a held-out trajectory shapes them.
 
-
 How near the skin is to every electrode: the film's thickness, pooled with kernels.
 
 The core is a half-cylinder about the x axis with a spherical tip about the origin

@@ -4,7 +4,6 @@ Force is learned from all rows, untouched ones included, so that nothing reads a
 location only from rows in contact. What is reported was measured with exactly the weights that are
 shipped: nothing is refitted on the held-out presses afterwards.
 
-
 Force and contact location on held-out trajectories, with the paper's network and metrics.
 
 For every unit a network of its own, and one of all units tested on each, as in the paper's table.

@@ -98,7 +98,7 @@ def process_files(
     _check_once(paths, [[trial_name(header) for header in one.headers] for one in files])
     store = None if mechanics is None else simulator.open_store(mechanics)
     rows, lost = process_all(_counted(paths, total, on_progress))
-    dropped = tuple(sorted((trial_name(one.header), one.reason) for one in lost))
+    dropped = tuple(sorted(lost))
     if not rows:
         raise DatasetError(
             f"none of {total} trials gave rows; the first: {dropped[0][1]}",
@@ -174,8 +174,7 @@ def _mix(
     on_progress: OnProgress,
 ) -> tuple[MixedDataset, Dropped]:
     fingertip = store.fingertip()
-    common, lost = common_trajectories(rows, set(store.ids()))
-    left_out = [(trial_name(one.header), one.reason) for one in lost]
+    common, left_out = common_trajectories(rows, set(store.ids()))
     simulated: dict[str, SimulatedTrial] = {}
     believable: list[TrialRows] = []
     names = sorted({one.header.trajectory for one in common})
