@@ -147,10 +147,6 @@ def data_ingest(
 def by_arm(words: Sequence[str], flag: str) -> dict[str, Path]:
     """Files by arm, from words such as ``left=FILE``.
 
-    Args:
-        words: As given.
-        flag: For messages, e.g. ``--urdf``.
-
     Raises:
         ConfigError: A word is no such pair, names another arm, or an arm comes twice.
     """

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -41,23 +42,20 @@ def train_field(
 
     palpate train field mixed.h5 models/field-twin/1 --name field-twin
     """
-    from palpate_training.datasets.experiment import read_mixed
-    from palpate_training.tasks.fields import FieldFitConfig, field_bundle
+    from palpate_training.tasks.fields import field_bundle
 
-    config = FieldFitConfig(epochs=epochs)
     chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
-    with _progress() as progress:
-        task = progress.add_task("field", total=config.epochs)
-        metrics = field_bundle(
-            read_mixed(data),
-            out,
-            units=chosen,
-            name=name,
-            version=version,
-            config=config,
-            seed=seed,
-            on_epoch=lambda: progress.advance(task),
-        )
+    metrics = _bundle(
+        field_bundle,
+        "field",
+        data,
+        out,
+        epochs,
+        units=chosen,
+        name=name,
+        version=version,
+        seed=seed,
+    )
     _show(metrics, f"{name} {version}: unseen trajectories", out)
 
 
@@ -74,23 +72,12 @@ def train_synthesis(
 
     palpate train synthesis mixed.h5 models/synthesis-twin/1 --unit biotac-2 --name synthesis-twin
     """
-    from palpate_training.datasets.experiment import read_mixed
-    from palpate_training.tasks.fields import FieldFitConfig
     from palpate_training.tasks.synthesis import synthesis_bundle
 
-    config = FieldFitConfig(epochs=epochs)
-    with _progress() as progress:
-        task = progress.add_task("synthesis", total=config.epochs)
-        metrics = synthesis_bundle(
-            read_mixed(data),
-            out,
-            unit=unit,
-            name=name,
-            version=version,
-            config=config,
-            seed=seed,
-            on_epoch=lambda: progress.advance(task),
-        )
+    metrics = _bundle(
+        synthesis_bundle, "synthesis", data, out, epochs,
+        unit=unit, name=name, version=version, seed=seed,
+    )  # fmt: skip
     _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
 
 
@@ -183,6 +170,26 @@ def train_features_command(
 
         report = train_features(data, out, name=name, version=version, seed=seed, on_epoch=on_epoch)
     _show(report.metrics, f"{name} {version}: unseen presses", out)
+
+
+def _bundle(
+    train: Callable[..., dict[str, float]],
+    task: str,
+    data: Path,
+    out: Path,
+    epochs: int,
+    **options: Any,
+) -> dict[str, float]:
+    """Train a field or synthesis bundle; its held-out metrics."""
+    from palpate_training.datasets.experiment import read_mixed
+    from palpate_training.tasks.fields import FieldFitConfig
+
+    with _progress() as progress:
+        bar = progress.add_task(task, total=epochs)
+        config = FieldFitConfig(epochs=epochs)
+        return train(
+            read_mixed(data), out, config=config, on_epoch=lambda: progress.advance(bar), **options
+        )
 
 
 def _progress() -> Progress:

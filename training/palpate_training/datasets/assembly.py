@@ -172,13 +172,6 @@ def assemble_mixed(
 ) -> MixedDataset:
     """The mixed data set; fields are compressed one by one, so ``mixed`` may be a stream.
 
-    Args:
-        mixed: Trials with their simulation, in any order.
-        basis: From ``fit_basis`` of the same fields.
-        mesh: Whose nodes move.
-        provenance: Where they come from.
-        unit_names: As in ``assemble_experiment``.
-
     Raises:
         DatasetError: As in ``assemble_experiment``, or a field is of another mesh.
     """

@@ -83,12 +83,7 @@ def fit_basis(
 
 
 def encode(basis: FieldBasis, displacement: FloatArray) -> FloatArray:
-    """Coefficients of fields, shape (R, K).
-
-    Args:
-        basis: Mean and modes.
-        displacement: [m], shape (R, V, 3).
-    """
+    """Coefficients of fields, shape (R, K), of displacements [m], shape (R, V, 3)."""
     flat = displacement.reshape(len(displacement), -1).astype(np.float64) - basis.mean.reshape(-1)
     return np.asarray(flat @ basis.modes.reshape(len(basis.modes), -1).T, np.float32)
 
@@ -172,11 +167,9 @@ Data = TypeVar("Data", ExperimentDataset, MixedDataset)
 
 
 def subset(data: Data, trials: Sequence[int]) -> Data:
-    """Keep some trials, and only the units and trajectories that they are of.
+    """Keep some trials, by index, and only the units and trajectories that they are of.
 
-    Args:
-        data: A data set.
-        trials: Indices of the trials to keep; the order stays that of the data set.
+    The order stays that of the data set.
 
     Raises:
         DatasetError: A trial does not exist, or none is given.

@@ -131,16 +131,7 @@ def add_array(digest: hashlib._Hash, name: str, array: npt.NDArray[Any]) -> None
 def write_tables(
     path: Path, schema: Hdf5Schema, columns: Mapping[str, StoredColumn], tables: StoredTables
 ) -> str:
-    """Write a file; it appears complete or not at all.
-
-    Args:
-        path: File to write (``.h5``).
-        schema: Its header.
-        columns: What each array is.
-        tables: What to write.
-
-    Returns:
-        The content's SHA-256, hex.
+    """Write a file, complete or not at all; returns the content's SHA-256, hex.
 
     Raises:
         DatasetError: The disk refused.

@@ -289,10 +289,7 @@ _MIXED_NUMBERS = ("loss_mean_m", "loss_max_m", "mesh_sha256")
 
 
 def write_experiment(path: Path, data: ExperimentDataset) -> str:
-    """Write a purely experimental data set; the file appears complete or not at all.
-
-    Returns:
-        The content's SHA-256, hex.
+    """Write a purely experimental data set, complete or not at all; returns its SHA-256, hex.
 
     Raises:
         DatasetError: The disk refused.
@@ -302,10 +299,7 @@ def write_experiment(path: Path, data: ExperimentDataset) -> str:
 
 
 def write_mixed(path: Path, data: MixedDataset) -> str:
-    """Write a mixed data set, its basis and its mesh; complete or not at all.
-
-    Returns:
-        The content's SHA-256, hex.
+    """Write a mixed data set with basis and mesh, complete or not at all; its SHA-256, hex.
 
     Raises:
         DatasetError: The disk refused.

@@ -45,11 +45,8 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
     ``electrode_vals``, ``contact_loc`` [m], ``force_vec`` [N] and ``indenter_type`` have an array
     ``data`` each; the attribute ``names`` of the last maps its numbers to indenters. Of a
     mixed data set ``biotac1_simulated.hdf5`` and so on hold the simulated force ``force_res`` [N]
-    and the nodal displacement ``nodal_res`` [m], row by row.
-
-    Args:
-        folder: Folder to make; must not exist, and appears complete or not at all.
-        data: What to write.
+    and the nodal displacement ``nodal_res`` [m], row by row. The folder must not exist, and appears
+    complete or not at all.
 
     Returns:
         The files.
@@ -78,14 +75,9 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
 
 
 def export_csv(path: Path, data: ExperimentDataset | MixedDataset) -> int:
-    """Write one line for each row, with a heading that carries the units.
+    """Write one line for each row, with a heading that carries the units; returns their number.
 
-    Args:
-        path: File to write; must not exist, and appears complete or not at all.
-        data: What to write.
-
-    Returns:
-        Lines below the heading.
+    The file must not exist, and appears complete or not at all.
 
     Raises:
         DatasetError: The file exists, or the disk refused.

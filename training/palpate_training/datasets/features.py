@@ -195,14 +195,7 @@ _CHUNK_ROWS = 4096
 
 
 def write_dataset(path: Path, data: FeatureDataset) -> str:
-    """Write a data set; the file appears complete or not at all.
-
-    Args:
-        path: File to write (``.h5``).
-        data: What to write.
-
-    Returns:
-        The content's SHA-256, hex.
+    """Write a data set, complete or not at all; returns the content's SHA-256, hex.
 
     Raises:
         DatasetError: The disk refused.
@@ -227,13 +220,7 @@ def write_dataset(path: Path, data: FeatureDataset) -> str:
 
 
 def open_dataset(path: Path) -> FeatureDataset:
-    """Read a data set and check everything about it.
-
-    Args:
-        path: File written by ``write_dataset``, or by anyone to the same schema.
-
-    Returns:
-        The data set, in memory.
+    """Read a data set into memory and check everything about it.
 
     Raises:
         DatasetError: The file is missing, damaged, of another schema or version, or its content

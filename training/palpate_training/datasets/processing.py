@@ -69,9 +69,6 @@ def filter_force(raw: RawTrial) -> RawTrial:
     is filtered on its own, mirrored at its ends. (With SciPy's default, odd extension, the
     last sample would keep all its noise.)
 
-    Args:
-        raw: A trial as recorded, before any subsampling (see the head of this file).
-
     Returns:
         The trial with its force filtered.
 
@@ -141,10 +138,7 @@ def last_of_increments(raw: RawTrial) -> RawTrial:
 
 
 def tare(raw: RawTrial) -> TrialRows:
-    """Subtract force and electrodes of the first time step, before contact (paper, step 2).
-
-    Args:
-        raw: A trial; the first row is what is subtracted.
+    """Subtract force and electrodes of the first row, before contact (paper, step 2).
 
     Returns:
         All its rows: force [N] from 0, electrodes as (E - E0) / 4095, and E0 as ``rest``.
@@ -312,13 +306,9 @@ class ForceOnset:
 
 
 def from_threshold(force: Floats, *, threshold_n: float = THRESHOLD_N) -> ForceOnset | None:
-    """Which rows to keep and which to prepend, of forces in order of travel.
+    """Which rows to keep and which to prepend, of forces [N] in order of travel, shape (R, 3).
 
     Rows below the threshold are left out wherever they are, as the paper says, a late dip included.
-
-    Args:
-        force: [N], shape (R, 3).
-        threshold_n: [N].
 
     Returns:
         The rows, or None where the force never stays above, or where the first row is above already

@@ -184,15 +184,9 @@ class TrialsContents:
 
 
 def write_trials(path: Path, trials: Iterable[RawTrial], provenance: Provenance) -> str:
-    """Write trials; the file appears whole or not at all.
+    """Write trials, one by one as they come; returns the content's SHA-256, hex.
 
-    Args:
-        path: File to write (``.h5``).
-        trials: May be a stream: each is written before the next is taken.
-        provenance: Where they come from.
-
-    Returns:
-        The content's SHA-256, hex.
+    The file appears whole or not at all.
 
     Raises:
         DatasetError: No trial, one twice, streams of a wrong shape or type, or the disk refused.

@@ -208,12 +208,7 @@ def size_table(statistics: DatasetStatistics) -> str:
 
 
 def unit_table(units: Sequence[SpecimenStatistics], paper: Sequence[int | None]) -> str:
-    """The paper's numbers for each BioTac beside those of this data set.
-
-    Args:
-        units: The units.
-        paper: For each the index of the paper's BioTac to put beside it, or None.
-    """
+    """The numbers of each unit, beside those of the paper's BioTac of that index, if any."""
     facts = [PAPER_UNITS[i] if i is not None else None for i in paper]
 
     def beside(values: Sequence[str], theirs: Sequence[str]) -> list[str]:

@@ -265,18 +265,10 @@ def check_parity(
     inputs: FloatArray,
     allowed: Allowed,
 ) -> float:
-    """Compare ONNX Runtime with torch on rows together and one by one.
-
-    Args:
-        graph: The truth.
-        model: ONNX bytes.
-        input_name: Name of the input.
-        output_names: Names of the outputs, in order.
-        inputs: Rows, shape ``(N, I)``.
-        allowed: What differences are divided by.
+    """Compare ONNX Runtime with torch on rows ``(N, I)``, together and one by one.
 
     Returns:
-        The largest difference, divided so.
+        The largest difference, divided by what is allowed.
 
     Raises:
         BundleError: It is ``PARITY_MAX`` or more, not finite, or the file does not run.

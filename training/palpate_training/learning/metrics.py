@@ -42,11 +42,7 @@ _SUMMARY = {
 
 
 def force_errors(estimate: Float, truth: Float) -> dict[str, npt.NDArray[np.float64]]:
-    """Errors of every row.
-
-    Args:
-        estimate: Estimated force [N], shape ``(N, 3)``.
-        truth: True force [N], shape ``(N, 3)``.
+    """Errors of every row, of forces [N], shape ``(N, 3)``.
 
     Returns:
         ``magnitude_n``, ``magnitude_over_norm``, ``vector_n``, ``angle_rad``, ``one_minus_cos``,
@@ -102,9 +98,7 @@ def location_metrics(estimate: Float, truth: Float) -> dict[str, float]:
 def summarise(pattern: str, values: npt.NDArray[np.float64]) -> dict[str, float]:
     """Median, mean and inter-quartile range of the rows that are not NaN.
 
-    Args:
-        pattern: Name with ``{}`` where the word goes, so that the unit can stand last.
-        values: Errors of every row, shape ``(N,)``.
+    ``{}`` in the pattern is where the word goes, so that the unit can stand last.
     """
     kept = values[~np.isnan(values)]
     if not kept.size:
@@ -212,9 +206,7 @@ def join(parts: Iterable[dict[str, Rows64]]) -> dict[str, Rows64]:
 def field_summary(errors: dict[str, Rows64], zero: dict[str, Rows64]) -> dict[str, float]:
     """Mean over rows of each error [m], and the skill over predicting zero.
 
-    Args:
-        errors: From ``field_errors``.
-        zero: The same of an estimate of zero on the same rows.
+    Both arguments come from ``field_errors`` on the same rows.
     """
     summary: dict[str, float] = {}
     for name, values in errors.items():
@@ -227,11 +219,7 @@ def field_summary(errors: dict[str, Rows64], zero: dict[str, Rows64]) -> dict[st
 
 
 def electrode_errors(estimate: Float, truth: Float) -> dict[str, Rows64]:
-    """Errors of every row.
-
-    Args:
-        estimate: Estimated tared counts [counts], shape ``(N, 19)``.
-        truth: True tared counts [counts], shape ``(N, 19)``.
+    """Errors of every row, of tared counts [counts], shape ``(N, 19)``.
 
     Returns:
         ``mean_square`` over the electrodes [counts^2] and ``l2_counts``, each ``(N,)``.

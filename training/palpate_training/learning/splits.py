@@ -107,14 +107,7 @@ def unseen_sensor(
 def by_group(
     group: Labels, *, test_share: float = 0.2, validation_share: float = 0.1, seed: int = 0
 ) -> RowSplit:
-    """Deal whole groups (presses, trajectories) to test, validation and train.
-
-    Args:
-        group: Group of every row, shape ``(N,)``.
-        test_share: Share of the groups to test on.
-        validation_share: Share of the groups to validate on.
-        seed: Seed of the deal.
-    """
+    """Deal whole groups (presses, trajectories) to test, validation and train."""
     groups = np.unique(group)
     if len(groups) < 3:
         raise DatasetError(

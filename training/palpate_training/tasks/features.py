@@ -103,14 +103,7 @@ def train_features(
 ) -> FeaturesReport:
     """Train, evaluate on presses that were never seen, and write the bundle.
 
-    Args:
-        dataset_path: HDF5 data set (``palpate_training.datasets.features``).
-        bundle_dir: Folder of the bundle; must not exist yet.
-        name: Name of the bundle.
-        version: Its version, from 1.
-        config: Settings of both trainings.
-        seed: Seed of the split, of the weights and of the order of rows.
-        on_epoch: Called after each epoch, for a progress bar.
+    The seed decides the split, the weights and the order of rows.
 
     Raises:
         DatasetError: The data set breaks its schema or has too few presses.

@@ -112,15 +112,9 @@ def fit_field(
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FieldModel:
-    """Train electrodes -> field on the training rows of some units.
+    """Train electrodes -> field on the training rows of a split; code None = modes of these rows.
 
-    Args:
-        data: The mixed data set.
-        split: Rows to train and to stop on.
-        code: Modes to use; None = those of the training rows.
-        config: Settings.
-        seed: Seed of weights, order of rows and noise of the untouched rows.
-        on_epoch: Called after each epoch.
+    The seed decides weights, order of rows and noise of the untouched rows.
     """
     config = config or FieldFitConfig()
     code = code or fit_code(data, split.train, split.validation)
@@ -253,13 +247,7 @@ def evaluate_field(
 def field_row_errors(
     data: MixedDataset, rows: Rows, models: Mapping[str, Sequence[Estimate]]
 ) -> dict[str, list[Errors]]:
-    """Errors of every row for each model and each of its seeds; whole fields in small parts.
-
-    Args:
-        data: Rows with their true fields.
-        rows: Which rows.
-        models: Functions from rows to displacements [m], shape (R, V, 3).
-    """
+    """Errors of every row for each model and each of its seeds; whole fields in small parts."""
     parts: dict[str, list[list[Errors]]] = {
         name: [[] for _ in each] for name, each in models.items()
     }
@@ -295,17 +283,7 @@ def field_bundle(
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
-    """Electrodes -> field, as a bundle.
-
-    Args:
-        data: The mixed data set.
-        folder: Folder of the bundle; must not exist.
-        units: Units to train and to test on; empty = all.
-        name: Name of the bundle.
-        version: Its version, from 1.
-        config: Settings of the training.
-        seed: Seed of split and weights.
-        on_epoch: Called after each epoch.
+    """Electrodes -> field of some units, empty = all, as a bundle.
 
     Returns:
         The held-out metrics in the manifest.

@@ -254,12 +254,7 @@ class ForcePanel:
 
 
 def draw_force(path: Path, panels: Sequence[ForcePanel]) -> None:
-    """Truth against estimate, one row of axes for each panel: x, y, z and the magnitude.
-
-    Args:
-        path: PNG to write.
-        panels: What to draw.
-    """
+    """Truth against estimate, one row of axes for each panel: x, y, z and the magnitude."""
     figure = new_figure(11, 3.1 * len(panels))
     parts = figure.subfigures(len(panels), 1, squeeze=False)[:, 0]
     for part, panel in zip(parts, panels, strict=True):

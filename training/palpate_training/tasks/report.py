@@ -205,13 +205,7 @@ _BIN_NAMES = ("< 2 N", "2-8 N", "> 8 N")
 
 
 def draw_field(path: Path, picture: ResultPicture, mesh: SkinMesh) -> None:
-    """Error by force bin and the example on the skin, seen from below.
-
-    Args:
-        path: PNG to write.
-        picture: What to draw; fields (V, 3) [m].
-        mesh: The skin.
-    """
+    """Error by force bin and the example on the skin, fields (V, 3) [m], seen from below."""
     figure = new_figure(13.0, 4.2)
     left, *right = figure.subplots(1, 4, width_ratios=[1.5, 1, 1, 1])
     _boxes(left, picture, 1e3, "mean nodal error, all nodes [mm]")
@@ -243,12 +237,7 @@ def draw_field(path: Path, picture: ResultPicture, mesh: SkinMesh) -> None:
 
 
 def draw_synthesis(path: Path, picture: ResultPicture) -> None:
-    """Error by force bin and the 19 electrodes of the example.
-
-    Args:
-        path: PNG to write.
-        picture: What to draw; tared counts (19,).
-    """
+    """Error by force bin and the example, tared counts of 19 electrodes."""
     figure = new_figure(11.0, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.6])
     _boxes(left, picture, 1.0, "norm of the error in R^19 [counts]")
@@ -272,12 +261,7 @@ def ventral_faces(mesh: SkinMesh) -> npt.NDArray[np.int32]:
 def by_force(
     force_n: npt.NDArray[np.floating], error: npt.NDArray[np.float64]
 ) -> list[npt.NDArray[np.float64]]:
-    """Errors of the rows of each force bin.
-
-    Args:
-        force_n: True force magnitude [N], shape (N,).
-        error: Error of the same rows, shape (N,).
-    """
+    """Errors (N,) of the rows of each force bin, by their true force magnitude [N], (N,)."""
     return [error[(force_n >= low) & (force_n < high)] for low, high in pairwise(FORCE_BINS_N)]
 
 

@@ -57,16 +57,7 @@ def force_result(
     *,
     draws: int = 2000,
 ) -> ModelResult:
-    """Metrics of one model, from the estimates of each of its seeds.
-
-    Args:
-        test: What was held out.
-        model: Name of the model.
-        estimates: Estimated force [N], shape ``(N, 3)``, one array for each seed.
-        truth: True force [N], shape ``(N, 3)``.
-        cluster: Block of every row, shape ``(N,)``.
-        draws: Draws of the bootstrap.
-    """
+    """Metrics of one model, from the force (N, 3) [N] that each of its seeds estimates."""
     errors = [force_errors(estimate, truth) for estimate in estimates]
     stacked = stack_seeds(errors, ("magnitude_n", "angle_rad", "vector_n"))
     seeds = [force_metrics(estimate, truth) for estimate in estimates]
@@ -217,12 +208,7 @@ def networks(data: ExperimentDataset, seeds: int) -> int:
 
 
 def typical(error: Rows64, force: FloatArray) -> int:
-    """The row whose error is the median among the harder half of the presses.
-
-    Args:
-        error: Error of every row, shape (N,).
-        force: True force [N], shape (N, 3).
-    """
+    """The row whose error (N,) is the median among the half with the larger force (N, 3) [N]."""
     magnitude = np.linalg.norm(force, axis=1)
     hard = np.flatnonzero(magnitude >= np.median(magnitude))
     return int(hard[np.argsort(error[hard], kind="stable")[len(hard) // 2]])

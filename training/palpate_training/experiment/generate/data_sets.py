@@ -59,14 +59,6 @@ def assemble(
 ) -> AssembledSets:
     """Make both data sets.
 
-    Args:
-        store: Simulated trajectories.
-        folder: Files of their trials.
-        unit_names: Specimens, in order.
-        provenance: Of both.
-        clearance_m: How far from the skin the simulated paths start [m].
-        on_progress: Called after each trajectory that was read.
-
     Raises:
         DatasetError: A file is damaged, or nothing was executed.
     """

@@ -64,15 +64,6 @@ def make_trials(
 ) -> None:
     """Execute what the store holds; trials that the folder holds already are not made again.
 
-    Args:
-        spec: The experiment.
-        store: Its mechanics; trajectories that are not there yet are left out.
-        specimens: Simulated BioTacs.
-        simulator: Plans the trajectories, makes the electrodes.
-        folder: Takes a file for each trajectory, whole or not at all.
-        runner: Does the work.
-        on_progress: Called after each trajectory.
-
     Raises:
         DatasetError: The store is damaged, or the disk refuses.
     """
@@ -120,10 +111,6 @@ def registration_errors(specimens: Sequence[Specimen], seed: int) -> dict[str, F
     Sideways it is what the registration procedure leaves, drawn by its own error model. Along the
     dorsal axis it is what each specimen was fitted to: published forces show how deep they were
     pressed.
-
-    Args:
-        specimens: Each of them was mounted and registered anew.
-        seed: Of the draws.
     """
     errors = {}
     for number, side in enumerate(ARMS):
