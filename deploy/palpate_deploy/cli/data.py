@@ -54,16 +54,15 @@ class _LazyGroup(typer.core.TyperGroup):
         Raises:
             MissingExtraError: The training extra is not installed.
         """
-        found: dict[str, Any] = typer.main.get_command(_app(self.room)).commands  # type: ignore[attr-defined]
-        return {**found, **self.joined()}
+        apps = [_app(self.room)] + ([twin_app] if self.room == "data" else [])
+        found: dict[str, Any] = {}
+        for app in apps:
+            found |= typer.main.get_command(app).commands  # type: ignore[attr-defined]
+        return found
 
     @commands.setter
     def commands(self, value: dict[str, Any]) -> None:
         """Typer sets the commands that it knows at the start: none."""
-
-    def joined(self) -> dict[str, Any]:
-        """Further commands that join this room with another one."""
-        return {}
 
 
 class _TrainGroup(_LazyGroup):
@@ -72,11 +71,6 @@ class _TrainGroup(_LazyGroup):
 
 class _DataGroup(_LazyGroup):
     room = "data"
-
-    def joined(self) -> dict[str, Any]:
-        """The commands that need the finite elements too."""
-        found: dict[str, Any] = typer.main.get_command(twin_app).commands  # type: ignore[attr-defined]
-        return found
 
 
 train = typer.Typer(

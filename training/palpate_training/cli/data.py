@@ -110,7 +110,7 @@ def data_inspect(
     kind, experiment = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
     found = experiment_contents(kind, experiment)
     if as_json:
-        console.print_json(json.dumps(found.as_dict()))
+        console.print_json(json.dumps(asdict(found)))
     else:
         console.print(experiment_table(found, str(path)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -19,7 +18,7 @@ from palpate import __version__
 from palpate.errors import ConfigError
 from palpate.process import typed_command
 from palpate.rigid import Transform
-from palpate_training.datasets.container import Provenance, sha256_of
+from palpate_training.datasets.container import Provenance, csv_rows, sha256_of
 from palpate_training.datasets.trials import TrialsContents, read_contents, write_trials
 from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import ARMS
@@ -259,11 +258,7 @@ def _instant(word: str) -> int:
 
 
 def _times(path: Path) -> dict[str, int]:
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path} cannot be read: {error}", remedy="check the path") from error
+    rows = [row for row in csv_rows(path, ConfigError) if row]
     if not rows or rows[0] != TIMES_COLUMNS:
         raise ConfigError(
             f"{path}: columns {', '.join(rows[0]) if rows else 'none'}",

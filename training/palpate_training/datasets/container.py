@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import logging
 import zipfile
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate.files.hdf5 import (
     Hdf5Schema,
     h5py_module,
@@ -95,6 +96,15 @@ def sha256_of(path: Path) -> str:
     """SHA-256 of a file, hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def csv_rows(path: Path, refuse: type[DatasetError] | type[ConfigError]) -> list[list[str]]:
+    """Rows of a CSV file as words; ``refuse`` is raised where it cannot be read."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise refuse(f"{path} cannot be read: {error}", remedy="check the path") from error
 
 
 def read_archive(

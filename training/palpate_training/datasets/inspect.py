@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -81,10 +80,6 @@ class ExperimentContents:
     field_loss_mean_m: float = 0.0
     field_loss_max_m: float = 0.0
     force_rms_n: float = 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
 
 
 def load(

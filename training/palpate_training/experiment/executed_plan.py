@@ -10,7 +10,6 @@ command.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from palpate.alignment import linear
 from palpate.errors import ConfigError, DatasetError
 from palpate.rigid import Floats, Transform
+from palpate_training.datasets.container import csv_rows
 from palpate_training.datasets.ingest import (
     SensorStreams,
     check_streams,
@@ -284,11 +284,7 @@ def read_joint_log(path: Path, arm: ArmKinematics) -> tuple[Times, Floats]:
             the line.
     """
     n = len(arm.joint_names)
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError(f"{path} cannot be read: {error}", remedy="check the path") from error
+    rows = csv_rows(path, DatasetError)
     if len(rows) < 2 or rows[0][:1] != ["time_s"] or len(rows[0]) != n + 1:
         raise DatasetError(
             f"{path}: columns {', '.join(rows[0]) if rows else 'none'}",

@@ -13,7 +13,6 @@ Registrations on disk: measured holes as a CSV file in, registrations of the arm
 
 from __future__ import annotations
 
-import csv
 import itertools
 import os
 from collections.abc import Mapping, Sequence
@@ -28,6 +27,7 @@ from pydantic import Field, ValidationError
 from palpate.errors import ConfigError
 from palpate.process import require
 from palpate.rigid import Floats, Transform
+from palpate_training.datasets.container import csv_rows
 from palpate_training.experiment.plan import ARMS
 from palpate_training.experiment.trajectory_file import StrictModel
 
@@ -283,11 +283,7 @@ def read_holes(path: Path) -> dict[str, MeasuredHoles]:
         ConfigError: It cannot be read, has other columns, or a line that is not an arm, a hole and
             six finite numbers; names the line.
     """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path} cannot be read: {error}", remedy="check the path") from error
+    rows = csv_rows(path, ConfigError)
     if len(rows) < 2 or tuple(word.strip() for word in rows[0]) != COLUMNS:
         raise ConfigError(
             f"{path}: columns {', '.join(rows[0]) if rows else 'none'}",

@@ -100,16 +100,15 @@ def write_page(
         "The normal of the last line is that of the core's form under the indenter's tip, so it is"
         " a rough number for long and flat indenters.\n",
     ]
-    on_step("contact locations")
     mesh = sources.mixed.mesh if sources.mixed is not None else None
-    parts += ["## Contact locations\n"]
-    parts += _picture("contacts.png", draw_contacts(folder / "contacts.png", data, mesh))
-    on_step("force")
-    parts += ["## Force\n"]
-    parts += _picture("force.png", draw_force_boxes(folder / "force.png", data))
-    on_step("electrodes")
-    parts += ["## Electrodes\n"]
-    parts += _picture("electrodes.png", draw_electrode_boxes(folder / "electrodes.png", data))
+    pictures: tuple[tuple[str, str, Callable[[Path], str]], ...] = (
+        ("contact locations", "contacts.png", lambda path: draw_contacts(path, data, mesh)),
+        ("force", "force.png", lambda path: draw_force_boxes(path, data)),
+        ("electrodes", "electrodes.png", lambda path: draw_electrode_boxes(path, data)),
+    )
+    for what, name, draw in pictures:
+        on_step(what)
+        parts += [f"## {what.capitalize()}\n", *_picture(name, draw(folder / name))]
     parts += [
         "Targets: real sensors, dominated by light contacts.\n",
         group_table(statistics.units),
@@ -124,7 +123,8 @@ def write_page(
     if sources.plate:
         on_step("sign pattern")
         parts += _signs(folder, data, sources.plate)
-    _write(folder / PAGE, "\n".join(parts))
+    with written_whole(folder / PAGE) as partial:
+        partial.write_text("\n".join(parts), encoding="utf-8")
     return statistics
 
 
@@ -171,20 +171,14 @@ def _picture(name: str, text: str) -> list[str]:
 def _provenance(data: ExperimentDataset) -> str:
     where = data.provenance
     made_by = f"`{where.command}`" if where.command else "-"
-    lines = [
-        f"* source: {where.source}",
-        f"* data set made by: {made_by} (palpate {where.palpate_version})",
-        f"* content sha256: {content_sha256(data)}",
-        f"* input sha256: {where.input_sha256 or '-'}",
-        f"* licence: {where.licence}",
-        f"* notes: {where.notes or '-'}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    with written_whole(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    return (
+        f"* source: {where.source}\n"
+        f"* data set made by: {made_by} (palpate {where.palpate_version})\n"
+        f"* content sha256: {content_sha256(data)}\n"
+        f"* input sha256: {where.input_sha256 or '-'}\n"
+        f"* licence: {where.licence}\n"
+        f"* notes: {where.notes or '-'}\n"
+    )
 
 
 _SIGN_WORDS = {1: "rises", -1: "falls", 0: "-"}
@@ -227,7 +221,10 @@ def unit_table(units: Sequence[SpecimenStatistics], paper: Sequence[int | None])
         ["trials", *(str(unit.trials) for unit in units)],
         ["unique trajectories", *(str(unit.trajectories) for unit in units)],
         ["rows", *(f"{unit.rows:,}" for unit in units)],
-        ["rows a trial: fewest, mean, most", *(_spread(unit.rows_per_trial) for unit in units)],
+        [
+            "rows a trial: fewest, mean, most",
+            *("{}, {:.1f}, {}".format(*unit.rows_per_trial) for unit in units),
+        ],
         ["tared electrodes, lowest to highest [1]", *tared],
         ["largest force [N]", *force],
         ["median force [N]", *(f"{unit.force_median_n:.2f}" for unit in units)],
@@ -328,11 +325,6 @@ def sign_table(real: PlateResponse, presses: Sequence[FlatPress]) -> str:
 
 def _percent(share: float) -> str:
     return "not known" if np.isnan(share) else f"{100 * share:.0f} %"
-
-
-def _spread(rows_per_trial: tuple[int, float, int]) -> str:
-    fewest, mean, most = rows_per_trial
-    return f"{fewest}, {mean:.1f}, {most}"
 
 
 def _range(values: np.ndarray, digits: int) -> str:

@@ -9,7 +9,7 @@ compute with the same numbers and the file is half as large.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +99,12 @@ SMALLEST_MODE = 0.1
 little but the rounding and the peculiarities of single trajectories."""
 
 
+def _register(module: nn.Module, **constants: npt.NDArray[Any]) -> None:
+    """Make arrays constants of a graph, by name."""
+    for name, values in constants.items():
+        module.register_buffer(name, torch.from_numpy(values))
+
+
 class FeaturesGraph(nn.Module):
     """The ``features`` task: one network for each quantity, and constant standard deviations.
 
@@ -123,13 +129,11 @@ class FeaturesGraph(nn.Module):
         super().__init__()
         self.force = force
         self.location = location
-        self.register_buffer("force_spread", torch.from_numpy(force_sd.astype(np.float32)))
+        _register(self, force_spread=force_sd.astype(np.float32))
         if (location is None) != (location_sd is None):
             raise ValueError("give location and location_sd, or neither")
         if location_sd is not None:
-            self.register_buffer(
-                "location_spread", torch.from_numpy(location_sd.astype(np.float32))
-            )
+            _register(self, location_spread=location_sd.astype(np.float32))
 
     def forward(self, electrodes: Tensor) -> tuple[Tensor, ...]:
         """Tared counts ``(N, 19)`` -> the task's outputs in order, each ``(N, 3)``."""
@@ -163,10 +167,8 @@ class FieldGraph(nn.Module):
     def __init__(self, net: Mlp, code: FieldCode, node_sd: FloatArray) -> None:
         super().__init__()
         self.net = net
-        self.register_buffer("modes", torch.from_numpy(code.modes))
-        self.register_buffer("scale", torch.from_numpy(code.scale))
-        self.register_buffer("mean", torch.from_numpy(code.mean))
-        self.register_buffer("node_spread", torch.from_numpy(node_sd.astype(np.float32)))
+        _register(self, modes=code.modes, scale=code.scale, mean=code.mean)
+        _register(self, node_spread=node_sd.astype(np.float32))
 
     def forward(self, electrodes: Tensor) -> tuple[Tensor, Tensor]:
         """Displacement ``(N, 3V)`` and standard deviation ``(N, V)``, both [m]."""
@@ -235,13 +237,9 @@ class SynthesisGraph(nn.Module):
     ) -> None:
         super().__init__()
         self.net = net
-        self.register_buffer("modes", torch.from_numpy(code.modes))
-        self.register_buffer("scale", torch.from_numpy(code.scale))
-        self.register_buffer("mean", torch.from_numpy(code.mean))
-        self.register_buffer("nodes", torch.from_numpy(pooling.nodes))
-        self.register_buffer("normals", torch.from_numpy(pooling.normals))
-        self.register_buffer("weights", torch.from_numpy(pooling.weights))
-        self.register_buffer("counts_spread", torch.from_numpy(counts_sd.astype(np.float32)))
+        _register(self, modes=code.modes, scale=code.scale, mean=code.mean)
+        _register(self, nodes=pooling.nodes, normals=pooling.normals, weights=pooling.weights)
+        _register(self, counts_spread=counts_sd.astype(np.float32))
 
     def forward(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
         """Tared counts and standard deviation, each ``(N, 19)`` [counts]."""

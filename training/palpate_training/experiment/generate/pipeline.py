@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def generate(
         path = folder / STORE
         if cluster is not None:
             complete = simulator.simulate_on_cluster(
-                spec, path, cluster, on_progress=_stage("mechanics", on_stage)
+                spec, path, cluster, on_progress=partial(on_stage, "mechanics")
             )
         else:
             complete = simulator.simulate(
@@ -120,7 +121,7 @@ def generate(
                 workers=workers,
                 threads=threads,
                 stop=stop,
-                on_progress=_stage("mechanics", on_stage),
+                on_progress=partial(on_stage, "mechanics"),
             )
         seconds["mechanics"] = time.monotonic() - began
         if not complete:
@@ -136,7 +137,7 @@ def generate(
                 simulator,
                 folder / TRIALS,
                 runner,
-                on_progress=_stage("trials", on_stage),
+                on_progress=partial(on_stage, "trials"),
             )
         finally:
             if runner is not cluster:
@@ -162,7 +163,7 @@ def generate(
         names,
         provenance,
         clearance_m=simulator.clearance_m,
-        on_progress=_stage("data sets", on_stage),
+        on_progress=partial(on_stage, "data sets"),
     )
     if not (folder / IDLE).exists():
         pressed = simulator.make_specimens(store.fingertip(), specimens)()
@@ -171,10 +172,6 @@ def generate(
     write_mixed(folder / MIXED, data.mixed)
     seconds["data sets"] = time.monotonic() - began
     return GeneratedExperiment(folder, data, digest, seconds, _sizes(folder))
-
-
-def _stage(name: str, on_stage: OnStage) -> Callable[[int, int, str], None]:
-    return lambda done, total, word: on_stage(name, done, total, word)
 
 
 def _sizes(folder: Path) -> dict[str, int]:
