@@ -50,7 +50,7 @@ from palpate_training.experiment.generate.simulator import (
     Specimen,
 )
 from palpate_training.experiment.generate.workers import RayCluster
-from palpate_training.experiment.plan import INCREMENT_M
+from palpate_training.experiment.plan import INCREMENT_M, PlannedTrajectory, assign_arm
 
 Floats = NDArray[np.float64]
 
@@ -152,6 +152,21 @@ def _build(spec: ExperimentSpec) -> BiotacTip:
 _fingertip = lru_cache(maxsize=1)(_build)
 
 
+def _campaign(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:
+    """All planned trajectories, first points first: what is there early is a fair sample."""
+    names = tuple(make_indenter(name).name for name in spec.indenters) or indenter_names()
+    plans = Campaign(
+        skin_of(cast("StoredFingertip", fingertip)),
+        names,
+        points=spec.points,
+        seed=spec.seed,
+        angled=spec.angled,
+        increment_m=INCREMENT_M,
+        overtravel_m=spec.overtravel_m,
+    )
+    return sorted(plans, key=lambda plan: (*plan.name.split("/")[1:], plan.name))
+
+
 class FemSimulator:
     """Skin by finite elements, electrodes by the film's conduction."""
 
@@ -163,19 +178,20 @@ class FemSimulator:
 
     def plans(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
-    ) -> Sequence[PlannedIndentation]:
-        """All planned trajectories, first points first: what is there early is a fair sample."""
-        names = tuple(make_indenter(name).name for name in spec.indenters) or indenter_names()
-        plans = Campaign(
-            skin_of(cast("StoredFingertip", fingertip)),
-            names,
-            points=spec.points,
-            seed=spec.seed,
-            angled=spec.angled,
-            increment_m=INCREMENT_M,
-            overtravel_m=spec.overtravel_m,
-        )
-        return sorted(plans, key=lambda plan: (*plan.name.split("/")[1:], plan.name))
+    ) -> Sequence[PlannedTrajectory]:
+        """All planned trajectories, each for the arm on its side of the finger."""
+        return [
+            PlannedTrajectory(
+                trajectory=plan.name,
+                indenter=plan.indenter,
+                arm=assign_arm(plan.target),
+                target=plan.target,
+                direction=plan.direction,
+                contact_m=plan.contact_m,
+                depth_m=plan.depth_m,
+            )
+            for plan in _campaign(spec, fingertip)
+        ]
 
     def simulate(
         self,
@@ -199,7 +215,7 @@ class FemSimulator:
             fingertip = batch.fingertip(stop)
             if fingertip is None:
                 return False
-            plans = self.plans(spec, fingertip)
+            plans = _campaign(spec, fingertip)
 
             def on_report(report: BatchReport) -> None:
                 present = len(plans) - report.total
@@ -222,7 +238,7 @@ class FemSimulator:
             WorkerLostError: The cluster lost machines again and again.
         """
         fingertip = self.fingertip(spec)
-        plans = self.plans(spec, fingertip)
+        plans = _campaign(spec, fingertip)
         with StoreWriter(
             store, fingertip, shared=True, outline=outline_of, command=COMMAND
         ) as writer:

@@ -10,7 +10,6 @@ import numpy as np
 from palpate.errors import ConfigError
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
-    IndentationPlan,
     IndentationStore,
     OnProgress,
     SimulatedFingertip,
@@ -23,7 +22,7 @@ from palpate_training.experiment.plan import (
     EliminatedTrajectory,
     PlannedTrajectory,
     RobotPlan,
-    assign_arm,
+    facing,
     make_plan,
 )
 from palpate_training.experiment.registration import ArmRegistration
@@ -89,40 +88,31 @@ def plan_experiment(
         raise ConfigError("no arm is registered", remedy="palpate data register")
     plans = simulator.plans(replace(spec, overtravel_m=0.0), fingertip)
     if store is not None:
-        _check_same(plans, store)
+        _check_same(plans, store, simulator.clearance_m)
 
     def trajectories() -> Iterator[PlannedTrajectory]:
         for k, plan in enumerate(plans):
-            on_progress(k, len(plans), plan.name)
-            yield _trajectory(plan, bases)
+            on_progress(k, len(plans), plan.trajectory)
+            yield plan if len(bases) > 1 else replace(plan, arm=next(iter(bases)))
 
     found = make_plan(trajectories(), bases)
     on_progress(len(plans), len(plans), "")
     return found
 
 
-def _trajectory(plan: IndentationPlan, bases: Mapping[str, ArmBase]) -> PlannedTrajectory:
-    arm = assign_arm(plan.target) if len(bases) > 1 else next(iter(bases))
-    return PlannedTrajectory(
-        trajectory=plan.name,
-        indenter=plan.indenter,
-        arm=arm,
-        target=plan.target,
-        direction=plan.direction,
-        contact_m=plan.contact_m,
-        depth_m=plan.depth_m,
-    )
-
-
-def _check_same(plans: Sequence[IndentationPlan], store: IndentationStore) -> None:
+def _check_same(
+    plans: Sequence[PlannedTrajectory], store: IndentationStore, clearance_m: float
+) -> None:
     """Refuse a store of another seed: its trajectories have the same names and other points."""
     there = set(store.ids())
     for plan in plans:
-        if plan.name not in there:
+        if plan.trajectory not in there:
             continue
-        off = float(np.abs(store.summary(plan.name).path[0] - plan.path[0]).max())
+        tip = plan.target + (plan.contact_m - clearance_m) * plan.direction
+        start = np.concatenate([tip, facing(plan.direction)])
+        off = float(np.abs(store.summary(plan.trajectory).path[0] - start).max())
         if off > SAME_PATH:
             raise ConfigError(
-                f"{store.path}: {plan.name} starts {off:.3g} m from this plan's",
+                f"{store.path}: {plan.trajectory} starts {off:.3g} m from this plan's",
                 remedy="give the --seed with which the store was made",
             )

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate_training.experiment.generate.workers import RayCluster
+from palpate_training.experiment.plan import PlannedTrajectory
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -55,38 +56,6 @@ class ExperimentSpec:
     fluid_volume_m3: float = FLUID_VOLUME_M3
     overtravel_m: float = OVERTRAVEL_M
     indenters: tuple[str, ...] = ()
-
-
-class IndentationPlan(Protocol):
-    """A trajectory to simulate."""
-
-    @property
-    def name(self) -> str:
-        """Id, ``<indenter>/<point>/<normal|angled-k>``."""
-
-    @property
-    def indenter(self) -> str:
-        """Name of the indenter."""
-
-    @property
-    def target(self) -> Floats:
-        """Point of the skin that it aims at [m], shape (3,)."""
-
-    @property
-    def direction(self) -> Floats:
-        """Where the tip moves, unit, shape (3,)."""
-
-    @property
-    def contact_m(self) -> float:
-        """Travel of the tip beyond the target at first contact [m]."""
-
-    @property
-    def depth_m(self) -> float:
-        """Travel from first contact to the last pose [m]."""
-
-    @property
-    def path(self) -> Floats:
-        """Poses of the tip, the first one clear of the skin, shape (K + 1, 7)."""
 
 
 class SimulatedStep(Protocol):
@@ -253,8 +222,8 @@ class TwinSimulator(Protocol):
 
     def plans(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
-    ) -> Sequence[IndentationPlan]:
-        """All trajectories of an experiment, the first points first."""
+    ) -> Sequence[PlannedTrajectory]:
+        """All trajectories of an experiment, the first points first, each for the arm on its side."""
 
     def simulate(
         self,

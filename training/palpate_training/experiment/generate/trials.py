@@ -25,7 +25,6 @@ from palpate_training.datasets.trials import TrialHeader, TrialRows
 from palpate_training.experiment.clearance import pad_poses, simulate_registrations
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
-    IndentationPlan,
     IndentationStore,
     MakeSpecimens,
     OnProgress,
@@ -36,7 +35,7 @@ from palpate_training.experiment.generate.simulator import (
     TwinSimulator,
 )
 from palpate_training.experiment.generate.workers import TaskRunner
-from palpate_training.experiment.plan import APPROACH_M, ARMS, assign_arm
+from palpate_training.experiment.plan import APPROACH_M, ARMS, PlannedTrajectory
 from palpate_training.experiment.stand_in_arm import sensor_robot, stand_in_arm
 from palpate_training.experiment.virtual_testbed import contact_travel, perform
 
@@ -69,8 +68,8 @@ def make_trials(
     """
     fingertip = store.fingertip()
     there = set(store.ids())
-    plans = [plan for plan in simulator.plans(spec, fingertip) if plan.name in there]
-    left = [plan for plan in plans if not file_of(folder, plan.name).exists()]
+    plans = [plan for plan in simulator.plans(spec, fingertip) if plan.trajectory in there]
+    left = [plan for plan in plans if not file_of(folder, plan.trajectory).exists()]
     done = len(plans) - len(left)
     on_progress(done, len(plans), "")
     if not left:
@@ -279,7 +278,7 @@ def _tasks(
     spec: ExperimentSpec,
     store: IndentationStore,
     specimens: Sequence[Specimen],
-    plans: Sequence[IndentationPlan],
+    plans: Sequence[PlannedTrajectory],
     simulator: TwinSimulator,
 ) -> Iterator[TrialTask]:
     fingertip = store.fingertip()
@@ -288,17 +287,16 @@ def _tasks(
         who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
         if not who:
             continue
-        arm = assign_arm(plan.target)
-        trajectory = store.trajectory(plan.name)
+        trajectory = store.trajectory(plan.trajectory)
         yield TrialTask(
-            name=plan.name,
-            arm=arm,
+            name=plan.trajectory,
+            arm=plan.arm,
             direction=plan.direction,
             planned_m=plan.depth_m - spec.overtravel_m,
             trajectory=trajectory,
             clear_steps=simulator.clear_steps(trajectory, fingertip),
             specimens=tuple(specimens[i] for i in who),
-            errors_m=errors[arm][np.array(who)],
+            errors_m=errors[plan.arm][np.array(who)],
             clearance_m=simulator.clearance_m,
             seed=spec.seed,
         )
