@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +14,7 @@ from rich.table import Table
 from palpate.errors import ConfigError
 from palpate.files.hdf5 import schema_of
 from palpate.process import typed_command
-from palpate_training.cli.experiment import print_trials
+from palpate_training.cli.experiment import new_table, print_trials, show
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
 from palpate_training.datasets.features import (
@@ -102,17 +101,11 @@ def data_inspect(
         return
     if schema == FEATURES_SCHEMA.name:
         data = open_dataset(path)
-        if as_json:
-            console.print_json(json.dumps(_features_summary(data)))
-        else:
-            console.print(contents(data, str(path)))
+        show(as_json, lambda: _features_summary(data), lambda: contents(data, str(path)))
         return
     kind, experiment = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
     found = experiment_contents(kind, experiment)
-    if as_json:
-        console.print_json(json.dumps(asdict(found)))
-    else:
-        console.print(experiment_table(found, str(path)))
+    show(as_json, lambda: asdict(found), lambda: experiment_table(found, str(path)))
 
 
 def data_export(
@@ -179,18 +172,8 @@ def experiment_table(found: ExperimentContents, title: str) -> Table:
             f" {found.field_loss_mean_m * 1e6:.2f} um mean, {found.field_loss_max_m * 1e6:.1f} um"
             f" at most; simulated force differs by {found.force_rms_n:.3g} N rms",
         )
-    table = Table(title=title, caption="\n".join(lines), caption_justify="left")
-    table.add_column("unit")
-    for heading in (
-        "trials",
-        "indenters",
-        "rows",
-        "tared min",
-        "tared max",
-        "|force| max [N]",
-        "electrode sd",
-    ):
-        table.add_column(heading, justify="right")
+    numbers = ("trials", "indenters", "rows", "tared min", "tared max", "|force| max [N]")
+    table = new_table(title, lines, ("unit",), (*numbers, "electrode sd"))
     for unit in found.units:
         table.add_row(
             unit.unit,
@@ -228,19 +211,18 @@ def _features_summary(data: FeatureDataset) -> dict[str, Any]:
 def contents(data: FeatureDataset, title: str) -> Table:
     """What a data set holds: arrays, units, ranges, provenance."""
     groups, blocks = len(np.unique(data.group)), len(np.unique(data.block))
-    table = Table(
-        title=title,
-        caption=f"{len(data)} rows, {groups} groups, {blocks} blocks,"
-        f" sensors {', '.join(data.sensor_names)}\n"
-        f"source: {data.provenance.source}\nlicence: {data.provenance.licence}\n"
-        f"made by: {data.provenance.command or '-'} (palpate {data.provenance.palpate_version})\n"
-        f"notes: {data.provenance.notes or '-'}\ncontent sha256: {data.content_sha256()}",
-        caption_justify="left",
-    )
-    for heading in ("dataset", "type", "shape", "unit"):
-        table.add_column(heading)
-    for heading in ("min", "median", "max"):
-        table.add_column(heading, justify="right")
+    where = data.provenance
+    lines = [
+        f"{len(data)} rows, {groups} groups, {blocks} blocks, sensors"
+        f" {', '.join(data.sensor_names)}",
+        f"source: {where.source}",
+        f"licence: {where.licence}",
+        f"made by: {where.command or '-'} (palpate {where.palpate_version})",
+        f"notes: {where.notes or '-'}",
+        f"content sha256: {data.content_sha256()}",
+    ]
+    columns = ("dataset", "type", "shape", "unit"), ("min", "median", "max")
+    table = new_table(title, lines, *columns)
     for name, array in data.arrays().items():
         values = array.astype(np.float64)
         low, middle, high = np.nanpercentile(values, [0, 50, 100])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -40,6 +40,24 @@ ToolOption = Annotated[
 ]
 
 
+def new_table(
+    title: str, caption: Sequence[str], words: Sequence[str], numbers: Sequence[str]
+) -> Table:
+    """A table with columns of words, then columns of numbers, and lines below it."""
+    table = Table(title=title, caption="\n".join(caption), caption_justify="left")
+    for heading in (*words, *numbers):
+        table.add_column(heading, justify="right" if heading in numbers else "left")
+    return table
+
+
+def show(as_json: bool, summary: Callable[[], object], table: Callable[[], Table]) -> None:
+    """Print a table for people, or the same as JSON."""
+    if as_json:
+        console.print_json(json.dumps(summary()))
+    else:
+        console.print(table())
+
+
 def data_register(
     holes: Annotated[
         Path,
@@ -65,10 +83,7 @@ def data_register(
                 f"{holes}: {arm} arm: {error.problem}", remedy=error.remedy
             ) from error
     write_registrations(out, found)
-    table = Table(title=str(holes), caption=f"wrote {out}", caption_justify="left")
-    for heading in ("arm", "hole"):
-        table.add_column(heading)
-    table.add_column("residual [mm]", justify="right")
+    table = new_table(str(holes), [f"wrote {out}"], ("arm", "hole"), ("residual [mm]",))
     for arm, item in found.items():
         for hole, residual in zip(item.holes, item.residual_m, strict=True):
             table.add_row(arm, hole, f"{residual * 1e3:.3f}")
@@ -188,10 +203,7 @@ def trials_table(found: TrialsContents, title: str) -> Table:
         *(f"{key}: {value or '-'}" for key, value in asdict(found.provenance).items()),
         f"content sha256: {found.content_sha256}",
     ]
-    table = Table(title=title, caption="\n".join(lines), caption_justify="left")
-    for heading in ("unit", "trajectory", "indenter", "arm"):
-        table.add_column(heading)
-    table.add_column("samples", justify="right")
+    table = new_table(title, lines, ("unit", "trajectory", "indenter", "arm"), ("samples",))
     for header, samples in zip(found.headers, found.samples, strict=True):
         table.add_row(header.unit, header.trajectory, header.indenter, header.arm, str(samples))
     return table
@@ -221,10 +233,7 @@ def print_trials(path: Path, *, as_json: bool) -> None:
     for _ in read_trials(path):  # checks every stream
         pass
     found = read_contents(path)
-    if as_json:
-        console.print_json(json.dumps(trials_summary(found)))
-    else:
-        console.print(trials_table(found, str(path)))
+    show(as_json, lambda: trials_summary(found), lambda: trials_table(found, str(path)))
 
 
 def _when(

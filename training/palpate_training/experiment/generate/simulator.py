@@ -223,7 +223,7 @@ class TwinSimulator(Protocol):
     def plans(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
     ) -> Sequence[PlannedTrajectory]:
-        """All trajectories of an experiment, the first points first, each for the arm on its side."""
+        """All trajectories of an experiment, first points first, each for the arm on its side."""
 
     def simulate(
         self,
