@@ -279,16 +279,13 @@ def ingest_lasa(
     blocks_per_recording: int = BLOCKS_PER_RECORDING,
     lag_rows: int = ELECTRODE_LAG_ROWS,
 ) -> FeatureDataset:
-    """Read ``force_calibration.npz``.
+    """Read ``force_calibration.npz``: both fingers, one recording (group) each, in order of time.
 
     Args:
         path: The archive.
         command: The command line, for provenance.
         blocks_per_recording: Contiguous pieces each recording is cut into.
         lag_rows: Electrodes of a row are paired with the force so many rows before.
-
-    Returns:
-        Both fingers, one recording (group) each, in order of time.
 
     Raises:
         DatasetError: The archive is missing, damaged, or not this one.

@@ -85,16 +85,13 @@ class ExperimentContents:
 def load(
     path: Path, *, axes: Sequence[str] = ("x", "y", "z"), force_on_indenter: bool = False
 ) -> tuple[str, ExperimentDataset | MixedDataset]:
-    """Read whatever lies there: a file of either schema, or a folder of published files.
+    """Read whatever lies there, and say what it is: either schema, or a folder of published files.
 
     Args:
         path: A file, a folder with published files, or one of these files; of a folder the BioTacs
             that are there are read.
         axes: Of published files, as in ``read_published``.
         force_on_indenter: Likewise.
-
-    Returns:
-        What it is, and the data set.
 
     Raises:
         DatasetError: It is none of these, or damaged.

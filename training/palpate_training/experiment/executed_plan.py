@@ -67,7 +67,7 @@ def ingest_experiment(
     start_wall_ns: int | Mapping[str, int],
     joint_logs: Mapping[str, JointLog] | None = None,
 ) -> list[RawTrial]:
-    """Cut a record into the trials of a plan.
+    """Cut a record into the trials of a plan, in its order.
 
     Args:
         record: ``NAME.mcap``.
@@ -77,9 +77,6 @@ def ingest_experiment(
         start_wall_ns: Wall clock when the plan started, or by trajectory when it started; with a
             mapping, trajectories that are not in it were not executed.
         joint_logs: By arm; None = poses come from the record.
-
-    Returns:
-        Trials in the order of the plan.
 
     Raises:
         RecordingError: Not a whole record.

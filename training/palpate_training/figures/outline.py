@@ -48,16 +48,13 @@ def lateral() -> tuple[Floats, Floats]:
 
 
 def unwrap(points: Floats) -> Floats:
-    """Lay the core's surface flat: way along it, distal and lateral, from below the origin.
+    """Lay the core flat: way along it, (distal, lateral) [m], shape (N, 2), from below the origin.
 
     The cylinder is rolled out about x; the spherical tip is laid out by its arc from the point
     below the origin, which meets the cylinder at x = 0 without a step.
 
     Args:
         points: Points on the core [m], shape (N, 3), sensor frame.
-
-    Returns:
-        (distal, lateral) [m], shape (N, 2).
     """
     x, y, z = np.asarray(points, np.float64).T
     beside = np.where(x > 0, np.hypot(x, y), np.abs(y))

@@ -69,10 +69,7 @@ def write_page(
     command: str,
     on_step: Callable[[str], None] = lambda step: None,
 ) -> DatasetStatistics:
-    """Write ``statistics.md`` and its pictures.
-
-    Returns:
-        The statistics.
+    """Write ``statistics.md`` and its pictures; returns the statistics.
 
     Raises:
         DatasetError: A unit of the data set has no trial, a stream is too short, or the

@@ -102,14 +102,11 @@ def read_plate_logs(folder: Path) -> tuple[PlateLog, ...]:
 
 
 def plate_response(logs: Sequence[PlateLog]) -> PlateResponse | None:
-    """Mean tared electrodes of all samples with a ventral plate on the pad.
+    """Mean tared electrodes of all samples with a ventral plate on the pad; None = none.
 
     Args:
         logs: Each is tared by its own untouched samples; those without any, or never touched by a
             ventral plate, are left out.
-
-    Returns:
-        The response; None where no log is left.
     """
     touched = [part for log in logs if len(part := _ventral(log))]
     if not touched:

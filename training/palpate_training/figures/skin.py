@@ -44,15 +44,12 @@ def final_rows(data: ExperimentDataset) -> npt.NDArray[np.int64]:
 
 
 def draw_contacts(path: Path, data: ExperimentDataset, mesh: SkinMesh | None) -> str:
-    """Draw the contact location of the final increment of each trial, one column for each unit.
+    """Draw the last contact location of each trial, a column for each unit; returns the caption.
 
     Args:
         path: PNG to write.
         data: What to draw.
         mesh: The skin to draw it on; None = an outline of a nominal fingertip.
-
-    Returns:
-        The caption.
     """
     last = final_rows(data)
     units = len(data.unit_names)
@@ -175,16 +172,13 @@ def motion_share(
 
 
 def draw_motion(path: Path, mesh: SkinMesh, share: Floats, rows: int) -> str:
-    """Draw the share on the outer skin, from the front and from below.
+    """Draw the share on the outer skin, from the front and from below; returns the caption.
 
     Args:
         path: PNG to write.
         mesh: Whose nodes move.
         share: From `motion_share`, shape (V,).
         rows: How many rows it is a share of.
-
-    Returns:
-        The caption.
     """
     outer = share[np.unique(mesh.outer_faces)]
     text = (

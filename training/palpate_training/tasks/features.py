@@ -278,11 +278,7 @@ def evaluate_features(
     draws: int = 2000,
     on_network: OnNetwork | None = None,
 ) -> list[TaskReport]:
-    """Force and contact location, every unit and all units.
-
-    Returns:
-        Task ``force`` and task ``location``.
-    """
+    """Reports on force and on contact location, every unit and all units."""
     split = by_trajectory(data, seed=split_seed)
     sets = unit_sets(data)
     x = np.asarray(data.tared * np.float32(COUNTS_MAX), np.float32)

@@ -283,10 +283,7 @@ def field_bundle(
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
-    """Electrodes -> field of some units, empty = all, as a bundle.
-
-    Returns:
-        The held-out metrics in the manifest.
+    """Electrodes -> field of some units, empty = all, as a bundle; returns its held-out metrics.
 
     Raises:
         DatasetError: A unit is not known, or too few trajectories are left.

@@ -127,11 +127,7 @@ def headline_table(reports: Sequence[TaskReport]) -> str:
 def write_report(
     folder: Path, reports: Sequence[TaskReport], mesh: SkinMesh, *, command: str, seeds: int
 ) -> list[Path]:
-    """Write ``twin.md``, a JSON for each task and a PNG for field and synthesis.
-
-    Returns:
-        What was written; every file appears whole or not at all.
-    """
+    """Write ``twin.md``, a JSON for each task, PNGs for field and synthesis; returns the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     text = ["# Learning on the twin", f"Made by `{command}`."]

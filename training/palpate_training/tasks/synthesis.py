@@ -71,13 +71,10 @@ class SynthesisModel:
 
 
 def synthesis_features(data: MixedDataset, code: FieldCode, film: FilmPooling) -> FloatArray:
-    """What the shipped graph computes from the field of every row, without making the fields.
+    """What the shipped graph makes of every row's field [m], shape (N, K + P), without the field.
 
     Projection and pooling are linear in the field and the field is linear in the data set's
     coefficients, so two small matrices do.
-
-    Returns:
-        Coefficients and pooled change of the film [m], shape (N, K + P).
     """
     modes, mean = data.basis.modes, data.basis.mean[None]
     lead = _features(np.concatenate([modes + mean, mean]), code, film)

@@ -239,12 +239,9 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
 def write_idle(
     folder: Path, specimens: Sequence[Specimen], pressed: PressedSpecimens, *, seed: int
 ) -> Path:
-    """Write the counts of untouched specimens as ``idle.npz``.
+    """Write ``idle.npz``: ``rate_hz``, and counts (T, 19) of each untouched specimen.
 
     Their noise and drift are compared with those of real sensors.
-
-    Returns:
-        The file: ``rate_hz`` and, for each specimen, counts of shape (T, 19).
     """
     path = folder / IDLE
     time_s = np.arange(0.0, IDLE_LENGTH_S, 1.0 / IDLE_RATE_HZ)

@@ -67,7 +67,7 @@ def plan_experiment(
     store: IndentationStore | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> tuple[RobotPlan, list[EliminatedTrajectory]]:
-    """Plan what the twin presses, to the paper's depths.
+    """Plan what the twin presses, to the paper's depths; also returns what no arm can follow.
 
     Args:
         spec: Indenters, points, angles and seed; its overtravel is left out.
@@ -76,9 +76,6 @@ def plan_experiment(
         simulator: Plans the trajectories on its skin.
         store: Simulation that the trials will be mixed with: what it holds must be this plan's.
         on_progress: Called before each trajectory.
-
-    Returns:
-        The plan, and what no arm can follow.
 
     Raises:
         ConfigError: No arm, or the store holds a trajectory of the same name that goes
