@@ -229,29 +229,21 @@ Values = npt.NDArray[Any]
 Rows = npt.NDArray[np.int64]
 
 
-def onset(force: Floats, *, threshold_n: float = THRESHOLD_N, stay: int = STAY_ROWS) -> int | None:
-    """First row of the contact: the first crossing that stays.
+def onset(force: Floats) -> int | None:
+    """First row of the contact, the first crossing that stays, of forces [N], shape (R, 3).
 
-    A crossing stays if its row and the next ``stay - 1`` rows, as far as the trial has them, are
-    all at or above the threshold. So a single noisy row in free motion is no contact, while a dip
-    late in a press does not move its beginning.
-
-    Args:
-        force: [N], shape (R, 3).
-        threshold_n: [N].
-        stay: Rows it must stay.
-
-    Returns:
-        Its index, or None where the force never stays above.
+    A crossing stays if `STAY_ROWS` rows from it on, as far as the trial has them, are all at or
+    above the threshold. So a single noisy row in free motion is no contact, while a dip late in a
+    press does not move its beginning. None where the force never stays above.
     """
-    above = np.linalg.norm(force, axis=1) >= threshold_n
+    above = np.linalg.norm(force, axis=1) >= THRESHOLD_N
     for row in np.flatnonzero(above):
-        if above[row : row + stay].all():
+        if above[row : row + STAY_ROWS].all():
             return int(row)
     return None
 
 
-def crossing(before: Floats, after: Floats, *, threshold_n: float = THRESHOLD_N) -> float:
+def crossing(before: Floats, after: Floats) -> float:
     """Where on the segment between two forces the magnitude is exactly the threshold.
 
     The magnitude of an interpolated vector is not the interpolated magnitude: where the direction
@@ -260,15 +252,14 @@ def crossing(before: Floats, after: Floats, *, threshold_n: float = THRESHOLD_N)
     Args:
         before: Force [N] of magnitude below the threshold, shape (3,).
         after: Force [N] of magnitude at or above it, shape (3,).
-        threshold_n: [N].
 
     Returns:
         Share s of the way from ``before`` to ``after``, in [0, 1].
     """
     step = after - before
     a, b = float(step @ step), float(before @ step)
-    c = float(before @ before) - threshold_n**2
-    if np.linalg.norm(before) > threshold_n + _SAME or np.linalg.norm(after) < threshold_n - _SAME:
+    c = float(before @ before) - THRESHOLD_N**2
+    if np.linalg.norm(before) > THRESHOLD_N + _SAME or np.linalg.norm(after) < THRESHOLD_N - _SAME:
         raise ValueError("the segment does not cross the threshold upwards")
     root = math.sqrt(max(b * b - a * c, 0.0))
     # Of the two forms of the positive root the one without a difference of like numbers.
@@ -290,22 +281,15 @@ class ForceOnset:
     share: float
     kept: Rows
 
-    @property
-    def exact(self) -> bool:
-        """Whether the first kept row is at exactly 0.5 N, so that none is prepended."""
-        return self.share > 1.0 - _SAME
-
-    def row(self, values: Values) -> Values:
-        """Value of a quantity (R, ...) at exactly 0.5 N, shape (1, ...)."""
-        first, second = values[self.before], values[self.before + 1]
-        return np.asarray(first + self.share * (second - first), values.dtype)[None]
-
     def rows(self, values: Values) -> Values:
         """The row at exactly 0.5 N and those after it, of a quantity (R, ...)."""
-        return np.concatenate([self.row(values), values[self.kept[int(self.exact) :]]])
+        first, second = values[self.before], values[self.before + 1]
+        exact = self.share > 1.0 - _SAME  # the first kept row is it, so it is not doubled
+        row = np.asarray(first + self.share * (second - first), values.dtype)
+        return np.concatenate([row[None], values[self.kept[int(exact) :]]])
 
 
-def from_threshold(force: Floats, *, threshold_n: float = THRESHOLD_N) -> ForceOnset | None:
+def from_threshold(force: Floats) -> ForceOnset | None:
     """Which rows to keep and which to prepend, of forces [N] in order of travel, shape (R, 3).
 
     Rows below the threshold are left out wherever they are, as the paper says, a late dip included.
@@ -314,9 +298,9 @@ def from_threshold(force: Floats, *, threshold_n: float = THRESHOLD_N) -> ForceO
         The rows, or None where the force never stays above, or where the first row is above already
         and there is nothing to interpolate from.
     """
-    first = onset(force, threshold_n=threshold_n)
+    first = onset(force)
     if first is None or first == 0:
         return None
-    kept = first + np.flatnonzero(np.linalg.norm(force[first:], axis=1) >= threshold_n)
-    share = crossing(force[first - 1], force[first], threshold_n=threshold_n)
+    kept = first + np.flatnonzero(np.linalg.norm(force[first:], axis=1) >= THRESHOLD_N)
+    share = crossing(force[first - 1], force[first])
     return ForceOnset(first - 1, share, kept)

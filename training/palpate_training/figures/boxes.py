@@ -193,17 +193,14 @@ def draw_map(axes: Any) -> None:
         (ELECTRODE_POSITIONS, ELECTRODE_NAMES, _ELECTRODE, "white"),
         (EXCITATION_POSITIONS, EXCITATION_NAMES, "white", INK),
     )
+    Circle = require("matplotlib.patches", extra="training").Circle  # noqa: N806
     for positions, names, fill, ink in kinds:
         for place, name in zip(MM * unwrap(positions), names, strict=True):
-            axes.add_patch(_disc(place, fill, _ELECTRODE if ink == "white" else INK))
+            edge = _ELECTRODE if ink == "white" else INK
+            axes.add_patch(Circle(place, _DISC_RADIUS_MM, facecolor=fill, edgecolor=edge, lw=0.9))
             axes.annotate(
                 name, place, ha="center", va="center_baseline", fontsize=7, color=ink, weight="bold"
             )
     label(axes, "distal, along the core [mm]", "lateral, along the core [mm]")
     axes.set(aspect="equal", xlim=(-19.9, 10.2), ylim=(10.2, -10.2))
     axes.set_yticks(range(-10, 11, 5))
-
-
-def _disc(place: Any, fill: str, edge: str) -> Any:
-    patches = require("matplotlib.patches", extra="training")
-    return patches.Circle(place, _DISC_RADIUS_MM, facecolor=fill, edgecolor=edge, lw=0.9)

@@ -73,12 +73,12 @@ def read_idle_twin(path: Path) -> tuple[IdleStream, ...]:
     """
     remedy = f"write {_RATE} and an array (T, {ELECTRODES}) for each unit with numpy.savez"
     arrays = read_archive(path, lambda held: held, remedy=remedy)
-    rate = arrays.pop(_RATE, None)
-    if rate is None or rate.size != 1 or not float(rate.reshape(-1)[0]) > 0:
+    rate = arrays.pop(_RATE, np.zeros(0))
+    hertz = float(rate.item()) if rate.size == 1 else 0.0
+    if not hertz > 0:
         raise DatasetError(f"{path}: {_RATE} is missing or not one positive number", remedy=remedy)
     if not arrays:
         raise DatasetError(f"{path}: there is no stream in it", remedy=remedy)
-    hertz = float(rate.reshape(-1)[0])
     return tuple(
         _checked(path, name, IdleStream(name, hertz, counts.astype(np.float64), real=False))
         for name, counts in arrays.items()
@@ -166,25 +166,20 @@ class ElectrodeDrift:
         return float(power[0] / power.sum()) if power.sum() > 0 else float("nan")
 
 
-def spectrum(counts: Floats, rate_hz: float, *, segment_s: float = _SEGMENT_S) -> NoiseSpectrum:
-    """Welch's power spectral density of each electrode.
+def spectrum(counts: Floats, rate_hz: float) -> NoiseSpectrum:
+    """Welch's power spectral density of each electrode, from untouched counts, shape (T, 19).
 
     Hann windows that overlap by half; a line is taken out of each, so that drift does not leak
     into the noise.
 
-    Args:
-        counts: Untouched counts [counts], shape (T, 19).
-        rate_hz: Samples per second.
-        segment_s: Length of a window [s].
-
     Raises:
         DatasetError: The stream is shorter than two windows.
     """
-    length = round(segment_s * rate_hz)
+    length = round(_SEGMENT_S * rate_hz)
     if len(counts) < 2 * length:
         raise DatasetError(
-            f"{len(counts)} samples at {rate_hz:g} Hz are too few for windows of {segment_s:g} s",
-            remedy=f"give at least {2 * segment_s:g} s of untouched electrodes",
+            f"{len(counts)} samples at {rate_hz:g} Hz are too few for windows of {_SEGMENT_S:g} s",
+            remedy=f"give at least {2 * _SEGMENT_S:g} s of untouched electrodes",
         )
     mlab = require("matplotlib.mlab", extra="training")
     densities = []
@@ -199,22 +194,17 @@ def spectrum(counts: Floats, rate_hz: float, *, segment_s: float = _SEGMENT_S) -
     return NoiseSpectrum(frequency[1:-1], np.stack(densities, axis=1)[1:-1])
 
 
-def drift(counts: Floats, rate_hz: float, *, mean_s: float = 1.0) -> ElectrodeDrift:
-    """Means over so many seconds, from the first one on.
-
-    Args:
-        counts: Untouched counts [counts], shape (T, 19).
-        rate_hz: Samples per second.
-        mean_s: Length of a mean [s].
+def drift(counts: Floats, rate_hz: float) -> ElectrodeDrift:
+    """Means over a second each of untouched counts, shape (T, 19), from the first one on.
 
     Raises:
         DatasetError: The stream is shorter than two means.
     """
-    length = round(mean_s * rate_hz)
+    length = round(rate_hz)
     means = len(counts) // max(length, 1)
     if length < 1 or means < 2:
         raise DatasetError(
-            f"{len(counts)} samples at {rate_hz:g} Hz hold no two means of {mean_s:g} s",
+            f"{len(counts)} samples at {rate_hz:g} Hz hold no two means of 1 s",
             remedy="give a longer stream of untouched electrodes",
         )
     whole = np.asarray(counts[: means * length], np.float64)

@@ -167,16 +167,13 @@ MOVING_M = 1e-4
 """The paper's "significant motion": nodes that move by more [m]."""
 
 
-def field_errors(
-    estimate: Float, truth: Float, subset: Indices, *, moving_m: float = MOVING_M
-) -> dict[str, Rows64]:
+def field_errors(estimate: Float, truth: Float, subset: Indices) -> dict[str, Rows64]:
     """Errors of every row [m].
 
     Args:
         estimate: Estimated displacement [m], shape ``(N, V, 3)``.
         truth: True displacement [m], shape ``(N, V, 3)``.
         subset: The 128 nodes of the paper's metric.
-        moving_m: True length from which a node counts as moving [m].
 
     Returns:
         ``subset_m``, ``all_m``, ``moving_m``, ``max_m``, each of shape ``(N,)``; ``moving_m`` is
@@ -185,7 +182,7 @@ def field_errors(
     if estimate.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3:
         raise ValueError(f"shapes {estimate.shape} and {truth.shape}, expected twice (N, V, 3)")
     distance = np.linalg.norm(estimate - truth, axis=2).astype(np.float64)
-    moves = np.linalg.norm(truth, axis=2) > moving_m
+    moves = np.linalg.norm(truth, axis=2) > MOVING_M
     count = moves.sum(axis=1)
     with np.errstate(invalid="ignore"):
         moving = np.where(moves, distance, 0.0).sum(axis=1) / np.where(count > 0, count, np.nan)
