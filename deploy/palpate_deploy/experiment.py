@@ -219,7 +219,8 @@ class FemSimulator:
 
             def on_report(report: BatchReport) -> None:
                 present = len(plans) - report.total
-                on_progress(report.done + present, len(plans), _outcomes(report))
+                word = "  ".join(f"{how} {count}" for how, count in sorted(report.outcomes.items()))
+                on_progress(report.done + present, len(plans), word)
 
             report, _ = sweep_into_store(
                 batch, plans, store, stop=stop, on_report=on_report, command=COMMAND
@@ -281,7 +282,3 @@ class FemSimulator:
         """How many steps there are before the indenter bears on what holds the finger."""
         held = cast("StoredFingertip", fingertip).mesh.fixed
         return clear_steps(cast("IndentationResult", indentation), held)
-
-
-def _outcomes(report: BatchReport) -> str:
-    return "  ".join(f"{how} {count}" for how, count in sorted(report.outcomes.items()))

@@ -94,15 +94,12 @@ def mix(rows: TrialRows, simulated: SimulatedTrial, count: int = INCREMENTS) -> 
 
 
 def interpolate(at: Floats, where: Floats, values: Values) -> Values:
-    """Linear interpolation along the first axis, in the type of ``values``.
+    """Linear interpolation along the first axis, in the type of ``values``; shape (Q, ...).
 
     Args:
         at: Where to, within ``where``, shape (Q,).
         where: Increasing, shape (R,), two or more.
         values: Shape (R, ...).
-
-    Returns:
-        Shape (Q, ...).
     """
     after = np.clip(np.searchsorted(where, at), 1, len(where) - 1)
     low, high = where[after - 1], where[after]

@@ -138,7 +138,9 @@ class _PublishedFile:
     def __init__(self, path: Path, axes: Sequence[str], force_on_indenter: bool) -> None:
         self.path = path
         with opened(path, extra="training") as file:
-            arrays = {name: _data(path, file, name) for name in GROUPS}
+            arrays: dict[str, npt.NDArray[Any]] = {
+                name: file[_group(path, file, name)]["data"][()] for name in GROUPS
+            }
             names = file[_group(path, file, "indenter")]["data"].attrs.get("names")
         rows = len(arrays["electrodes"])
         for name, columns in (("electrodes", ELECTRODES), ("location", 3), ("force", 3)):
@@ -169,11 +171,6 @@ def _group(path: Path, file: h5py.File, name: str) -> str:
         f" {', '.join(file) or 'nothing'}",
         remedy="download the file again; if its group has another name, rename it",
     )
-
-
-def _data(path: Path, file: h5py.File, name: str) -> npt.NDArray[Any]:
-    data: npt.NDArray[Any] = file[_group(path, file, name)]["data"][()]
-    return data
 
 
 def _check_table(path: Path, name: str, values: npt.NDArray[Any], shape: tuple[int, int]) -> None:
@@ -333,14 +330,8 @@ class PublishedRun:
 def find_runs(name: str, force: Floats, location: Floats, indenter: Texts) -> list[PublishedRun]:
     """Cut the rows of a file into trajectories.
 
-    A trajectory begins where the indenter changes, where the force falls back to 0.5 N, or where
-    the tip jumps.
-
-    Args:
-        name: Of the file, for messages.
-        force: [N], shape (N, 3).
-        location: [m], shape (N, 3).
-        indenter: Names, shape (N,).
+    A trajectory begins where the indenter changes, where the force (N, 3) [N] falls back to 0.5 N,
+    or where the tip (N, 3) [m] jumps.
 
     Raises:
         DatasetError: Most rows stand alone, so they are in no order of trajectories.

@@ -95,15 +95,11 @@ def pin_poses(holes: Floats) -> Floats:
 
 
 def link_sensitivity(arm: ArmKinematics, joints: npt.ArrayLike) -> Floats:
-    """How errors of the links move the tip: shape (T, 3, 6 n), robot frame.
+    """How errors of the links move the tip at joints (T, n): shape (T, 3, 6 n), robot frame.
 
     Error j of n, displacement [m] and rotation vector [rad] of the far end of link j in the frame
     that moves with its joint, moves the tip by ``R_j (d + w x r)`` where ``r`` leads from that
     frame to the tip; to first order, which is exact to 1 um for errors of a milliradian.
-
-    Args:
-        arm: The arm.
-        joints: [rad or m], shape (T, n).
     """
     tips, _ = arm.tip(joints)
     origins, rotations = arm.link_frames(joints)

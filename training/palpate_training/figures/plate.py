@@ -194,7 +194,9 @@ def agreement(real: Floats, twin: Floats) -> tuple[int, int]:
 
 def draw_signs(path: Path, real: PlateResponse, presses: Sequence[FlatPress]) -> str:
     """Draw the mean tared value of each electrode, real and of each unit; returns the caption."""
-    counted = [f"{press.name} {_of(agreement(real.tared, press.tared))}" for press in presses]
+    counted = [
+        "{} {} of {}".format(press.name, *agreement(real.tared, press.tared)) for press in presses
+    ]
     text = (
         "Mean tared value of each electrode while something flat presses the pad from below, within"
         f" 20 degrees. Real: plate on one BioTac, {real.samples:,} samples of {real.logs} logs;"
@@ -225,7 +227,3 @@ def draw_signs(path: Path, real: PlateResponse, presses: Sequence[FlatPress]) ->
         loc="outside upper right", ncols=len(series), frameon=False, fontsize=9, labelcolor=INK
     )
     return finish(figure, path, "Rise and fall under a flat ventral press", text)
-
-
-def _of(counts: tuple[int, int]) -> str:
-    return f"{counts[0]} of {counts[1]}"

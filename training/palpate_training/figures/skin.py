@@ -46,10 +46,7 @@ def final_rows(data: ExperimentDataset) -> npt.NDArray[np.int64]:
 def draw_contacts(path: Path, data: ExperimentDataset, mesh: SkinMesh | None) -> str:
     """Draw the last contact location of each trial, a column for each unit; returns the caption.
 
-    Args:
-        path: PNG to write.
-        data: What to draw.
-        mesh: The skin to draw it on; None = an outline of a nominal fingertip.
+    Without a mesh of the skin they are drawn on the outline of a nominal fingertip.
     """
     last = final_rows(data)
     units = len(data.unit_names)

@@ -54,14 +54,7 @@ def linear(inputs: Float, targets: Float) -> AffineModel:
 def ridge(
     inputs: Float, targets: Float, validation_inputs: Float, validation_targets: Float
 ) -> AffineModel:
-    """Least squares with intercept and a penalty that is chosen on the validation rows.
-
-    Args:
-        inputs: Training rows, shape ``(N, I)``.
-        targets: What belongs to them, shape ``(N, O)``.
-        validation_inputs: Rows to choose the penalty on, shape ``(M, I)``.
-        validation_targets: What belongs to them, shape ``(M, O)``.
-    """
+    """Least squares with intercept and a penalty that is chosen on the validation rows."""
     centre, offset = inputs.mean(axis=0, dtype=float), targets.mean(axis=0, dtype=float)
     spread = inputs.std(axis=0, dtype=float)
     spread = np.where(spread > 0, spread, 1.0)

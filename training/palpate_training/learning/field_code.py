@@ -13,7 +13,7 @@ The core is a half-cylinder about the x axis with a spherical tip about the orig
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -126,8 +126,7 @@ def fit_code(
         rotation=rotation.astype(np.float32),
         truncation_m={},
     )
-    seen = validation[np.linspace(0, len(validation) - 1, _CHOICE_ROWS).astype(int)]
-    seen = np.unique(seen)
+    seen = np.unique(validation[np.linspace(0, len(validation) - 1, _CHOICE_ROWS).astype(int)])
     lost: dict[int, float] = {}
     for count in sorted({min(count, rotation.shape[1]) for count in mode_counts}):
         shorter = _first(code, count, lost)
@@ -138,13 +137,12 @@ def fit_code(
 
 
 def _first(code: FieldCode, count: int, lost: dict[int, float]) -> FieldCode:
-    return FieldCode(
-        code.mean,
-        code.modes[:count],
-        code.scale[:count],
-        code.centre,
-        code.rotation[:, :count],
-        lost,
+    return replace(
+        code,
+        modes=code.modes[:count],
+        scale=code.scale[:count],
+        rotation=code.rotation[:, :count],
+        truncation_m=lost,
     )
 
 

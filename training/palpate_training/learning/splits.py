@@ -87,11 +87,8 @@ def unseen_sensor(
 ) -> RowSplit:
     """Train on the other sensors, test on all rows of one that was never seen.
 
-    Args:
-        sensor: Sensor of every row, shape ``(N,)``.
-        block: Block of every row, shape ``(N,)``; each tenth block of the others validates.
-        test_sensor: The sensor to hold out.
-        guard_rows: Rows left out between training and validation.
+    Sensor and block are those of every row, shape ``(N,)``. Each tenth block of the others
+    validates; rows beside it are left out.
     """
     test = sensor == test_sensor
     if not test.any() or test.all():

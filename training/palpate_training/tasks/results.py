@@ -219,9 +219,7 @@ def stack_seeds(errors: Sequence[Errors], names: Sequence[str]) -> dict[str, Row
     return {name: np.stack([one[name] for one in errors], axis=1) for name in names}
 
 
-def interval_of(
-    errors: Sequence[Errors], cluster: npt.NDArray[np.int32], draws: int
-) -> dict[str, tuple[float, float]]:
+def interval_of(errors: Sequence[Errors], cluster: Labels, draws: int) -> dict[str, Interval]:
     """95 % intervals of the headline numbers, whole trajectories drawn with replacement."""
     if "subset_m" in errors[0]:
         stacked = stack_seeds(errors, ("subset_m", "all_m"))
@@ -255,19 +253,13 @@ def averaged(
     test: str,
     model: str,
     seeds: Sequence[dict[str, float]],
-    interval: dict[str, tuple[float, float]],
+    interval: dict[str, Interval],
 ) -> ModelResult:
     """Metrics averaged over seeds, with their standard deviation where there are several."""
     values = {name: [one[name] for one in seeds] for name in seeds[0]}
-    return ModelResult(
-        test,
-        model,
-        {name: float(np.mean(each)) for name, each in values.items()},
-        {name: float(np.std(each, ddof=1)) for name, each in values.items()}
-        if len(seeds) > 1
-        else {},
-        interval,
-    )
+    means = {name: float(np.mean(each)) for name, each in values.items()}
+    sd = {name: float(np.std(each, ddof=1)) for name, each in values.items() if len(seeds) > 1}
+    return ModelResult(test, model, means, sd, interval)
 
 
 def tick(on_network: OnNetwork | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,7 +109,7 @@ def join(
     """
     mesh = skin_mesh(fingertip)
     on_progress(0, 1, "basis of the fields")
-    basis = fit_basis(lambda: _blocks(simulated.values()))
+    basis = fit_basis(lambda: (trial.displacement for trial in simulated.values()))
     on_progress(0, 1, "mixed data set")
     mixed = assemble_mixed(
         _mixed(rows, simulated, dropped), basis, mesh, provenance, unit_names=unit_names
@@ -140,11 +140,6 @@ def simulated_trial(
         displacement=np.concatenate([np.zeros_like(fields[:1]), fields]),
         converged=len(steps) + 1,
     )
-
-
-def _blocks(simulated: Iterable[SimulatedTrial]) -> Iterator[npt.NDArray[np.float32]]:
-    for trial in simulated:
-        yield trial.displacement
 
 
 def _mixed(
