@@ -18,7 +18,7 @@ from palpate.errors import BundleError, PalpateError
 from palpate.files.bundle import read_bundle
 from palpate.files.record import RecordWriter
 from palpate.process import require
-from palpate_deploy.cli.data import EXTRA_MODULES
+from palpate_deploy.station.host import TRAINING_MODULES
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline
@@ -175,7 +175,7 @@ def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
         MissingExtraError: The training extra is not installed.
         BundleError: The folder exists, or the exported model differs from the trained one.
     """
-    for module in EXTRA_MODULES:
+    for module in TRAINING_MODULES:
         require(module, extra="training")
     from palpate_training.datasets.features import write_dataset
     from palpate_training.datasets.ingest import ingest_record
