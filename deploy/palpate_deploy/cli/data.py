@@ -19,7 +19,7 @@ import typer
 from palpate.errors import ConfigError, MissingExtraError
 from palpate.process import typed_command
 from palpate_deploy.cli.options import JsonOption, show_left_out
-from palpate_deploy.station.host import TRAINING_MODULES
+from palpate_training import EXTRA_MODULES
 
 if TYPE_CHECKING:
     from palpate_training.experiment.generate.measured import Dropped, ProcessedExperiment
@@ -96,7 +96,7 @@ def _app(room: str) -> typer.Typer:
         from palpate_training.cli import data_app, train_app
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing in TRAINING_MODULES:
+        if missing in EXTRA_MODULES:
             raise MissingExtraError(missing, extra="training") from error
         raise
     return train_app if room == "train" else data_app

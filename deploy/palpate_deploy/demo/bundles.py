@@ -18,12 +18,12 @@ from palpate.errors import BundleError, PalpateError
 from palpate.files.bundle import read_bundle
 from palpate.files.record import RecordWriter
 from palpate.process import require
-from palpate_deploy.station.host import TRAINING_MODULES
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import PACKAGED, available, resolve
+from palpate_training import EXTRA_MODULES
 
 _SHOWN_METRICS = (
     "force_magnitude_n_median",
@@ -175,7 +175,7 @@ def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
         MissingExtraError: The training extra is not installed.
         BundleError: The folder exists, or the exported model differs from the trained one.
     """
-    for module in TRAINING_MODULES:
+    for module in EXTRA_MODULES:
         require(module, extra="training")
     from palpate_training.datasets.features import write_dataset
     from palpate_training.datasets.ingest import ingest_record

@@ -1,4 +1,4 @@
-"""What a run needs of this host: free ports, extras, a folder for its profile and logs."""
+"""What a run needs of this host: free ports, and a folder for its profile and logs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,6 @@ from palpate.bus import Session
 from palpate.config import endpoint_host_port
 from palpate.errors import ConfigError, LinkError
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
-
-TRAINING_MODULES = ("torch", "onnx", "h5py", "matplotlib")
-"""What ``palpate[training]`` installs and a bare palpate has not."""
 
 
 def check_free(endpoints: Iterable[str]) -> None:
