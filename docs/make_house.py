@@ -14,6 +14,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,13 +33,13 @@ ROWS = (("deploy",), ("gateway", "services", "fem", "training"), ("protos",))
 Graph = dict[str, set[str]]
 
 
-def product_modules() -> dict[str, Path]:
-    """Name -> file of every module that is written by hand."""
+def product_modules(folder: Path = ROOT) -> dict[str, Path]:
+    """Name -> file of every module of the rooms below ``folder`` that is written by hand."""
     found = {}
     for room, package in ROOMS.items():
-        for path in sorted((ROOT / room / package).rglob("*.py")):
+        for path in sorted((folder / room / package).rglob("*.py")):
             if not path.stem.endswith("_pb2"):
-                parts = path.relative_to(ROOT / room).with_suffix("").parts
+                parts = path.relative_to(folder / room).with_suffix("").parts
                 found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 
@@ -51,41 +52,13 @@ def import_graph(modules: Mapping[str, Path]) -> Graph:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 targets |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            elif isinstance(node, ast.ImportFrom):
+                assert node.module, f"{path}: relative import"
                 for alias in node.names:
                     inner = f"{node.module}.{alias.name}"
                     targets.add(inner if inner in modules else node.module)
         graph[name] = {target for target in targets if target in modules and target != name}
     return graph
-
-
-def circles(graph: Graph) -> list[set[str]]:
-    """Groups of modules that import one another in a circle, by Tarjan's algorithm."""
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[set[str]] = []
-
-    def visit(node: str) -> None:
-        index[node] = low[node] = len(index)
-        stack.append(node)
-        for target in sorted(graph[node]):
-            if target not in index:
-                visit(target)
-                low[node] = min(low[node], low[target])
-            elif target in stack:
-                low[node] = min(low[node], index[target])
-        if low[node] == index[node]:
-            group = {stack.pop()}
-            while node not in group:
-                group.add(stack.pop())
-            if len(group) > 1:
-                found.append(group)
-
-    for node in sorted(graph):
-        if node not in index:
-            visit(node)
-    return found
 
 
 def _box_of(module: str, modules: Mapping[str, Path]) -> str | None:
@@ -108,21 +81,15 @@ def box_graph(modules: Mapping[str, Path], graph: Graph) -> Graph:
 
 
 def _levels(boxes: Iterable[str], graph: Graph) -> dict[str, int]:
-    """Box -> row in its room: 0 imports nothing of the room; a circle shares a row."""
+    """Box -> row in its room; 0 imports nothing of the room.
+
+    Raises:
+        graphlib.CycleError: Boxes import one another in a circle.
+    """
     inside = {box: graph[box] & set(boxes) for box in boxes}
-    joined = {box: frozenset(group) for group in circles(inside) for box in group}
     levels: dict[str, int] = {}
-
-    def level(box: str) -> int:
-        if box not in levels:
-            group = joined.get(box, frozenset({box}))
-            below = {target for member in group for target in inside[member]} - group
-            value = 1 + max((level(target) for target in sorted(below)), default=-1)
-            levels.update(dict.fromkeys(group, value))
-        return levels[box]
-
-    for box in sorted(inside):
-        level(box)
+    for box in TopologicalSorter(inside).static_order():
+        levels[box] = 1 + max((levels[target] for target in inside[box]), default=-1)
     return levels
 
 
@@ -260,14 +227,10 @@ def _rectangle(at: Rectangle, colour: str, radius: int) -> str:
 
 
 def _arrow(source: Rectangle, target: Rectangle) -> str:
-    """From the lower edge of one box to the upper edge of another; sideways within a row."""
+    """From the lower edge of one box to the upper edge of another."""
     start = (source.x + source.width / 2, source.y + source.height)
     end = (target.x + target.width / 2, target.y)
-    if target.y <= source.y:  # a circle of imports: drawn above the row, so that it stands out
-        start = (start[0], source.y)
-        bend = f"C{start[0]:.1f} {start[1] - 22:.1f} {end[0]:.1f} {end[1] - 22:.1f}"
-    else:
-        bend = f"C{start[0]:.1f} {start[1] + 14:.1f} {end[0]:.1f} {end[1] - 14:.1f}"
+    bend = f"C{start[0]:.1f} {start[1] + 14:.1f} {end[0]:.1f} {end[1] - 14:.1f}"
     return (
         f'<path d="M{start[0]:.1f} {start[1]:.1f}{bend} {end[0]:.1f} {end[1]:.1f}"'
         ' fill="none" stroke="#555" marker-end="url(#tip)"/>'

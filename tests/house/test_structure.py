@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import ast
+import runpy
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -12,7 +13,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("protos", "gateway", "fem", "training", "services", "deploy")
 
 FILES_MAX = 420
 """Product files, without what protoc generates."""
@@ -23,6 +23,10 @@ FRAGMENTS_MAX = 25
 FRAGMENT_LINES = 110
 
 
+# The program that draws the house knows its modules and their imports.
+HOUSE = runpy.run_path(str(ROOT / "docs" / "make_house.py"))
+
+
 @dataclass(frozen=True, slots=True)
 class _Module:
     path: Path
@@ -30,34 +34,20 @@ class _Module:
     lines: int
 
 
-def _read(folder: Path, rooms: Iterable[str]) -> dict[str, _Module]:
+def _read(folder: Path) -> dict[str, _Module]:
     """Dotted name -> module, of every product file that was written by hand."""
     found = {}
-    for room in rooms:
-        for path in sorted((folder / room).rglob("*.py")):
-            if path.stem.endswith("_pb2"):
-                continue
-            parts = path.relative_to(folder / room).with_suffix("").parts
-            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-            text = path.read_text(encoding="utf-8")
-            found[name] = _Module(path, ast.parse(text), len(text.splitlines()))
+    for name, path in HOUSE["product_modules"](folder).items():
+        text = path.read_text(encoding="utf-8")
+        found[name] = _Module(path, ast.parse(text), len(text.splitlines()))
     return found
 
 
 def _imports(modules: Mapping[str, _Module]) -> dict[str, set[str]]:
     """Module -> the product's modules that it imports, also inside functions and for types only."""
-    graph: dict[str, set[str]] = {}
-    for name, module in modules.items():
-        named: set[str] = set()
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.Import):
-                named.update(alias.name for alias in node.names)
-            elif isinstance(node, ast.ImportFrom):
-                assert node.module, f"{module.path}: relative import"
-                for alias in node.names:
-                    full = f"{node.module}.{alias.name}"
-                    named.add(full if full in modules else node.module)
-        graph[name] = {other for other in named if other in modules and other != name}
+    graph: dict[str, set[str]] = HOUSE["import_graph"](
+        {name: module.path for name, module in modules.items()}
+    )
     return graph
 
 
@@ -99,7 +89,7 @@ def _shared_names(modules: Mapping[str, _Module]) -> dict[str, list[str]]:
 @pytest.fixture(scope="module")
 def modules() -> dict[str, _Module]:
     """The product."""
-    return _read(ROOT, ROOMS)
+    return _read(ROOT)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +143,7 @@ def small_house(tmp_path: Path) -> Path:
 
 
 def test_each_fault_is_found_where_it_is_planted(small_house: Path) -> None:
-    found = _read(small_house, ["fem"])
+    found = _read(small_house)
     graph = _imports(found)
     assert set(found) == {"palpate_fem", "palpate_fem.a", "palpate_fem.b"}
     assert set(_circle(graph)) == {"palpate_fem.a", "palpate_fem.b"}
