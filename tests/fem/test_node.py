@@ -274,6 +274,23 @@ def test_nobody_waits_for_it_any_more(service: Any) -> None:
     service.until(lambda: service.robot.status()[0].gauges["busy_workers"] == 0)
 
 
+def test_a_caller_may_ask_again_at_once_with_the_same_id(
+    serving: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The end of its first call is noticed while the second one runs."""
+    on_gone = node.SimulationService.caller_gone
+
+    def late(self: node.SimulationService, key: str, when_s: float) -> None:
+        time.sleep(0.1)  # the look at the tokens was made before the second call
+        on_gone(self, key, when_s)
+
+    monkeypatch.setattr(node.SimulationService, "caller_gone", late)
+    with serving() as served:
+        for friction in (fakes.QUICK, fakes.SLOW) * 5:
+            reply = served.robot.simulate(fakes.request("same", friction))
+            assert reply.outcome is SimulationOutcome.COMPLETE
+
+
 def test_large_fields(serving: Any) -> None:
     """All fields of one step fit a message; those of all steps need not."""
     with serving(workers=1, options={"nodes": 60_000}) as served:

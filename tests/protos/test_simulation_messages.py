@@ -248,16 +248,18 @@ def test_who_waits_no_longer_is_noticed(
     answers: Answers,
     wait_until: WaitUntil,
 ) -> None:
-    gone: list[str] = []
+    gone: dict[str, float] = {}
     with Session.open(link) as watcher:
-        watcher.watch_callers(gone.append)
+        watcher.watch_callers(gone.__setitem__)
         time.sleep(0.2)
         thread, _ = in_thread(lambda: robot.simulate(REQUEST))
         wait_until(lambda: answers)
         assert caller_key("lab", "r") not in gone
+        before_s = time.monotonic()
         answers[0].fail(SimulationError("a", remedy="b"))
         thread.join(5)
-        wait_until(lambda: gone == [caller_key("lab", "r")])
+        wait_until(lambda: list(gone) == [caller_key("lab", "r")])
+        assert before_s < gone[caller_key("lab", "r")] < time.monotonic()
         first = robot.session.caller_token("again")
         with robot.session.caller_token("again"):  # the same question, asked a second time
             first.close()

@@ -68,6 +68,7 @@ class ActiveSimulation:
 
     Attributes:
         steps_done: Steps that were sent.
+        since_s: When it was accepted [s, monotonic].
     """
 
     def __init__(
@@ -80,13 +81,13 @@ class ActiveSimulation:
         self.answer = answer
         self.steps_done = 0
         self._progress = progress
-        self._since = time.monotonic()
+        self.since_s = time.monotonic()
         self._mesh = b""
 
     @property
     def elapsed_s(self) -> float:
         """Time since it was accepted [s]."""
-        return time.monotonic() - self._since
+        return time.monotonic() - self.since_s
 
     def on_event(self, event: JobEvent) -> None:
         """Send what an event means to the caller.
@@ -234,14 +235,20 @@ class SimulationService(Closing):
         """Stop a simulation, no matter who requested it."""
         return SimulationCancelReply(self.pool.cancel(request.request_id))
 
-    def caller_gone(self, key: str) -> None:
+    def caller_gone(self, key: str, when_s: float) -> None:
         """Stop the simulations of a caller that has left.
 
         Args:
             key: The ``caller_key`` that vanished.
+            when_s: When it vanished [s, monotonic]; a later request with the same id is another
+                call.
         """
         with self._lock:
-            ids = [name for name in self._active if caller_key(self._station, name) == key]
+            ids = [
+                name
+                for name, active in self._active.items()
+                if active.since_s <= when_s and caller_key(self._station, name) == key
+            ]
         for name in ids:
             if self.pool.cancel(name):
                 self._health.count("callers_gone")

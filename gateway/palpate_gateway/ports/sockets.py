@@ -38,6 +38,12 @@ _STAMP_SPACE = 64
 _PAGE_REMEDY = "open this address in a browser: check address, cable and that the device has power"
 
 
+_STAMPING_S = 0.2
+"""Longest wait for the kernel to stamp at arrival [s]; a few milliseconds as a rule."""
+
+_PROBE_S = 1e-3
+
+
 class ReceivedBytes(NamedTuple):
     """Bytes, and when the last of them arrived, by the host's monotonic clock [ns]."""
 
@@ -75,6 +81,7 @@ class _SocketPort(Port):
         if sys.platform.startswith("linux"):
             with contextlib.suppress(OSError):
                 link.setsockopt(socket.SOL_SOCKET, _STAMP, 1)
+                _wait_for_stamping()
                 self._stamps = KernelStamps()
 
     def close(self) -> None:
@@ -134,6 +141,29 @@ class _SocketPort(Port):
             f"{self.name} is gone: {why}",
             remedy="check its address, cable and power; it is opened again by itself",
         )
+
+
+def _wait_for_stamping() -> None:
+    """Wait until the kernel stamps datagrams when they arrive.
+
+    It switches stamping on a little after the first socket of the host has asked for it. Until then
+    it stamps when a datagram is read, so that an early one may bear a later time than its
+    successor. A datagram that this function sends to itself shows which of both holds.
+    """
+    until_s = time.monotonic() + _STAMPING_S
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, _STAMP, 1)
+        probe.bind(("127.0.0.1", 0))
+        probe.connect(probe.getsockname())
+        probe.settimeout(_STAMPING_S)
+        while time.monotonic() < until_s:
+            probe.send(b"?")
+            time.sleep(_PROBE_S)
+            read_ns = time.time_ns()
+            _, extras, _, _ = probe.recvmsg(1, _STAMP_SPACE)
+            stamps = [_TIMESPEC.unpack(value) for _, kind, value in extras if kind == _STAMP]
+            if stamps and 1_000_000_000 * stamps[0][0] + stamps[0][1] < read_ns:
+                return
 
 
 class TcpPort(_SocketPort):

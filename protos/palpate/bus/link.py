@@ -331,8 +331,11 @@ class Session(Closing):
         """Show that this process waits for an answer, until it is closed or this process dies."""
         return CallerToken(self._raw, caller_key(self.station, request_id))
 
-    def watch_callers(self, on_gone: Callable[[str], None]) -> None:
-        """Call ``on_gone`` with the ``caller_key`` of every caller that waits no longer."""
+    def watch_callers(self, on_gone: Callable[[str, float], None]) -> None:
+        """Call ``on_gone`` for every caller that waits no longer.
+
+        It gets its ``caller_key``, and since when it is gone [s, monotonic].
+        """
         self._keep(CallerWatch(self._raw, caller_key(self.station, "*"), on_gone))
 
     def presence(self, service: str, *, instance: str) -> Presence:

@@ -15,8 +15,6 @@ from palpate.bus.topics import live_key
 from palpate.process import Closing
 
 _LOOK_S = 1.0
-_SETTLE_S = 0.1
-"""How long a vanished token may take to be declared again [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,16 +84,19 @@ class CallerToken(Closing):
 
 
 class CallerWatch(Closing):
-    """Calls ``on_gone``, in a thread of its own, with the key of every token that has vanished.
+    """Calls ``on_gone``, in a thread of its own, for every token that has vanished.
 
-    A token that vanishes and is declared again at once, because its caller asked a second time,
-    does not count as vanished. ``key`` names the tokens, with a ``"*"``.
+    It gets the token's key and when it vanished [s, monotonic]. A caller that asks again with the
+    same request id declares its token again: an answer that was begun after the token vanished
+    belongs to the new call. ``key`` names the tokens, with a ``"*"``.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, on_gone: Callable[[str], None]) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, on_gone: Callable[[str, float], None]
+    ) -> None:
         self._session = session
         self._on_gone = on_gone
-        self._vanished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._vanished: queue.SimpleQueue[tuple[str, float] | None] = queue.SimpleQueue()
         self._worker = threading.Thread(target=self._run, name=f"callers {key}", daemon=True)
         self._worker.start()
         self._subscriber = session.liveliness().declare_subscriber(
@@ -104,16 +105,16 @@ class CallerWatch(Closing):
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
-            self._vanished.put(str(sample.key_expr))
+            self._vanished.put((str(sample.key_expr), time.monotonic()))
 
     def _run(self) -> None:
-        while (key := self._vanished.get()) is not None:
-            # On a loaded host the new token of a caller that asks again comes a little later than
-            # the end of the old one.
-            time.sleep(_SETTLE_S)
+        while (vanished := self._vanished.get()) is not None:
+            key, when_s = vanished
             try:
+                # The end of a token may be reported after the request of the next call, whose
+                # token was declared before that request and is found here.
                 if not any(self._session.liveliness().get(key, timeout=_LOOK_S)):
-                    self._on_gone(key)
+                    self._on_gone(key, when_s)
             except zenoh.ZError:  # the session is closing
                 return
 
