@@ -8,6 +8,7 @@ times stay as recorded, so that the result does not depend on when it is replaye
 from __future__ import annotations
 
 import math
+import secrets
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -46,6 +47,11 @@ _DELAYS = 512
 """Number of readings over which the median delay is taken."""
 
 
+def new_session_id() -> int:
+    """A random name for one run of a gateway, 64 bits, never 0."""
+    return secrets.randbelow(2**64 - 1) + 1
+
+
 class HostTime(NamedTuple):
     """One instant on the host's monotonic and on its wall clock [ns]."""
 
@@ -73,6 +79,8 @@ class ClockMap(ABC):
     """Identifies the monotonic clock of the mapped times."""
     paced = False
     """Whether a frame must wait until its mapped time before it is published."""
+    of_this_run = True
+    """Whether the mapped times belong to this run of the gateway, and the stamps carry its id."""
 
     @abstractmethod
     def map(
@@ -214,6 +222,8 @@ class FileClock(_RecordedClock):
             epoch.
     """
 
+    of_this_run = False
+
     def __init__(self, serial: str, start_wall_ns: int | None) -> None:
         super().__init__()
         self._start_wall_ns = start_wall_ns or 0
@@ -248,10 +258,15 @@ class Stamper:
     """Turns readings into frames: each stream has its sequence, each frame its stamp.
 
     Belongs to one thread.
+
+    Args:
+        origin: Where the readings come from.
+        session_id: Names this run of the gateway; 0 = unknown.
     """
 
-    def __init__(self, origin: Origin) -> None:
+    def __init__(self, origin: Origin, session_id: int = 0) -> None:
         self._origin = origin
+        self._session_id = session_id
         self._clock: ClockMap | None = None
         self._serial = ""
         self._sensor_type: SensorType | None = None
@@ -336,4 +351,5 @@ class Stamper:
             self._clock.clock_id,
             self._origin,
             missed_before,
+            self._session_id if self._clock.of_this_run else 0,
         )

@@ -15,6 +15,7 @@ from palpate.errors import ConfigError, PalpateError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
 from palpate.process import avoid_pauses
+from palpate_gateway.clock.stamps import new_session_id
 from palpate_gateway.clock.wall_clock import WallClock, wall_discipline
 from palpate_gateway.condition.condition import RetareRules
 from palpate_gateway.condition.stillness import StillLimits
@@ -63,6 +64,7 @@ def run(
             device.join(link, station)
     sources: dict[tuple[str, str], str] = {}
     wall = WallClock()
+    session_id = new_session_id()
     health = Health(SERVICE, instance)
     health.set_sensors(tuple(sensor.name for sensor in config.sensors))
     with Session.open(link, station=station) as session:
@@ -73,7 +75,7 @@ def run(
             worker = SensorWorker(
                 sensor.name,
                 device,
-                _pipeline(config, device),
+                _pipeline(config, device, session_id),
                 {
                     topic.name: session.publisher(topic, sensor=sensor.key_name, lossless=lossless)
                     for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE)
@@ -122,7 +124,7 @@ def _device(sensor: SensorConfig) -> Device:
     return device
 
 
-def _pipeline(config: GatewayConfig, device: Device) -> Pipeline:
+def _pipeline(config: GatewayConfig, device: Device, session_id: int) -> Pipeline:
     again_s = config.retare_after_s
     return Pipeline(
         device.info,
@@ -130,6 +132,7 @@ def _pipeline(config: GatewayConfig, device: Device) -> Pipeline:
         tare_frames=config.tare_frames,
         limits=StillLimits(config.tare_max_sd_counts, config.tare_max_pac_sd_counts),
         retare=None if again_s is None else RetareRules(again_s, config.retare_drift_counts),
+        session_id=session_id,
     )
 
 

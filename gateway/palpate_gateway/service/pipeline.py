@@ -35,6 +35,7 @@ class Pipeline:
         tare_frames: Frames in a tare.
         limits: Noise up to which a sensor counts as still.
         retare: When to tare again without a request; None = never.
+        session_id: Names this run of the gateway in the stamps; 0 = unknown.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Pipeline:
         tare_frames: int = TARE_FRAMES,
         limits: StillLimits | None = None,
         retare: RetareRules | None = None,
+        session_id: int = 0,
     ) -> None:
         self._limits = limits or StillLimits()
         electrodes_only = replace(self._limits, pac_sd=inf, pdc_sd=inf)
@@ -64,7 +66,7 @@ class Pipeline:
         self._kind = info.sensor_type
         self.tare_frames = tare_frames
         self._serial = ""
-        self._stamper = Stamper(info.origin)
+        self._stamper = Stamper(info.origin, session_id)
         self._held: list[DueMessage] = []
         self._held_frames = 0
         # Without electrodes there is never a tare: the recording would be held back to its end.

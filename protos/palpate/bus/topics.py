@@ -6,6 +6,8 @@ Keys (docs/adr/0004-keys-and-qos.md)::
     palpate/@v1/<station>/@service/<service>/<instance>/<endpoint>   status, endpoints
     palpate/@v1/@live/<station>/<service>/<instance>/<alive|ready>   presence (liveliness tokens)
     palpate/@v1/@asking/<station>/<digest of a request's id>          a caller that waits (token)
+    palpate/@v1/@sensor/<station>/<sensor>/<wanted|held>/<since>/<session>/<instance>/<host>/<serial>
+                                                                     a gateway's claim (token)
 
 ``@v1`` is a verbatim chunk: ``*`` and ``**`` never match it, so a future contract cannot be taken
 for this one by accident.
@@ -32,6 +34,7 @@ CONTRACT_VERSION = 1
 ROOT = f"palpate/@v{CONTRACT_VERSION}"
 LIVE_ROOT = f"{ROOT}/@live"
 ASKING_ROOT = f"{ROOT}/@asking"
+CLAIM_ROOT = f"{ROOT}/@sensor"
 ENCODING_PREFIX = "application/protobuf;"
 
 MAX_MESSAGE_BYTES = 4 << 20
@@ -159,6 +162,98 @@ def caller_key(station: str, request_id: str) -> str:
     """
     digest = "*" if request_id == "*" else hashlib.sha256(request_id.encode()).hexdigest()[:32]
     return f"{ASKING_ROOT}/{_chunks(station=station)}/{digest}"
+
+
+@dataclass(frozen=True, slots=True)
+class SensorClaim:
+    """A gateway's claim on the key of a sensor: only the gateway that holds it publishes there.
+
+    Attributes:
+        station: Station of the sensor.
+        sensor: Its name in keys.
+        session_id: Run of the gateway, as in ``Stamp.session_id``; never 0.
+        held: Whether it publishes; else it waits, or is about to take over.
+        since_wall_ns: Wall clock when the claim was made or taken over [ns since the Unix epoch].
+        instance: Name of the gateway among several.
+        host: Name of its host; empty = unknown.
+        serial: Serial number of the sensor; empty = not opened yet.
+    """
+
+    station: str
+    sensor: str
+    session_id: int
+    held: bool = True
+    since_wall_ns: int = 0
+    instance: str = "gateway"
+    host: str = ""
+    serial: str = ""
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Of two claims that are held, the one of higher rank holds.
+
+        The later one has taken over while the other was gone; at one instant the lower session id.
+        """
+        return self.since_wall_ns, -self.session_id
+
+
+def claim_key(claim: SensorClaim) -> str:
+    """Key of the liveliness token of a claim."""
+    names = _chunks(station=claim.station, sensor=claim.sensor)
+    state = "held" if claim.held else "wanted"
+    numbers = f"{claim.since_wall_ns:016x}/{claim.session_id:016x}"
+    texts = f"{_hidden(claim.host)}/{_hidden(claim.serial)}"
+    return f"{CLAIM_ROOT}/{names}/{state}/{numbers}/{_chunks(instance=claim.instance)}/{texts}"
+
+
+def claims_key(station: str, sensor: str = "*", *, held_only: bool = False) -> str:
+    """Key that matches all claims on a sensor; ``"*"`` for any station or sensor."""
+    names = _chunks(station=station, sensor=sensor)
+    return f"{CLAIM_ROOT}/{names}/{'held' if held_only else '*'}/*/*/*/*/*"
+
+
+def parse_claim_key(key: str) -> SensorClaim:
+    """The claim that a token's key stands for; the inverse of ``claim_key``.
+
+    Raises:
+        WireError: It is not such a key (reason ``"key"``).
+    """
+    try:
+        if not key.startswith(f"{CLAIM_ROOT}/"):
+            raise ValueError("another root")
+        chunks = key.removeprefix(f"{CLAIM_ROOT}/").split("/")
+        station, sensor, state, since, session, instance, host, serial = chunks
+        claim = SensorClaim(
+            check_name(station, "station"),
+            check_name(sensor, "sensor"),
+            int(session, 16),
+            state == "held",
+            int(since, 16),
+            check_name(instance, "instance"),
+            _shown(host),
+            _shown(serial),
+        )
+        if claim_key(claim) != key or claim.session_id <= 0 or claim.since_wall_ns < 0:
+            raise ValueError("not as claim_key writes it")
+    except ValueError as error:
+        raise WireError(
+            f"key {key!r} is no claim on a sensor: {error}",
+            remedy="declare the keys of docs/adr/0004-keys-and-qos.md",
+            reason="key",
+        ) from error
+    return claim
+
+
+def _hidden(text: str) -> str:
+    """Any text as a chunk of a key: its bytes in hex, behind an ``x``."""
+    return "x" + text.encode().hex()
+
+
+def _shown(chunk: str) -> str:
+    """The text of ``_hidden``; raises ``ValueError`` for anything else."""
+    if not chunk.startswith("x"):
+        raise ValueError(f"{chunk!r} is no text in hex")
+    return bytes.fromhex(chunk[1:]).decode()
 
 
 def _chunks(**names: str) -> str:

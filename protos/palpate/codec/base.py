@@ -98,7 +98,14 @@ def stamp_from_wire(msg: common_pb2.Stamp) -> Stamp:
     if monotonic_ns >> 63 or wall_ns >> 63:
         reject("stamp", f"stamp times {monotonic_ns}, {wall_ns} ns exceed int64")
     return Stamp(
-        sequence, msg.device_tick, monotonic_ns, wall_ns, msg.clock_id, origin, msg.missed_before
+        sequence,
+        msg.device_tick,
+        monotonic_ns,
+        wall_ns,
+        msg.clock_id,
+        origin,
+        msg.missed_before,
+        msg.session_id,
     )
 
 
@@ -114,6 +121,7 @@ def stamp_to_wire(stamp: Stamp, msg: common_pb2.Stamp) -> None:
         msg.clock_id = stamp.clock_id
         msg.origin = int(stamp.origin)  # type: ignore[assignment]
         msg.missed_before = stamp.missed_before
+        msg.session_id = stamp.session_id
     except (ValueError, TypeError) as error:
         raise WireError(f"stamp {stamp}: {error}", remedy=_SENDER, reason="stamp") from error
     if stamp.monotonic_ns >> 63 or stamp.wall_ns >> 63:

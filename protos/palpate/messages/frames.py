@@ -132,6 +132,8 @@ class Stamp:
         clock_id: Names the monotonic clock; one value per host and boot.
         origin: Live, simulated or replayed.
         missed_before: Frames the device is known to have lost directly before this one.
+        session_id: Names the run of the gateway; 0 = unknown: an older gateway, or a log played as
+            fast as possible. A replayed record keeps the value of the run that was recorded.
     """
 
     sequence: int
@@ -141,6 +143,7 @@ class Stamp:
     clock_id: int
     origin: Origin
     missed_before: int = 0
+    session_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)

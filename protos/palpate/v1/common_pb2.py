@@ -24,21 +24,21 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17palpate/v1/common.proto\x12\npalpate.v1\"\xa2\x01\n\x05Stamp\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12\x13\n\x0b\x64\x65vice_tick\x18\x02 \x01(\x04\x12\x14\n\x0cmonotonic_ns\x18\x03 \x01(\x06\x12\x0f\n\x07wall_ns\x18\x04 \x01(\x06\x12\x10\n\x08\x63lock_id\x18\x05 \x01(\x07\x12\"\n\x06origin\x18\x06 \x01(\x0e\x32\x12.palpate.v1.Origin\x12\x15\n\rmissed_before\x18\x07 \x01(\r\"*\n\x07Vector3\x12\t\n\x01x\x18\x01 \x01(\x02\x12\t\n\x01y\x18\x02 \x01(\x02\x12\t\n\x01z\x18\x03 \x01(\x02\"Z\n\x04Pose\x12\n\n\x02px\x18\x01 \x01(\x01\x12\n\n\x02py\x18\x02 \x01(\x01\x12\n\n\x02pz\x18\x03 \x01(\x01\x12\n\n\x02qw\x18\x04 \x01(\x01\x12\n\n\x02qx\x18\x05 \x01(\x01\x12\n\n\x02qy\x18\x06 \x01(\x01\x12\n\n\x02qz\x18\x07 \x01(\x01*\\\n\x06Origin\x12\x16\n\x12ORIGIN_UNSPECIFIED\x10\x00\x12\x0f\n\x0bORIGIN_LIVE\x10\x01\x12\x14\n\x10ORIGIN_SIMULATED\x10\x02\x12\x13\n\x0fORIGIN_REPLAYED\x10\x03*\\\n\nSensorType\x12\x1b\n\x17SENSOR_TYPE_UNSPECIFIED\x10\x00\x12\x16\n\x12SENSOR_TYPE_BIOTAC\x10\x01\x12\x19\n\x15SENSOR_TYPE_BIOTAC_SP\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17palpate/v1/common.proto\x12\npalpate.v1\"\xb6\x01\n\x05Stamp\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12\x13\n\x0b\x64\x65vice_tick\x18\x02 \x01(\x04\x12\x14\n\x0cmonotonic_ns\x18\x03 \x01(\x06\x12\x0f\n\x07wall_ns\x18\x04 \x01(\x06\x12\x10\n\x08\x63lock_id\x18\x05 \x01(\x07\x12\"\n\x06origin\x18\x06 \x01(\x0e\x32\x12.palpate.v1.Origin\x12\x15\n\rmissed_before\x18\x07 \x01(\r\x12\x12\n\nsession_id\x18\x08 \x01(\x06\"*\n\x07Vector3\x12\t\n\x01x\x18\x01 \x01(\x02\x12\t\n\x01y\x18\x02 \x01(\x02\x12\t\n\x01z\x18\x03 \x01(\x02\"Z\n\x04Pose\x12\n\n\x02px\x18\x01 \x01(\x01\x12\n\n\x02py\x18\x02 \x01(\x01\x12\n\n\x02pz\x18\x03 \x01(\x01\x12\n\n\x02qw\x18\x04 \x01(\x01\x12\n\n\x02qx\x18\x05 \x01(\x01\x12\n\n\x02qy\x18\x06 \x01(\x01\x12\n\n\x02qz\x18\x07 \x01(\x01*\\\n\x06Origin\x12\x16\n\x12ORIGIN_UNSPECIFIED\x10\x00\x12\x0f\n\x0bORIGIN_LIVE\x10\x01\x12\x14\n\x10ORIGIN_SIMULATED\x10\x02\x12\x13\n\x0fORIGIN_REPLAYED\x10\x03*\\\n\nSensorType\x12\x1b\n\x17SENSOR_TYPE_UNSPECIFIED\x10\x00\x12\x16\n\x12SENSOR_TYPE_BIOTAC\x10\x01\x12\x19\n\x15SENSOR_TYPE_BIOTAC_SP\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'palpate.v1.common_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_ORIGIN']._serialized_start=340
-  _globals['_ORIGIN']._serialized_end=432
-  _globals['_SENSORTYPE']._serialized_start=434
-  _globals['_SENSORTYPE']._serialized_end=526
+  _globals['_ORIGIN']._serialized_start=360
+  _globals['_ORIGIN']._serialized_end=452
+  _globals['_SENSORTYPE']._serialized_start=454
+  _globals['_SENSORTYPE']._serialized_end=546
   _globals['_STAMP']._serialized_start=40
-  _globals['_STAMP']._serialized_end=202
-  _globals['_VECTOR3']._serialized_start=204
-  _globals['_VECTOR3']._serialized_end=246
-  _globals['_POSE']._serialized_start=248
-  _globals['_POSE']._serialized_end=338
+  _globals['_STAMP']._serialized_end=222
+  _globals['_VECTOR3']._serialized_start=224
+  _globals['_VECTOR3']._serialized_end=266
+  _globals['_POSE']._serialized_start=268
+  _globals['_POSE']._serialized_end=358
 # @@protoc_insertion_point(module_scope)

@@ -26,7 +26,7 @@ SENSOR_TYPE_BIOTAC: SensorType
 SENSOR_TYPE_BIOTAC_SP: SensorType
 
 class Stamp(_message.Message):
-    __slots__ = ("sequence", "device_tick", "monotonic_ns", "wall_ns", "clock_id", "origin", "missed_before")
+    __slots__ = ("sequence", "device_tick", "monotonic_ns", "wall_ns", "clock_id", "origin", "missed_before", "session_id")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DEVICE_TICK_FIELD_NUMBER: _ClassVar[int]
     MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
@@ -34,6 +34,7 @@ class Stamp(_message.Message):
     CLOCK_ID_FIELD_NUMBER: _ClassVar[int]
     ORIGIN_FIELD_NUMBER: _ClassVar[int]
     MISSED_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     device_tick: int
     monotonic_ns: int
@@ -41,7 +42,8 @@ class Stamp(_message.Message):
     clock_id: int
     origin: Origin
     missed_before: int
-    def __init__(self, sequence: _Optional[int] = ..., device_tick: _Optional[int] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., clock_id: _Optional[int] = ..., origin: _Optional[_Union[Origin, str]] = ..., missed_before: _Optional[int] = ...) -> None: ...
+    session_id: int
+    def __init__(self, sequence: _Optional[int] = ..., device_tick: _Optional[int] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., clock_id: _Optional[int] = ..., origin: _Optional[_Union[Origin, str]] = ..., missed_before: _Optional[int] = ..., session_id: _Optional[int] = ...) -> None: ...
 
 class Vector3(_message.Message):
     __slots__ = ("x", "y", "z")
