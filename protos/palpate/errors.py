@@ -23,6 +23,7 @@ class ErrorCode(IntEnum):
     DISK = 8
     SIMULATION = 9
     INTERNAL = 10
+    PERMISSION_DENIED = 11
 
 
 class PalpateError(Exception):

@@ -55,6 +55,13 @@ STATUS = Endpoint(
 MODEL = Endpoint(
     "model", codec.SERVICE_REQUEST, codec.MODEL_METADATA, "metadata of the served bundle", True
 )
+MODELS = Endpoint(
+    "models",
+    codec.MODEL_REQUEST,
+    codec.MODEL_INVENTORY,
+    "list, load, unload or roll back bundles; needs the station's admin token",
+    True,
+)
 ESTIMATE_FIELD = Endpoint(
     "estimate", codec.FIELD_REQUEST, codec.FIELD_ESTIMATE, "field of one electrode frame", True
 )

@@ -11,6 +11,7 @@ from palpate.codec.frames import (
     ROBOT_POSE_FRAME,
     WRENCH_FRAME,
 )
+from palpate.codec.models import MODEL_COMMAND, MODEL_INVENTORY, MODEL_REQUEST
 from palpate.codec.service import (
     ERROR,
     FIELD_REQUEST,
@@ -44,7 +45,10 @@ __all__ = [
     "FIELD_FRAME",
     "FIELD_REQUEST",
     "INDENTER_POSE_FRAME",
+    "MODEL_COMMAND",
+    "MODEL_INVENTORY",
     "MODEL_METADATA",
+    "MODEL_REQUEST",
     "ROBOT_POSE_FRAME",
     "SERVICE_REQUEST",
     "SIMULATION_CANCEL_REPLY",

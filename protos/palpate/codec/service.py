@@ -22,6 +22,7 @@ from palpate.codec.base import (
     vector3_to_wire,
 )
 from palpate.codec.frames import ELECTRODE_FRAME, electrodes_from_wire
+from palpate.codec.models import served_from_wire, served_to_wire
 from palpate.config import check_name
 from palpate.errors import ConfigError, ErrorCode
 from palpate.messages import (
@@ -250,6 +251,7 @@ def _metadata_from_wire(msg: service_pb2.ModelMetadata) -> ModelMetadata:
         msg.training_data_sha256,
         dict(msg.metrics),
         _check_text(msg.trained_on, "trained_on"),
+        served_from_wire(msg.served),
     )
 
 
@@ -271,6 +273,7 @@ def _metadata_encode(metadata: ModelMetadata) -> bytes:
         training_data_sha256=metadata.training_data_sha256,
         metrics=dict(metadata.metrics),
         trained_on=metadata.trained_on[:_TEXT_MAX],
+        served=served_to_wire(metadata.served),
     ).SerializeToString()
 
 

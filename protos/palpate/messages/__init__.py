@@ -30,6 +30,13 @@ from palpate.messages.frames import (
     Stamp,
     WrenchFrame,
 )
+from palpate.messages.models import (
+    ModelAction,
+    ModelCommand,
+    ModelInventory,
+    ModelRequest,
+    ServedModel,
+)
 from palpate.messages.service import (
     ChannelFault,
     ErrorReply,
@@ -79,13 +86,18 @@ __all__ = [
     "FloatArray",
     "FrameLayout",
     "IndenterPoseFrame",
+    "ModelAction",
+    "ModelCommand",
+    "ModelInventory",
     "ModelMetadata",
+    "ModelRequest",
     "Origin",
     "Pose",
     "RobotPoseFrame",
     "SensorState",
     "SensorStatus",
     "SensorType",
+    "ServedModel",
     "ServiceRequest",
     "ServiceState",
     "SimulationCancelReply",

@@ -8,6 +8,7 @@ from enum import IntEnum
 
 from palpate.errors import ErrorCode
 from palpate.messages.frames import NO_TARE, ElectrodeFrame, FloatArray, Stamp
+from palpate.messages.models import ServedModel
 
 
 class SensorState(IntEnum):
@@ -219,6 +220,7 @@ class ModelMetadata:
         training_data_sha256: Digest of the data set it was trained on, hex.
         metrics: Held-out results; the name ends in the unit.
         trained_on: One line for people.
+        served: Which bundle serves which sensor; the other attributes describe the first.
     """
 
     name: str
@@ -231,3 +233,4 @@ class ModelMetadata:
     training_data_sha256: str
     metrics: Mapping[str, float]
     trained_on: str
+    served: Sequence[ServedModel] = ()

@@ -24,9 +24,10 @@ _sym_db = _symbol_database.Default()
 
 from palpate.v1 import common_pb2 as palpate_dot_v1_dot_common__pb2
 from palpate.v1 import frames_pb2 as palpate_dot_v1_dot_frames__pb2
+from palpate.v1 import models_pb2 as palpate_dot_v1_dot_models__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18palpate/v1/service.proto\x12\npalpate.v1\x1a\x17palpate/v1/common.proto\x1a\x17palpate/v1/frames.proto\"\xc8\x01\n\x04Tare\x12\x0f\n\x07tare_id\x18\x01 \x01(\x06\x12 \n\x05stamp\x18\x02 \x01(\x0b\x32\x11.palpate.v1.Stamp\x12\x15\n\rsensor_serial\x18\x03 \x01(\t\x12\x12\n\nelectrodes\x18\x04 \x03(\x02\x12\x15\n\relectrodes_sd\x18\x05 \x03(\x02\x12\x0b\n\x03pdc\x18\x06 \x01(\x02\x12\x0b\n\x03pac\x18\x07 \x01(\x02\x12\x0b\n\x03tac\x18\x08 \x01(\x02\x12\x0b\n\x03tdc\x18\t \x01(\x02\x12\x17\n\x0f\x66rames_averaged\x18\n \x01(\r\".\n\x0bTareRequest\x12\x0f\n\x07tare_id\x18\x01 \x01(\x06\x12\x0e\n\x06\x66rames\x18\x02 \x01(\r\"%\n\x11WrenchZeroRequest\x12\x10\n\x08readings\x18\x01 \x01(\r\"\xa1\x02\n\nWrenchZero\x12\x15\n\rsensor_serial\x18\x01 \x01(\t\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x14\n\x0cmonotonic_ns\x18\x03 \x01(\x06\x12\x0f\n\x07wall_ns\x18\x04 \x01(\x06\x12)\n\x0c\x66orce_before\x18\x05 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12*\n\rtorque_before\x18\x06 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12(\n\x0b\x66orce_after\x18\x07 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12)\n\x0ctorque_after\x18\x08 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12\x19\n\x11readings_averaged\x18\t \x01(\r\"\x10\n\x0eServiceRequest\"E\n\x0c\x43hannelFault\x12#\n\x04kind\x18\x01 \x01(\x0e\x32\x15.palpate.v1.FaultKind\x12\x10\n\x08\x63hannels\x18\x02 \x03(\t\"\x9b\x01\n\x0cSensorStatus\x12\x0c\n\x04name\x18\x01 \x01(\t\x12&\n\x05state\x18\x02 \x01(\x0e\x32\x17.palpate.v1.SensorState\x12\x1a\n\x12since_monotonic_ns\x18\x03 \x01(\x06\x12(\n\x06\x66\x61ults\x18\x04 \x03(\x0b\x32\x18.palpate.v1.ChannelFault\x12\x0f\n\x07message\x18\x05 \x01(\t\"\xdc\x03\n\x06Status\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\x10\n\x08instance\x18\x02 \x01(\t\x12\'\n\x05state\x18\x03 \x01(\x0e\x32\x18.palpate.v1.ServiceState\x12\x14\n\x0cmonotonic_ns\x18\x04 \x01(\x06\x12\x0f\n\x07wall_ns\x18\x05 \x01(\x06\x12\x10\n\x08uptime_s\x18\x06 \x01(\x01\x12\x0f\n\x07version\x18\x07 \x01(\t\x12\x32\n\x08\x63ounters\x18\x08 \x03(\x0b\x32 .palpate.v1.Status.CountersEntry\x12.\n\x06gauges\x18\t \x03(\x0b\x32\x1e.palpate.v1.Status.GaugesEntry\x12\x0f\n\x07sensors\x18\n \x03(\t\x12\x0f\n\x07message\x18\x0b \x01(\t\x12%\n\nlast_error\x18\x0c \x01(\x0b\x32\x11.palpate.v1.Error\x12/\n\rsensor_states\x18\r \x03(\x0b\x32\x18.palpate.v1.SensorStatus\x1a/\n\rCountersEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x04:\x02\x38\x01\x1a-\n\x0bGaugesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"F\n\nTensorInfo\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05\x64type\x18\x02 \x01(\t\x12\r\n\x05shape\x18\x03 \x03(\x03\x12\x0c\n\x04unit\x18\x04 \x01(\t\"\xd9\x02\n\rModelMetadata\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\r\x12\x0c\n\x04task\x18\x03 \x01(\t\x12\x15\n\rbundle_sha256\x18\x04 \x01(\x0c\x12\x18\n\x10\x63ontract_version\x18\x05 \x01(\r\x12&\n\x06inputs\x18\x06 \x03(\x0b\x32\x16.palpate.v1.TensorInfo\x12\'\n\x07outputs\x18\x07 \x03(\x0b\x32\x16.palpate.v1.TensorInfo\x12\x1c\n\x14training_data_sha256\x18\x08 \x01(\t\x12\x37\n\x07metrics\x18\t \x03(\x0b\x32&.palpate.v1.ModelMetadata.MetricsEntry\x12\x12\n\ntrained_on\x18\n \x01(\t\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"e\n\x05\x45rror\x12#\n\x04\x63ode\x18\x01 \x01(\x0e\x32\x15.palpate.v1.ErrorCode\x12\x0f\n\x07message\x18\x02 \x01(\t\x12\x0e\n\x06remedy\x18\x03 \x01(\t\x12\x16\n\x0eretry_after_ms\x18\x04 \x01(\r\"I\n\x0c\x46ieldRequest\x12\x0e\n\x06sensor\x18\x01 \x01(\t\x12)\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x1a.palpate.v1.ElectrodeFrame*\xb6\x01\n\x0cServiceState\x12\x1d\n\x19SERVICE_STATE_UNSPECIFIED\x10\x00\x12\x1a\n\x16SERVICE_STATE_STARTING\x10\x01\x12\x17\n\x13SERVICE_STATE_READY\x10\x02\x12\x1a\n\x16SERVICE_STATE_DEGRADED\x10\x03\x12\x1a\n\x16SERVICE_STATE_FINISHED\x10\x04\x12\x1a\n\x16SERVICE_STATE_STOPPING\x10\x05*\xc2\x01\n\x0bSensorState\x12\x1c\n\x18SENSOR_STATE_UNSPECIFIED\x10\x00\x12\x19\n\x15SENSOR_STATE_STARTING\x10\x01\x12\x15\n\x11SENSOR_STATE_LIVE\x10\x02\x12\x18\n\x14SENSOR_STATE_WARMING\x10\x03\x12\x1a\n\x16SENSOR_STATE_ZERO_LOST\x10\x04\x12\x15\n\x11SENSOR_STATE_LOST\x10\x05\x12\x16\n\x12SENSOR_STATE_ENDED\x10\x06*\x80\x01\n\tFaultKind\x12\x1a\n\x16\x46\x41ULT_KIND_UNSPECIFIED\x10\x00\x12\x18\n\x14\x46\x41ULT_KIND_SATURATED\x10\x01\x12\x13\n\x0f\x46\x41ULT_KIND_DEAD\x10\x02\x12\x14\n\x10\x46\x41ULT_KIND_STUCK\x10\x03\x12\x12\n\x0e\x46\x41ULT_KIND_ODD\x10\x04*\xc1\x02\n\tErrorCode\x12\x1a\n\x16\x45RROR_CODE_UNSPECIFIED\x10\x00\x12\x1e\n\x1a\x45RROR_CODE_INVALID_REQUEST\x10\x01\x12\x18\n\x14\x45RROR_CODE_NOT_FOUND\x10\x02\x12\x1a\n\x16\x45RROR_CODE_UNAVAILABLE\x10\x03\x12!\n\x1d\x45RROR_CODE_RESOURCE_EXHAUSTED\x10\x04\x12 \n\x1c\x45RROR_CODE_DEADLINE_EXCEEDED\x10\x05\x12\x1d\n\x19\x45RROR_CODE_WRONG_CONTRACT\x10\x06\x12\x15\n\x11\x45RROR_CODE_DEVICE\x10\x07\x12\x13\n\x0f\x45RROR_CODE_DISK\x10\x08\x12\x19\n\x15\x45RROR_CODE_SIMULATION\x10\t\x12\x17\n\x13\x45RROR_CODE_INTERNAL\x10\nb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18palpate/v1/service.proto\x12\npalpate.v1\x1a\x17palpate/v1/common.proto\x1a\x17palpate/v1/frames.proto\x1a\x17palpate/v1/models.proto\"\xc8\x01\n\x04Tare\x12\x0f\n\x07tare_id\x18\x01 \x01(\x06\x12 \n\x05stamp\x18\x02 \x01(\x0b\x32\x11.palpate.v1.Stamp\x12\x15\n\rsensor_serial\x18\x03 \x01(\t\x12\x12\n\nelectrodes\x18\x04 \x03(\x02\x12\x15\n\relectrodes_sd\x18\x05 \x03(\x02\x12\x0b\n\x03pdc\x18\x06 \x01(\x02\x12\x0b\n\x03pac\x18\x07 \x01(\x02\x12\x0b\n\x03tac\x18\x08 \x01(\x02\x12\x0b\n\x03tdc\x18\t \x01(\x02\x12\x17\n\x0f\x66rames_averaged\x18\n \x01(\r\".\n\x0bTareRequest\x12\x0f\n\x07tare_id\x18\x01 \x01(\x06\x12\x0e\n\x06\x66rames\x18\x02 \x01(\r\"%\n\x11WrenchZeroRequest\x12\x10\n\x08readings\x18\x01 \x01(\r\"\xa1\x02\n\nWrenchZero\x12\x15\n\rsensor_serial\x18\x01 \x01(\t\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x14\n\x0cmonotonic_ns\x18\x03 \x01(\x06\x12\x0f\n\x07wall_ns\x18\x04 \x01(\x06\x12)\n\x0c\x66orce_before\x18\x05 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12*\n\rtorque_before\x18\x06 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12(\n\x0b\x66orce_after\x18\x07 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12)\n\x0ctorque_after\x18\x08 \x01(\x0b\x32\x13.palpate.v1.Vector3\x12\x19\n\x11readings_averaged\x18\t \x01(\r\"\x10\n\x0eServiceRequest\"E\n\x0c\x43hannelFault\x12#\n\x04kind\x18\x01 \x01(\x0e\x32\x15.palpate.v1.FaultKind\x12\x10\n\x08\x63hannels\x18\x02 \x03(\t\"\x9b\x01\n\x0cSensorStatus\x12\x0c\n\x04name\x18\x01 \x01(\t\x12&\n\x05state\x18\x02 \x01(\x0e\x32\x17.palpate.v1.SensorState\x12\x1a\n\x12since_monotonic_ns\x18\x03 \x01(\x06\x12(\n\x06\x66\x61ults\x18\x04 \x03(\x0b\x32\x18.palpate.v1.ChannelFault\x12\x0f\n\x07message\x18\x05 \x01(\t\"\xdc\x03\n\x06Status\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\x10\n\x08instance\x18\x02 \x01(\t\x12\'\n\x05state\x18\x03 \x01(\x0e\x32\x18.palpate.v1.ServiceState\x12\x14\n\x0cmonotonic_ns\x18\x04 \x01(\x06\x12\x0f\n\x07wall_ns\x18\x05 \x01(\x06\x12\x10\n\x08uptime_s\x18\x06 \x01(\x01\x12\x0f\n\x07version\x18\x07 \x01(\t\x12\x32\n\x08\x63ounters\x18\x08 \x03(\x0b\x32 .palpate.v1.Status.CountersEntry\x12.\n\x06gauges\x18\t \x03(\x0b\x32\x1e.palpate.v1.Status.GaugesEntry\x12\x0f\n\x07sensors\x18\n \x03(\t\x12\x0f\n\x07message\x18\x0b \x01(\t\x12%\n\nlast_error\x18\x0c \x01(\x0b\x32\x11.palpate.v1.Error\x12/\n\rsensor_states\x18\r \x03(\x0b\x32\x18.palpate.v1.SensorStatus\x1a/\n\rCountersEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x04:\x02\x38\x01\x1a-\n\x0bGaugesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"F\n\nTensorInfo\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05\x64type\x18\x02 \x01(\t\x12\r\n\x05shape\x18\x03 \x03(\x03\x12\x0c\n\x04unit\x18\x04 \x01(\t\"\x82\x03\n\rModelMetadata\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\r\x12\x0c\n\x04task\x18\x03 \x01(\t\x12\x15\n\rbundle_sha256\x18\x04 \x01(\x0c\x12\x18\n\x10\x63ontract_version\x18\x05 \x01(\r\x12&\n\x06inputs\x18\x06 \x03(\x0b\x32\x16.palpate.v1.TensorInfo\x12\'\n\x07outputs\x18\x07 \x03(\x0b\x32\x16.palpate.v1.TensorInfo\x12\x1c\n\x14training_data_sha256\x18\x08 \x01(\t\x12\x37\n\x07metrics\x18\t \x03(\x0b\x32&.palpate.v1.ModelMetadata.MetricsEntry\x12\x12\n\ntrained_on\x18\n \x01(\t\x12\'\n\x06served\x18\x0b \x03(\x0b\x32\x17.palpate.v1.ServedModel\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"e\n\x05\x45rror\x12#\n\x04\x63ode\x18\x01 \x01(\x0e\x32\x15.palpate.v1.ErrorCode\x12\x0f\n\x07message\x18\x02 \x01(\t\x12\x0e\n\x06remedy\x18\x03 \x01(\t\x12\x16\n\x0eretry_after_ms\x18\x04 \x01(\r\"I\n\x0c\x46ieldRequest\x12\x0e\n\x06sensor\x18\x01 \x01(\t\x12)\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x1a.palpate.v1.ElectrodeFrame*\xb6\x01\n\x0cServiceState\x12\x1d\n\x19SERVICE_STATE_UNSPECIFIED\x10\x00\x12\x1a\n\x16SERVICE_STATE_STARTING\x10\x01\x12\x17\n\x13SERVICE_STATE_READY\x10\x02\x12\x1a\n\x16SERVICE_STATE_DEGRADED\x10\x03\x12\x1a\n\x16SERVICE_STATE_FINISHED\x10\x04\x12\x1a\n\x16SERVICE_STATE_STOPPING\x10\x05*\xc2\x01\n\x0bSensorState\x12\x1c\n\x18SENSOR_STATE_UNSPECIFIED\x10\x00\x12\x19\n\x15SENSOR_STATE_STARTING\x10\x01\x12\x15\n\x11SENSOR_STATE_LIVE\x10\x02\x12\x18\n\x14SENSOR_STATE_WARMING\x10\x03\x12\x1a\n\x16SENSOR_STATE_ZERO_LOST\x10\x04\x12\x15\n\x11SENSOR_STATE_LOST\x10\x05\x12\x16\n\x12SENSOR_STATE_ENDED\x10\x06*\x80\x01\n\tFaultKind\x12\x1a\n\x16\x46\x41ULT_KIND_UNSPECIFIED\x10\x00\x12\x18\n\x14\x46\x41ULT_KIND_SATURATED\x10\x01\x12\x13\n\x0f\x46\x41ULT_KIND_DEAD\x10\x02\x12\x14\n\x10\x46\x41ULT_KIND_STUCK\x10\x03\x12\x12\n\x0e\x46\x41ULT_KIND_ODD\x10\x04*\xe3\x02\n\tErrorCode\x12\x1a\n\x16\x45RROR_CODE_UNSPECIFIED\x10\x00\x12\x1e\n\x1a\x45RROR_CODE_INVALID_REQUEST\x10\x01\x12\x18\n\x14\x45RROR_CODE_NOT_FOUND\x10\x02\x12\x1a\n\x16\x45RROR_CODE_UNAVAILABLE\x10\x03\x12!\n\x1d\x45RROR_CODE_RESOURCE_EXHAUSTED\x10\x04\x12 \n\x1c\x45RROR_CODE_DEADLINE_EXCEEDED\x10\x05\x12\x1d\n\x19\x45RROR_CODE_WRONG_CONTRACT\x10\x06\x12\x15\n\x11\x45RROR_CODE_DEVICE\x10\x07\x12\x13\n\x0f\x45RROR_CODE_DISK\x10\x08\x12\x19\n\x15\x45RROR_CODE_SIMULATION\x10\t\x12\x17\n\x13\x45RROR_CODE_INTERNAL\x10\n\x12 \n\x1c\x45RROR_CODE_PERMISSION_DENIED\x10\x0b\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -39,42 +40,42 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_STATUS_GAUGESENTRY']._serialized_options = b'8\001'
   _globals['_MODELMETADATA_METRICSENTRY']._loaded_options = None
   _globals['_MODELMETADATA_METRICSENTRY']._serialized_options = b'8\001'
-  _globals['_SERVICESTATE']._serialized_start=1997
-  _globals['_SERVICESTATE']._serialized_end=2179
-  _globals['_SENSORSTATE']._serialized_start=2182
-  _globals['_SENSORSTATE']._serialized_end=2376
-  _globals['_FAULTKIND']._serialized_start=2379
-  _globals['_FAULTKIND']._serialized_end=2507
-  _globals['_ERRORCODE']._serialized_start=2510
-  _globals['_ERRORCODE']._serialized_end=2831
-  _globals['_TARE']._serialized_start=91
-  _globals['_TARE']._serialized_end=291
-  _globals['_TAREREQUEST']._serialized_start=293
-  _globals['_TAREREQUEST']._serialized_end=339
-  _globals['_WRENCHZEROREQUEST']._serialized_start=341
-  _globals['_WRENCHZEROREQUEST']._serialized_end=378
-  _globals['_WRENCHZERO']._serialized_start=381
-  _globals['_WRENCHZERO']._serialized_end=670
-  _globals['_SERVICEREQUEST']._serialized_start=672
-  _globals['_SERVICEREQUEST']._serialized_end=688
-  _globals['_CHANNELFAULT']._serialized_start=690
-  _globals['_CHANNELFAULT']._serialized_end=759
-  _globals['_SENSORSTATUS']._serialized_start=762
-  _globals['_SENSORSTATUS']._serialized_end=917
-  _globals['_STATUS']._serialized_start=920
-  _globals['_STATUS']._serialized_end=1396
-  _globals['_STATUS_COUNTERSENTRY']._serialized_start=1302
-  _globals['_STATUS_COUNTERSENTRY']._serialized_end=1349
-  _globals['_STATUS_GAUGESENTRY']._serialized_start=1351
-  _globals['_STATUS_GAUGESENTRY']._serialized_end=1396
-  _globals['_TENSORINFO']._serialized_start=1398
-  _globals['_TENSORINFO']._serialized_end=1468
-  _globals['_MODELMETADATA']._serialized_start=1471
-  _globals['_MODELMETADATA']._serialized_end=1816
-  _globals['_MODELMETADATA_METRICSENTRY']._serialized_start=1770
-  _globals['_MODELMETADATA_METRICSENTRY']._serialized_end=1816
-  _globals['_ERROR']._serialized_start=1818
-  _globals['_ERROR']._serialized_end=1919
-  _globals['_FIELDREQUEST']._serialized_start=1921
-  _globals['_FIELDREQUEST']._serialized_end=1994
+  _globals['_SERVICESTATE']._serialized_start=2063
+  _globals['_SERVICESTATE']._serialized_end=2245
+  _globals['_SENSORSTATE']._serialized_start=2248
+  _globals['_SENSORSTATE']._serialized_end=2442
+  _globals['_FAULTKIND']._serialized_start=2445
+  _globals['_FAULTKIND']._serialized_end=2573
+  _globals['_ERRORCODE']._serialized_start=2576
+  _globals['_ERRORCODE']._serialized_end=2931
+  _globals['_TARE']._serialized_start=116
+  _globals['_TARE']._serialized_end=316
+  _globals['_TAREREQUEST']._serialized_start=318
+  _globals['_TAREREQUEST']._serialized_end=364
+  _globals['_WRENCHZEROREQUEST']._serialized_start=366
+  _globals['_WRENCHZEROREQUEST']._serialized_end=403
+  _globals['_WRENCHZERO']._serialized_start=406
+  _globals['_WRENCHZERO']._serialized_end=695
+  _globals['_SERVICEREQUEST']._serialized_start=697
+  _globals['_SERVICEREQUEST']._serialized_end=713
+  _globals['_CHANNELFAULT']._serialized_start=715
+  _globals['_CHANNELFAULT']._serialized_end=784
+  _globals['_SENSORSTATUS']._serialized_start=787
+  _globals['_SENSORSTATUS']._serialized_end=942
+  _globals['_STATUS']._serialized_start=945
+  _globals['_STATUS']._serialized_end=1421
+  _globals['_STATUS_COUNTERSENTRY']._serialized_start=1327
+  _globals['_STATUS_COUNTERSENTRY']._serialized_end=1374
+  _globals['_STATUS_GAUGESENTRY']._serialized_start=1376
+  _globals['_STATUS_GAUGESENTRY']._serialized_end=1421
+  _globals['_TENSORINFO']._serialized_start=1423
+  _globals['_TENSORINFO']._serialized_end=1493
+  _globals['_MODELMETADATA']._serialized_start=1496
+  _globals['_MODELMETADATA']._serialized_end=1882
+  _globals['_MODELMETADATA_METRICSENTRY']._serialized_start=1836
+  _globals['_MODELMETADATA_METRICSENTRY']._serialized_end=1882
+  _globals['_ERROR']._serialized_start=1884
+  _globals['_ERROR']._serialized_end=1985
+  _globals['_FIELDREQUEST']._serialized_start=1987
+  _globals['_FIELDREQUEST']._serialized_end=2060
 # @@protoc_insertion_point(module_scope)

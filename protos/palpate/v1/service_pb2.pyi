@@ -1,5 +1,6 @@
 from palpate.v1 import common_pb2 as _common_pb2
 from palpate.v1 import frames_pb2 as _frames_pb2
+from palpate.v1 import models_pb2 as _models_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
@@ -49,6 +50,7 @@ class ErrorCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ERROR_CODE_DISK: _ClassVar[ErrorCode]
     ERROR_CODE_SIMULATION: _ClassVar[ErrorCode]
     ERROR_CODE_INTERNAL: _ClassVar[ErrorCode]
+    ERROR_CODE_PERMISSION_DENIED: _ClassVar[ErrorCode]
 SERVICE_STATE_UNSPECIFIED: ServiceState
 SERVICE_STATE_STARTING: ServiceState
 SERVICE_STATE_READY: ServiceState
@@ -78,6 +80,7 @@ ERROR_CODE_DEVICE: ErrorCode
 ERROR_CODE_DISK: ErrorCode
 ERROR_CODE_SIMULATION: ErrorCode
 ERROR_CODE_INTERNAL: ErrorCode
+ERROR_CODE_PERMISSION_DENIED: ErrorCode
 
 class Tare(_message.Message):
     __slots__ = ("tare_id", "stamp", "sensor_serial", "electrodes", "electrodes_sd", "pdc", "pac", "tac", "tdc", "frames_averaged")
@@ -222,7 +225,7 @@ class TensorInfo(_message.Message):
     def __init__(self, name: _Optional[str] = ..., dtype: _Optional[str] = ..., shape: _Optional[_Iterable[int]] = ..., unit: _Optional[str] = ...) -> None: ...
 
 class ModelMetadata(_message.Message):
-    __slots__ = ("name", "version", "task", "bundle_sha256", "contract_version", "inputs", "outputs", "training_data_sha256", "metrics", "trained_on")
+    __slots__ = ("name", "version", "task", "bundle_sha256", "contract_version", "inputs", "outputs", "training_data_sha256", "metrics", "trained_on", "served")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -240,6 +243,7 @@ class ModelMetadata(_message.Message):
     TRAINING_DATA_SHA256_FIELD_NUMBER: _ClassVar[int]
     METRICS_FIELD_NUMBER: _ClassVar[int]
     TRAINED_ON_FIELD_NUMBER: _ClassVar[int]
+    SERVED_FIELD_NUMBER: _ClassVar[int]
     name: str
     version: int
     task: str
@@ -250,7 +254,8 @@ class ModelMetadata(_message.Message):
     training_data_sha256: str
     metrics: _containers.ScalarMap[str, float]
     trained_on: str
-    def __init__(self, name: _Optional[str] = ..., version: _Optional[int] = ..., task: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., contract_version: _Optional[int] = ..., inputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., training_data_sha256: _Optional[str] = ..., metrics: _Optional[_Mapping[str, float]] = ..., trained_on: _Optional[str] = ...) -> None: ...
+    served: _containers.RepeatedCompositeFieldContainer[_models_pb2.ServedModel]
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[int] = ..., task: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., contract_version: _Optional[int] = ..., inputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., training_data_sha256: _Optional[str] = ..., metrics: _Optional[_Mapping[str, float]] = ..., trained_on: _Optional[str] = ..., served: _Optional[_Iterable[_Union[_models_pb2.ServedModel, _Mapping]]] = ...) -> None: ...
 
 class Error(_message.Message):
     __slots__ = ("code", "message", "remedy", "retry_after_ms")
