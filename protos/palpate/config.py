@@ -38,6 +38,20 @@ def check_name(name: str, what: str = "name") -> str:
     return name
 
 
+def check_duration(seconds: float, what: str, *, most: float) -> float:
+    """Check that a time is a number of seconds in (0, ``most``], and return it.
+
+    Raises:
+        ConfigError: It is not; the error calls it ``what``.
+    """
+    if not 0.0 < seconds <= most:  # NaN is refused, too
+        raise ConfigError(
+            f"{what} = {seconds!r} is no time from 0 to {most:g} s",
+            remedy=f"give {what} in seconds, more than 0",
+        )
+    return seconds
+
+
 Name = Annotated[str, AfterValidator(check_name)]
 """A configuration value that is checked by :func:`check_name`."""
 
@@ -78,8 +92,8 @@ class LinkConfig(StrictConfig):
     connect: tuple[str, ...] = (DEFAULT_ROUTER,)
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     direct: bool = True
-    wait_for_router_s: float = -1.0
-    lease_s: float = Field(default=2.0, gt=0.1)
+    wait_for_router_s: float = Field(default=-1.0, le=86_400.0, allow_inf_nan=False)
+    lease_s: float = Field(default=2.0, gt=0.1, le=600.0, allow_inf_nan=False)
     tls: TlsConfig | None = None
 
     @field_validator("connect", "listen")

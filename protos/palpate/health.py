@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from palpate import __version__, clock
 from palpate.bus import Session, endpoints
-from palpate.bus.query import error_reply
+from palpate.bus.queryable import error_reply
 from palpate.bus.topics import STATUS as STATUS_TOPIC
 from palpate.errors import PalpateError
 from palpate.messages import (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from palpate.bus import MAX_REPLY_BYTES, Delivery
+from palpate.bus import MAX_PAYLOAD_BYTES, Delivery
 from palpate.bus.topics import ENCODING_PREFIX, SIMULATION_PROGRESS, sensor_key
 from palpate.client import Client
 from palpate.client.simulations import straight_path
@@ -297,7 +297,7 @@ def test_large_fields(serving: Any) -> None:
         asked = fakes.request("large", steps=6, want_displacement=True, want_contact_force=True)
         reply = served.robot.simulate(asked)
         sizes = [step.displacement.nbytes for step in reply.steps if step.displacement is not None]
-        assert 2 * sum(sizes) > MAX_REPLY_BYTES > 2 * sizes[0]
+        assert 2 * sum(sizes) > MAX_PAYLOAD_BYTES > 2 * sizes[0]
         assert len(sizes) == 6
     with serving(workers=1, options={"nodes": 180_000}) as served:
         with pytest.raises(RemoteError, match="MiB") as caught:

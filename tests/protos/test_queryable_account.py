@@ -11,8 +11,10 @@ from typing import Any
 import pytest
 
 from palpate.bus import endpoints
-from palpate.bus.query import MAX_REPLY_BYTES, Queryable, QueryAnswer, single_reply
-from palpate.bus.topics import ENCODING_PREFIX
+from palpate.bus import queryable as queryable_module
+from palpate.bus.deadline import attachment_of, deadline_of
+from palpate.bus.queryable import Queryable, QueryAnswer, error_reply, single_reply
+from palpate.bus.topics import ENCODING_PREFIX, MAX_PAYLOAD_BYTES
 from palpate.codec import ERROR
 from palpate.errors import ErrorCode, WireError
 from palpate.messages import Tare, TareRequest
@@ -25,8 +27,19 @@ OURS = ENCODING_PREFIX + ASKED.schema
 class Query:
     """What Zenoh hands over, and what came of it."""
 
-    def __init__(self, payload: bytes | None, encoding: str | None = OURS) -> None:
+    def __init__(
+        self,
+        payload: bytes | None,
+        encoding: str | None = OURS,
+        *,
+        key: str = KEY,
+        attachment: bytes | None = None,
+    ) -> None:
+        self.key_expr = key
         self.payload = None if payload is None else SimpleNamespace(to_bytes=lambda: payload)
+        self.attachment = (
+            None if attachment is None else SimpleNamespace(to_bytes=lambda: attachment)
+        )
         self.encoding = encoding
         self.replies: list[bytes] = []
         self.errors: list[Any] = []
@@ -160,10 +173,119 @@ def test_a_reply_may_be_as_large_as_a_message() -> None:
     query = Query(None)
     codec: Any = SimpleNamespace(schema="palpate.v1.Tare", encode=lambda size: bytes(size))
     answer: QueryAnswer[int] = QueryAnswer(query, KEY, codec)  # type: ignore[arg-type]
-    answer.send(MAX_REPLY_BYTES)
+    answer.send(MAX_PAYLOAD_BYTES)
     with pytest.raises(WireError, match="larger than a message may be") as caught:
-        answer.send(MAX_REPLY_BYTES + 1)
+        answer.send(MAX_PAYLOAD_BYTES + 1)
     assert caught.value.reason == "size"
     answer.end()
     answer.send(1)
-    assert [len(reply) for reply in query.replies] == [MAX_REPLY_BYTES], "nothing after the end"
+    assert [len(reply) for reply in query.replies] == [MAX_PAYLOAD_BYTES], "nothing after the end"
+
+
+def test_who_has_stopped_waiting_is_told_and_not_served(tare: Tare) -> None:
+    go, served = threading.Event(), []
+
+    def handler(request: TareRequest) -> Tare:
+        served.append(request.tare_id)
+        assert go.wait(10)
+        return tare
+
+    asked = Asked(handler)
+    patient = asked.ask(Query(ASKED.encode(TareRequest(1)), attachment=b"foreign, no time"))
+    deadline = time.monotonic() + 10
+    while not served:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    late = asked.ask(Query(ASKED.encode(TareRequest(2)), attachment=attachment_of(0.01)))
+    in_time = asked.ask(Query(ASKED.encode(TareRequest(3)), attachment=attachment_of(60.0)))
+    time.sleep(0.05)
+    go.set()
+    asked.queryable.close()
+    assert served == [1, 3], "no work for a caller that has left"
+    assert [error.code for error in late.errors] == [ErrorCode.DEADLINE_EXCEEDED]
+    assert len(patient.replies) == len(in_time.replies) == 1
+    assert asked.queryable.counters == {"received": 3, "answered": 2, "expired": 1}
+
+
+@pytest.mark.parametrize("text", [b"palpate.v1;timeout_ms=-5", b"palpate.v1;timeout_ms=\xff"])
+def test_a_damaged_deadline_is_refused(tare: Tare, text: bytes) -> None:
+    with Asked(lambda _: tare).queryable as queryable:
+        query = Query(None, attachment=text)
+        queryable._on_query(query)  # type: ignore[arg-type]
+        assert query.ended.wait(10)
+    assert [error.code for error in query.errors] == [ErrorCode.INVALID_REQUEST]
+    assert queryable.counters == {"received": 1, "rejected_attachment": 1}
+
+
+@pytest.mark.parametrize("seconds", [0.0004, 0.25, 3.0, 86_400.0])
+def test_the_time_that_is_left_arrives(seconds: float) -> None:
+    before = time.monotonic()
+    deadline = deadline_of(attachment_of(seconds) + b";key=of a later version")
+    assert before + seconds <= deadline <= time.monotonic() + seconds + 0.001
+
+
+def test_one_question_is_for_one_sensor(tare: Tare) -> None:
+    """A question to a wildcard would tare every finger."""
+    with Asked(lambda _: tare).queryable as queryable:
+        query = Query(None, key="any/key/*/a/queryable")
+        queryable._on_query(query)  # type: ignore[arg-type]
+        assert query.ended.wait(10)
+    assert not query.replies
+    assert "names more than one sensor" in query.errors[0].message
+
+
+def test_the_hint_grows_with_the_queue_and_with_the_time_an_answer_takes(tare: Tare) -> None:
+    go = threading.Event()
+    asked = Asked(lambda _: (go.wait(10), tare)[1], capacity=4)
+
+    def full() -> list[Query]:
+        deadline = time.monotonic() + 10
+        queries = [asked.ask(Query(None))]
+        while asked.queryable.waiting:  # until the worker has it
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        return [*queries, *(asked.ask(Query(None)) for _ in range(4))]
+
+    def hint() -> float:
+        (error,) = asked.ask(Query(None)).errors
+        return float(error.retry_after_s)
+
+    go.set()
+    timed = [asked.ask(Query(None)) for _ in range(3)]
+    assert all(query.ended.wait(10) for query in timed)
+    go.clear()
+    held = full()
+    quick = hint()
+    time.sleep(0.3)
+    assert hint() >= 0.3, "a handler that takes longer than before does not promise room at once"
+    go.set()
+    assert all(query.ended.wait(10) for query in held)
+    with asked.queryable._lock:
+        asked.queryable._service_s = 2.0
+    go.clear()
+    held = full()
+    assert 7.0 < hint() <= 8.0, "four wait, two seconds each"
+    assert quick < 0.3
+    go.set()
+    asked.queryable.close()
+
+
+def test_closing_answers_what_a_hanging_handler_keeps_waiting(
+    tare: Tare, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(queryable_module, "_CLOSE_S", 0.2)
+    go = threading.Event()
+    asked = Asked(lambda _: (go.wait(20), tare)[1], capacity=2)
+    queries = [asked.ask(Query(None)) for _ in range(2)]
+    asked.queryable.close()
+    waiting = queries[-1]
+    assert waiting.errors[0].code is ErrorCode.UNAVAILABLE
+    assert waiting.errors[0].retry_after_s > 0
+    go.set()
+
+
+def test_an_error_of_any_length_and_any_text_arrives() -> None:
+    reply = error_reply(ValueError("a\udcff" + "x" * 10_000_000))
+    arrived = ERROR.decode(ERROR.encode(reply))
+    assert arrived.code is ErrorCode.INTERNAL
+    assert "characters more)" in arrived.message

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import MAX_REPLY_BYTES, QueryAnswer, Session, endpoints
+from palpate.bus import MAX_PAYLOAD_BYTES, QueryAnswer, Session, endpoints
 from palpate.bus.topics import caller_key
 from palpate.client import Client
 from palpate.client.simulations import join, straight_path
@@ -222,7 +222,7 @@ def test_an_error_after_some_steps(robot: Client, answers: Answers, wait_until: 
 def test_a_reply_larger_than_a_message_is_not_sent(
     robot: Client, answers: Answers, wait_until: WaitUntil
 ) -> None:
-    nodes = MAX_REPLY_BYTES // 12
+    nodes = MAX_PAYLOAD_BYTES // 12
     fields = np.zeros((nodes, 3), np.float32)
     large = dataclasses.replace(
         part(0), steps=(dataclasses.replace(a_step(), displacement=fields),)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bus import MAX_REPLY_BYTES
+from palpate.bus import MAX_PAYLOAD_BYTES
 from palpate.errors import ConfigError
 from palpate.messages import (
     FloatArray,
@@ -83,10 +83,10 @@ def check_size(request: SimulationRequest, nodes: int) -> None:
     """
     fields = request.want_displacement + request.want_contact_force
     size = _STEP_BYTES + fields * nodes * 12  # three float32 for each node
-    if size > MAX_REPLY_BYTES:
+    if size > MAX_PAYLOAD_BYTES:
         raise ConfigError(
             f"one step with {fields} fields of {nodes:,} nodes has {size / 2**20:.1f} MiB, a "
-            f"message at most {MAX_REPLY_BYTES / 2**20:.1f} MiB",
+            f"message at most {MAX_PAYLOAD_BYTES / 2**20:.1f} MiB",
             remedy="ask for one field, or for none",
         )
 

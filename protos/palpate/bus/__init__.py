@@ -7,12 +7,15 @@ sensor streams drop rather than block; a query is always answered; plain TCP, ne
 from palpate.bus.link import Session, run_router
 from palpate.bus.presence import AliveService, CallerToken, Presence
 from palpate.bus.pubsub import Delivery, Publisher, ReceivedMessage, Subscriber, Tap, TapSample
-from palpate.bus.query import MAX_REPLY_BYTES, QueryAnswer
+from palpate.bus.query import Cancellation
+from palpate.bus.queryable import QueryAnswer
+from palpate.bus.topics import MAX_PAYLOAD_BYTES
 
 __all__ = [
-    "MAX_REPLY_BYTES",
+    "MAX_PAYLOAD_BYTES",
     "AliveService",
     "CallerToken",
+    "Cancellation",
     "Delivery",
     "Presence",
     "Publisher",

@@ -15,16 +15,10 @@ import zenoh
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Delivery, Publisher, Subscriber, Tap
-from palpate.bus.query import (
-    Queryable,
-    QueryAnswer,
-    ask,
-    first_reply,
-    raise_errors,
-    single_reply,
-)
+from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
+from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
 from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
-from palpate.config import LinkConfig
+from palpate.config import LinkConfig, check_name
 from palpate.errors import LinkError, PalpateError
 from palpate.process import Closing
 
@@ -292,17 +286,26 @@ class Session(Closing):
         instance: str = "*",
         timeout_s: float = 1.0,
     ) -> R:
-        """Ask an endpoint of a sensor, or of a service.
+        """Ask an endpoint of one sensor, or of a service.
+
+        A refusal that says when to ask again is followed within ``timeout_s``.
 
         Raises:
-            LinkError: Nobody serves it.
+            ConfigError: Not the name of one sensor, no time, or values that cannot be sent.
+            LinkError: Nobody serves it, or its answer was lost.
             StreamTimeout: No answer in time.
             RemoteError: The service's typed error.
-            WireError: The answer breaks the contract.
+            WireError: The answer breaks the contract, or the request is too large.
         """
+        if sensor is not None:
+            check_name(sensor, "sensor")
         key = self._key(endpoint, sensor, service, instance)
-        replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=True)
-        return first_reply(list(replies), key)
+
+        def once(left_s: float) -> R:
+            replies = ask(self._raw, key, endpoint, request, timeout_s=left_s, everyone=True)
+            return first_reply(list(replies), lambda: no_reply(self._raw, key))
+
+        return ask_again(once, timeout_s)
 
     def query_all(
         self,
@@ -322,10 +325,13 @@ class Session(Closing):
     def query_stream(
         self, endpoint: Endpoint[Q, R], request: Q, *, sensor: str, timeout_s: float
     ) -> Iterator[R]:
-        """The replies of a sensor's endpoint as they come; raises the errors of ``query``."""
-        key = self._key(endpoint, sensor, "", "")
+        """The replies of a sensor's endpoint as they come; raises the errors of ``query``.
+
+        A refusal is raised at once, however soon one may ask again.
+        """
+        key = self._key(endpoint, check_name(sensor, "sensor"), "", "")
         replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=False)
-        return raise_errors(replies, key)
+        return raise_errors(replies, lambda: no_reply(self._raw, key))
 
     def caller_token(self, request_id: str) -> CallerToken:
         """Show that this process waits for an answer, until it is closed or this process dies."""

@@ -1,23 +1,28 @@
-"""Questions and answers: every query is answered, if need be with a typed error.
+"""Asking questions: replies as they come, typed errors, and never more than the time that is given.
 
-A query has one reply or, for a simulation, many that are sent as they become known. Both use the
-same queryable and the same way of asking.
+A question may be cancelled from another thread, and one that a service refuses for lack of room is
+asked again while there is time.
 """
 
 from __future__ import annotations
 
-import logging
 import queue
+import random
 import threading
+import time
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, TypeVar
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
 import zenoh
 
+from palpate.bus.deadline import attachment_of
 from palpate.bus.endpoints import Endpoint
-from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema
-from palpate.codec import ERROR, Codec
+from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
+from palpate.codec import ERROR
+from palpate.config import check_duration
 from palpate.errors import (
+    ConfigError,
     ErrorCode,
     LinkError,
     PalpateError,
@@ -25,174 +30,64 @@ from palpate.errors import (
     StreamTimeout,
     WireError,
 )
-from palpate.messages import ErrorReply
-from palpate.process import Closing
 
 Q = TypeVar("Q")
 R = TypeVar("R")
 
-_log = logging.getLogger(__name__)
+LONGEST_S = 86_400.0
+"""Longest time that a question may take [s]: a day."""
 
-_FRAMING_BYTES = 4096
-"""Upper bound of what key, encoding and Zenoh's headers add to a payload; about 200 in practice."""
-
-MAX_REPLY_BYTES = MAX_MESSAGE_BYTES - _FRAMING_BYTES
-"""Largest payload of one reply [bytes]; receivers drop larger messages without an error."""
-
-
-def error_reply(error: BaseException) -> ErrorReply:
-    """The message that describes an exception to a caller."""
-    if isinstance(error, PalpateError):
-        # What breaks the contract here came with the request.
-        code = ErrorCode.INVALID_REQUEST if isinstance(error, WireError) else error.code
-        return ErrorReply(code, error.problem, error.remedy, error.retry_after_s)
-    return ErrorReply(
-        ErrorCode.INTERNAL,
-        f"{type(error).__name__}: {error}",
-        "this is a defect of the service: look at its log",
-    )
+_RETRIED = (ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
+_LOOK_S = 0.05
+_DROPPED = f"larger than a message may be ({MAX_MESSAGE_BYTES >> 20} MiB), so that it was dropped"
 
 
-class QueryAnswer(Generic[R]):
-    """The answer to one query: any number of replies, then an end or an error.
+class Cancellation:
+    """Ends the questions that are asked inside its ``with`` block, from any thread.
 
-    Safe to use from several threads. After the end nothing more is sent.
+    A question that is cancelled ends without further replies; its caller is expected to have left.
     """
 
-    def __init__(self, query: zenoh.Query, key: str, codec: Codec[R]) -> None:
-        self._query: zenoh.Query | None = query
-        # A query may use wildcards; the reply names the key of the queryable that answers.
-        self._key = key
-        self._codec = codec
+    _current = threading.local()
+
+    def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._tokens: list[zenoh.CancellationToken] = []
+        self.cancelled = threading.Event()
 
-    def send(self, reply: R) -> None:
-        """Send a reply; does nothing if the caller is gone or the answer has ended.
+    def __enter__(self) -> Self:
+        self._current.value = self
+        return self
 
-        Raises:
-            WireError: The reply breaks the contract, or is larger than a message may be (reason
-                ``"size"``).
-        """
-        payload = self._codec.encode(reply)
-        if len(payload) > MAX_REPLY_BYTES:
-            raise WireError(
-                f"a {self._codec.schema} of {len(payload):,} bytes is larger than a message may be"
-                f" ({MAX_REPLY_BYTES:,} bytes)",
-                remedy="ask for less in one answer",
-                reason="size",
-            )
-        encoding = zenoh.Encoding(ENCODING_PREFIX + self._codec.schema)
-        with self._lock:
-            if self._query is None:
-                return
-            try:
-                self._query.reply(self._key, payload, encoding=encoding)
-            except zenoh.ZError:
-                _log.warning("the caller of %s is gone", self._key)
-
-    def fail(self, error: BaseException) -> None:
-        """End with a typed error."""
-        payload = ERROR.encode(error_reply(error))
-        encoding = zenoh.Encoding(ENCODING_PREFIX + ERROR.schema)
-        with self._lock:
-            if self._query is None:
-                return
-            try:
-                self._query.reply_err(payload, encoding=encoding)
-            except zenoh.ZError:
-                _log.warning("the caller of %s is gone", self._key)
-            self._drop()
-
-    def end(self) -> None:
-        """End without an error."""
-        with self._lock:
-            self._drop()
-
-    def _drop(self) -> None:
-        if self._query is not None:
-            self._query.drop()
-            self._query = None
-
-
-class Queryable(Closing):
-    """Gives each question and its ``QueryAnswer`` to ``handler``, in threads of its own.
-
-    The handler may return before the answer has ended, and may end it from another thread. An
-    exception of the handler, a request that does not decode and a full queue end the answer with a
-    typed error; Zenoh itself would leave the caller without a reply. Made by ``Session.queryable``
-    and ``Session.stream_queryable``.
-
-    ``capacity`` questions may wait, and ``workers`` are handled at the same time. With more than
-    one worker, a quick question overtakes a slow one.
-    """
-
-    def __init__(
+    def __exit__(
         self,
-        session: zenoh.Session,
-        key: str,
-        endpoint: Endpoint[Q, R],
-        handler: Callable[[Q, QueryAnswer[R]], None],
-        *,
-        capacity: int,
-        workers: int = 1,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
-        self.key = key
-        self._endpoint: Endpoint[Any, Any] = endpoint
-        self._handler: Callable[[Any, QueryAnswer[Any]], None] = handler
-        self._queries: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
-        self._workers = [
-            threading.Thread(target=self._run, name=f"query {key} {i}", daemon=True)
-            for i in range(workers)
-        ]
-        for worker in self._workers:
-            worker.start()
-        self._queryable = session.declare_queryable(key, self._on_query, complete=True)
+        self._current.value = None
 
-    def _on_query(self, query: zenoh.Query) -> None:
-        try:
-            self._queries.put_nowait(query)
-        except queue.Full:
-            QueryAnswer(query, self.key, self._endpoint.reply).fail(
-                RemoteError(
-                    f"{self.key} has {self._queries.maxsize} queries waiting",
-                    remedy="ask again later",
-                    code=ErrorCode.RESOURCE_EXHAUSTED,
-                    retry_after_s=0.5,
-                )
-            )
+    @classmethod
+    def current(cls) -> Cancellation | None:
+        """The one in whose block this thread is."""
+        found: Cancellation | None = getattr(cls._current, "value", None)
+        return found
 
-    def _run(self) -> None:
-        while (query := self._queries.get()) is not None:
-            answer = QueryAnswer(query, self.key, self._endpoint.reply)
-            try:
-                payload = b"" if query.payload is None else query.payload.to_bytes()
-                if query.encoding is not None and payload:
-                    check_schema(str(query.encoding), self._endpoint.request.schema)
-                self._handler(self._endpoint.request.decode(payload), answer)
-            except PalpateError as error:
-                answer.fail(error)
-            except Exception as error:
-                # The last line of defence: both the caller and the log must get this error.
-                _log.exception("query on %s failed", self.key)
-                answer.fail(error)
+    def cancel(self) -> None:
+        """End the present question, and do not begin another."""
+        with self._lock:
+            self.cancelled.set()
+            tokens, self._tokens = self._tokens, []
+        for token in tokens:
+            token.cancel()
 
-    def close(self) -> None:
-        """Undeclare; questions that were already accepted are still handled."""
-        self._queryable.undeclare()
-        for _ in self._workers:
-            self._queries.put(None)
-        for worker in self._workers:
-            worker.join(timeout=5)
-
-
-def single_reply(handler: Callable[[Q], R]) -> Callable[[Q, QueryAnswer[R]], None]:
-    """A handler for ``Queryable`` of a function that returns the only reply."""
-
-    def handle(request: Q, answer: QueryAnswer[R]) -> None:
-        answer.send(handler(request))
-        answer.end()
-
-    return handle
+    def watch(self, token: zenoh.CancellationToken) -> None:
+        """Cancel this token, too."""
+        with self._lock:
+            if not self.cancelled.is_set():
+                self._tokens.append(token)
+                return
+        token.cancel()
 
 
 def ask(
@@ -206,22 +101,37 @@ def ask(
 ) -> Iterator[R | PalpateError]:
     """Replies to a query as they come; typed errors are yielded as exceptions, not raised.
 
-    Closing the iterator cancels the query. All of it may take ``timeout_s``. The key may have
-    wildcards: ``everyone`` asks every queryable that matches, else the best matching one answers.
+    Closing the iterator cancels the query. All of it may take ``timeout_s``, and the service is
+    told so. The key may have wildcards: ``everyone`` asks every queryable that matches, else the
+    best matching one answers.
+
+    Raises:
+        ConfigError: The request or the time cannot be sent.
+        WireError: The request breaks the contract, or is larger than a message may be (reason
+            ``"size"``).
     """
+    check_duration(timeout_s, "timeout_s", most=LONGEST_S)
+    payload = _encoded(endpoint, request)
     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
     stopped = zenoh.CancellationToken()
+    cancellation = Cancellation.current()
+    if cancellation is not None:
+        cancellation.watch(stopped)
     target = zenoh.QueryTarget.ALL if everyone else zenoh.QueryTarget.BEST_MATCHING
-    session.get(
-        key,
-        zenoh.handlers.Callback(replies.put, lambda: replies.put(None)),
-        payload=endpoint.request.encode(request),
-        encoding=zenoh.Encoding(ENCODING_PREFIX + endpoint.request.schema),
-        timeout=timeout_s,
-        target=target,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        cancellation_token=stopped,
-    )
+    try:
+        session.get(
+            key,
+            zenoh.handlers.Callback(replies.put, lambda: replies.put(None)),
+            payload=payload,
+            encoding=zenoh.Encoding(ENCODING_PREFIX + endpoint.request.schema),
+            attachment=attachment_of(timeout_s),
+            timeout=timeout_s,
+            target=target,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            cancellation_token=stopped,
+        )
+    except zenoh.ZError as error:
+        raise LinkError(f"cannot ask {key}: {error}", remedy="open the session again") from error
     try:
         while (item := replies.get()) is not None:
             if item.err is not None:
@@ -236,6 +146,56 @@ def ask(
                     yield reply
     finally:
         stopped.cancel()
+
+
+def _encoded(endpoint: Endpoint[Q, R], request: Q) -> bytes:
+    schema = endpoint.request.schema
+    try:
+        payload = endpoint.request.encode(request)
+    except PalpateError:
+        raise
+    except (ValueError, TypeError, AttributeError) as error:
+        # Protobuf's words for a number that its field cannot hold, e.g. a negative count.
+        raise ConfigError(
+            f"{str(request)[:200]} cannot be sent as {schema}: {error}",
+            remedy=f"correct the value; docs/messages.md says what {schema} may hold",
+        ) from error
+    check_size(payload, schema, remedy="ask about less at once")
+    return payload
+
+
+def ask_again(once: Callable[[float], R], timeout_s: float) -> R:
+    """The answer of ``once``, which is told how much time is left [s].
+
+    While there is time, a refusal that says when to ask again is waited out: with
+    ``RESOURCE_EXHAUSTED`` or ``UNAVAILABLE`` the service has not begun to work. Up to a quarter is
+    added by chance, so that callers that were refused together do not come back together.
+
+    Raises:
+        PalpateError: Of the last attempt.
+    """
+    end_s = time.monotonic() + check_duration(timeout_s, "timeout_s", most=LONGEST_S)
+    left_s = timeout_s
+    while True:
+        try:
+            return once(left_s)
+        except RemoteError as error:
+            pause_s = error.retry_after_s * random.uniform(1.0, 1.25)
+            left_s = end_s - time.monotonic() - pause_s
+            if error.code not in _RETRIED or not pause_s > 0.0 or left_s <= 0.0:
+                raise
+            _pause(pause_s)
+            left_s = end_s - time.monotonic()
+            if left_s <= 0.0:
+                raise
+
+
+def _pause(seconds: float) -> None:
+    cancellation = Cancellation.current()
+    if cancellation is None:
+        time.sleep(seconds)
+    else:
+        cancellation.cancelled.wait(seconds)
 
 
 def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> PalpateError:
@@ -253,8 +213,9 @@ def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> Palpat
         )
     if payload == b"Timeout":
         return StreamTimeout(
-            f"{key} did not answer within {timeout_s:g} s",
-            remedy="check its load with palpate status, or allow more time",
+            f"{key} did not answer within {timeout_s:g} s: it is busy or hangs, or its answer is "
+            f"{_DROPPED}",
+            remedy="look at its state with palpate status; allow more time, or ask for less",
         )
     return RemoteError(
         f"{key} answered with an untyped error: {payload[:200]!r}",
@@ -263,27 +224,28 @@ def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> Palpat
     )
 
 
-def first_reply(replies: list[R | PalpateError], key: str) -> R:
+def first_reply(replies: list[R | PalpateError], silence: Callable[[], PalpateError]) -> R:
     """The first reply that is no error.
 
     Raises:
-        LinkError: There is no reply at all.
-        PalpateError: All replies are errors; the first of them.
+        PalpateError: All replies are errors; the first of them. Or that of ``silence``: there is
+            no reply at all.
     """
     errors: list[PalpateError] = []
     for reply in replies:
         if not isinstance(reply, PalpateError):
             return reply
         errors.append(reply)
-    raise errors[0] if errors else no_reply(key)
+    raise errors[0] if errors else silence()
 
 
-def raise_errors(replies: Iterator[R | PalpateError], key: str) -> Iterator[R]:
+def raise_errors(
+    replies: Iterator[R | PalpateError], silence: Callable[[], PalpateError]
+) -> Iterator[R]:
     """The same replies; an error is raised, and so is their absence.
 
     Raises:
-        LinkError: There is no reply at all.
-        PalpateError: A reply is an error.
+        PalpateError: A reply is an error. Or that of ``silence``: there is no reply at all.
     """
     silent = True
     for reply in replies:
@@ -292,12 +254,38 @@ def raise_errors(replies: Iterator[R | PalpateError], key: str) -> Iterator[R]:
             raise reply
         yield reply
     if silent:
-        raise no_reply(key)
+        raise silence()
 
 
-def no_reply(key: str) -> LinkError:
-    """The error for a question that had no reply at all."""
+def no_reply(session: zenoh.Session, key: str) -> LinkError:
+    """The error for a question that had no reply at all: nobody serves it, or the reply was lost.
+
+    Zenoh tells neither; whether somebody serves the key is looked up here.
+    """
+    if _served(session, key):
+        return LinkError(
+            f"{key} is served, but no answer arrived: it ended while it worked on the question, "
+            f"or its answer is {_DROPPED}",
+            remedy="ask again; if that fails, ask for less and look at the log of the service",
+        )
     return LinkError(
         f"no service answers on {key}",
         remedy="start the service: palpate up; see what runs: palpate status",
     )
+
+
+def _served(session: zenoh.Session, key: str) -> bool:
+    if "*" in key:  # Zenoh does not tell
+        return False
+    querier = session.declare_querier(key, target=zenoh.QueryTarget.ALL)
+    try:
+        end_s = time.monotonic() + _LOOK_S
+        while True:
+            status: Any = querier.matching_status  # stub says bool, 1.10 gives a status object
+            if getattr(status, "matching", status):
+                return True
+            if time.monotonic() >= end_s:
+                return False
+            time.sleep(0.002)
+    finally:
+        querier.undeclare()

@@ -40,6 +40,12 @@ ENCODING_PREFIX = "application/protobuf;"
 MAX_MESSAGE_BYTES = 4 << 20
 """Larger messages are refused on arrival; Zenoh's own limit is 1 GiB."""
 
+_FRAMING_BYTES = 4096
+"""Upper bound of what key, encoding and Zenoh's headers add to a payload; about 200 in practice."""
+
+MAX_PAYLOAD_BYTES = MAX_MESSAGE_BYTES - _FRAMING_BYTES
+"""Largest payload of a message [bytes]; receivers drop larger messages without an error."""
+
 
 class Priority(IntEnum):
     """Zenoh priorities in use; the numbers are Zenoh's."""
@@ -286,6 +292,21 @@ def parse_key(key: str) -> StreamAddress:
         remedy="publish under the keys of docs/adr/0004-keys-and-qos.md",
         reason="key",
     )
+
+
+def check_size(payload: bytes, schema: str, *, remedy: str) -> None:
+    """Check that a payload fits into a message.
+
+    Raises:
+        WireError: It does not, and would be lost on the way (reason ``"size"``).
+    """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise WireError(
+            f"a {schema} of {len(payload):,} bytes is larger than a message may be"
+            f" ({MAX_PAYLOAD_BYTES:,} bytes)",
+            remedy=remedy,
+            reason="size",
+        )
 
 
 def check_schema(encoding: str, wanted: str) -> None:
