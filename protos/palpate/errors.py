@@ -101,6 +101,12 @@ class LinkError(PalpateError, OSError):
     code = ErrorCode.UNAVAILABLE
 
 
+class SensorTaken(PalpateError, OSError):
+    """Another gateway publishes under the key of this sensor."""
+
+    code = ErrorCode.UNAVAILABLE
+
+
 class StreamTimeout(PalpateError, TimeoutError):
     """No message arrived in time."""
 

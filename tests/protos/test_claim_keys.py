@@ -80,11 +80,14 @@ def test_other_keys_are_refused(change: tuple[str, str]) -> None:
     assert caught.value.reason == "key"
 
 
-def test_of_two_that_hold_the_later_one_ranks_higher() -> None:
-    later = replace(CLAIM, session_id=0xFFF, since_wall_ns=CLAIM.since_wall_ns + 1)
-    lower = replace(CLAIM, session_id=0xAAA)
-    assert max((CLAIM, later), key=lambda one: one.rank) is later
-    assert max((CLAIM, lower), key=lambda one: one.rank) is lower
+def test_who_has_held_the_longest_comes_first() -> None:
+    later = replace(CLAIM, session_id=0xAAA, since_wall_ns=CLAIM.since_wall_ns + 1)
+    higher = replace(CLAIM, session_id=0xFFF)
+    assert min((later, higher, CLAIM), key=lambda one: one.order) is CLAIM
+    early = replace(CLAIM, held=False, session_id=0xFFF, since_wall_ns=1)
+    lower = replace(CLAIM, held=False, session_id=1)
+    assert min((early, lower), key=lambda one: one.order) is lower
+    assert min((early, lower, later), key=lambda one: one.order) is later
 
 
 def test_a_stamp_without_a_session_is_the_bytes_of_an_older_gateway(

@@ -4,6 +4,7 @@ Rules that were learned by running it (docs/adr/0004-keys-and-qos.md): callbacks
 sensor streams drop rather than block; a query is always answered; plain TCP, never ``lowlatency``.
 """
 
+from palpate.bus.claims import SensorClaims
 from palpate.bus.link import Session, run_router
 from palpate.bus.presence import AliveService, CallerToken, Presence
 from palpate.bus.pubsub import Delivery, Publisher, ReceivedMessage, Subscriber, Tap, TapSample
@@ -21,6 +22,7 @@ __all__ = [
     "Publisher",
     "QueryAnswer",
     "ReceivedMessage",
+    "SensorClaims",
     "Session",
     "Subscriber",
     "Tap",

@@ -12,6 +12,7 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
+from palpate.bus.claims import SensorClaims
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Delivery, Publisher, Subscriber, Tap
@@ -347,6 +348,20 @@ class Session(Closing):
     def presence(self, service: str, *, instance: str) -> Presence:
         """Declare this process alive; call ``ready`` on the result when it serves."""
         return self._keep(Presence(self._raw, self.station, service, instance))
+
+    def claims(self, *, session_id: int, instance: str, lease_s: float) -> SensorClaims:
+        """Claims of the gateway ``instance`` on sensors of this station; see ``SensorClaims``."""
+        info = self._raw.info
+        return self._keep(
+            SensorClaims(
+                self._raw,
+                self.station,
+                session_id=session_id,
+                instance=instance,
+                lease_s=lease_s,
+                joined=lambda: bool(info.routers_zid() or info.peers_zid()),
+            )
+        )
 
     def alive(self, *, station: str | None = None) -> list[AliveService]:
         """Which processes are alive, and which of them are ready."""

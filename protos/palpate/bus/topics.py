@@ -174,12 +174,15 @@ def caller_key(station: str, request_id: str) -> str:
 class SensorClaim:
     """A gateway's claim on the key of a sensor: only the gateway that holds it publishes there.
 
+    A frame may arrive before the token that announces its session. While the serial number becomes
+    known there are two tokens of one session; the older is withdrawn after the newer is declared.
+
     Attributes:
         station: Station of the sensor.
         sensor: Its name in keys.
         session_id: Run of the gateway, as in ``Stamp.session_id``; never 0.
         held: Whether it publishes; else it waits, or is about to take over.
-        since_wall_ns: Wall clock when the claim was made or taken over [ns since the Unix epoch].
+        since_wall_ns: Wall clock when it came into this state [ns since the Unix epoch].
         instance: Name of the gateway among several.
         host: Name of its host; empty = unknown.
         serial: Serial number of the sensor; empty = not opened yet.
@@ -195,12 +198,13 @@ class SensorClaim:
     serial: str = ""
 
     @property
-    def rank(self) -> tuple[int, int]:
-        """Of two claims that are held, the one of higher rank holds.
+    def order(self) -> tuple[bool, int, int]:
+        """Of all claims on a sensor the first in this order may publish: the one held the longest.
 
-        The later one has taken over while the other was gone; at one instant the lower session id.
+        Among those that only wait it is the one with the lowest session id. Two are held for a
+        moment where neither could see the other, e.g. while the router was started again.
         """
-        return self.since_wall_ns, -self.session_id
+        return not self.held, self.since_wall_ns if self.held else 0, self.session_id
 
 
 def claim_key(claim: SensorClaim) -> str:

@@ -1,0 +1,225 @@
+"""Claims on sensors: under the key of one sensor only one gateway publishes.
+
+Each gateway declares a token for each of its sensors, first as ``wanted``. When no other gateway
+holds the sensor, and none with a lower session id wants it, for ``SETTLE_S``, the token becomes
+``held`` and the gateway may publish. A token vanishes with its process, or with the lease of a link
+whose process stands still, and one that waits takes over.
+
+A process that itself stood still for longer than the lease may have lost a claim without seeing it:
+it gives the claim up and begins again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import platform
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import zenoh
+
+from palpate.bus.topics import SensorClaim, claim_key, claims_key, parse_claim_key
+from palpate.errors import SensorTaken, WireError
+from palpate.process import Closing
+
+SETTLE_S = 0.2
+"""For so long a sensor must have been free before it is taken [s]: by then each of two gateways
+that start at one instant sees the token of the other."""
+
+YIELD_S = 0.5
+"""Of two that hold one sensor, the later one gives it up after this time [s]; one that stood still
+notices that itself, sooner."""
+
+_LOOK_S = 0.05
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Own:
+    """One claim of this process, its tokens, and since when it could change its state."""
+
+    claim: SensorClaim
+    tokens: dict[str, zenoh.LivelinessToken]
+    rival: SensorClaim | None = None
+    since_s: float | None = None
+
+
+class SensorClaims(Closing):
+    """The claims of one gateway. Safe to use from several threads; made by ``Session.claims``.
+
+    Args:
+        session: The Zenoh session.
+        station: Station of the sensors.
+        session_id: This run of the gateway.
+        instance: Its name among several.
+        lease_s: After such a silence others see this process as gone [s].
+        joined: Whether the session has a link to others: without it a free sensor means nothing.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        station: str,
+        *,
+        session_id: int,
+        instance: str,
+        lease_s: float,
+        joined: Callable[[], bool],
+    ) -> None:
+        self._liveliness = session.liveliness()
+        self._station, self._session_id, self._instance = station, session_id, instance
+        self._lease_s = lease_s
+        self._joined = joined
+        self._own: dict[str, _Own] = {}
+        self._others: dict[str, SensorClaim] = {}
+        self._changed = threading.Condition(threading.RLock())
+        self._closed = False
+        self._alive_s = time.monotonic()
+        self._subscriber = self._liveliness.declare_subscriber(
+            claims_key(station), self._on_sample, history=True
+        )
+        self._thread = threading.Thread(target=self._run, name="claims", daemon=True)
+        self._thread.start()
+
+    def want(self, sensor: str) -> None:
+        """Claim a sensor; it is held as soon as nobody else holds it."""
+        claim = SensorClaim(
+            self._station, sensor, self._session_id, False, 0, self._instance, platform.node()
+        )
+        with self._changed:
+            if sensor not in self._own:
+                self._own[sensor] = own = _Own(claim, {})
+                self._declare(own, claim)
+
+    def wait(self, sensor: str, timeout_s: float) -> bool:
+        """Whether a sensor is held, at once or within this time."""
+        own = self._own[sensor]
+        with self._changed:
+            self._changed.wait_for(lambda: own.claim.held or self._closed, timeout_s)
+            return own.claim.held
+
+    def refusal(self, sensor: str) -> SensorTaken | None:
+        """Why a sensor is not held: the gateway that comes first; None = it is, or may be soon."""
+        own = self._own[sensor]
+        with self._changed:
+            return None if own.rival is None or own.claim.held else _taken(own.rival)
+
+    def check(self, sensor: str) -> None:
+        """Before each message: whether this gateway still holds the sensor.
+
+        Raises:
+            SensorTaken: It does not.
+        """
+        own = self._own[sensor]
+        now_s = time.monotonic()
+        if own.claim.held and now_s - self._alive_s < self._lease_s:
+            self._alive_s = now_s
+            return
+        with self._changed:
+            self._look()
+            # Given up only because this process stood still, it is held again after a moment.
+            self._changed.wait_for(
+                lambda: own.claim.held or own.rival is not None or self._closed, self._lease_s
+            )
+            if not own.claim.held:
+                raise _taken(own.rival) if own.rival is not None else _unknown(own.claim)
+
+    def name_serial(self, sensor: str, serial: str) -> None:
+        """Add the serial number of the sensor to the claim, once the sensor is open."""
+        own = self._own[sensor]
+        with self._changed:
+            if serial != own.claim.serial:
+                self._declare(own, replace(own.claim, serial=serial))
+
+    def close(self) -> None:
+        """Withdraw all claims."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(timeout=2)
+        with contextlib.suppress(zenoh.ZError):  # the session is gone, and the tokens with it
+            self._subscriber.undeclare()
+            for own in self._own.values():
+                for token in own.tokens.values():
+                    token.undeclare()
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        try:
+            claim = parse_claim_key(key)
+        except WireError as error:
+            _log.warning("%s", error)
+            return
+        if claim.session_id == self._session_id:
+            return
+        with self._changed:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._others.pop(key, None)
+            else:
+                self._others[key] = claim
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        with self._changed:
+            while not self._closed:
+                try:
+                    self._look()
+                except zenoh.ZError:  # the session is closing
+                    return
+                self._changed.wait(_LOOK_S)
+
+    def _look(self) -> None:
+        """Bring every claim up to date; with the lock."""
+        now_s = time.monotonic()
+        stood_still = now_s - self._alive_s >= self._lease_s
+        self._alive_s = now_s
+        for own in self._own.values():
+            if stood_still and own.claim.held:
+                _log.warning("this process stood still: who publishes %s?", own.claim.sensor)
+                self._become(own, held=False)
+            others = [one for one in self._others.values() if one.sensor == own.claim.sensor]
+            first = min(others, key=lambda one: one.order, default=own.claim)
+            own.rival = first if first.order < own.claim.order else None
+            may_change = (own.rival is None) != own.claim.held
+            if not may_change or not (own.claim.held or self._joined()):
+                own.since_s = None
+            elif own.since_s is None or stood_still:
+                own.since_s = now_s
+            elif now_s - own.since_s >= (YIELD_S if own.claim.held else SETTLE_S):
+                self._become(own, held=not own.claim.held)
+
+    def _become(self, own: _Own, *, held: bool) -> None:
+        own.since_s = None
+        self._declare(own, replace(own.claim, held=held, since_wall_ns=time.time_ns()))
+        self._changed.notify_all()
+
+    def _declare(self, own: _Own, claim: SensorClaim) -> None:
+        """Replace the token of a claim; the new one first, so that it is never seen without."""
+        key = claim_key(claim)
+        before, own.tokens = own.tokens, {key: self._liveliness.declare_token(key)}
+        own.claim = claim
+        for token in before.values():
+            token.undeclare()
+
+
+def _taken(rival: SensorClaim) -> SensorTaken:
+    of = f" (serial {rival.serial})" if rival.serial else ""
+    where = f" on host {rival.host}" if rival.host else ""
+    return SensorTaken(
+        f"sensor {rival.sensor!r}{of} of station {rival.station!r} is already published by gateway "
+        f"{rival.instance!r}{where}, session {rival.session_id:016x}",
+        remedy="stop that gateway, or give this sensor another name; it is taken over by itself "
+        "when the other one ends",
+    )
+
+
+def _unknown(claim: SensorClaim) -> SensorTaken:
+    return SensorTaken(
+        f"this gateway stood still, or has no link to the router: sensor {claim.sensor!r} may have "
+        "been taken over by another one",
+        remedy="start the router: palpate up; publishing goes on by itself",
+    )

@@ -1,0 +1,206 @@
+"""Claims on sensors: one gateway publishes under a key, whatever starts, ends or stands still."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from palpate.bus import SensorClaims, Session
+from palpate.bus.claims import YIELD_S
+from palpate.bus.topics import SensorClaim, claim_key
+from palpate.config import LinkConfig
+from palpate.errors import SensorTaken
+
+PATIENCE_S = 20.0
+LEASE_S = 2.0
+
+HOLDER = """
+import sys, time
+from palpate.bus import Session
+from palpate.config import LinkConfig
+endpoint, session_id = sys.argv[1], int(sys.argv[2])
+with Session.open(LinkConfig(connect=(endpoint,), wait_for_router_s=20)) as session:
+    claims = session.claims(session_id=session_id, instance="child", lease_s=2.0)
+    claims.want("finger")
+    before = None
+    while True:
+        held = claims.wait("finger", 0.02)
+        if held is not before:
+            before = held
+            print("held" if held else "not held", flush=True)
+"""
+
+
+@contextmanager
+def claims_of(link: LinkConfig, session_id: int) -> Iterator[SensorClaims]:
+    with Session.open(link) as session:
+        claims = session.claims(
+            session_id=session_id, instance=f"gateway-{session_id}", lease_s=LEASE_S
+        )
+        claims.want("finger")
+        yield claims
+
+
+def held_within_patience(claims: SensorClaims) -> bool:
+    return claims.wait("finger", PATIENCE_S)
+
+
+def refusal_of(claims: SensorClaims) -> SensorTaken:
+    deadline = time.monotonic() + PATIENCE_S
+    while (refusal := claims.refusal("finger")) is None:
+        assert time.monotonic() < deadline, "it was not refused"
+        time.sleep(0.01)
+    return refusal
+
+
+def test_the_second_is_refused_and_told_who_is_first(link: LinkConfig) -> None:
+    with claims_of(link, 20) as first, ExitStack() as stack:
+        assert held_within_patience(first)
+        # The lower session id decides only between two that both wait.
+        other = stack.enter_context(claims_of(link, 10))
+        first.name_serial("finger", "BT 0001/#2")
+        deadline = time.monotonic() + PATIENCE_S
+        while "BT 0001/#2" not in str(refusal_of(other)) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        text = str(refusal_of(other))
+        for part in ("'finger'", "'lab'", "BT 0001/#2", "'gateway-20'", os.uname().nodename):
+            assert part in text
+        assert not other.wait("finger", 0.5)
+        with pytest.raises(SensorTaken):
+            other.check("finger")
+        first.check("finger")
+
+
+def test_one_that_waits_takes_over_and_other_sensors_are_free(link: LinkConfig) -> None:
+    with ExitStack() as stack:
+        first = stack.enter_context(claims_of(link, 1))
+        assert held_within_patience(first)
+        with claims_of(link, 2) as second:
+            refusal_of(second)
+            second.want("thumb")
+            assert second.wait("thumb", PATIENCE_S)
+            assert not second.wait("finger", 0.0)
+            stack.close()
+            assert held_within_patience(second)
+            second.check("finger")
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_of_some_that_start_at_one_instant_exactly_one_holds(link: LinkConfig, count: int) -> None:
+    with ExitStack() as stack:
+        sessions = [stack.enter_context(Session.open(link)) for _ in range(count)]
+        barrier = threading.Barrier(count)
+        claims: dict[int, SensorClaims] = {}
+
+        def start(number: int) -> None:
+            barrier.wait()
+            made = sessions[number].claims(
+                session_id=100 - number, instance=f"g{number}", lease_s=LEASE_S
+            )
+            made.want("finger")
+            claims[number] = made
+
+        threads = [threading.Thread(target=start, args=(k,)) for k in range(count)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        # The lowest session id.
+        assert held_within_patience(claims[count - 1])
+        for number in range(count - 1):
+            assert not claims[number].wait("finger", 0.0)
+            assert "session 000000000000006" in str(refusal_of(claims[number])) or count == 2
+
+
+@contextmanager
+def child(link: LinkConfig, session_id: int) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, link.connect[0], str(session_id)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.kill()
+        process.wait()
+
+
+def says(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def test_a_killed_holder_is_followed(link: LinkConfig) -> None:
+    with child(link, 1) as first:
+        while says(first) != "held":
+            pass
+        with claims_of(link, 2) as second:
+            assert "'child'" in str(refusal_of(second))
+            first.kill()
+            assert held_within_patience(second)
+
+
+def test_a_frozen_holder_is_followed_and_does_not_come_back(link: LinkConfig) -> None:
+    with child(link, 1) as first:
+        while says(first) != "held":
+            pass
+        with claims_of(link, 2) as second:
+            refusal_of(second)
+            first.send_signal(signal.SIGSTOP)
+            assert held_within_patience(second)
+            first.send_signal(signal.SIGCONT)
+            assert says(first) == "not held"
+            # It would have to yield within this time, if the other insisted.
+            time.sleep(1.5)
+            second.check("finger")
+            assert "'child'" not in str(second.refusal("finger"))
+        # Only now it gets the sensor back.
+        assert says(first) == "held"
+
+
+def test_a_stall_of_this_process_alone_costs_no_claim(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with claims_of(link, 1) as claims:
+        assert held_within_patience(claims)
+        with claims._changed:
+            claims._alive_s -= 2 * LEASE_S
+        claims.check("finger")  # looks again, and holds again
+
+
+@pytest.mark.parametrize("older", [True, False])
+def test_of_two_that_could_not_see_each_other_the_older_holds(
+    link: LinkConfig, older: bool
+) -> None:
+    """As after the router was away: both hold, and then they meet."""
+    other = SensorClaim("lab", "finger", 5, True, 1 if older else 2**62)
+    with claims_of(link, 9) as claims, Session.open(link) as met:
+        assert held_within_patience(claims)
+        token = met._raw.liveliness().declare_token(claim_key(other))
+        if older:
+            assert "session 0000000000000005" in str(refusal_of(claims))
+            with pytest.raises(SensorTaken):
+                claims.check("finger")
+            token.undeclare()
+            assert held_within_patience(claims)
+        else:
+            time.sleep(3 * YIELD_S)
+            claims.check("finger")
+            assert claims.refusal("finger") is None
+
+
+def test_without_a_link_nothing_is_taken(free_port: int) -> None:
+    alone = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port}",))
+    with claims_of(alone, 1) as claims:
+        assert not claims.wait("finger", 1.0)
+        assert claims.refusal("finger") is None
