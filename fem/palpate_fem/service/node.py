@@ -23,6 +23,7 @@ from palpate.errors import (
     WireError,
 )
 from palpate.health import Health, HealthReporter
+from palpate.heartbeat import beat
 from palpate.messages import (
     ServiceState,
     SimulationCancelReply,
@@ -353,6 +354,8 @@ def _serve(pool: WorkerPool, health: Health, presence: Presence, stop: threading
         RemoteError: No worker will ever be ready.
     """
     while not stop.wait(_POLL_S):
+        if not pool.turns.late:
+            beat()
         if pool.broken is not None:
             raise pool.broken
         if pool.ready:

@@ -24,6 +24,7 @@ from enum import Enum
 from multiprocessing.connection import Connection
 
 from palpate.errors import ErrorCode, RemoteError
+from palpate.heartbeat import Turns
 from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome
@@ -52,6 +53,7 @@ _THREAD_VARIABLES = (
 )
 _END_WAIT_S = 5.0
 _TICK_S = 0.05
+_TURN_S = 2.0  # the upkeep takes far less for a turn
 _STARTS_BEFORE_GIVING_UP = 3
 _PAUSE_S = 0.25  # after a worker that did not start; doubled each time
 _LONGEST_PAUSE_S = 30.0
@@ -198,6 +200,7 @@ class WorkerPool(Closing):
     Attributes:
         broken: Error that says why no worker starts; None while they do.
         restarts: Number of workers that were started again.
+        turns: Those of the thread that starts, ends and replaces workers.
     """
 
     def __init__(
@@ -212,6 +215,7 @@ class WorkerPool(Closing):
     ) -> None:
         self.broken: RemoteError | None = None
         self.restarts = 0
+        self.turns = Turns()
         self._setup = setup
         self._threads = threads
         self._capacity = waiting
@@ -429,6 +433,7 @@ class WorkerPool(Closing):
     def _keep_up(self) -> None:
         """Start missing workers; end jobs that are too late, or that no worker will take."""
         while not self._closing.wait(_TICK_S):
+            self.turns.next(_TURN_S)
             now = time.monotonic()
             with self._lock:
                 if self._closing.is_set():

@@ -13,6 +13,7 @@ from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, PalpateError
 from palpate.health import Health, HealthReporter
+from palpate.heartbeat import LIMIT_S, beat
 from palpate.messages import ServiceState
 from palpate.process import avoid_pauses
 from palpate_gateway.clock.stamps import new_session_id
@@ -31,6 +32,7 @@ _log = logging.getLogger(__name__)
 SERVICE = "gateway"
 
 _POLL_S = 0.05
+_JOIN_S = 2.0
 _SETTLE_S = 0.3
 """Wait between a consumer's presence and the first frame of a lossless replay [s]: its subscription
 may arrive after its presence, and a frame before the subscription would be lost."""
@@ -109,8 +111,9 @@ def run(
                     health.set_state(ServiceState.STOPPING)
                 stop.set()
                 presence.not_ready()
+                deadline_s = time.monotonic() + _JOIN_S
                 for worker in workers:
-                    worker.join(2.0)
+                    worker.join(max(deadline_s - time.monotonic(), 0.0))
                 refresh()
 
 
@@ -169,18 +172,26 @@ def _serve(
         for worker in workers:
             if worker.crash is not None:
                 raise worker.crash
+        _beat_for(workers)
         _update(health, workers, presence)
         if not finished and all(worker.ended.is_set() for worker in workers):
             finished = True
             refresh()
             _finish(health, workers)
             if config.exit_at_end:
+                beat(config.linger_s + LIMIT_S)
                 stop.wait(config.linger_s)
                 for worker in workers:
                     if worker.error is not None:
                         raise worker.error
                 return
         stop.wait(_POLL_S)
+
+
+def _beat_for(workers: list[SensorWorker]) -> None:
+    """Beat while the thread of every sensor goes on: one that hangs must not stay unnoticed."""
+    if not any(worker.hangs() for worker in workers):
+        beat()
 
 
 def _update(health: Health, workers: list[SensorWorker], presence: Presence) -> None:
@@ -231,6 +242,7 @@ def _wait_for(
     health.set_state(ServiceState.STARTING, f"waiting for {', '.join(names)}")
     told_s = time.monotonic()
     while not stop.is_set():
+        beat()
         try:
             ready = {item.service for item in session.alive() if item.ready}
         except PalpateError as error:

@@ -13,9 +13,14 @@ import numpy as np
 from palpate.bus import Publisher
 from palpate.errors import WireError
 from palpate.health import Health
+from palpate.heartbeat import Turns
 from palpate_gateway.clock.stamps import DueMessage
 
 _ENCODERS_DECIDE = "the frame was not published; this is a defect of the device driver"
+
+LATE_S = 75.0
+"""A device that opens or takes its zero, and the put of a lossless replay, end within this time
+[s]; a thread that takes longer hangs."""
 
 _KEPT = 512
 """Number of reads whose latencies are kept."""
@@ -32,6 +37,7 @@ class MessagePublisher:
         stop: Ends a wait for a recorded message's time.
         claim: Called with the name of its stream before each message; raises where another sensor
             publishes that stream.
+        turns: Those of the thread: a recorded message may be due much later.
     """
 
     def __init__(
@@ -41,12 +47,14 @@ class MessagePublisher:
         *,
         stop: threading.Event,
         claim: Callable[[str], None],
+        turns: Turns | None = None,
     ) -> None:
         self.counters: Counter[str] = Counter()
         self._publishers = publishers
         self._health = health
         self._stop = stop
         self._claim = claim
+        self._turns = turns or Turns()
         self._reasons: set[str] = set()
         self._latencies_ns: deque[int] = deque(maxlen=_KEPT)
 
@@ -80,8 +88,10 @@ class MessagePublisher:
         for item in items:
             if item.due_ns:
                 wait_s = (item.due_ns - time.monotonic_ns()) * 1e-9
-                if wait_s > 0 and self._stop.wait(wait_s):
-                    return False
+                if wait_s > 0:
+                    self._turns.next(wait_s + LATE_S)
+                    if self._stop.wait(wait_s):
+                        return False
             self._claim(item.topic)
             publisher = self._publishers[item.topic]
             try:

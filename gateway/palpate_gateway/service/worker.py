@@ -26,12 +26,13 @@ from palpate.errors import (
     RemoteError,
 )
 from palpate.health import Health
+from palpate.heartbeat import Turns
 from palpate.messages import NO_TARE, Tare, TareRequest, WrenchZero, WrenchZeroRequest
 from palpate_gateway.clock.stamps import ArrivalClock, ClockMap, FileClock, LiveClock, PacedClock
 from palpate_gateway.clock.wall_clock import WallClock
 from palpate_gateway.device import Device
 from palpate_gateway.service.pipeline import Pipeline
-from palpate_gateway.service.publication import MessagePublisher
+from palpate_gateway.service.publication import LATE_S, MessagePublisher
 from palpate_gateway.service.sensor_report import SensorReport
 from palpate_gateway.wrench.device import WrenchDevice
 from palpate_gateway.wrench.zeroing import Zeroing
@@ -48,6 +49,8 @@ frames [s]: consumers then know within 50 ms."""
 
 _READ_S = 0.5
 _SILENT_READ_S = 0.025
+_TURN_S = 2.0
+"""A live sensor is read, and its readings published, in far less [s]."""
 
 _STALL_S = 0.02
 """A read that takes longer than it was allowed by more than this [s] shows that the process stood
@@ -144,12 +147,16 @@ class SensorWorker:
         """Whether nothing has come for longer than ``LOST_S``."""
         self.ended = threading.Event()
         """Set when the thread has nothing more to do."""
+        self._turns = Turns()
+        self._hangs = False
         self._health = health
         self._pace = pace
         self._wall = wall or WallClock()
         self._clock_map: ClockMap | None = None
         self._stop = stop
-        self._publisher = MessagePublisher(publishers, health, stop=stop, claim=claim)
+        self._publisher = MessagePublisher(
+            publishers, health, stop=stop, claim=claim, turns=self._turns
+        )
         self._counters: Counter[str] = Counter()
         self._device_counters: Counter[str] = Counter()
         self._report = SensorReport(name, health)
@@ -191,6 +198,19 @@ class SensorWorker:
             self.error or self.silent or self._publisher.has_rejected or self._report.is_wrong
         )
 
+    def hangs(self) -> bool:
+        """Whether the thread does not come back, e.g. from its driver."""
+        late = self._turns.late
+        if late and not self._hangs:
+            self._health.fail(
+                DeviceError(
+                    f"sensor {self.name!r} hangs: its driver does not return",
+                    remedy="the gateway is started again by `palpate up`; its log shows where",
+                )
+            )
+        self._hangs = late
+        return late
+
     def _run(self) -> None:
         self._report.starts()
         try:
@@ -208,13 +228,16 @@ class SensorWorker:
         finally:
             self.serving = False
             self._give_up("the sensor has ended")
+            self._turns.next(LATE_S)
             self.device.close()
+            self._turns.next(inf)
             self._report.ended(self.error)
             self.ended.set()
 
     def _serve(self) -> None:
         backoff_s = BACKOFF_S[0]
         while not self._stop.is_set():
+            self._turns.next(LATE_S)
             try:
                 self.device.open()
                 self._clock_map = self._clock()
@@ -232,6 +255,7 @@ class SensorWorker:
                 self._report.is_lost(error, backoff_s)
                 self._give_up(error.problem)
             self._device_counters += Counter(self.device.counters)
+            self._turns.next(LATE_S)
             self.device.close()
             self._stop.wait(backoff_s)
             backoff_s = min(2.0 * backoff_s, BACKOFF_S[1])
@@ -249,7 +273,9 @@ class SensorWorker:
         info = self.device.info
         read_s = _SILENT_READ_S if info.live else _READ_S
         silence = SilenceTimer(max(LOST_S, 3.0 / info.rate_hz) if info.live else inf, read_s)
+        turn_s = _TURN_S if info.live else LATE_S
         while not self._stop.is_set():
+            self._turns.next(turn_s)
             try:
                 readings = self.device.read(min(silence.begin(), _READ_S))
             except DeviceTimeout as error:
@@ -274,6 +300,7 @@ class SensorWorker:
             self._report.tare_refused(self.pipeline.tare_error)
             self.serving = True
             if self.zeroing is not None:
+                self._turns.next(LATE_S)
                 self.zeroing.follow(readings)
             lost = self._wrench is not None and self._wrench.zero_lost
             self._report.delivers(self.pipeline.condition, zero_lost=lost)

@@ -1,11 +1,10 @@
-"""Joining the bus: settings of Zenoh, the session of a process, and the router."""
+"""Joining the bus: settings of Zenoh, and the session of a process."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self, TypeVar
@@ -107,14 +106,19 @@ def no_router(link: LinkConfig) -> LinkError:
     )
 
 
-def open_zenoh(link: LinkConfig, mode: str) -> zenoh.Session:
+def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) -> zenoh.Session:
     """Open a Zenoh session and translate why it does not open.
+
+    ``also_listen`` are endpoints of any protocol of Zenoh that are not offered to others.
 
     Raises:
         LinkError: A port is in use, or a client finds no router.
     """
+    config = zenoh_config(link, mode)
+    if also_listen:
+        config.insert_json5("listen/endpoints", json.dumps([*link.listen, *also_listen]))
     try:
-        return zenoh.open(zenoh_config(link, mode))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         if _IN_USE.search(str(error)):
             raise LinkError(
@@ -129,25 +133,6 @@ def open_zenoh(link: LinkConfig, mode: str) -> zenoh.Session:
         raise LinkError(
             f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
         ) from error
-
-
-def run_router(
-    listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
-) -> None:
-    """Run the router at endpoints, e.g. ``("tcp/127.0.0.1:7447",)``, until ``stop`` is set.
-
-    Lease and certificates are those of ``link``; None = defaults.
-
-    Raises:
-        LinkError: A port is in use.
-    """
-    base = link or LinkConfig()
-    config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
-    raw = open_zenoh(config, "router")
-    try:
-        stop.wait()
-    finally:
-        raw.close()
 
 
 M = TypeVar("M")

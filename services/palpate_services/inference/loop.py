@@ -24,6 +24,7 @@ from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.files.bundle import read_bundle
 from palpate.health import Health, HealthReporter
+from palpate.heartbeat import beat
 from palpate.messages import Origin, ServiceState, Stamp
 from palpate.process import avoid_pauses
 from palpate_services.config import EstimatingConfig
@@ -272,6 +273,7 @@ def serve(
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
             while not stop.is_set():
+                beat()
                 try:
                     publisher.take(messages.next(_WAIT_S))
                 except StreamTimeout:

@@ -12,6 +12,7 @@ from palpate.bus.topics import TOPICS, Topic
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, StreamTimeout
 from palpate.health import Health, HealthReporter
+from palpate.heartbeat import beat
 from palpate.messages import ServiceState
 from palpate.process import avoid_pauses
 from palpate_services.config import RecorderConfig
@@ -77,11 +78,13 @@ def run_recorder(
 def _drain(tap: Tap, files: RecordFiles) -> int:
     """Record all waiting samples; returns their number."""
     came = 0
+    beat()
     try:
         while True:
             files.write(tap.next(0.0))
             came += 1
             if came % _CHECK_AFTER == 0:
+                beat()
                 files.tick()
     except StreamTimeout:
         files.tick(idle=came == 0)
