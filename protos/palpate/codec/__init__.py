@@ -3,7 +3,12 @@
 from typing import Any
 
 from palpate.codec.base import Codec
-from palpate.codec.estimates import FEATURE_ESTIMATE, FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
+from palpate.codec.estimates import (
+    FEATURE_ESTIMATE,
+    FIELD_ESTIMATE,
+    STAGE_TIMINGS,
+    SYNTHESIS_ESTIMATE,
+)
 from palpate.codec.frames import (
     ELECTRODE_FRAME,
     FIELD_FRAME,
@@ -12,9 +17,16 @@ from palpate.codec.frames import (
     WRENCH_FRAME,
 )
 from palpate.codec.models import MODEL_COMMAND, MODEL_INVENTORY, MODEL_REQUEST
+from palpate.codec.requests import (
+    BASIS_REQUEST,
+    FEATURE_REQUEST,
+    FIELD_BASIS,
+    FIELD_REQUEST,
+    SYNTHESIS_REPLY,
+    SYNTHESIS_REQUEST,
+)
 from palpate.codec.service import (
     ERROR,
-    FIELD_REQUEST,
     MODEL_METADATA,
     SERVICE_REQUEST,
     STATUS,
@@ -37,10 +49,13 @@ CODECS: tuple[Codec[Any], ...] = tuple(
 """All codecs of the contract: what is imported above."""
 
 __all__ = [
+    "BASIS_REQUEST",
     "CODECS",
     "ELECTRODE_FRAME",
     "ERROR",
     "FEATURE_ESTIMATE",
+    "FEATURE_REQUEST",
+    "FIELD_BASIS",
     "FIELD_ESTIMATE",
     "FIELD_FRAME",
     "FIELD_REQUEST",
@@ -56,8 +71,11 @@ __all__ = [
     "SIMULATION_PROGRESS",
     "SIMULATION_REPLY",
     "SIMULATION_REQUEST",
+    "STAGE_TIMINGS",
     "STATUS",
     "SYNTHESIS_ESTIMATE",
+    "SYNTHESIS_REPLY",
+    "SYNTHESIS_REQUEST",
     "TARE",
     "TARE_REQUEST",
     "WRENCH_FRAME",

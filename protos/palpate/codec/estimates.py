@@ -1,6 +1,12 @@
-"""Codec of estimates: features, fields, synthesis. Large float fields are spliced (see checks)."""
+"""Codec of estimates and their timings. Large float fields are spliced (see checks)."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+from math import isfinite
+
+import numpy as np
 
 from palpate.codec.base import (
     check_digest,
@@ -8,6 +14,7 @@ from palpate.codec.base import (
     check_field,
     check_serial,
     codec_of,
+    delimited,
     field_from_wire,
     reject,
     splice,
@@ -16,8 +23,39 @@ from palpate.codec.base import (
     vector3_from_wire,
     vector3_to_wire,
 )
-from palpate.messages import FeatureEstimate, FieldEstimate, SynthesisEstimate
+from palpate.messages import (
+    FeatureEstimate,
+    FieldEstimate,
+    FloatArray,
+    QualityFlag,
+    StageTimings,
+    SynthesisEstimate,
+)
 from palpate.v1 import estimates_pb2
+
+_FLAGS = {int(flag): flag for flag in QualityFlag}
+_NAME_MAX, _VERSION_MAX = 64, (1 << 32) - 1
+
+
+def _quality_from_wire(values: Iterable[int]) -> tuple[QualityFlag, ...]:
+    """Flags, ascending, each once; those of a newer palpate become ``UNKNOWN``."""
+    return tuple(sorted({_FLAGS.get(value, QualityFlag.UNKNOWN) for value in values}))
+
+
+def _quality_to_wire(flags: tuple[QualityFlag, ...]) -> tuple[int, ...]:
+    values = tuple(map(int, flags))
+    if any(a >= b for a, b in pairwise(values)) or not all(value in _FLAGS for value in values):
+        reject("quality", f"quality {values} are no flags in ascending order, each once")
+    return values
+
+
+def _check_bundle(name: str, version: int) -> tuple[str, int]:
+    """Name and version of a bundle; empty and 0 = it was not said."""
+    if name and not (len(name) <= _NAME_MAX and name.isascii() and name.isprintable()):
+        reject("bundle", f"bundle_name {name[:80]!r} is not at most 64 printable ASCII characters")
+    if not 0 <= version <= _VERSION_MAX:
+        reject("bundle", f"bundle_version {version} is not in uint32")
+    return name, version
 
 
 def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
@@ -44,6 +82,8 @@ def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
         force_sd,
         location,
         location_sd,
+        _quality_from_wire(msg.quality),
+        *_check_bundle(msg.bundle_name, msg.bundle_version),
     )
 
 
@@ -53,6 +93,10 @@ def _features_encode(estimate: FeatureEstimate) -> bytes:
         bundle_sha256=check_digest(estimate.bundle_sha256, "bundle_sha256"),
         tare_id=estimate.tare_id,
         in_contact=estimate.in_contact,
+        quality=_quality_to_wire(estimate.quality),  # type: ignore[arg-type]
+    )
+    msg.bundle_name, msg.bundle_version = _check_bundle(
+        estimate.bundle_name, estimate.bundle_version
     )
     stamp_to_wire(estimate.source, msg.source)
     vector3_to_wire(estimate.force, msg.force, "force")
@@ -70,10 +114,25 @@ def _features_encode(estimate: FeatureEstimate) -> bytes:
     return msg.SerializeToString()
 
 
+_NO_FIELD: FloatArray = np.zeros((0, 3), np.float32)
+"""Displacement of a reduced reply."""
+
+
 def _field_from_wire(msg: estimates_pb2.FieldEstimate) -> FieldEstimate:
-    displacement = field_from_wire(msg.displacement, 3, "displacement")
-    nodes = displacement.shape[0]
+    coefficients = None
+    if msg.coefficients:
+        coefficients = field_from_wire(msg.coefficients, 1, "coefficients")
+        check_digest(msg.basis_sha256, "basis_sha256")
+    elif msg.basis_sha256:
+        reject("basis", "basis_sha256 comes without coefficients")
+    if not msg.displacement and coefficients is not None:
+        displacement, nodes = _NO_FIELD, 0
+    else:
+        displacement = field_from_wire(msg.displacement, 3, "displacement")
+        nodes = displacement.shape[0]
     sd = contact_force = None
+    if not nodes and (msg.displacement_sd or msg.contact_force):
+        reject("shape", "displacement_sd or contact_force comes without displacement")
     if msg.displacement_sd:
         sd = field_from_wire(msg.displacement_sd, 1, "displacement_sd", rows=nodes, deviation=True)
     if msg.contact_force:
@@ -87,11 +146,24 @@ def _field_from_wire(msg: estimates_pb2.FieldEstimate) -> FieldEstimate:
         displacement,
         sd,
         contact_force,
+        _quality_from_wire(msg.quality),
+        *_check_bundle(msg.bundle_name, msg.bundle_version),
+        coefficients,
+        msg.basis_sha256,
     )
 
 
 def _field_encode(estimate: FieldEstimate) -> bytes:
-    displacement = check_field(estimate.displacement, 3, "displacement")
+    coefficients = estimate.coefficients
+    if coefficients is not None:
+        check_field(coefficients, 1, "coefficients")
+        check_digest(estimate.basis_sha256, "basis_sha256")
+    elif estimate.basis_sha256:
+        reject("basis", "basis_sha256 is given without coefficients")
+    reduced = coefficients is not None and not len(estimate.displacement)
+    if reduced and not (estimate.displacement_sd is None and estimate.contact_force is None):
+        reject("shape", "displacement_sd or contact_force is given without displacement")
+    displacement = _NO_FIELD if reduced else check_field(estimate.displacement, 3, "displacement")
     nodes = displacement.shape[0]
     msg = estimates_pb2.FieldEstimate(
         sensor_serial=check_serial(estimate.sensor_serial),
@@ -106,10 +178,20 @@ def _field_encode(estimate: FieldEstimate) -> bytes:
         payload += splice(7, sd)
     if estimate.contact_force is not None:
         payload += splice(8, check_field(estimate.contact_force, 3, "contact_force", rows=nodes))
+    name, version = _check_bundle(estimate.bundle_name, estimate.bundle_version)
+    tail = estimates_pb2.FieldEstimate(
+        quality=_quality_to_wire(estimate.quality),  # type: ignore[arg-type]
+        bundle_name=name,
+        bundle_version=version,
+    )
+    payload += tail.SerializeToString()
+    if coefficients is not None:
+        payload += splice(12, coefficients) + delimited(13, estimate.basis_sha256)
     return payload
 
 
-def _synthesis_from_wire(msg: estimates_pb2.SynthesisEstimate) -> SynthesisEstimate:
+def synthesis_from_wire(msg: estimates_pb2.SynthesisEstimate) -> SynthesisEstimate:
+    """Check and convert a synthesis."""
     counts = check_electrodes(field_from_wire(msg.tared_counts, 1, "tared_counts"), "tared_counts")
     sd = None
     if msg.tared_counts_sd:
@@ -123,6 +205,8 @@ def _synthesis_from_wire(msg: estimates_pb2.SynthesisEstimate) -> SynthesisEstim
         check_digest(msg.mesh_sha256, "mesh_sha256"),
         counts,
         sd,
+        _quality_from_wire(msg.quality),
+        *_check_bundle(msg.bundle_name, msg.bundle_version),
     )
 
 
@@ -140,11 +224,42 @@ def _synthesis_encode(estimate: SynthesisEstimate) -> bytes:
             estimate.tared_counts_sd, 1, "tared_counts_sd", rows=counts.shape[0], deviation=True
         )
         payload += splice(6, sd)
-    return payload
+    name, version = _check_bundle(estimate.bundle_name, estimate.bundle_version)
+    tail = estimates_pb2.SynthesisEstimate(
+        quality=_quality_to_wire(estimate.quality),  # type: ignore[arg-type]
+        bundle_name=name,
+        bundle_version=version,
+    )
+    return payload + tail.SerializeToString()
+
+
+_STAGES = ("waiting_s", "decode_s", "tare_s", "infer_s", "encode_s")
+
+
+def _timings_from_wire(msg: estimates_pb2.StageTimings) -> StageTimings:
+    stages = [getattr(msg, name) for name in _STAGES]
+    age_s = msg.age_at_arrival_s if msg.HasField("age_at_arrival_s") else None
+    if not isfinite(sum(stages) + (age_s or 0.0)) or min(stages) < 0:
+        reject("timings", f"timings {stages} with age {age_s} are not finite, or negative")
+    return StageTimings(age_s, *stages)
+
+
+def _timings_encode(timings: StageTimings) -> bytes:
+    msg = estimates_pb2.StageTimings(
+        age_at_arrival_s=timings.age_at_arrival_s,
+        waiting_s=timings.waiting_s,
+        decode_s=timings.decode_s,
+        tare_s=timings.tare_s,
+        infer_s=timings.infer_s,
+        encode_s=timings.encode_s,
+    )
+    _timings_from_wire(msg)
+    return msg.SerializeToString()
 
 
 FEATURE_ESTIMATE = codec_of(estimates_pb2.FeatureEstimate, _features_encode, _features_from_wire)
 FIELD_ESTIMATE = codec_of(estimates_pb2.FieldEstimate, _field_encode, _field_from_wire)
 SYNTHESIS_ESTIMATE = codec_of(
-    estimates_pb2.SynthesisEstimate, _synthesis_encode, _synthesis_from_wire
+    estimates_pb2.SynthesisEstimate, _synthesis_encode, synthesis_from_wire
 )
+STAGE_TIMINGS = codec_of(estimates_pb2.StageTimings, _timings_encode, _timings_from_wire)

@@ -165,7 +165,8 @@ def _pose_encode(frame: IndenterPoseFrame) -> bytes:
     return msg.SerializeToString()
 
 
-def _field_from_wire(msg: frames_pb2.FieldFrame) -> FieldFrame:
+def field_frame_from_wire(msg: frames_pb2.FieldFrame) -> FieldFrame:
+    """Check and convert a field."""
     return FieldFrame(
         stamp_from_wire(msg.stamp),
         check_serial(msg.sensor_serial),
@@ -187,7 +188,7 @@ def _field_encode(frame: FieldFrame) -> bytes:
 ELECTRODE_FRAME = codec_of(frames_pb2.ElectrodeFrame, _electrodes_encode, electrodes_from_wire)
 WRENCH_FRAME = codec_of(frames_pb2.WrenchFrame, _wrench_encode, _wrench_from_wire)
 INDENTER_POSE_FRAME = codec_of(frames_pb2.IndenterPoseFrame, _pose_encode, _pose_from_wire)
-FIELD_FRAME = codec_of(frames_pb2.FieldFrame, _field_encode, _field_from_wire)
+FIELD_FRAME = codec_of(frames_pb2.FieldFrame, _field_encode, field_frame_from_wire)
 
 
 _TIMES = 1 << 63

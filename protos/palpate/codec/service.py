@@ -13,7 +13,6 @@ from palpate.codec.base import (
     check_electrodes,
     check_serial,
     codec_of,
-    delimited,
     field_from_wire,
     reject,
     stamp_from_wire,
@@ -21,16 +20,13 @@ from palpate.codec.base import (
     vector3_from_wire,
     vector3_to_wire,
 )
-from palpate.codec.frames import ELECTRODE_FRAME, electrodes_from_wire
 from palpate.codec.models import served_from_wire, served_to_wire
-from palpate.config import check_name
-from palpate.errors import ConfigError, ErrorCode
+from palpate.errors import ErrorCode
 from palpate.messages import (
     NO_TARE,
     ChannelFault,
     ErrorReply,
     FaultKind,
-    FieldRequest,
     ModelMetadata,
     SensorState,
     SensorStatus,
@@ -40,6 +36,8 @@ from palpate.messages import (
     Tare,
     TareRequest,
     TensorInfo,
+    TrainingRange,
+    ValueRange,
     WrenchZero,
     WrenchZeroRequest,
 )
@@ -239,6 +237,46 @@ def _status_encode(status: Status) -> bytes:
     ).SerializeToString()
 
 
+def _check_digest_or_none(digest: bytes, what: str) -> bytes:
+    return check_digest(digest, what) if digest else b""
+
+
+def _value_range_from_wire(msg: service_pb2.ValueRange) -> ValueRange:
+    if len(msg.low) != len(msg.high) or not isfinite(sum(msg.low) + sum(msg.high)):
+        reject("training_range", f"range of {msg.name!r} has no finite low and high for each value")
+    if not (isfinite(msg.length_max) and msg.length_max >= 0):
+        reject("training_range", f"range of {msg.name!r}: length_max = {msg.length_max}")
+    return ValueRange(msg.name, msg.unit, tuple(msg.low), tuple(msg.high), msg.length_max)
+
+
+def _value_range_to_wire(one: ValueRange) -> service_pb2.ValueRange:
+    return service_pb2.ValueRange(
+        name=one.name, unit=one.unit, low=one.low, high=one.high, length_max=one.length_max
+    )
+
+
+def _range_from_wire(msg: service_pb2.TrainingRange) -> TrainingRange:
+    return TrainingRange(
+        _check_text(msg.source, "source of the training range"),
+        msg.data_sha256,
+        msg.rows,
+        tuple(map(_value_range_from_wire, msg.inputs)),
+        tuple(map(_value_range_from_wire, msg.outputs)),
+        msg.combinations,
+    )
+
+
+def _range_to_wire(known: TrainingRange) -> service_pb2.TrainingRange:
+    return service_pb2.TrainingRange(
+        source=known.source[:_TEXT_MAX],
+        data_sha256=known.data_sha256,
+        rows=known.rows,
+        inputs=map(_value_range_to_wire, known.inputs),
+        outputs=map(_value_range_to_wire, known.outputs),
+        combinations=known.combinations,
+    )
+
+
 def _metadata_from_wire(msg: service_pb2.ModelMetadata) -> ModelMetadata:
     return ModelMetadata(
         check_serial(msg.name, "name"),
@@ -252,6 +290,10 @@ def _metadata_from_wire(msg: service_pb2.ModelMetadata) -> ModelMetadata:
         dict(msg.metrics),
         _check_text(msg.trained_on, "trained_on"),
         served_from_wire(msg.served),
+        _range_from_wire(msg.training_range) if msg.HasField("training_range") else None,
+        _check_digest_or_none(msg.mesh_sha256, "mesh_sha256"),
+        _check_digest_or_none(msg.basis_sha256, "basis_sha256"),
+        msg.modes,
     )
 
 
@@ -274,23 +316,13 @@ def _metadata_encode(metadata: ModelMetadata) -> bytes:
         metrics=dict(metadata.metrics),
         trained_on=metadata.trained_on[:_TEXT_MAX],
         served=served_to_wire(metadata.served),
+        training_range=(
+            None if metadata.training_range is None else _range_to_wire(metadata.training_range)
+        ),
+        mesh_sha256=_check_digest_or_none(metadata.mesh_sha256, "mesh_sha256"),
+        basis_sha256=_check_digest_or_none(metadata.basis_sha256, "basis_sha256"),
+        modes=metadata.modes,
     ).SerializeToString()
-
-
-def _check_sensor(sensor: str) -> str:
-    try:
-        return check_name(sensor, "sensor")
-    except ConfigError as error:
-        reject("sensor", error.problem)
-
-
-def _field_request_from_wire(msg: service_pb2.FieldRequest) -> FieldRequest:
-    return FieldRequest(_check_sensor(msg.sensor), electrodes_from_wire(msg.frame))
-
-
-def _field_request_encode(request: FieldRequest) -> bytes:
-    head = service_pb2.FieldRequest(sensor=_check_sensor(request.sensor))
-    return head.SerializeToString() + delimited(2, ELECTRODE_FRAME.encode(request.frame))
 
 
 TARE = codec_of(service_pb2.Tare, _tare_encode, _tare_from_wire)
@@ -302,7 +334,6 @@ TARE_REQUEST: Codec[TareRequest] = codec_of(
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()
 )
-FIELD_REQUEST = codec_of(service_pb2.FieldRequest, _field_request_encode, _field_request_from_wire)
 STATUS = codec_of(service_pb2.Status, _status_encode, _status_from_wire)
 MODEL_METADATA = codec_of(service_pb2.ModelMetadata, _metadata_encode, _metadata_from_wire)
 ERROR: Codec[ErrorReply] = codec_of(

@@ -54,7 +54,8 @@ def check_positive(value: float, what: str) -> float:
     return value
 
 
-def _request_from_wire(msg: simulation_pb2.SimulationRequest) -> SimulationRequest:
+def simulation_request_from_wire(msg: simulation_pb2.SimulationRequest) -> SimulationRequest:
+    """Check and convert a request."""
     values: dict[str, float] = {}
     for name in _PARAMETERS:
         if msg.parameters.HasField(name):
@@ -94,7 +95,7 @@ def _request_encode(request: SimulationRequest) -> bytes:
         want_displacement=request.want_displacement,
         want_contact_force=request.want_contact_force,
     )
-    _request_from_wire(msg)  # rare message: one set of checks serves both ways
+    simulation_request_from_wire(msg)  # rare message: one set of checks serves both ways
     return msg.SerializeToString()
 
 
@@ -125,7 +126,9 @@ def progress_to_wire(progress: SimulationProgress) -> simulation_pb2.SimulationP
     )
 
 
-SIMULATION_REQUEST = codec_of(simulation_pb2.SimulationRequest, _request_encode, _request_from_wire)
+SIMULATION_REQUEST = codec_of(
+    simulation_pb2.SimulationRequest, _request_encode, simulation_request_from_wire
+)
 SIMULATION_PROGRESS: Codec[SimulationProgress] = codec_of(
     simulation_pb2.SimulationProgress,
     lambda progress: progress_to_wire(progress).SerializeToString(),
@@ -145,7 +148,7 @@ SIMULATION_CANCEL_REPLY: Codec[SimulationCancelReply] = codec_of(
 )
 
 
-_OUTCOMES = {int(outcome): outcome for outcome in SimulationOutcome}
+OUTCOMES_BY_NUMBER = {int(outcome): outcome for outcome in SimulationOutcome}
 
 
 def _doubles(values: Sequence[float], count: int, what: str) -> DoubleArray:
@@ -169,7 +172,8 @@ def _convergence(source: Any, target: Callable[..., C], what: str) -> C:
     return target(**counts, **sizes)
 
 
-def _step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> SimulationStep:
+def step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> SimulationStep:
+    """Check and convert a step."""
     displacement = contact_force = centre = convergence = None
     if msg.displacement:
         displacement = field_from_wire(msg.displacement, 3, f"{what}.displacement")
@@ -201,7 +205,8 @@ def _step_from_wire(msg: simulation_pb2.SimulationStep, what: str) -> Simulation
     )
 
 
-def _step_encode(step: SimulationStep, what: str) -> bytes:
+def step_encode(step: SimulationStep, what: str) -> bytes:
+    """Check a step and give its bytes."""
     if not isfinite(step.fluid_pressure_pa):
         reject("non_finite", f"{what}.fluid_pressure_pa is not finite")
     # Fields in order of their numbers, so that the bytes equal the official encoder's.
@@ -231,13 +236,13 @@ def _step_encode(step: SimulationStep, what: str) -> bytes:
 
 
 def _reply_from_wire(msg: simulation_pb2.SimulationReply) -> SimulationReply:
-    outcome = _OUTCOMES.get(msg.outcome)
+    outcome = OUTCOMES_BY_NUMBER.get(msg.outcome)
     if outcome is None:
         reject("outcome", f"outcome {msg.outcome} is not known")
     return SimulationReply(
         check_serial(msg.request_id, "request_id"),
         _check_mesh(msg.mesh_sha256, len(msg.steps)),
-        tuple(_step_from_wire(step, f"steps[{i}]") for i, step in enumerate(msg.steps)),
+        tuple(step_from_wire(step, f"steps[{i}]") for i, step in enumerate(msg.steps)),
         msg.stopped_because,
         check_positive(msg.elapsed_s, "elapsed_s"),
         msg.more,
@@ -268,7 +273,7 @@ def _reply_encode(reply: SimulationReply) -> bytes:
     )
     # A reply is head, steps (field 3) and tail: the steps' packed floats are spliced, so they are
     # not part of a message that protobuf would encode once more.
-    steps = (delimited(3, _step_encode(step, f"steps[{i}]")) for i, step in enumerate(reply.steps))
+    steps = (delimited(3, step_encode(step, f"steps[{i}]")) for i, step in enumerate(reply.steps))
     return head.SerializeToString() + b"".join(steps) + tail.SerializeToString()
 
 

@@ -7,6 +7,8 @@ are not copied on construction and must not be written to afterwards. The codec 
 from palpate.messages.estimates import (
     FeatureEstimate,
     FieldEstimate,
+    QualityFlag,
+    StageTimings,
     SynthesisEstimate,
     as_field_frame,
 )
@@ -37,11 +39,19 @@ from palpate.messages.models import (
     ModelRequest,
     ServedModel,
 )
+from palpate.messages.requests import (
+    BasisRequest,
+    ContactDescription,
+    FeatureRequest,
+    FieldBasis,
+    FieldRequest,
+    SynthesisReply,
+    SynthesisRequest,
+)
 from palpate.messages.service import (
     ChannelFault,
     ErrorReply,
     FaultKind,
-    FieldRequest,
     ModelMetadata,
     SensorState,
     SensorStatus,
@@ -66,6 +76,7 @@ from palpate.messages.simulation import (
     SimulationRequest,
     SimulationStep,
 )
+from palpate.messages.training_range import TrainingRange, ValueRange
 
 __all__ = [
     "BIOTAC_LAYOUT",
@@ -73,13 +84,17 @@ __all__ = [
     "COUNTS_MAX",
     "NO_TARE",
     "PAC_SAMPLES",
+    "BasisRequest",
     "ChannelFault",
+    "ContactDescription",
     "CountArray",
     "DoubleArray",
     "ElectrodeFrame",
     "ErrorReply",
     "FaultKind",
     "FeatureEstimate",
+    "FeatureRequest",
+    "FieldBasis",
     "FieldEstimate",
     "FieldFrame",
     "FieldRequest",
@@ -93,6 +108,7 @@ __all__ = [
     "ModelRequest",
     "Origin",
     "Pose",
+    "QualityFlag",
     "RobotPoseFrame",
     "SensorState",
     "SensorStatus",
@@ -110,12 +126,17 @@ __all__ = [
     "SimulationReply",
     "SimulationRequest",
     "SimulationStep",
+    "StageTimings",
     "Stamp",
     "Status",
     "SynthesisEstimate",
+    "SynthesisReply",
+    "SynthesisRequest",
     "Tare",
     "TareRequest",
     "TensorInfo",
+    "TrainingRange",
+    "ValueRange",
     "WrenchFrame",
     "WrenchZero",
     "WrenchZeroRequest",

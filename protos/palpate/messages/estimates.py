@@ -1,14 +1,45 @@
 """Estimates: pure functions of a frame, its tare and a bundle.
 
 ``source`` is the stamp of the frame that an estimate was made from, ``sensor_serial`` names that
-frame's sensor, and ``bundle_sha256`` is the digest of the bundle's manifest, 32 bytes.
+frame's sensor, and ``bundle_sha256`` is the digest of the bundle's manifest, 32 bytes; name and
+version of the bundle are for people. ``quality`` holds flags in ascending order.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 from palpate.messages.frames import FieldFrame, FloatArray, Stamp
+
+
+class QualityFlag(IntEnum):
+    """What a consumer has to know of an estimate beside its uncertainty.
+
+    docs/adr/0019-what-an-estimate-is-worth.md says how each is decided. An estimate without flags
+    has none against it.
+    """
+
+    UNKNOWN = 0
+    """A flag of a newer palpate."""
+
+    STALE = 1
+    """In replies only: the frame was older than the service's limit when the question came."""
+
+    SATURATED = 2
+    """An electrode stands at an end of the converter's range: the truth lies beyond it."""
+
+    UNTARED = 3
+    """The tare may not hold any more: the temperature has moved away from the tare's."""
+
+    OUT_OF_RANGE = 4
+    """The input is unlike every input that the model was trained on."""
+
+    EXTRAPOLATING = 5
+    """The output lies beyond all that the model was trained to give."""
+
+    RANGE_UNKNOWN = 6
+    """The bundle does not say what it was trained on, so the two above cannot be known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +65,9 @@ class FeatureEstimate:
     force_sd: FloatArray
     contact_location: FloatArray | None = None
     contact_location_sd: FloatArray | None = None
+    quality: tuple[QualityFlag, ...] = ()
+    bundle_name: str = ""
+    bundle_version: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +77,13 @@ class FieldEstimate:
     Attributes:
         tare_id: Tare that was subtracted.
         mesh_sha256: Content hash of the mesh, 32 bytes.
-        displacement: Nodal displacement from the pressurised state [m], shape ``(V, 3)``.
+        displacement: Nodal displacement from the pressurised state [m], shape ``(V, 3)``; of a
+            reduced reply ``(0, 3)``.
         displacement_sd: One standard deviation of its magnitude [m], shape ``(V,)``, or None.
         contact_force: Nodal contact force on the skin [N], shape ``(V, 3)``, or None.
+        coefficients: The same displacement in the bundle's basis [m], shape ``(K,)``, or None:
+            see ``FieldBasis``.
+        basis_sha256: Content hash of that basis, 32 bytes; empty without coefficients.
     """
 
     source: Stamp
@@ -56,6 +94,11 @@ class FieldEstimate:
     displacement: FloatArray
     displacement_sd: FloatArray | None = None
     contact_force: FloatArray | None = None
+    quality: tuple[QualityFlag, ...] = ()
+    bundle_name: str = ""
+    bundle_version: int = 0
+    coefficients: FloatArray | None = None
+    basis_sha256: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +119,31 @@ class SynthesisEstimate:
     mesh_sha256: bytes
     tared_counts: FloatArray
     tared_counts_sd: FloatArray | None = None
+    quality: tuple[QualityFlag, ...] = ()
+    bundle_name: str = ""
+    bundle_version: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class StageTimings:
+    """Where the time went between a reading and its estimate [s]; no part of the estimate.
+
+    Attributes:
+        age_at_arrival_s: From the reading to its arrival at the service; None where the stamp says
+            nothing of it (a replay, another host's clock).
+        waiting_s: Between arrival and the beginning of work.
+        decode_s: Bytes to message.
+        tare_s: Looking up the tare and subtracting it.
+        infer_s: Running the model.
+        encode_s: Message to bytes.
+    """
+
+    age_at_arrival_s: float | None
+    waiting_s: float
+    decode_s: float
+    tare_s: float
+    infer_s: float
+    encode_s: float
 
 
 def as_field_frame(field: FieldFrame | FieldEstimate) -> FieldFrame:

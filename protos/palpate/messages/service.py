@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from palpate.errors import ErrorCode
-from palpate.messages.frames import NO_TARE, ElectrodeFrame, FloatArray, Stamp
+from palpate.messages.frames import NO_TARE, FloatArray, Stamp
 from palpate.messages.models import ServedModel
+from palpate.messages.training_range import TrainingRange
 
 
 class SensorState(IntEnum):
@@ -128,19 +129,6 @@ class TareRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class FieldRequest:
-    """Ask a field service for the field of one frame.
-
-    Attributes:
-        sensor: Name of the sensor in the key of its streams; its gateway knows the frame's tare.
-        frame: Raw counts of one sampling round.
-    """
-
-    sensor: str
-    frame: ElectrodeFrame
-
-
-@dataclass(frozen=True, slots=True)
 class ServiceRequest:
     """Ask a service for its status or its model's metadata."""
 
@@ -221,6 +209,10 @@ class ModelMetadata:
         metrics: Held-out results; the name ends in the unit.
         trained_on: One line for people.
         served: Which bundle serves which sensor; the other attributes describe the first.
+        training_range: What it was trained on; None = it does not say.
+        mesh_sha256: Content hash of the mesh of its fields, 32 bytes; empty = no fields.
+        basis_sha256: Content hash of the basis of its coefficients, 32 bytes; empty = none.
+        modes: Modes of that basis.
     """
 
     name: str
@@ -234,3 +226,7 @@ class ModelMetadata:
     metrics: Mapping[str, float]
     trained_on: str
     served: Sequence[ServedModel] = ()
+    training_range: TrainingRange | None = None
+    mesh_sha256: bytes = b""
+    basis_sha256: bytes = b""
+    modes: int = 0

@@ -225,7 +225,7 @@ class TensorInfo(_message.Message):
     def __init__(self, name: _Optional[str] = ..., dtype: _Optional[str] = ..., shape: _Optional[_Iterable[int]] = ..., unit: _Optional[str] = ...) -> None: ...
 
 class ModelMetadata(_message.Message):
-    __slots__ = ("name", "version", "task", "bundle_sha256", "contract_version", "inputs", "outputs", "training_data_sha256", "metrics", "trained_on", "served")
+    __slots__ = ("name", "version", "task", "bundle_sha256", "contract_version", "inputs", "outputs", "training_data_sha256", "metrics", "trained_on", "served", "training_range", "mesh_sha256", "basis_sha256", "modes")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -244,6 +244,10 @@ class ModelMetadata(_message.Message):
     METRICS_FIELD_NUMBER: _ClassVar[int]
     TRAINED_ON_FIELD_NUMBER: _ClassVar[int]
     SERVED_FIELD_NUMBER: _ClassVar[int]
+    TRAINING_RANGE_FIELD_NUMBER: _ClassVar[int]
+    MESH_SHA256_FIELD_NUMBER: _ClassVar[int]
+    BASIS_SHA256_FIELD_NUMBER: _ClassVar[int]
+    MODES_FIELD_NUMBER: _ClassVar[int]
     name: str
     version: int
     task: str
@@ -255,7 +259,41 @@ class ModelMetadata(_message.Message):
     metrics: _containers.ScalarMap[str, float]
     trained_on: str
     served: _containers.RepeatedCompositeFieldContainer[_models_pb2.ServedModel]
-    def __init__(self, name: _Optional[str] = ..., version: _Optional[int] = ..., task: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., contract_version: _Optional[int] = ..., inputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., training_data_sha256: _Optional[str] = ..., metrics: _Optional[_Mapping[str, float]] = ..., trained_on: _Optional[str] = ..., served: _Optional[_Iterable[_Union[_models_pb2.ServedModel, _Mapping]]] = ...) -> None: ...
+    training_range: TrainingRange
+    mesh_sha256: bytes
+    basis_sha256: bytes
+    modes: int
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[int] = ..., task: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., contract_version: _Optional[int] = ..., inputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[TensorInfo, _Mapping]]] = ..., training_data_sha256: _Optional[str] = ..., metrics: _Optional[_Mapping[str, float]] = ..., trained_on: _Optional[str] = ..., served: _Optional[_Iterable[_Union[_models_pb2.ServedModel, _Mapping]]] = ..., training_range: _Optional[_Union[TrainingRange, _Mapping]] = ..., mesh_sha256: _Optional[bytes] = ..., basis_sha256: _Optional[bytes] = ..., modes: _Optional[int] = ...) -> None: ...
+
+class ValueRange(_message.Message):
+    __slots__ = ("name", "unit", "low", "high", "length_max")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    LENGTH_MAX_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    unit: str
+    low: _containers.RepeatedScalarFieldContainer[float]
+    high: _containers.RepeatedScalarFieldContainer[float]
+    length_max: float
+    def __init__(self, name: _Optional[str] = ..., unit: _Optional[str] = ..., low: _Optional[_Iterable[float]] = ..., high: _Optional[_Iterable[float]] = ..., length_max: _Optional[float] = ...) -> None: ...
+
+class TrainingRange(_message.Message):
+    __slots__ = ("source", "data_sha256", "rows", "inputs", "outputs", "combinations")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    DATA_SHA256_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    INPUTS_FIELD_NUMBER: _ClassVar[int]
+    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
+    COMBINATIONS_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    data_sha256: str
+    rows: int
+    inputs: _containers.RepeatedCompositeFieldContainer[ValueRange]
+    outputs: _containers.RepeatedCompositeFieldContainer[ValueRange]
+    combinations: bool
+    def __init__(self, source: _Optional[str] = ..., data_sha256: _Optional[str] = ..., rows: _Optional[int] = ..., inputs: _Optional[_Iterable[_Union[ValueRange, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[ValueRange, _Mapping]]] = ..., combinations: _Optional[bool] = ...) -> None: ...
 
 class Error(_message.Message):
     __slots__ = ("code", "message", "remedy", "retry_after_ms")
@@ -270,9 +308,11 @@ class Error(_message.Message):
     def __init__(self, code: _Optional[_Union[ErrorCode, str]] = ..., message: _Optional[str] = ..., remedy: _Optional[str] = ..., retry_after_ms: _Optional[int] = ...) -> None: ...
 
 class FieldRequest(_message.Message):
-    __slots__ = ("sensor", "frame")
+    __slots__ = ("sensor", "frame", "reduced")
     SENSOR_FIELD_NUMBER: _ClassVar[int]
     FRAME_FIELD_NUMBER: _ClassVar[int]
+    REDUCED_FIELD_NUMBER: _ClassVar[int]
     sensor: str
     frame: _frames_pb2.ElectrodeFrame
-    def __init__(self, sensor: _Optional[str] = ..., frame: _Optional[_Union[_frames_pb2.ElectrodeFrame, _Mapping]] = ...) -> None: ...
+    reduced: bool
+    def __init__(self, sensor: _Optional[str] = ..., frame: _Optional[_Union[_frames_pb2.ElectrodeFrame, _Mapping]] = ..., reduced: _Optional[bool] = ...) -> None: ...
