@@ -26,6 +26,8 @@ class EstimatingConfig(StrictConfig):
         max_age_s: A live or simulated message older than this gets no estimate [s]; None = no
             limit.
         accept_replayed: Whether replayed messages get estimates; false on a live station.
+        batch_wait_s: How long a message may wait for those of other sensors, to be computed with
+            them [s]; 0 = only those that wait already.
         drain_s: How long a stopping service still processes messages that have arrived [s].
     """
 
@@ -35,6 +37,7 @@ class EstimatingConfig(StrictConfig):
     keep_newest: int = Field(default=3, ge=1, le=100)
     max_age_s: float | None = Field(default=0.03, gt=0)
     accept_replayed: bool = False
+    batch_wait_s: float = Field(default=0.0, ge=0, le=0.002)
     drain_s: float = Field(default=2.0, ge=0, le=30)
 
 

@@ -21,7 +21,7 @@ from palpate.health import Health
 from palpate.messages import ElectrodeFrame, FeatureEstimate, Origin
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import loop
-from palpate_services.inference.estimates import EstimateRefusal
+from palpate_services.inference.estimates import EstimateRefusal, Estimation
 from palpate_services.inference.loop import EstimatePublisher, ServiceRoute
 
 MS = 1_000_000
@@ -42,11 +42,22 @@ class Station:
         self.gauges: dict[str, float] = {}
         self.sensors: tuple[str, ...] = ()
         self.refused: EstimateRefusal | None = None
+        self.batches: list[int] = []
+        # By sensor; each is a bundle of its own.
+        self.runtimes: dict[str, Any] = {}
+        self.runtime = self.bundle()
         monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic_ns=lambda: self.now_ns))
 
-    def estimate(self, sensor: str, frame: ElectrodeFrame) -> Any:
+    def sample(self, sensor: str, frame: ElectrodeFrame, runtime: object) -> Any:
+        return self.refused or np.zeros(19, np.float32)
+
+    def run_all(self, samples: list[Any]) -> list[dict[str, Any]]:
         self.now_ns += self.work_ns
-        return self.refused or frame.stamp.sequence
+        self.batches.append(len(samples))
+        return [{} for _ in samples]
+
+    def bundle(self) -> Any:
+        return type("Runtime", (), {"run_all": staticmethod(self.run_all)})()
 
     def make(self, *, rate_hz: float | None = None, **config: Any) -> EstimatePublisher[Any, Any]:
         def publisher(topic: object, *, sensor: str, lossless: bool) -> object:
@@ -69,7 +80,8 @@ class Station:
             session,  # type: ignore[arg-type]
             FeaturesServiceConfig(**given),
             health,  # type: ignore[arg-type]
-            self.estimate,
+            SimpleNamespace(of=lambda sensor: self.runtimes.get(sensor, self.runtime)),  # type: ignore[arg-type]
+            Estimation(self.sample, lambda frame, *_: frame.stamp.sequence),
             rate_hz=rate_hz,
         )
 
@@ -99,8 +111,8 @@ def test_the_first_message_of_each_period_is_answered(station: Station, came: Ca
     """By the stamps, and each sensor by itself: 20 of 100 a second."""
     publisher = station.make(rate_hz=20.0)
     for k in range(12):
-        publisher.take(came(k, START_NS + 10 * k * MS))
-    publisher.take(came(50, START_NS, sensor="thumb"))
+        publisher.take([came(k, START_NS + 10 * k * MS)])
+    publisher.take([came(50, START_NS, sensor="thumb")])
     publisher.report(last=True)
     assert station.put == [("finger", 0), ("finger", 5), ("finger", 10), ("thumb", 50)]
     assert station.counts == {
@@ -114,9 +126,9 @@ def test_a_message_without_an_estimate_leaves_its_period_to_the_next(
 ) -> None:
     publisher = station.make(rate_hz=20.0)
     station.refused = EstimateRefusal.UNTARED
-    publisher.take(came(1, START_NS))
+    publisher.take([came(1, START_NS)])
     station.refused = None
-    publisher.take(came(2, START_NS + MS))
+    publisher.take([came(2, START_NS + MS)])
     publisher.report(last=True)
     assert station.put == [("finger", 2)]
     assert station.counts["untared"] == 1
@@ -124,8 +136,8 @@ def test_a_message_without_an_estimate_leaves_its_period_to_the_next(
 
 def test_sensors_of_others_are_not_even_counted(station: Station, came: Came) -> None:
     publisher = station.make(sensors=("finger",))
-    publisher.take(came(1, START_NS, sensor="thumb"))
-    publisher.take(came(2, START_NS))
+    publisher.take([came(1, START_NS, sensor="thumb")])
+    publisher.take([came(2, START_NS)])
     publisher.report(last=True)
     assert station.put == [("finger", 2)]
     assert station.counts["frames_received"] == 1
@@ -148,7 +160,7 @@ def test_latency_counts_from_the_reading_where_its_clock_is_ours(
     received = came(1, START_NS, arrived_ns=START_NS + MS, **changes)
     object.__setattr__(received.message.stamp, "clock_id", clock_id)
     station.now_ns, station.work_ns = START_NS + 3 * MS, MS // 2
-    publisher.take(received)
+    publisher.take([received])
     publisher.report(last=True)
     assert station.gauges["latency_p50_s"] == pytest.approx(latency_s)
 
@@ -157,7 +169,7 @@ def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
     publisher = station.make()
     for k in range(1, 101):  # of 1 to 100 ms
         station.now_ns, station.work_ns = START_NS + 5 * k * MS, MS
-        publisher.take(came(k, station.now_ns - (k - 1) * MS))
+        publisher.take([came(k, station.now_ns - (k - 1) * MS)])
     station.now_ns = START_NS + 999 * MS
     publisher.report()
     assert not station.gauges, "a second is not over"
@@ -173,13 +185,38 @@ def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
 
 def test_counts_are_handed_over_five_times_a_second(station: Station, came: Came) -> None:
     publisher = station.make()
-    publisher.take(came(1, START_NS))
+    publisher.take([came(1, START_NS)])
     for after_ms, received in ((199, 0), (200, 1), (300, 1), (400, 2)):
         if after_ms == 300:
-            publisher.take(came(2, START_NS))
+            publisher.take([came(2, START_NS)])
         station.now_ns = START_NS + after_ms * MS
         publisher.report()
         assert station.counts["frames_received"] == received
+
+
+def test_sensors_of_one_bundle_share_a_run(station: Station, came: Came) -> None:
+    publisher = station.make()
+    station.runtimes = {"thumb": station.bundle()}
+    names = ("finger", "thumb", "middle", "ring")
+    publisher.take([came(n, START_NS, sensor=name) for n, name in enumerate(names)])
+    assert sorted(station.batches) == [1, 3]
+    assert sorted(station.put) == sorted((name, n) for n, name in enumerate(names))
+
+
+def test_the_rate_holds_for_messages_that_waited_together(station: Station, came: Came) -> None:
+    publisher = station.make(rate_hz=20.0)
+    waited = [came(n, START_NS + 10 * n * MS) for n in range(7)]
+    publisher.take([came(50, START_NS, sensor="thumb"), *waited])
+    assert station.put == [("thumb", 50), ("finger", 0), ("finger", 5)]
+
+
+def test_a_sensor_without_a_bundle_is_counted(station: Station, came: Came) -> None:
+    publisher = station.make()
+    station.runtimes = {"thumb": None}
+    publisher.take([came(1, START_NS, sensor="thumb"), came(2, START_NS)])
+    publisher.report(last=True)
+    assert station.put == [("finger", 2)]
+    assert station.counts["no_model"] == 1
 
 
 def test_what_has_come_is_answered_before_it_leaves(
@@ -189,18 +226,21 @@ def test_what_has_come_is_answered_before_it_leaves(
     stop, begun, go = threading.Event(), threading.Event(), threading.Event()
     kept: list[Health] = []
 
-    def prepare(session: Session, runtime: object, health: Health) -> Any:
+    def prepare(session: Session, models: object, health: Health) -> Any:
         kept.append(health)
 
-        def slow(sensor: str, frame: ElectrodeFrame) -> FeatureEstimate:
+        def slow(sensor: str, frame: ElectrodeFrame, runtime: object) -> Any:
             begun.set()
             assert go.wait(20)
+            return np.zeros(19, np.float32)
+
+        def complete(frame: ElectrodeFrame, *_: object) -> FeatureEstimate:
             place = np.zeros(3, np.float32)
             return FeatureEstimate(
                 frame.stamp, "BT", bytes(32), 5, True, place + 1, place, place, place
             )
 
-        return slow
+        return Estimation(slow, complete)
 
     config = FeaturesServiceConfig(bundle=str(make_bundle()), delivery="every", max_age_s=None)
     service = threading.Thread(

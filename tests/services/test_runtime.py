@@ -12,7 +12,8 @@ import pytest
 
 from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import Bundle, read_bundle
-from palpate_services.inference.model import has_external_data, load
+from palpate_services.inference.model import Runtime, has_external_data, load
+from palpate_services.inference.repository import available, resolve
 
 onnx = pytest.importorskip("onnx")
 
@@ -128,3 +129,63 @@ def test_metadata_says_what_is_served(bundle: Bundle) -> None:
     assert (metadata.name, metadata.version) == ("test", 1)
     assert metadata.bundle_sha256 == bundle.sha256
     assert metadata.metrics == {"force_median_error_n": 0.1}
+
+
+@pytest.mark.parametrize("name", available())
+def test_a_batch_has_the_bits_of_single_runs(name: str) -> None:
+    """Of any size and composition: what one sensor's estimate is, no other sensor may change."""
+    bundle = read_bundle(resolve(name))
+    runtime = load(bundle, bundle.manifest.task)
+    golden = bundle.golden[bundle.manifest.inputs[0].name]
+    rng = np.random.default_rng(3)
+    scale = float(np.abs(golden).max())
+    samples = [
+        np.asarray(
+            row * np.float32(rng.uniform(0, 1)) + rng.normal(0, 0.01 * scale, row.shape), np.float32
+        )
+        for row in np.tile(golden, (20 // len(golden) + 1, 1))[:20]
+    ]
+    alone = [runtime.run(sample) for sample in samples]
+    for size in range(1, len(samples) + 1):
+        for one, other in zip(alone, runtime.run_all(samples[:size]), strict=False):
+            assert one is not None
+            assert other is not None
+            assert {key: value.tobytes() for key, value in one.items()} == {
+                key: value.tobytes() for key, value in other.items()
+            }
+
+
+def test_models_of_narrow_inputs_run_in_batches(bundle: Bundle) -> None:
+    assert load(bundle, "features").batch_most > 1
+
+
+def test_a_model_that_computes_a_batch_otherwise_runs_alone(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a kernel does that sums in another order: the last bit of one value differs."""
+    whole = Runtime._run_batch
+
+    def other_bits(self: Runtime, samples: Any) -> Any:
+        answers = whole(self, samples)
+        if len(samples) >= 4 and answers[0] is not None:
+            answers[0]["force"][1] = np.nextafter(answers[0]["force"][1], np.float32(1e9))
+        return answers
+
+    monkeypatch.setattr(Runtime, "_run_batch", other_bits)
+    runtime = load(bundle, "features")
+    assert runtime.batch_most == 3
+    samples = list(bundle.golden["electrodes"])
+    for one, other in zip(map(runtime.run, samples), runtime.run_all(samples), strict=True):
+        assert one is not None
+        assert other is not None
+        assert one["force"].tobytes() == other["force"].tobytes()
+
+
+def test_one_bad_sample_spoils_no_other_of_its_batch(bundle: Bundle) -> None:
+    runtime = load(bundle, "features")
+    good = bundle.golden["electrodes"][0]
+    first, bad, last = runtime.run_all([good, good * np.float32(np.inf), good])
+    assert bad is None
+    assert first is not None
+    assert last is not None
+    assert first["force"].tobytes() == last["force"].tobytes()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 from math import sqrt
 from typing import Generic, TypeVar
@@ -34,8 +35,9 @@ from palpate.messages import (
     as_field_frame,
 )
 from palpate_services.config import ElectrodesConfig, EstimatingConfig
-from palpate_services.inference.model import Runtime
+from palpate_services.inference.model import Outputs, Runtime
 
+M = TypeVar("M")
 E = TypeVar("E")
 
 FIRST_RETRY_S = 0.5
@@ -78,6 +80,9 @@ class EstimateRefusal(StrEnum):
     REPLAYED = "replayed_refused"
     """The message was replayed, and the service accepts only live and simulated ones."""
 
+    NO_MODEL = "no_model"
+    """The bundle of the sensor was unloaded, or could not be found again after a restart."""
+
     SKIPPED_RATE = "skipped_rate"
     """The estimate of this period was already published (``rate_hz``)."""
 
@@ -95,9 +100,79 @@ def estimate(
     ``tare`` is the one that ``frame.tare_id`` names, None if it is not known; ``runtime`` is a
     bundle of the task ``features``.
     """
-    outputs = _run_on_electrodes(frame, tare, runtime)
-    if isinstance(outputs, EstimateRefusal):
-        return outputs
+    return _completed(frame, sample_of_frame(frame, tare, runtime), runtime, features_of)
+
+
+def estimate_field(
+    frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
+) -> FieldEstimate | EstimateRefusal:
+    """Estimate the displacement of each node of the bundle's mesh; as ``estimate`` otherwise."""
+    return _completed(frame, sample_of_frame(frame, tare, runtime), runtime, field_of)
+
+
+def synthesise(
+    field: FieldFrame | FieldEstimate, runtime: Runtime
+) -> SynthesisEstimate | EstimateRefusal:
+    """Estimate the tared counts that belong to a displacement field on the mesh of the bundle.
+
+    Returns the estimate, or why there is none; ``runtime`` is a bundle of the task ``synthesis``.
+    """
+    return _completed(field, sample_of_field(field, runtime), runtime, synthesis_of)
+
+
+def _completed(
+    message: M,
+    sample: FloatArray | EstimateRefusal,
+    runtime: Runtime,
+    complete: Callable[[M, FloatArray, Outputs, Runtime], E],
+) -> E | EstimateRefusal:
+    if isinstance(sample, EstimateRefusal):
+        return sample
+    outputs = runtime.run(sample)
+    return (
+        EstimateRefusal.NON_FINITE
+        if outputs is None
+        else complete(message, sample, outputs, runtime)
+    )
+
+
+# An estimate is made in three parts, so that the middle one, the model, can run on the samples of
+# several sensors at once: the sample of a message, the model's outputs, and the estimate.
+
+
+def sample_of_frame(
+    frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
+) -> FloatArray | EstimateRefusal:
+    """What the model of a bundle gets of a frame: tared counts; or why it gets nothing."""
+    if frame.sensor_type is not runtime.sensor_type:
+        return EstimateRefusal.WRONG_SENSOR
+    if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
+        return EstimateRefusal.UNTARED
+    if tare.electrodes.shape != frame.electrodes.shape:  # of a finger that was exchanged
+        return EstimateRefusal.UNTARED
+    if not frame.electrodes_valid:
+        return EstimateRefusal.INVALID_CHANNELS
+    return tared_counts(frame, tare)
+
+
+def sample_of_field(
+    field: FieldFrame | FieldEstimate, runtime: Runtime
+) -> FloatArray | EstimateRefusal:
+    """What the model of a bundle gets of a field: its displacements; or why it gets nothing."""
+    known = as_field_frame(field)
+    sample = known.displacement.reshape(-1)
+    if known.mesh_sha256 != runtime.mesh_sha256 or sample.shape != runtime.sample_shape:
+        return EstimateRefusal.WRONG_MESH
+    # The network may hide a NaN: a rectifier (max(x, 0)) turns it into 0 on some machines.
+    if not np.isfinite(sample).all():
+        return EstimateRefusal.NON_FINITE
+    return sample
+
+
+def features_of(
+    frame: ElectrodeFrame, sample: FloatArray, outputs: Outputs, runtime: Runtime
+) -> FeatureEstimate:
+    """The features of a frame, from its sample and what the model made of it."""
     force = outputs["force"]
     # In doubles and without NumPy: three values are faster so, and the threshold is a double.
     x, y, z = force.tolist()
@@ -115,13 +190,10 @@ def estimate(
     )
 
 
-def estimate_field(
-    frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
-) -> FieldEstimate | EstimateRefusal:
-    """Estimate the displacement of each node of the bundle's mesh; as ``estimate`` otherwise."""
-    outputs = _run_on_electrodes(frame, tare, runtime)
-    if isinstance(outputs, EstimateRefusal):
-        return outputs
+def field_of(
+    frame: ElectrodeFrame, sample: FloatArray, outputs: Outputs, runtime: Runtime
+) -> FieldEstimate:
+    """The field of a frame, from its sample and what the model made of it."""
     return FieldEstimate(
         source=frame.stamp,
         sensor_serial=frame.sensor_serial,
@@ -133,23 +205,11 @@ def estimate_field(
     )
 
 
-def synthesise(
-    field: FieldFrame | FieldEstimate, runtime: Runtime
-) -> SynthesisEstimate | EstimateRefusal:
-    """Estimate the tared counts that belong to a displacement field on the mesh of the bundle.
-
-    Returns the estimate, or why there is none; ``runtime`` is a bundle of the task ``synthesis``.
-    """
+def synthesis_of(
+    field: FieldFrame | FieldEstimate, sample: FloatArray, outputs: Outputs, runtime: Runtime
+) -> SynthesisEstimate:
+    """The electrodes of a field, from its sample and what the model made of it."""
     known = as_field_frame(field)
-    sample = known.displacement.reshape(-1)
-    if known.mesh_sha256 != runtime.mesh_sha256 or sample.shape != runtime.sample_shape:
-        return EstimateRefusal.WRONG_MESH
-    # The network may hide a NaN: a rectifier (max(x, 0)) turns it into 0 on some machines.
-    if not np.isfinite(sample).all():
-        return EstimateRefusal.NON_FINITE
-    outputs = runtime.run(sample)
-    if outputs is None:
-        return EstimateRefusal.NON_FINITE
     return SynthesisEstimate(
         source=known.stamp,
         sensor_serial=known.sensor_serial,
@@ -160,20 +220,26 @@ def synthesise(
     )
 
 
-def _run_on_electrodes(
-    frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
-) -> dict[str, FloatArray] | EstimateRefusal:
-    """Outputs of a model for the tared counts of a frame, or why there are none."""
-    if frame.sensor_type is not runtime.sensor_type:
-        return EstimateRefusal.WRONG_SENSOR
-    if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
-        return EstimateRefusal.UNTARED
-    if tare.electrodes.shape != frame.electrodes.shape:  # of a finger that was exchanged
-        return EstimateRefusal.UNTARED
-    if not frame.electrodes_valid:
-        return EstimateRefusal.INVALID_CHANNELS
-    outputs = runtime.run(tared_counts(frame, tare))
-    return EstimateRefusal.NON_FINITE if outputs is None else outputs
+@dataclass(frozen=True, slots=True)
+class Estimation(Generic[M, E]):
+    """How a service makes estimates of its messages.
+
+    Attributes:
+        sample: From a sensor's name, one of its messages and the bundle to what the model gets, or
+            to why there is no estimate.
+        complete: From the message, its sample, what the model made of it, and the bundle to the
+            estimate.
+    """
+
+    sample: Callable[[str, M, Runtime], FloatArray | EstimateRefusal]
+    complete: Callable[[M, FloatArray, Outputs, Runtime], E]
+
+    def one(self, sensor: str, message: M, runtime: Runtime | None) -> E | EstimateRefusal:
+        """The estimate of one message, or why there is none; without a bundle there is none."""
+        if runtime is None:
+            return EstimateRefusal.NO_MODEL
+        sample = self.sample(sensor, message, runtime)
+        return _completed(message, sample, runtime, self.complete)
 
 
 class AgeLimit:
@@ -238,21 +304,19 @@ class TareLookup:
             self._misses.pop(next(iter(self._misses)))
 
 
-class TaredEstimator(Generic[E]):
-    """Estimates from electrode frames, each with the tare that it names. Use from one thread.
+class TaredSamples:
+    """The samples of electrode frames, each with the tare that it names. Use from one thread.
 
-    ``health`` gets one error for each sensor whose type the bundle was not made for.
+    ``health`` gets one error for each sensor whose type its bundle was not made for.
 
-    With ``any_age`` also a frame that became too old during the search for its tare gets an
-    estimate: right for a request, whose sender wants this very frame.
+    With ``any_age`` also a frame that became too old during the search for its tare is taken:
+    right for a request, whose sender wants this very frame.
     """
 
     def __init__(
         self,
         session: Session,
         config: ElectrodesConfig,
-        runtime: Runtime,
-        estimate: Callable[[ElectrodeFrame, Tare | None, Runtime], E | EstimateRefusal],
         health: Health,
         *,
         any_age: bool = False,
@@ -260,15 +324,15 @@ class TaredEstimator(Generic[E]):
         book = TareBook(session, query_timeout_s=config.tare_timeout_s)
         self._tares = TareLookup(book, wait=config.delivery == "every")
         self._age_limit = None if any_age else AgeLimit(config)
-        self._runtime = runtime
-        self._estimate = estimate
         self._health = health
-        self._wrong_sensors: set[str] = set()
+        self._wrong_sensors: set[tuple[str, bytes]] = set()
 
-    def estimate(self, sensor: str, frame: ElectrodeFrame) -> E | EstimateRefusal:
-        """The estimate from a frame, or the reason why there is none."""
-        if frame.sensor_type is not self._runtime.sensor_type:
-            self._report_wrong_sensor(sensor, frame)
+    def take(
+        self, sensor: str, frame: ElectrodeFrame, runtime: Runtime
+    ) -> FloatArray | EstimateRefusal:
+        """The sample of a frame for the model of a bundle, or why there is no estimate."""
+        if frame.sensor_type is not runtime.sensor_type:
+            self._report_wrong_sensor(sensor, frame, runtime)
             return EstimateRefusal.WRONG_SENSOR
         tare = None
         if frame.tare_id != NO_TARE:
@@ -279,19 +343,20 @@ class TaredEstimator(Generic[E]):
                 refusal = self._age_limit.refusal(frame.stamp)
                 if refusal is not None:
                     return refusal
-        return self._estimate(frame, tare, self._runtime)
+        return sample_of_frame(frame, tare, runtime)
 
-    def _report_wrong_sensor(self, sensor: str, frame: ElectrodeFrame) -> None:
-        """Report each such sensor once; the counter ``wrong_sensor`` counts all its frames."""
-        if sensor in self._wrong_sensors:
+    def _report_wrong_sensor(self, sensor: str, frame: ElectrodeFrame, runtime: Runtime) -> None:
+        """Report each such pair once; the counter ``wrong_sensor`` counts all frames."""
+        pair = (sensor, runtime.sha256)
+        if pair in self._wrong_sensors or len(self._wrong_sensors) >= _MISSES_KEPT:
             return
-        self._wrong_sensors.add(sensor)
-        manifest, kind = self._runtime.manifest, frame.sensor_type
+        self._wrong_sensors.add(pair)
+        kind = frame.sensor_type
         error = RemoteError(
             f"sensor {sensor!r} is a {kind.name} with {kind.layout.electrodes} electrodes, the "
-            f"bundle {manifest.name}:{manifest.version} is made for a {manifest.sensor_type}",
+            f"bundle {runtime.label} is made for a {runtime.sensor_type.name}",
             remedy=f"name the other sensors in the option sensors, or serve a bundle for a "
-            f"{kind.name}",
+            f"{kind.name}: palpate model load NAME --sensor {sensor}",
             code=ErrorCode.INVALID_REQUEST,
         )
         # Not degraded: the sensors of the right type are served as before.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -25,18 +25,19 @@ from palpate.errors import ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.files.bundle import read_bundle
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
-from palpate.messages import Origin, ServiceState, Stamp
+from palpate.messages import FloatArray, Origin, ServiceState, Stamp
 from palpate.process import avoid_pauses
 from palpate_services.config import EstimatingConfig
-from palpate_services.inference.estimates import AgeLimit, EstimateRefusal
-from palpate_services.inference.model import Runtime, load
+from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation
+from palpate_services.inference.model import BATCH_MOST, Runtime, load
 from palpate_services.inference.repository import resolve
+from palpate_services.inference.served import ServedModels, Serving
 
 M = TypeVar("M")
 E = TypeVar("E")
 
-EstimateFrom = Callable[[str, M], E | EstimateRefusal]
-"""From a sensor's name and one of its messages to the estimate, or to why there is none."""
+Prepare = Callable[[Session, ServedModels, Health], Estimation[M, E]]
+"""Declares the endpoints of a service, and returns how it makes estimates."""
 
 _COUNT_PERIOD_NS = 200_000_000
 _GAUGE_PERIOD_NS = 1_000_000_000
@@ -73,6 +74,11 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
         ErrorCode.INTERNAL,
         "the model has no finite output for this input",
         "serve another bundle, and report this one to its maker",
+    ),
+    EstimateRefusal.NO_MODEL: (
+        ErrorCode.UNAVAILABLE,
+        "no bundle serves this sensor",
+        "load one: palpate model load NAME",
     ),
     EstimateRefusal.TARE_UNKNOWN: (
         ErrorCode.NOT_FOUND,
@@ -121,8 +127,8 @@ class RateLimit:
 class EstimatePublisher(Generic[M, E]):
     """Publishes an estimate for each message, or counts why there is none. Use from one thread.
 
-    ``health`` gets counters and gauges; ``estimate`` makes the estimate; ``rate_hz`` limits the
-    estimates a second and sensor [Hz], None = no limit.
+    ``health`` gets counters and gauges; ``models`` are the bundles and ``estimation`` how they are
+    used; ``rate_hz`` limits the estimates a second and sensor [Hz], None = no limit.
     """
 
     def __init__(
@@ -131,14 +137,16 @@ class EstimatePublisher(Generic[M, E]):
         session: Session,
         config: EstimatingConfig,
         health: Health,
-        estimate: EstimateFrom[M, E],
+        models: ServedModels,
+        estimation: Estimation[M, E],
         *,
         rate_hz: float | None = None,
     ) -> None:
         self._route = route
         self._session = session
         self._health = health
-        self._estimate = estimate
+        self._models = models
+        self._estimation = estimation
         self._lossless = config.delivery == "every"
         self._sensors = frozenset(config.sensors)
         self._age_limit = AgeLimit(config)
@@ -147,45 +155,78 @@ class EstimatePublisher(Generic[M, E]):
         self._counts: Counter[str] = Counter()
         self._latencies_ns: list[int] = []
         self._busy_ns = 0
+        self._batches = self._batched = 0
         self._counted_ns = self._gauged_ns = time.monotonic_ns()
 
-    def take(self, received: ReceivedMessage[M]) -> None:
-        """Publish the estimate of a message, or count why there is none."""
-        sensor = received.sensor
-        if self._sensors and sensor not in self._sensors:
-            return
+    def take(self, messages: Sequence[ReceivedMessage[M]]) -> None:
+        """Publish the estimates of messages, or count why there are none.
+
+        The model runs once for messages of different sensors that have the same bundle.
+        """
         began_ns = time.monotonic_ns()
-        self._counts[self._route.received] += 1
+        for tick in _without_repetition(messages):
+            samples: dict[Runtime, list[tuple[ReceivedMessage[M], FloatArray]]] = {}
+            for received in tick:
+                sensor = received.sensor
+                if self._sensors and sensor not in self._sensors:
+                    continue
+                self._counts[self._route.received] += 1
+                # One bundle makes all of an estimate, whichever is loaded meanwhile.
+                runtime = self._models.of(sensor)
+                sample = self._sample(received, runtime)
+                if isinstance(sample, EstimateRefusal):
+                    self._counts[sample.value] += 1
+                elif runtime is not None:
+                    samples.setdefault(runtime, []).append((received, sample))
+            for runtime, taken in samples.items():
+                self._run(runtime, taken)
+        self._busy_ns += time.monotonic_ns() - began_ns
+
+    def _sample(
+        self, received: ReceivedMessage[M], runtime: Runtime | None
+    ) -> FloatArray | EstimateRefusal:
+        """What the model gets of a message, or why it gets nothing."""
+        stamp = self._stamp_of(received)
+        if (refusal := self._age_limit.refusal(stamp)) is not None:
+            return refusal
+        if self._rate_limit.reached(received.sensor, stamp):
+            return EstimateRefusal.SKIPPED_RATE
+        if runtime is None:
+            return EstimateRefusal.NO_MODEL
+        return self._estimation.sample(received.sensor, received.message, runtime)
+
+    def _run(
+        self, runtime: Runtime, taken: Sequence[tuple[ReceivedMessage[M], FloatArray]]
+    ) -> None:
+        """Run a model on samples, and publish the estimates or count why there are none."""
+        self._batches += 1
+        self._batched += len(taken)
+        outputs_of = runtime.run_all([sample for _, sample in taken])
+        for (received, sample), outputs in zip(taken, outputs_of, strict=True):
+            if outputs is None:
+                self._counts[EstimateRefusal.NON_FINITE.value] += 1
+                continue
+            message = received.message
+            estimate = self._estimation.complete(message, sample, outputs, runtime)
+            try:
+                self._publisher(received.sensor).put(estimate)
+            except WireError as error:  # finite, and still not allowed by the message contract
+                self._counts[f"unpublishable_{error.reason}"] += 1
+                continue
+            stamp = self._stamp_of(received)
+            self._rate_limit.note(received.sensor, stamp)
+            self._counts["estimates_published"] += 1
+            # Latency counts from the reading, so that it holds the way through gateway and bus.
+            # Only where the stamp is of another clock, or long past (a replay), it counts from the
+            # arrival.
+            live = stamp.origin is not Origin.REPLAYED and stamp.clock_id == clock.CLOCK_ID
+            since_ns = stamp.monotonic_ns if live else received.received_monotonic_ns
+            self._latencies_ns.append(time.monotonic_ns() - since_ns)
+
+    def _stamp_of(self, received: ReceivedMessage[M]) -> Stamp:
         stamp = self._route.source.stamp_of(received.message)
         assert stamp is not None, "every message of these topics has a stamp"
-        reason = self._publish(sensor, stamp, received.message)
-        ended_ns = time.monotonic_ns()
-        self._busy_ns += ended_ns - began_ns
-        if reason is not None:
-            self._counts[reason] += 1
-            return
-        self._counts["estimates_published"] += 1
-        # Latency counts from the reading, so that it holds the way through gateway and bus. Only
-        # where the stamp is of another clock, or long past (a replay), it counts from the arrival.
-        live = stamp.origin is not Origin.REPLAYED and stamp.clock_id == clock.CLOCK_ID
-        since_ns = stamp.monotonic_ns if live else received.received_monotonic_ns
-        self._latencies_ns.append(ended_ns - since_ns)
-
-    def _publish(self, sensor: str, stamp: Stamp, message: M) -> str | None:
-        """Publish one estimate; the counter of the reason if there is none."""
-        if (refusal := self._age_limit.refusal(stamp)) is not None:
-            return refusal.value
-        if self._rate_limit.reached(sensor, stamp):
-            return EstimateRefusal.SKIPPED_RATE.value
-        estimate = self._estimate(sensor, message)
-        if isinstance(estimate, EstimateRefusal):
-            return estimate.value
-        try:
-            self._publisher(sensor).put(estimate)
-        except WireError as error:  # finite, and still not allowed by the message contract
-            return f"unpublishable_{error.reason}"
-        self._rate_limit.note(sensor, stamp)
-        return None
+        return stamp
 
     def _publisher(self, sensor: str) -> Publisher[E]:
         publisher = self._publishers.get(sensor)
@@ -214,6 +255,26 @@ class EstimatePublisher(Generic[M, E]):
                 self._health.gauge("latency_p50_s", float(p50))
                 self._health.gauge("latency_p99_s", float(p99))
                 self._latencies_ns = []
+            if self._batches:
+                self._health.gauge("batch_mean_samples", self._batched / self._batches)
+                self._batches = self._batched = 0
+
+
+def _without_repetition(
+    messages: Sequence[ReceivedMessage[M]],
+) -> Iterator[Sequence[ReceivedMessage[M]]]:
+    """The messages in order, in parts in which no sensor comes twice.
+
+    What is published of a sensor's message decides about its next one (``RateLimit``).
+    """
+    start, seen = 0, set[str]()
+    for at, received in enumerate(messages):
+        if received.sensor in seen:
+            yield messages[start:at]
+            start = at
+            seen.clear()
+        seen.add(received.sensor)
+    yield messages[start:]
 
 
 def reply(estimate: E | EstimateRefusal, health: Health) -> E:
@@ -240,26 +301,28 @@ def serve(
     stop: threading.Event,
     *,
     instance: str | None,
-    prepare: Callable[[Session, Runtime, Health], EstimateFrom[M, E]],
+    prepare: Prepare[M, E],
     rate_hz: float | None = None,
 ) -> None:
     """Serve until ``stop`` is set; then withdraw, answer what has already come, and leave.
 
-    ``route`` says from which topic to which; ``prepare`` returns what makes the estimates, and may
+    ``route`` says from which topic to which; ``prepare`` returns how estimates are made, and may
     declare endpoints of the service; ``rate_hz`` limits the estimates a second and sensor [Hz]. The
     other arguments and the errors are those of ``run_estimating``.
     """
     instance = instance or route.service
     # Before the bus is joined: no message may wait while the model loads and warms up.
-    runtime = load(read_bundle(resolve(config.bundle)), route.service)
+    models = ServedModels(Serving(load(read_bundle(resolve(config.bundle)), route.service)))
     health = Health(route.service, instance)
     with Session.open(link, station=station) as session:
         presence = session.presence(route.service, instance=instance)
         session.queryable(
-            endpoints.MODEL, lambda _: runtime.metadata(), service=route.service, instance=instance
+            endpoints.MODEL, lambda _: models.metadata(), service=route.service, instance=instance
         )
-        estimate = prepare(session, runtime, health)
-        publisher = EstimatePublisher(route, session, config, health, estimate, rate_hz=rate_hz)
+        estimation = prepare(session, models, health)
+        publisher = EstimatePublisher(
+            route, session, config, health, models, estimation, rate_hz=rate_hz
+        )
         messages = session.subscriber(
             route.source,
             sensor=config.sensors[0] if len(config.sensors) == 1 else "*",
@@ -267,29 +330,37 @@ def serve(
             depth=config.keep_newest,
         )
         with HealthReporter(session, health, refresh=lambda: _copy_counters(messages, health)):
-            manifest = runtime.manifest
-            health.set_state(ServiceState.READY, f"serving {manifest.name}:{manifest.version}")
+            health.set_state(ServiceState.READY, models.describe())
             avoid_pauses()
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
             while not stop.is_set():
                 beat()
-                try:
-                    publisher.take(messages.next(_WAIT_S))
-                except StreamTimeout:
-                    pass
+                publisher.take(_waiting(messages, _WAIT_S, config.batch_wait_s))
                 publisher.report()
             # Withdrawn first, so that no client relies on this service while it drains.
             presence.not_ready()
             health.set_state(ServiceState.STOPPING, "draining")
             deadline = time.monotonic() + config.drain_s
-            try:
-                while time.monotonic() < deadline:
-                    publisher.take(messages.next(_QUIET_S))
-            except StreamTimeout:
-                pass
+            while time.monotonic() < deadline and (left := _waiting(messages, _QUIET_S)):
+                publisher.take(left)
             messages.close()
             publisher.report(last=True)
+
+
+def _waiting(
+    messages: Subscriber[M], timeout_s: float, more_s: float = 0.0
+) -> list[ReceivedMessage[M]]:
+    """The next message and those that wait with it or come within ``more_s``; empty = none."""
+    taken: list[ReceivedMessage[M]] = []
+    try:
+        taken.append(messages.next(timeout_s))
+        deadline = time.monotonic() + more_s
+        while len(taken) < BATCH_MOST:
+            taken.append(messages.next(max(0.0, deadline - time.monotonic()) if more_s else 0.0))
+    except StreamTimeout:
+        pass
+    return taken
 
 
 def _copy_counters(messages: Subscriber[M], health: Health) -> None:

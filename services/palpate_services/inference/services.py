@@ -18,13 +18,15 @@ from palpate_services.config import (
     SynthesisServiceConfig,
 )
 from palpate_services.inference.estimates import (
-    TaredEstimator,
-    estimate,
-    estimate_field,
-    synthesise,
+    Estimation,
+    TaredSamples,
+    features_of,
+    field_of,
+    sample_of_field,
+    synthesis_of,
 )
-from palpate_services.inference.loop import EstimateFrom, ServiceRoute, reply, serve
-from palpate_services.inference.model import Runtime
+from palpate_services.inference.loop import ServiceRoute, reply, serve
+from palpate_services.inference.served import ServedModels
 
 _FEATURES = ServiceRoute("features", ELECTRODES, FEATURES, "frames_received")
 _FIELD = ServiceRoute("field", ELECTRODES, FIELD, "frames_received")
@@ -65,29 +67,31 @@ def run_estimating(
 
 
 def _features(
-    config: FeaturesServiceConfig, session: Session, runtime: Runtime, health: Health
-) -> EstimateFrom[Any, Any]:
-    return TaredEstimator(session, config, runtime, estimate, health).estimate
+    config: FeaturesServiceConfig, session: Session, models: ServedModels, health: Health
+) -> Estimation[Any, Any]:
+    return Estimation(TaredSamples(session, config, health).take, features_of)
 
 
 def _field(
-    config: FieldServiceConfig, session: Session, runtime: Runtime, health: Health
-) -> EstimateFrom[Any, Any]:
-    # Requests come in a thread of their own, and an estimator belongs to one thread.
-    requested = TaredEstimator(session, config, runtime, estimate_field, health, any_age=True)
+    config: FieldServiceConfig, session: Session, models: ServedModels, health: Health
+) -> Estimation[Any, Any]:
+    # Requests come in a thread of their own, and samples are taken in one thread.
+    requested = Estimation(TaredSamples(session, config, health, any_age=True).take, field_of)
 
     def handle(request: FieldRequest) -> FieldEstimate:
-        return reply(requested.estimate(request.sensor, request.frame), health)
+        runtime = models.of(request.sensor)
+        return reply(requested.one(request.sensor, request.frame, runtime), health)
 
     session.queryable(endpoints.ESTIMATE_FIELD, handle, service="field", instance=health.instance)
-    return TaredEstimator(session, config, runtime, estimate_field, health).estimate
+    return Estimation(TaredSamples(session, config, health).take, field_of)
 
 
-def _synthesis(session: Session, runtime: Runtime, health: Health) -> EstimateFrom[Any, Any]:
+def _synthesis(session: Session, models: ServedModels, health: Health) -> Estimation[Any, Any]:
+    made = Estimation(lambda _, field, runtime: sample_of_field(field, runtime), synthesis_of)
     session.queryable(
         endpoints.SYNTHESISE,
-        lambda field: reply(synthesise(field, runtime), health),
+        lambda field: reply(made.one("", field, models.of("")), health),
         service="synthesis",
         instance=health.instance,
     )
-    return lambda _, field: synthesise(field, runtime)
+    return made
