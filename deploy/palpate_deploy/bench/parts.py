@@ -1,12 +1,14 @@
-"""The gateway and the client of ``palpate bench e2e``, processes of their own.
+"""The services and the client of a benchmark, processes of their own.
 
-``python -m palpate_deploy.bench.parts gateway PROFILE`` is the gateway as a station runs it, with
-the benchmark's device in its driver table. ``... client ENDPOINT STATION OUT DELIVERY`` is a
+``python -m palpate_deploy.bench.parts SERVICE PROFILE`` is a service as a station runs it, with the
+benchmark's device in the gateway's driver table. ``... client ENDPOINT STATION OUT DELIVERY`` is a
 robot's client, which notes the age of every estimate.
 """
 
 from __future__ import annotations
 
+import os
+import select
 import sys
 import time
 from pathlib import Path
@@ -16,14 +18,20 @@ from palpate_deploy.bench.harness import dropped_by, received, stop_on_sigterm, 
 DRIVER = "palpate_deploy.bench.device:BenchDevice"
 
 
-def gateway(profile: str) -> None:
-    """Run the gateway with the benchmark's driver."""
-    from palpate_deploy.station.processes import run_service
+def service(name: str, profile: str) -> None:
+    """Run a service of a profile, the gateway with the benchmark's driver."""
+    from palpate_deploy.station.processes import run_service, service_named
     from palpate_deploy.station.profile import load_profile
-    from palpate_gateway.drivers import DRIVERS
 
-    DRIVERS["bench"] = DRIVER
-    run_service("gateway", load_profile(profile))
+    if name == "gateway":
+        from palpate_gateway.drivers import DRIVERS
+
+        DRIVERS["bench"] = DRIVER
+    if "FAKETIME_TIMESTAMP_FILE" in os.environ:
+        # libfaketime 0.9.10 breaks clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME), which is how
+        # Python sleeps.
+        time.sleep = lambda seconds: select.select([], [], [], float(seconds)) and None
+    run_service(service_named(name), load_profile(profile))
 
 
 def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
@@ -52,7 +60,7 @@ def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "gateway":
-        gateway(sys.argv[2])
-    else:
+    if sys.argv[1] == "client":
         client(sys.argv[2], sys.argv[3], Path(sys.argv[4]), sys.argv[5])
+    else:
+        service(sys.argv[1], sys.argv[2])

@@ -91,3 +91,17 @@ def codec(
     from palpate_deploy.bench.codec import run_codec
 
     run_codec(rounds, as_json=json_, save=save)
+
+
+@bench_app.command(epilog=example("palpate bench faults", "palpate bench faults --only disk"))
+def faults(
+    seconds: Annotated[float, typer.Option(min=0.5, help="Duration of a quiet part [s].")] = 5.0,
+    only: Annotated[str, typer.Option(help="Only the rows whose name contains this.")] = "",
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Break what is around a station, one thing after another, and measure what is noticed."""
+    from palpate_deploy.bench.faults import run_faults
+
+    raise typer.Exit(run_faults(seconds=seconds, only=only, as_json=json_, save=save, out=out))

@@ -1,0 +1,619 @@
+"""``palpate bench faults``: what a station does when something around it goes wrong.
+
+Each row breaks one thing from outside, in a station of its own, and measures what others notice of
+it. The goals are those of the serving reference (A5). Processes that are killed or hang have a
+benchmark of their own (``palpate bench restart``), as have exchanged models (``bench swap``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import resource
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from rich.console import Console
+from rich.table import Table
+
+from palpate.bus import Delivery, endpoints
+from palpate.bus.link import open_zenoh
+from palpate.bus.topics import (
+    ELECTRODES,
+    ENCODING_PREFIX,
+    MAX_MESSAGE_BYTES,
+    STATUS,
+    sensor_key,
+)
+from palpate.codec import ELECTRODE_FRAME, ERROR, TARE_REQUEST
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, ErrorCode, PalpateError, StreamTimeout
+from palpate.files.record import read_record
+from palpate.messages import ServiceState, TareRequest
+from palpate_deploy.bench.fault_station import (
+    FORGED_TICK,
+    SENSOR,
+    EstimateAccount,
+    FaultStation,
+    resident_bytes,
+)
+from palpate_deploy.bench.results import finish, progress_bar
+
+Figures = dict[str, float | int | str]
+FAKETIME = (
+    "/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1",
+    "/usr/lib/aarch64-linux-gnu/faketime/libfaketime.so.1",
+)
+"""Where Debian's package ``libfaketime`` puts its library."""
+
+_PATIENCE_S = 20.0
+_SEED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class FaultResult:
+    """One row.
+
+    Attributes:
+        fault: What was broken.
+        goal: What must hold.
+        met: Whether it did; None = it could not be tried on this host, ``why`` says why.
+        figures: What was measured; names end in the unit.
+        why: Why it was not tried, or what ended the trial.
+    """
+
+    fault: str
+    goal: str
+    met: bool | None
+    figures: Figures
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultTrial:
+    """A row before it is tried: ``run`` gets the duration of its quiet parts [s]."""
+
+    name: str
+    goal: str
+    run: Callable[[float], tuple[bool, Figures]]
+
+
+class _Untried(Exception):
+    """This host cannot try a row."""
+
+
+def _shown(account: EstimateAccount, prefix: str = "") -> Figures:
+    return {
+        f"{prefix}estimates": account.received,
+        f"{prefix}lost": account.lost,
+        f"{prefix}p99_s": account.p99_s,
+        f"{prefix}longest_gap_s": account.longest_gap_s,
+    }
+
+
+def _until(true: Callable[[], bool], timeout_s: float = _PATIENCE_S) -> float:
+    """Time until something holds [s]; infinity if it does not in time."""
+    began_s = time.monotonic()
+    while not true():
+        if time.monotonic() - began_s > timeout_s:
+            return float("inf")
+        time.sleep(0.005)
+    return time.monotonic() - began_s
+
+
+def router_killed(seconds: float) -> tuple[bool, Figures]:
+    """The router is gone for five seconds: links between processes go on, new ones resume."""
+    with FaultStation() as station:
+        names = ("features", "recorder", "gateway")
+        before = {name: station.pid(name) for name in names}
+        mark = station.observer.mark()
+        station.kill("router", signal.SIGKILL)
+        time.sleep(5.0)
+        station.start("router")
+        back_s = _until(station.observer.session.has_router)
+        with station.fresh_session() as session:
+
+            def all_there() -> bool:
+                return {one.service for one in session.alive() if one.ready} >= set(names)
+
+            found_s = back_s + _until(all_there)
+        station.observer.wait_for_next()
+        station.check(*names)
+        same = before == {name: station.pid(name) for name in names}
+        account = station.observer.account(mark)
+    met = found_s <= 2.0 and same and account.lost == 0
+    return met, {"resumed_s": back_s, "all_found_s": found_s, **_shown(account)}
+
+
+def subscriber_frozen(seconds: float) -> tuple[bool, Figures]:
+    """A robot's client is stopped: nobody else may notice, and nothing may pile up."""
+    rounds = 3
+    with FaultStation() as station:
+        pids = {name: station.pid(name) for name in ("gateway", "features", "router")}
+        quiet, frozen, grew = [], [], Counter[str]()
+        for index in range(rounds):
+            mark = station.observer.mark()
+            time.sleep(seconds)
+            quiet.append(station.observer.account(mark))
+            client = station.start_client(f"client{index}")
+            time.sleep(2.0)
+            resident = {name: resident_bytes(pid) for name, pid in pids.items()}
+            mark = station.observer.mark()
+            station.kill(f"client{index}", signal.SIGSTOP)
+            time.sleep(seconds)
+            frozen.append(station.observer.account(mark))
+            for name, pid in pids.items():
+                grew[name] = max(grew[name], resident_bytes(pid) - resident[name])
+            station.kill(f"client{index}", signal.SIGKILL)
+            assert client > 0
+        medians = [
+            sorted(account.p99_s for account in side)[rounds // 2] for side in (quiet, frozen)
+        ]
+    lost = sum(account.lost for account in frozen)
+    ratio = medians[1] / medians[0]
+    figures: Figures = {
+        "p99_quiet_s": medians[0],
+        "p99_frozen_s": medians[1],
+        "p99_ratio": ratio,
+        "lost": lost,
+        "longest_gap_s": max(account.longest_gap_s for account in frozen),
+        **{f"{name}_grew_bytes": count for name, count in grew.items()},
+    }
+    return ratio <= 1.1 and lost == 0 and max(grew.values()) < 8 << 20, figures
+
+
+def _small_disk(folder: Path, size_mib: int) -> tuple[str, ...]:
+    """Words that run a command with a small disk of its own at a folder."""
+    script = f'mount -t tmpfs -o size={size_mib}m tmpfs "$1" && shift && exec "$@"'
+    return (
+        "unshare",
+        "--user",
+        "--map-root-user",
+        "--mount",
+        "sh",
+        "-c",
+        script,
+        "sh",
+        str(folder),
+    )
+
+
+def _disk_trial(
+    seconds: float, break_it: Callable[[Path, int], None], mend: Callable[[Path, int], None]
+) -> tuple[bool, Figures]:
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="palpate-disk-") as name:
+        folder = Path(name)
+        with FaultStation(
+            recorder={"out": name, "min_free_bytes": 2 << 20},
+            prefix={"recorder": _small_disk(folder, 24)},
+        ) as station:
+            pid = station.pid("recorder")
+            inside = Path(f"/proc/{pid}/root{name}")
+            if not list(inside.glob("*.mcap*")):
+                raise _Untried("this host allows no file systems of one's own (unshare --mount)")
+            says = station.observer.session.subscriber(STATUS, service="recorder")
+            mark = station.observer.mark()
+            time.sleep(seconds)
+            quiet = station.observer.account(mark)
+            mark = station.observer.mark()
+            break_it(inside, pid)
+            told_s = _until(lambda: _state_said(says) is ServiceState.DEGRADED)
+            time.sleep(seconds)
+            broken = station.observer.account(mark)
+            mend(inside, pid)
+            resumed_s = _until(lambda: _state_said(says) is ServiceState.READY)
+            time.sleep(1.0)
+            station.check("recorder", "features", "gateway")
+            status = station.stop_one("recorder")
+            readable = 0
+            records = sorted(inside.glob("*.mcap")) if inside.exists() else []
+            for record in records:
+                readable += sum(1 for _ in read_record(record))
+    ratio = broken.p99_s / quiet.p99_s
+    figures: Figures = {
+        "told_s": told_s,
+        "resumed_s": resumed_s,
+        "p99_ratio": ratio,
+        "recorder_exit_status": status,
+        **_shown(broken),
+    }
+    return told_s <= 1.5 and resumed_s < _PATIENCE_S and broken.lost == 0 and status == 0, figures
+
+
+def _state_said(says: Any) -> ServiceState | None:
+    """The newest state that a process has published; None = nothing new."""
+    state = None
+    with contextlib.suppress(StreamTimeout):
+        while True:
+            state = says.next(0.0).message.state
+    return state
+
+
+def disk_full(seconds: float) -> tuple[bool, Figures]:
+    """The disk of the records is full, and has space again."""
+
+    def fill(inside: Path, pid: int) -> None:
+        with contextlib.suppress(OSError), open(inside / "filler", "wb", buffering=0) as file:
+            while file.write(bytes(1 << 20)):
+                pass
+
+    return _disk_trial(seconds, fill, lambda inside, pid: (inside / "filler").unlink())
+
+
+def disk_refuses(seconds: float) -> tuple[bool, Figures]:
+    """Every write to a file fails for the recorder (a limit of the system), and works again."""
+
+    def limit(pid: int, size: int) -> None:
+        _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, hard))
+
+    return _disk_trial(
+        seconds,
+        lambda inside, pid: limit(pid, 1),
+        lambda inside, pid: limit(pid, resource.RLIM_INFINITY),
+    )
+
+
+def wall_clock_jumps(seconds: float) -> tuple[bool, Figures]:
+    """The wall clock of the station jumps by an hour, forth and back, and then runs fast."""
+    library = next((path for path in FAKETIME if Path(path).is_file()), None)
+    if library is None:
+        raise _Untried("libfaketime is not installed (Debian: apt install libfaketime)")
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="palpate-clock-") as name:
+        told = Path(name) / "time"
+        told.write_text("+0\n", encoding="ascii")
+        words = (
+            "env",
+            f"LD_PRELOAD={library}",
+            f"FAKETIME_TIMESTAMP_FILE={told}",
+            "FAKETIME_CACHE_DURATION=1",
+            "FAKETIME_DONT_FAKE_MONOTONIC=1",
+            "DONT_FAKE_MONOTONIC=1",
+        )
+        fake = dict.fromkeys(("gateway", "features", "recorder"), words)
+        with FaultStation(prefix=fake) as station:
+            mark = station.observer.mark()
+            time.sleep(4 * seconds)
+            # The library slows every process that waits; without jumps this is the same.
+            quiet = station.observer.account(mark)
+            mark = station.observer.mark()
+            for offset in ("+3600", "-3600", "+0", "+0 x1.0005"):
+                time.sleep(seconds)
+                # In one step: the library reads the file once a second.
+                part = told.with_suffix(".new")
+                part.write_text(f"{offset}\n", encoding="ascii")
+                part.replace(told)
+            time.sleep(seconds)
+            station.check("gateway", "features", "recorder")
+            account = station.observer.account(mark)
+            counters = _counters(station, "gateway")
+            dropped = _refusals(station)
+    steps = counters.get("wall_steps", 0)
+    figures: Figures = {
+        "wall_steps_told": steps,
+        "refused": dropped,
+        "youngest_s": account.youngest_s,
+        "quiet_lost": quiet.lost,
+        **_shown(account),
+    }
+    sound = account.lost <= quiet.lost and account.disordered == 0 and account.youngest_s >= 0.0
+    return sound and steps >= 3, figures
+
+
+def _counters(station: FaultStation, service: str) -> dict[str, int]:
+    from palpate.messages import ServiceRequest
+
+    status = station.observer.session.query(
+        endpoints.STATUS, ServiceRequest(), service=service, timeout_s=5.0
+    )
+    return dict(status.counters)
+
+
+def _refusals(station: FaultStation) -> str:
+    """What the features service has counted beside the good frames, for people."""
+    usual = ("frames_received", "estimates_published", "untared")
+    counters = _counters(station, "features")
+    return ", ".join(
+        f"{name} {count}" for name, count in sorted(counters.items()) if count and name not in usual
+    )
+
+
+@contextlib.contextmanager
+def _stranger(station: FaultStation) -> Iterator[zenoh.Session]:
+    """A session of another program, which keeps to no contract."""
+    link = LinkConfig(connect=station.profile.link.connect, wait_for_router_s=5.0)
+    session = open_zenoh(link, "peer")
+    try:
+        time.sleep(0.5)
+        yield session
+    finally:
+        session.close()
+
+
+def bad_sequences(seconds: float) -> tuple[bool, Figures]:
+    """Frames with wrong numbers or times are sent under the finger's name, among good ones."""
+    import dataclasses
+
+    with FaultStation() as station, _stranger(station) as stranger:
+        profile = station.profile
+        key = sensor_key(profile.station, SENSOR, ELECTRODES.name)
+        frames = station.observer.session.subscriber(
+            ELECTRODES, sensor=SENSOR, delivery=Delivery.QUEUE
+        )
+        good = frames.next(5.0).message
+        encoding = zenoh.Encoding(ELECTRODES.encoding)
+
+        def send(sequence: int, later_ns: int) -> None:
+            stamp = dataclasses.replace(
+                good.stamp,
+                sequence=max(good.stamp.sequence + sequence, 1),
+                device_tick=FORGED_TICK,
+                monotonic_ns=good.stamp.monotonic_ns + later_ns,
+                wall_ns=good.stamp.wall_ns + later_ns,
+            )
+            frame = dataclasses.replace(good, stamp=stamp)
+            stranger.put(key, ELECTRODE_FRAME.encode(frame), encoding=encoding)
+
+        mark = station.observer.mark()
+        sent: Counter[str] = Counter()
+        kinds: dict[str, tuple[int, int]] = {
+            "repeated": (0, 0),
+            "old": (-50, -500_000_000),
+            "jump": (900, 20_000_000),
+            "far_jump": (1 << 40, 20_000_000),
+            "future": (5, 3_600_000_000_000),
+            "past": (5, -3_600_000_000_000),
+        }
+        until_s = time.monotonic() + 6 * seconds
+        turn = 0
+        while time.monotonic() < until_s:
+            with contextlib.suppress(StreamTimeout):
+                while True:
+                    newest = frames.next(0.0).message
+                    if newest.stamp.device_tick != FORGED_TICK:
+                        good = newest
+            kind = list(kinds)[turn % len(kinds)]
+            send(*kinds[kind])
+            sent[kind] += 1
+            turn += 1
+            time.sleep(0.113)
+        account = station.observer.account(mark)
+        refused = _refusals(station)
+    figures: Figures = {
+        "bad_sent": sum(sent.values()),
+        "refused": refused,
+        "forged": account.forged,
+        "disordered": account.disordered,
+        **_shown(account),
+    }
+    return account.lost <= sum(sent.values()) and account.forged == 0, figures
+
+
+def hostile_payloads(seconds: float) -> tuple[bool, Figures]:
+    """Random, mutated, oversize and mislabelled payloads are sent to the features service."""
+    rng = random.Random(_SEED)
+    per_s = 2000
+    with FaultStation() as station, _stranger(station) as stranger:
+        key = sensor_key(station.profile.station, SENSOR, ELECTRODES.name)
+        frames = station.observer.session.subscriber(ELECTRODES, sensor=SENSOR)
+        whole = frames.next(5.0).payload
+        frames.close()
+        right = zenoh.Encoding(ELECTRODES.encoding)
+        mark = station.observer.mark()
+        time.sleep(seconds)
+        quiet = station.observer.account(mark)
+        before = _counters(station, "features")
+        resident = resident_bytes(station.pid("features"))
+        mark = station.observer.mark()
+        sent, due_s = 0, time.monotonic()
+        for _ in range(int(3 * seconds * per_s)):
+            kind = rng.random()
+            encoding = right
+            if kind < 0.5:
+                payload = rng.randbytes(rng.randrange(400))
+            elif kind < 0.9:
+                # Cut off: every such prefix lacks what the contract requires.
+                payload = whole[: rng.randrange(len(whole) // 2)]
+            elif kind < 0.999:
+                payload, encoding = whole, zenoh.Encoding(ENCODING_PREFIX + "palpate.v9.Frame")
+            else:
+                payload = bytes(MAX_MESSAGE_BYTES // 8)
+            stranger.put(key, payload, encoding=encoding)
+            sent += 1
+            due_s += 1.0 / per_s
+            if (left_s := due_s - time.monotonic()) > 0.0:
+                time.sleep(left_s)
+        time.sleep(1.5)
+        account = station.observer.account(mark)
+        after = _counters(station, "features")
+        grew = resident_bytes(station.pid("features")) - resident
+        station.check("gateway", "features", "recorder")
+    told = sum(
+        after.get(name, 0) - before.get(name, 0)
+        for name in after
+        if name.startswith("rejected") or name.startswith("dropped")
+    )
+    figures: Figures = {
+        "sent": sent,
+        "rejected_or_dropped": told,
+        "p99_ratio": account.p99_s / quiet.p99_s,
+        "features_grew_bytes": grew,
+        **_shown(account),
+    }
+    return account.lost <= 0.01 * account.received and grew < 16 << 20, figures
+
+
+def query_flood(seconds: float) -> tuple[bool, Figures]:
+    """A hundred times more questions than the gateway can hold: refused, typed, and soon over."""
+    many = 1600
+    codes: Counter[str] = Counter()
+    with FaultStation() as station, _stranger(station) as stranger:
+        mark = station.observer.mark()
+        time.sleep(seconds)
+        quiet = station.observer.account(mark)
+        tare = station.observer.session.query(
+            endpoints.TARE, TareRequest(), sensor=SENSOR, timeout_s=10.0
+        )
+        key = sensor_key(station.profile.station, SENSOR, endpoints.TARE.name)
+        payload = TARE_REQUEST.encode(TareRequest())
+        encoding = zenoh.Encoding(ENCODING_PREFIX + TARE_REQUEST.schema)
+        ended = threading.Semaphore(0)
+        lock = threading.Lock()
+
+        def note(reply: zenoh.Reply) -> None:
+            code = "answered"
+            if reply.err is not None:
+                code = "untyped"
+                if str(reply.err.encoding) == ENCODING_PREFIX + ERROR.schema:
+                    code = ERROR.decode(reply.err.payload.to_bytes()).code.name.lower()
+                elif reply.err.payload.to_bytes() == b"Timeout":
+                    code = "timeout"
+            with lock:
+                codes[code] += 1
+
+        mark = station.observer.mark()
+        for _ in range(many):
+            stranger.get(
+                key,
+                zenoh.handlers.Callback(note, ended.release),
+                payload=payload,
+                encoding=encoding,
+                timeout=30.0,
+            )
+        for _ in range(many):
+            ended.acquire(timeout=60.0)
+        account = station.observer.account(mark)
+
+        def answers() -> bool:
+            try:
+                station.observer.session.query(
+                    endpoints.TARE, TareRequest(tare_id=tare.tare_id), sensor=SENSOR, timeout_s=0.5
+                )
+            except PalpateError:
+                return False
+            return True
+
+        again_s = _until(answers)
+    figures: Figures = {
+        "asked": many,
+        **{f"{name}_replies": count for name, count in sorted(codes.items())},
+        "answers_again_s": again_s,
+        "p99_ratio": account.p99_s / quiet.p99_s,
+        **_shown(account),
+    }
+    refused = codes[ErrorCode.RESOURCE_EXHAUSTED.name.lower()]
+    silent = many - sum(codes.values()) + codes["untyped"] + codes["timeout"]
+    return silent == 0 and refused > 0 and again_s <= 1.0 and account.lost == 0, figures
+
+
+TRIALS = tuple(
+    FaultTrial(name, goal, run)
+    for name, goal, run in (
+        (
+            "router killed for 5 s",
+            "all found again <= 2 s after its return, 0 lost, no process restarted",
+            router_killed,
+        ),
+        (
+            "subscriber frozen",
+            "p99 of others <= 1.1 times, 0 lost, no memory piles up",
+            subscriber_frozen,
+        ),
+        ("disk full", "told <= 1.5 s, estimates untouched, resumes by itself", disk_full),
+        (
+            "disk refuses to write",
+            "told <= 1.5 s, estimates untouched, resumes by itself",
+            disk_refuses,
+        ),
+        (
+            "wall clock jumps +-1 h, runs 500 ppm fast",
+            "none lost by it, no negative age, each jump counted",
+            wall_clock_jumps,
+        ),
+        (
+            "repeated, old, jumping, future frames",
+            "a bad frame costs at most one good one",
+            bad_sequences,
+        ),
+        (
+            "hostile payloads, 2000 a second",
+            "no crash, no growth, <= 1 % of good frames lost",
+            hostile_payloads,
+        ),
+        (
+            "1600 questions at once",
+            "each answered, the rest refused and typed, over <= 1 s, 0 lost",
+            query_flood,
+        ),
+    )
+)
+"""All rows, in the order of the table."""
+
+
+def run_faults(*, seconds: float, only: str, as_json: bool, save: bool, out: Path | None) -> int:
+    """``palpate bench faults``, whose help explains the options; 1 if a goal is missed.
+
+    Raises:
+        ConfigError: No row's name contains ``only``.
+    """
+    import json
+
+    chosen = [trial for trial in TRIALS if only in trial.name]
+    if not chosen:
+        raise ConfigError(
+            f"no fault is named {only!r}",
+            remedy=f"one of: {'; '.join(trial.name for trial in TRIALS)}",
+        )
+    results = []
+    with progress_bar() as bar:
+        task = bar.add_task("faults", total=len(chosen))
+        for trial in chosen:
+            bar.update(task, description=trial.name)
+            results.append(_tried(trial, seconds))
+            bar.advance(task)
+    values = {"faults": [asdict(result) for result in results]}
+    finish("faults", values, lambda: _print(results), as_json=as_json, save=save)
+    if out is not None:
+        from palpate_deploy.bench.results import machine
+
+        text = json.dumps({**values, "machine": machine()}, indent=1)
+        out.write_text(text + "\n", encoding="utf-8")
+    return int(any(result.met is False for result in results))
+
+
+def _tried(trial: FaultTrial, seconds: float) -> FaultResult:
+    try:
+        met, figures = trial.run(seconds)
+    except _Untried as reason:
+        return FaultResult(trial.name, trial.goal, None, {}, str(reason))
+    except PalpateError as error:
+        print(f"{trial.name}: {error}", file=sys.stderr)
+        return FaultResult(trial.name, trial.goal, False, {}, str(error))
+    return FaultResult(trial.name, trial.goal, met, figures)
+
+
+def _print(results: list[FaultResult]) -> None:
+    table = Table(title="faults around a station of one finger at 100 Hz", title_justify="left")
+    for column in ("fault", "goal", "met", "measured"):
+        table.add_column(column, overflow="fold")
+    words = {True: "[green]yes[/]", False: "[red]no[/]", None: "[yellow]not tried[/]"}
+    for result in results:
+        measured = ", ".join(f"{name} {_number(value)}" for name, value in result.figures.items())
+        table.add_row(result.fault, result.goal, words[result.met], measured or result.why)
+    Console(highlight=False).print(table)
+
+
+def _number(value: float | int | str) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
