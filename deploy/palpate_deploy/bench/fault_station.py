@@ -140,6 +140,7 @@ class FaultStation:
     Args:
         sensor: Table of the finger in the profile; None = prepared frames.
         recorder: Keys of the recorder's table.
+        emulator: Arguments of ``palpate emulate``, for the device of ``sensor``.
         prefix: Words in front of a process's command, by its name, e.g. ``env NAME=VALUE``.
     """
 
@@ -148,6 +149,7 @@ class FaultStation:
         *,
         sensor: Mapping[str, Any] | None = None,
         recorder: Mapping[str, Any] | None = None,
+        emulator: Sequence[object] = (),
         prefix: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self._run = FiniteRun("bench-faults")
@@ -166,8 +168,14 @@ class FaultStation:
                 self.start(name)
             wait_ready(self.profile, {"features", "recorder"})
             self.observer = EstimateObserver(self.profile)
+            if emulator:
+                self._run.start_module("emulator", "__main__", "emulate", *emulator)
             self.start("gateway")
-            self.observer.wait_for_next()
+            try:
+                self.observer.wait_for_next()
+            except LinkError:
+                self.check("gateway", "features")  # what has ended says why
+                raise
         except BaseException:
             self._run.stop()
             raise

@@ -24,20 +24,22 @@ import zenoh
 from rich.console import Console
 from rich.table import Table
 
+from palpate import clock
 from palpate.bus import Delivery, endpoints
 from palpate.bus.link import open_zenoh
 from palpate.bus.topics import (
     ELECTRODES,
     ENCODING_PREFIX,
+    FEATURES,
     MAX_MESSAGE_BYTES,
     STATUS,
     sensor_key,
 )
 from palpate.codec import ELECTRODE_FRAME, ERROR, TARE_REQUEST
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, ErrorCode, PalpateError, StreamTimeout
+from palpate.errors import ConfigError, ErrorCode, PalpateError, StaleError, StreamTimeout
 from palpate.files.record import read_record
-from palpate.messages import ServiceState, TareRequest
+from palpate.messages import SensorState, ServiceState, TareRequest
 from palpate_deploy.bench.fault_station import (
     FORGED_TICK,
     SENSOR,
@@ -53,6 +55,8 @@ FAKETIME = (
     "/usr/lib/aarch64-linux-gnu/faketime/libfaketime.so.1",
 )
 """Where Debian's package ``libfaketime`` puts its library."""
+
+LOST = SensorState.LOST
 
 _PATIENCE_S = 20.0
 _SEED = 5
@@ -342,6 +346,47 @@ def _stranger(station: FaultStation) -> Iterator[zenoh.Session]:
         session.close()
 
 
+def sensor_silent(seconds: float) -> tuple[bool, Figures]:
+    """A BioTac on a serial line stops sending, and goes on after three seconds."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="palpate-line-") as name:
+        line = f"{name}/bridge"
+        sensor = {"driver": "biotac_bridge", "options": {"line": line, "source": 1, "port": 1}}
+        emulator = ("biotac-bridge", "--link", line, "--fingers", 1, "--play", "press")
+        with FaultStation(sensor=sensor, emulator=emulator) as station:
+            time.sleep(seconds)
+            session = station.observer.session
+            says = session.subscriber(STATUS, service="gateway", delivery=Delivery.QUEUE)
+            newest = session.subscriber(FEATURES, sensor=SENSOR)
+            frames = session.subscriber(ELECTRODES, sensor=SENSOR, delivery=Delivery.QUEUE)
+            time.sleep(0.5)
+            station.kill("emulator", signal.SIGSTOP)
+            stopped_s = time.monotonic()
+            told_ns = stale_used = 0
+            while time.monotonic() < stopped_s + 3.0:
+                with contextlib.suppress(StreamTimeout):
+                    status = says.next(0.0)
+                    lost = [one for one in status.message.sensor_states if one.state is LOST]
+                    if lost and not told_ns:
+                        told_ns = status.received_monotonic_ns
+                with contextlib.suppress(StaleError):
+                    stamp = newest.latest(max_age_s=0.03).message.source
+                    stale_used += clock.age_s(stamp) > 0.035  # of which reading takes a little
+                time.sleep(0.002)
+            last_ns = 0
+            with contextlib.suppress(StreamTimeout):
+                while True:
+                    last_ns = frames.next(0.0).message.stamp.monotonic_ns
+            station.kill("emulator", signal.SIGCONT)
+            back_s = station.observer.wait_for_next(taken_after_ns=time.monotonic_ns())
+            station.check("gateway", "features")
+    told_s = (told_ns - last_ns) * 1e-9 if told_ns else float("inf")
+    figures: Figures = {"told_lost_s": told_s, "stale_used": stale_used, "back_s": back_s}
+    # A frame lasts 10 ms and is published after its last slot.
+    return told_s <= 0.07 and not stale_used and back_s <= 1.0, figures
+
+
 def bad_sequences(seconds: float) -> tuple[bool, Figures]:
     """Frames with wrong numbers or times are sent under the finger's name, among good ones."""
     import dataclasses
@@ -536,6 +581,11 @@ TRIALS = tuple(
             "disk refuses to write",
             "told <= 1.5 s, estimates untouched, resumes by itself",
             disk_refuses,
+        ),
+        (
+            "sensor silent for 3 s",
+            "LOST told <= 70 ms after the last frame, nothing stale used, back <= 1 s",
+            sensor_silent,
         ),
         (
             "wall clock jumps +-1 h, runs 500 ppm fast",
