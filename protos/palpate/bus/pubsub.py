@@ -19,8 +19,9 @@ import zenoh
 
 from palpate import clock
 from palpate.bus.topics import StreamAddress, Topic, check_schema, parse_key
+from palpate.codec import STAGE_TIMINGS
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
-from palpate.messages import Origin
+from palpate.messages import Origin, StageTimings
 from palpate.process import Closing
 
 T = TypeVar("T")
@@ -165,6 +166,14 @@ class Publisher(Generic[M], Closing):
         )
         self._encode = topic.codec.encode
 
+    def encode(self, message: M) -> bytes:
+        """Check and encode, for ``put_payload``.
+
+        Raises:
+            WireError: The message breaks the contract.
+        """
+        return self._encode(message)
+
     def put(self, message: M) -> None:
         """Check, encode and publish.
 
@@ -174,14 +183,14 @@ class Publisher(Generic[M], Closing):
         """
         self.put_payload(self._encode(message))
 
-    def put_payload(self, payload: bytes) -> None:
-        """Publish a payload that is already encoded.
+    def put_payload(self, payload: bytes, *, attachment: bytes | None = None) -> None:
+        """Publish a payload that is already encoded; of an estimate, with its timings.
 
         Raises:
             LinkError: The session is closed.
         """
         try:
-            self._publisher.put(payload)
+            self._publisher.put(payload, attachment=attachment)
         except zenoh.ZError as error:
             raise LinkError(
                 f"cannot publish on {self.key}: {error}", remedy="open the session again"
@@ -197,6 +206,19 @@ class Publisher(Generic[M], Closing):
         self._publisher.undeclare()
 
 
+def timings_of(attachment: bytes) -> StageTimings | None:
+    """The timings in the attachment of an estimate; None if there are none, or of another kind.
+
+    They are read only when asked for, and what cannot be read costs no message.
+    """
+    if not attachment:
+        return None
+    try:
+        return STAGE_TIMINGS.decode(attachment)
+    except WireError:
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class ReceivedMessage(Generic[M]):
     """A valid message, where it came from and when.
@@ -206,6 +228,8 @@ class ReceivedMessage(Generic[M]):
         station: Station that published it.
         sensor: Sensor, or ``service/instance`` for a service's topic.
         received_monotonic_ns: Arrival in this process, host monotonic clock [ns].
+        attachment: What travelled beside the payload; of an estimate, its timings.
+        decode_s: How long its decoding took [s].
     """
 
     message: M
@@ -213,6 +237,13 @@ class ReceivedMessage(Generic[M]):
     station: str
     sensor: str
     received_monotonic_ns: int
+    attachment: bytes = b""
+    decode_s: float = 0.0
+
+    @property
+    def timings(self) -> StageTimings | None:
+        """Where the time of an estimate went; None = its service does not say."""
+        return timings_of(self.attachment)
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,8 +378,13 @@ class Subscriber(Generic[M], Closing):
         check_schema(str(sample.encoding), self.topic.codec.schema)
         address = self._address(str(sample.key_expr))
         payload = sample.payload.to_bytes()
+        began_ns = time.monotonic_ns()
         message = self.topic.codec.decode(payload)
-        return ReceivedMessage(message, payload, address.station, address.sensor, received_ns)
+        decode_s = (time.monotonic_ns() - began_ns) * 1e-9
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        return ReceivedMessage(
+            message, payload, address.station, address.sensor, received_ns, attachment, decode_s
+        )
 
     def _in_order(self, received: ReceivedMessage[M], lost_here: int) -> bool:
         """Count gaps, restarts and duplicates in the sequence; False = do not deliver."""
