@@ -63,7 +63,7 @@ def test_no_contact_no_location(
     make_bundle: Callable[..., Path], make_frame: Frames, make_tare: Callable[..., Tare]
 ) -> None:
     frame, tare = make_frame(60), make_tare()
-    deaf = load(read_bundle(make_bundle(contact_threshold_n=1e6)), "features")
+    deaf = load(read_bundle(make_bundle(contact_threshold_n=1e3)), "features")
     keen = load(read_bundle(make_bundle(contact_threshold_n=0.0)), "features")
     below, above = estimate(frame, tare, deaf), estimate(frame, tare, keen)
     assert isinstance(below, FeatureEstimate)

@@ -23,6 +23,7 @@ from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import PACKAGED, available, resolve
+from palpate_services.inference.trial import proven
 from palpate_training import EXTRA_MODULES
 
 _SHOWN_METRICS = (
@@ -85,7 +86,7 @@ def verify_model(name: str) -> None:
         MissingExtraError: ONNX Runtime is not installed.
     """
     bundle = read_bundle(resolve(name))
-    load(bundle, bundle.manifest.task)
+    load(proven(bundle, bundle.manifest.task), bundle.manifest.task)
     manifest = bundle.manifest
     rows = next(iter(bundle.golden.values())).shape[0]
     print(f"ok  {manifest.name}:{manifest.version}  task {manifest.task}  {bundle.folder}")

@@ -168,10 +168,11 @@ def _bundle(profile: Profile) -> Found:
     from palpate.files.bundle import read_bundle
     from palpate_services.inference.model import load
     from palpate_services.inference.repository import resolve
+    from palpate_services.inference.trial import proven
 
     names = []
     for task, name in served.items():
-        manifest = load(read_bundle(resolve(name)), task).manifest
+        manifest = load(proven(read_bundle(resolve(name)), task), task).manifest
         names.append(f"{manifest.name}:{manifest.version}")
     what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
     return "ok", f"{', '.join(names)} {what}", ""

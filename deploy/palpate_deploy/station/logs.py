@@ -8,6 +8,7 @@ import time
 from typing import Literal
 
 from palpate.errors import ConfigError, DeviceError, MissingExtraError, PalpateError
+from palpate.printable import printable
 
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
@@ -41,8 +42,15 @@ def _add_level(record: logging.LogRecord) -> bool:
     return True
 
 
+class _TextFormatter(logging.Formatter):
+    """Log lines for people: what strangers sent is shown, and does not act on the terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record), keep="\n\t")
+
+
 def _text_formatter() -> logging.Formatter:
-    formatter = logging.Formatter("%(asctime)s %(level)s %(name)s: %(message)s")
+    formatter = _TextFormatter("%(asctime)s %(level)s %(name)s: %(message)s")
     formatter.default_time_format, formatter.default_msec_format = "%H:%M:%S", "%s.%03d"
     return formatter
 
@@ -71,5 +79,5 @@ def exit_code(error: PalpateError) -> int:
 
 def print_error(error: PalpateError) -> None:
     """Print to stderr what was wrong and what to do about it."""
-    print(f"error: {error.problem}", file=sys.stderr)
-    print(f"  fix: {error.remedy}", file=sys.stderr, flush=True)
+    print(f"error: {printable(error.problem)}", file=sys.stderr)
+    print(f"  fix: {printable(error.remedy)}", file=sys.stderr, flush=True)

@@ -12,9 +12,9 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -23,11 +23,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import BundleError
+from palpate.config import check_name
+from palpate.errors import BundleError, ConfigError
+from palpate.files.bounded import arrays_of_npz, parse_json, read_regular
 from palpate.files.tasks import SENSOR_TYPE, TaskContract, check_tensors
 from palpate.messages import FloatArray, SensorType, TensorInfo
+from palpate.printable import printable
 
 BUNDLE_CONTRACT_VERSION = 1
+
+VERSION_MAX = 999_999_999
+THRESHOLD_MAX_N = 1000.0
+"""Largest contact threshold [N]: twenty times what breaks a finger."""
+
+_OPSET_MAX = 999
+_METRICS_MAX = 1000
+_METRIC_MAX = 1e30
+_TEXT_MAX = 20_000
+_DEPTH_MAX = 16
+_TENSORS_MAX = 32
+_RANK_MAX = 8
+_WIDTH_MAX = 100_000_000
+_DIGEST = re.compile(r"(?:[0-9a-f]{64})?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +109,16 @@ def check_task(manifest: Manifest, where: str) -> TaskContract:
     return contract
 
 
+def _tensors(values: object, key: str) -> tuple[TensorInfo, ...]:
+    if not isinstance(values, list) or len(values) > _TENSORS_MAX:
+        raise ValueError(f"{key} are no list of at most {_TENSORS_MAX} tensors")
+    return tuple(_tensor_info(value) for value in values)
+
+
 def _tensor_info(values: Mapping[str, Any]) -> TensorInfo:
     shape = tuple(int(n) for n in values["shape"])
+    if len(shape) > _RANK_MAX or any(not -1 <= size <= _WIDTH_MAX for size in shape):
+        raise ValueError("a tensor's shape has too many or too large dimensions")
     return TensorInfo(str(values["name"]), str(values["dtype"]), shape, str(values["unit"]))
 
 
@@ -104,7 +129,7 @@ def parse_manifest(text: bytes, where: Path) -> Manifest:
         BundleError: It is no manifest, or one of a future contract.
     """
     try:
-        values = json.loads(text)
+        values = parse_json(text)
         if not isinstance(values, dict):
             raise ValueError("not an object")
         version = values.get("contract_version")
@@ -117,22 +142,86 @@ def parse_manifest(text: bytes, where: Path) -> Manifest:
         known = {f.name for f in fields(Manifest)}
         if unknown := set(values) - known:
             raise ValueError(f"unknown keys {', '.join(sorted(unknown))}")
+        _check_values(values)
         for key in ("inputs", "outputs"):
-            values[key] = tuple(_tensor_info(t) for t in values[key])
+            values[key] = _tensors(values[key], key)
         manifest = Manifest(**values)
-        if not np.isfinite(float(manifest.contact_threshold_n)):
-            raise ValueError("contact_threshold_n is not finite")
         if manifest.contract_version != BUNDLE_CONTRACT_VERSION:
             raise ValueError(f"contract_version {manifest.contract_version!r} is not known")
         if manifest.sensor_type not in SensorType.__members__:
             raise ValueError(f"sensor_type {manifest.sensor_type!r} is not known")
     except BundleError:
         raise
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise BundleError(
-            f"{where} is not a bundle manifest: {error}", remedy="export the bundle again"
+            f"{where} is not a bundle manifest: {printable(str(error))}",
+            remedy="export the bundle again",
         ) from error
     return manifest
+
+
+def _check_values(values: Mapping[str, Any]) -> None:
+    """Check what a manifest says of itself before anything is named after it or computed with it.
+
+    Raises:
+        ValueError: A name that could be a path, a number out of range, a text with control
+            characters; it names the key.
+    """
+    try:
+        check_name(values["name"])
+    except ConfigError as error:
+        raise ValueError(error.problem) from error
+    _check_number(values, "version", 1, VERSION_MAX, whole=True)
+    _check_number(values, "opset", 1, _OPSET_MAX, whole=True)
+    _check_number(values, "contact_threshold_n", 0.0, THRESHOLD_MAX_N)
+    for key in ("training_data_sha256", "model_sha256", "golden_sha256"):
+        _check_digest(values[key], key)
+    for key in ("mesh_sha256", "mesh_file_sha256"):
+        _check_digest(values.get(key, ""), key)
+    metrics = values["metrics"]
+    if not isinstance(metrics, dict) or len(metrics) > _METRICS_MAX:
+        raise ValueError(f"metrics are no object of at most {_METRICS_MAX} numbers")
+    for key in metrics:
+        _check_number(metrics, key, -_METRIC_MAX, _METRIC_MAX)
+    if not isinstance(values.get("normalisation", {}), dict):
+        raise ValueError("normalisation is not an object")
+    for key in ("task", "sensor_type", "trained_on", "created", "palpate_version"):
+        if not isinstance(values[key], str):
+            raise ValueError(f"{key} is not a text")
+    _check_texts(values)
+
+
+def _check_number(
+    values: Mapping[str, Any], key: str, least: float, most: float, *, whole: bool = False
+) -> None:
+    value = values[key]
+    if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+        raise ValueError(f"{key} is {value!r}, not a {'whole ' if whole else ''}number")
+    if not least <= value <= most:
+        raise ValueError(f"{key} is {value:g}, {least:g} to {most:g} is allowed")
+
+
+def _check_digest(value: object, key: str) -> None:
+    if not isinstance(value, str) or not _DIGEST.fullmatch(value):
+        raise ValueError(f"{key} is no SHA-256 in hex")
+
+
+def _check_texts(value: object, depth: int = 0) -> None:
+    """Refuse control and direction characters, which would act on the terminal that shows them."""
+    if depth > _DEPTH_MAX:
+        raise ValueError(f"values are nested more than {_DEPTH_MAX} deep")
+    if isinstance(value, str):
+        if len(value) > _TEXT_MAX:
+            raise ValueError(f"a text has {len(value):,} characters, {_TEXT_MAX:,} are allowed")
+        if printable(value) != value:
+            raise ValueError(f"a text holds control characters: {value!r}")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            _check_texts(key, depth + 1)
+            _check_texts(item, depth + 1)
+    elif isinstance(value, list):
+        for item in value:
+            _check_texts(item, depth + 1)
 
 
 IndexArray = npt.NDArray[np.int32]
@@ -205,21 +294,33 @@ def mesh_from_bytes(data: bytes, where: str) -> FieldMesh:
         BundleError: It is no NumPy archive, lacks an array, or an array is not what it must be.
     """
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            mesh = FieldMesh(
-                archive["nodes"],
-                archive["outer_faces"],
-                archive["inner_faces"],
-                archive["sha256"].astype(np.uint8).tobytes(),
-            )
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise BundleError(f"{where} is not a mesh: {error}", remedy=_MESH_REMEDY) from error
+        arrays = arrays_of_npz(data, _MESH_BYTES_MAX)
+        mesh = FieldMesh(
+            arrays["nodes"],
+            arrays["outer_faces"],
+            arrays["inner_faces"],
+            arrays["sha256"].astype(np.uint8).tobytes(),
+        )
+    except (ValueError, KeyError) as error:
+        raise BundleError(
+            f"{where} is not a mesh: {printable(str(error))}", remedy=_MESH_REMEDY
+        ) from error
     check_mesh(mesh, where)
     return mesh
 
 
 MODEL, MANIFEST, GOLDEN, MESH = "model.onnx", "manifest.json", "golden.npz", "mesh.npz"
-_FILE_BYTES_MAX = 256 << 20
+_MODEL_BYTES_MAX = 256 << 20
+_MANIFEST_BYTES_MAX = 1 << 20
+_GOLDEN_BYTES_MAX = 64 << 20
+_MESH_BYTES_MAX = 64 << 20
+_BYTES_MAX = {
+    MODEL: _MODEL_BYTES_MAX,
+    MANIFEST: _MANIFEST_BYTES_MAX,
+    GOLDEN: _GOLDEN_BYTES_MAX,
+    MESH: _MESH_BYTES_MAX,
+}
+"""Size of each file, and of what its arrays expand to; those that ship have 1 % of it [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,6 +425,7 @@ def write_bundle(
         files[MESH] = mesh_to_bytes(mesh)
         values["mesh_file_sha256"] = sha256_hex(files[MESH])
     text = (json.dumps(values, indent=2, sort_keys=True) + "\n").encode()
+    parse_manifest(text, folder / MANIFEST)  # what would be refused is not written
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -384,24 +486,22 @@ def _read_checked(folder: Path, name: str, sha256: str) -> bytes:
 def _read(folder: Path, name: str) -> bytes:
     path = folder / name
     try:
-        if path.stat().st_size > _FILE_BYTES_MAX:
-            raise BundleError(
-                f"{path} exceeds {_FILE_BYTES_MAX >> 20} MiB", remedy="ship a smaller model"
-            )
-        return path.read_bytes()
-    except OSError as error:
+        return read_regular(path, _BYTES_MAX[name])
+    except (OSError, ValueError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or error
         raise BundleError(
-            f"{path} cannot be read: {error.strerror or error}",
-            remedy="a bundle is a folder with model.onnx, manifest.json, golden.npz and, of "
-            "fields, mesh.npz",
+            f"{path} cannot be read: {why}",
+            remedy="a bundle is a folder with the regular files model.onnx, manifest.json, "
+            "golden.npz and, of fields, mesh.npz",
         ) from error
 
 
 def _read_golden(data: bytes, folder: Path) -> dict[str, npt.NDArray[np.float32]]:
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {name: np.asarray(archive[name], np.float32) for name in archive.files}
-    except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
+        arrays = arrays_of_npz(data, _GOLDEN_BYTES_MAX)
+        return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
+    except ValueError as error:
         raise BundleError(
-            f"{folder / GOLDEN} is not a NumPy archive: {error}", remedy="export the bundle again"
+            f"{folder / GOLDEN} is not a NumPy archive: {printable(str(error))}",
+            remedy="export the bundle again",
         ) from error

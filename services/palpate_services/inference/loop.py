@@ -32,6 +32,7 @@ from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Esti
 from palpate_services.inference.model import BATCH_MOST, Runtime, load
 from palpate_services.inference.repository import resolve
 from palpate_services.inference.served import ServedModels, Serving
+from palpate_services.inference.trial import proven
 
 M = TypeVar("M")
 E = TypeVar("E")
@@ -312,7 +313,8 @@ def serve(
     """
     instance = instance or route.service
     # Before the bus is joined: no message may wait while the model loads and warms up.
-    models = ServedModels(Serving(load(read_bundle(resolve(config.bundle)), route.service)))
+    bundle = proven(read_bundle(resolve(config.bundle)), route.service)
+    models = ServedModels(Serving(load(bundle, route.service)))
     health = Health(route.service, instance)
     with Session.open(link, station=station) as session:
         presence = session.presence(route.service, instance=instance)

@@ -1,0 +1,138 @@
+"""Reading what a stranger may have written: no more than a stated number of bytes, ever.
+
+Sizes are checked before anything is read, expanded or allocated. All functions raise ``ValueError``
+with what is wrong, or the ``OSError`` of the file; the caller names the file in its typed error.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import stat
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+_READ_BYTES = 1 << 20
+_ARRAYS_MAX = 64
+_HEADER_BYTES_MAX = 1 << 12
+_RANK_MAX = 8
+_KINDS = "biuf"  # truth values and numbers: no objects, no records, no texts
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """All bytes of a regular file.
+
+    A link, a FIFO, a device or a socket is refused without being read: reading it could block, or
+    never end.
+
+    Raises:
+        OSError: It cannot be opened.
+        ValueError: It is no regular file, or has more than ``most_bytes``.
+    """
+    # O_NONBLOCK: to open a FIFO would wait for its writer. It changes nothing for a file.
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+    if path.is_symlink():
+        raise ValueError("it is a symbolic link, not a regular file")
+    with open(os.open(path, flags), "rb", buffering=0) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("it is not a regular file")
+        if status.st_size > most_bytes:
+            raise ValueError(f"it has {status.st_size:,} bytes, {most_bytes:,} are allowed")
+        parts, left = [], most_bytes + 1
+        while left > 0 and (part := file.read(min(left, _READ_BYTES))):
+            parts.append(part)
+            left -= len(part)
+    if left <= 0:  # it has grown since its size was asked
+        raise ValueError(f"it has more than {most_bytes:,} bytes")
+    return b"".join(parts)
+
+
+def parse_json(text: bytes) -> Any:
+    """The value of a JSON text: finite numbers only, each key once, nested moderately.
+
+    Raises:
+        ValueError: It is no such JSON.
+    """
+    try:
+        return json.loads(text, parse_constant=_not_finite, object_pairs_hook=_each_key_once)
+    except RecursionError as error:
+        raise ValueError("its values are nested too deeply") from error
+
+
+def _not_finite(word: str) -> float:
+    raise ValueError(f"{word} is not a number of JSON")
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) != len(pairs):
+        raise ValueError("a key stands twice in one object")
+    return values
+
+
+def arrays_of_npz(data: bytes, most_bytes: int) -> dict[str, npt.NDArray[Any]]:
+    """Arrays of a NumPy archive by name, which together have at most ``most_bytes``.
+
+    Raises:
+        ValueError: It is no such archive, holds anything but arrays of numbers, or its arrays are
+            larger than allowed or than what the archive holds of them.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) > _ARRAYS_MAX:
+                raise ValueError(f"it holds {len(members)} arrays, {_ARRAYS_MAX} are allowed")
+            size = sum(member.file_size for member in members)
+            if size > most_bytes:
+                raise ValueError(
+                    f"its arrays say that they have {size:,} bytes, {most_bytes:,} are allowed"
+                )
+            arrays = {}
+            for member in members:
+                with archive.open(member) as file:
+                    # A member that expands to more than it says ends at what it says.
+                    content = file.read(member.file_size)
+                name = member.filename.removesuffix(".npy")
+                if name in arrays:
+                    raise ValueError(f"the array {name!r} stands twice in it")
+                arrays[name] = _array(name, content)
+            return arrays
+    except (OSError, EOFError, RuntimeError, NotImplementedError, zlib.error) as error:
+        raise ValueError(str(error)) from error
+    except zipfile.BadZipFile as error:
+        raise ValueError(str(error)) from error
+
+
+def _array(name: str, content: bytes) -> npt.NDArray[Any]:
+    file = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(file)
+        reader = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if reader is None:
+            raise ValueError(f"its format version is {version}")
+        shape, fortran, dtype = reader(file, max_header_size=_HEADER_BYTES_MAX)
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+        raise ValueError(f"the header of the array {name!r} cannot be read: {error}") from error
+    if dtype.kind not in _KINDS or dtype.hasobject:
+        raise ValueError(f"the array {name!r} is of type {dtype}, which is no number")
+    if len(shape) > _RANK_MAX or any(size < 0 for size in shape):
+        raise ValueError(f"the array {name!r} has the shape {shape}")
+    stated = math.prod(shape) * dtype.itemsize
+    found = len(content) - file.tell()
+    if stated != found:
+        raise ValueError(
+            f"the array {name!r} says that it has {stated:,} bytes, the archive holds {found:,}"
+        )
+    flat = np.frombuffer(content, dtype, offset=file.tell())
+    return flat.reshape(shape, order="F" if fortran else "C").copy()
