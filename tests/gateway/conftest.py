@@ -159,7 +159,8 @@ PATIENCE_S = 20.0
 class Running:
     """A gateway in a thread."""
 
-    def __init__(self, values: dict[str, Any], link: LinkConfig) -> None:
+    def __init__(self, values: dict[str, Any], link: LinkConfig, instance: str) -> None:
+        self.instance = instance
         self.stop = threading.Event()
         self.error: BaseException | None = None
         self._config = parse_config(GatewayConfig, values, where="test")
@@ -169,7 +170,7 @@ class Running:
 
     def _run(self) -> None:
         try:
-            node.run(self._config, self._link, "lab", self.stop)
+            node.run(self._config, self._link, "lab", self.stop, instance=self.instance)
         except PalpateError as error:
             self.error = error
 
@@ -182,8 +183,8 @@ class Bus:
     session: Session
 
     @contextmanager
-    def gateway(self, values: dict[str, Any]) -> Iterator[Running]:
-        running = Running(values, self.link)
+    def gateway(self, values: dict[str, Any], *, instance: str = "gateway") -> Iterator[Running]:
+        running = Running(values, self.link, instance)
         try:
             yield running
         finally:
@@ -206,6 +207,11 @@ class Bus:
             return self.session.query(endpoints.STATUS, ServiceRequest(), service="gateway")
         except PalpateError:
             return None
+
+    def statuses(self) -> list[Status]:
+        """Of all gateways."""
+        answers = self.session.query_all(endpoints.STATUS, ServiceRequest(), service="gateway")
+        return [answer for answer in answers if isinstance(answer, Status)]
 
     def state(self, wanted: ServiceState) -> Status:
         """The status when it says so."""

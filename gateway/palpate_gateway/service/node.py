@@ -24,6 +24,7 @@ from palpate_gateway.config import GatewayConfig, SensorConfig
 from palpate_gateway.device import BusDevice, Device
 from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.sensor_key import ClaimedKey
 from palpate_gateway.service.worker import SensorWorker
 from palpate_gateway.wrench.device import WrenchDevice
 
@@ -71,6 +72,7 @@ def run(
     health.set_sensors(tuple(sensor.name for sensor in config.sensors))
     with Session.open(link, station=station) as session:
         workers = []
+        claims = session.claims(session_id=session_id, instance=instance, lease_s=link.lease_s)
         for sensor, device in zip(config.sensors, devices, strict=True):
             # A live source must never wait for a slow subscriber, whatever the pace of others.
             lossless = config.pace == "fast" and not device.info.live
@@ -86,7 +88,7 @@ def run(
                 pace=config.pace,
                 stop=stop,
                 wall=wall,
-                claim=partial(_claim, sources, sensor),
+                key=ClaimedKey(claims, sensor, sources),
             )
             workers.append(worker)
             if isinstance(device, WrenchDevice):
@@ -137,20 +139,6 @@ def _pipeline(config: GatewayConfig, device: Device, session_id: int) -> Pipelin
         retare=None if again_s is None else RetareRules(again_s, config.retare_drift_counts),
         session_id=session_id,
     )
-
-
-def _claim(sources: dict[tuple[str, str], str], sensor: SensorConfig, stream: str) -> None:
-    """Each stream has one source, the finger itself first: two would mix their sequences."""
-    source = sources.get((sensor.key_name, stream))
-    if source == sensor.name:
-        return
-    if source is None or sensor.of is None:
-        sources[sensor.key_name, stream] = sensor.name
-    else:
-        raise ConfigError(
-            f"{source!r} and {sensor.name!r} both publish the {stream} of {sensor.key_name!r}",
-            remedy=f"take one of them out of the profile, or leave out `of` of {sensor.name!r}",
-        )
 
 
 def _serve(

@@ -35,8 +35,8 @@ class MessagePublisher:
         publishers: A publisher for each stream.
         health: Receives the errors of messages that cannot be encoded.
         stop: Ends a wait for a recorded message's time.
-        claim: Called with the name of its stream before each message; raises where another sensor
-            publishes that stream.
+        claim: Called with the name of its stream before each message; raises where another gateway
+            or sensor publishes that stream.
         turns: Those of the thread: a recorded message may be due much later.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 
-from palpate.errors import DeviceError, DeviceTimeout, PalpateError
+from palpate.errors import DeviceError, DeviceTimeout, PalpateError, SensorTaken
 from palpate.health import Health
 from palpate.messages import ChannelFault, FaultKind, SensorState
 from palpate_gateway.condition.channel_health import REMEDIES, describe
@@ -33,6 +33,7 @@ class SensorReport:
         self._zero_lost = False
         self._refused = False
         self._lost_by, self._log_again_s = "", 0.0
+        self._taken_by = ""
         self.is_wrong = False
         """Whether it delivers wrong values: dead or stuck channels, forces without their zero."""
 
@@ -47,7 +48,7 @@ class SensorReport:
         if not back and now_s - self._looked_s < _LOOK_S:
             return
         self._looked_s = now_s
-        self._lost_by = ""
+        self._lost_by = self._taken_by = ""
         faults = () if condition is None else condition.faults
         message = "" if condition is None else condition.message
         self.is_wrong = zero_lost or (condition is not None and condition.has_wrong_channel)
@@ -79,6 +80,15 @@ class SensorReport:
         if error.problem != self._lost_by or now_s >= self._log_again_s:
             self._lost_by, self._log_again_s = error.problem, now_s + _LOG_AGAIN_S
             _log.warning("sensor %s lost, open again in %.1f s: %s", self._name, backoff_s, error)
+
+    def is_taken(self, error: SensorTaken) -> None:
+        """Another gateway publishes under its key; told once for each such gateway."""
+        if error.problem == self._taken_by:
+            return
+        self._taken_by = error.problem
+        self._set_state(SensorState.STARTING, message=error.problem)
+        self._health.fail(error)
+        _log.error("%s", error)
 
     def ended(self, error: PalpateError | None) -> None:
         """It will deliver no more."""

@@ -10,7 +10,6 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import Future
 from math import inf
 from typing import Any, Literal, TypeVar
@@ -24,6 +23,7 @@ from palpate.errors import (
     LinkError,
     PalpateError,
     RemoteError,
+    SensorTaken,
 )
 from palpate.health import Health
 from palpate.heartbeat import Turns
@@ -33,6 +33,7 @@ from palpate_gateway.clock.wall_clock import WallClock
 from palpate_gateway.device import Device
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.publication import LATE_S, MessagePublisher
+from palpate_gateway.service.sensor_key import SensorKey
 from palpate_gateway.service.sensor_report import SensorReport
 from palpate_gateway.wrench.device import WrenchDevice
 from palpate_gateway.wrench.zeroing import Zeroing
@@ -117,8 +118,7 @@ class SensorWorker:
         pace: How a recording is paced.
         stop: Ends the thread.
         wall: The wall clock of the process; None = a new one.
-        claim: Called with the name of its stream before each message; raises where another sensor
-            publishes that stream.
+        key: The key under which it publishes; None = nobody else can.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class SensorWorker:
         pace: Literal["recorded", "fast"],
         stop: threading.Event,
         wall: WallClock | None = None,
-        claim: Callable[[str], None] = lambda stream: None,
+        key: SensorKey | None = None,
     ) -> None:
         self.name = name
         self.device = device
@@ -154,8 +154,9 @@ class SensorWorker:
         self._wall = wall or WallClock()
         self._clock_map: ClockMap | None = None
         self._stop = stop
+        self._key = key or SensorKey()
         self._publisher = MessagePublisher(
-            publishers, health, stop=stop, claim=claim, turns=self._turns
+            publishers, health, stop=stop, claim=self._key.check, turns=self._turns
         )
         self._counters: Counter[str] = Counter()
         self._device_counters: Counter[str] = Counter()
@@ -236,14 +237,23 @@ class SensorWorker:
 
     def _serve(self) -> None:
         backoff_s = BACKOFF_S[0]
-        while not self._stop.is_set():
+        # Before the device is opened: some can serve one process only, and it may be another's.
+        while self._key.wait(self._stop, self._report.is_taken):
             self._turns.next(LATE_S)
             try:
                 self.device.open()
+                self._key.opened(self.device.identity.serial)
                 self._clock_map = self._clock()
                 self.pipeline.begin(self.device.identity, self._clock_map)
                 if self._pump():
                     return
+            except SensorTaken as error:
+                if not self.device.info.live:
+                    raise
+                self.serving = self.silent = False
+                self._counters["taken_over"] += 1
+                self._report.is_taken(error)
+                self._give_up(error.problem)
             except DeviceError as error:
                 if not self.device.info.live:
                     self._publisher.put(self.pipeline.finish())
@@ -257,6 +267,7 @@ class SensorWorker:
             self._device_counters += Counter(self.device.counters)
             self._turns.next(LATE_S)
             self.device.close()
+            self._turns.next(inf)  # another gateway may hold the key for as long as it likes
             self._stop.wait(backoff_s)
             backoff_s = min(2.0 * backoff_s, BACKOFF_S[1])
 
