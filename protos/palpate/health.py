@@ -1,6 +1,7 @@
 """Health of a process: its counters, gauges and state, and the states of its sensors.
 
-Published once a second and on each change of state, and given when asked.
+Published once a second and on each change of state, and given when asked. Bad news is told at once;
+a trouble is over only when it has stayed away for a while, so that no state flaps.
 """
 
 from __future__ import annotations
@@ -24,14 +25,29 @@ from palpate.messages import (
     SensorStatus,
     ServiceState,
     Status,
+    SupervisedProcess,
 )
 from palpate.process import Closing
+from palpate.usage import ProcessUsage
 
 _log = logging.getLogger(__name__)
 
 
+RECOVERY_S = 1.0
+"""A degraded process is ready again when nothing has failed for this long [s]."""
+
+SENSOR_RECOVERY_S = 0.5
+"""A lost sensor is live again when it has delivered for this long without a silence [s]."""
+
 _APART_S = 5e-3
-"""Least time between two statuses [s], however fast states change."""
+"""Least time between two statuses [s]: changes that come together share one."""
+
+_BURST = 5
+_CHANGES_HZ = 5.0
+"""So many statuses are sent at once one after another, and so many a second in the long run [Hz],
+however fast states change."""
+
+_DELIVERING = frozenset({SensorState.LIVE, SensorState.WARMING, SensorState.ZERO_LOST})
 
 
 class Health:
@@ -49,8 +65,13 @@ class Health:
         self._state = ServiceState.STARTING
         self._message = ""
         self._last_error: ErrorReply | None = None
+        self._recovery: tuple[float, str] | None = None  # since when all is well, and the message
         self._sensors: tuple[str, ...] = ()
         self._sensor_states: dict[str, SensorStatus] = {}
+        self._sensor_recovery: dict[str, SensorStatus] = {}
+        self._processes: tuple[SupervisedProcess, ...] = ()
+        self._models: tuple[str, ...] = ()
+        self._usage = ProcessUsage()
         self._started = time.monotonic()
         self._version = __version__
         self.changed = threading.Event()
@@ -73,26 +94,60 @@ class Health:
 
     def fail(self, error: PalpateError, *, degraded: bool = True) -> None:
         """Remember the last error; by default the state becomes DEGRADED."""
+        told = error_reply(error)
         with self._lock:
-            self._last_error = error_reply(error)
-            if degraded:
-                self._state = ServiceState.DEGRADED
+            new = told != self._last_error
+            self._last_error = told
             self._message = error.problem
-        self.changed.set()
+            if degraded:
+                new = new or self._state is not ServiceState.DEGRADED
+                self._state, self._recovery = ServiceState.DEGRADED, None
+        if new:
+            self.changed.set()
 
     def set_state(self, state: ServiceState, message: str = "") -> None:
-        """Set the state of this process."""
+        """Set the state of this process; from DEGRADED it is READY after ``RECOVERY_S`` only."""
         with self._lock:
+            if state is ServiceState.READY and self._state is ServiceState.DEGRADED:
+                since_s = time.monotonic() if self._recovery is None else self._recovery[0]
+                self._recovery = since_s, message
+                return
             different = state is not self._state
-            self._state = state
-            self._message = message
+            self._state, self._message, self._recovery = state, message, None
         if different:
             self.changed.set()
 
     @property
     def state(self) -> ServiceState:
-        """The state last set."""
+        """The present state."""
+        self.settle()
         return self._state
+
+    def settle(self) -> float | None:
+        """End the troubles that have stayed away for long enough.
+
+        Returns:
+            When it has to be called again at the latest [s from now]; None = no trouble is ending.
+        """
+        now_s = time.monotonic()
+        with self._lock:
+            left = []
+            if self._recovery is not None:
+                since_s, message = self._recovery
+                if now_s >= since_s + RECOVERY_S:
+                    self._state, self._message = ServiceState.READY, message
+                    self._recovery = None
+                    self.changed.set()
+                else:
+                    left.append(since_s + RECOVERY_S - now_s)
+            for name, waiting in list(self._sensor_recovery.items()):
+                due_s = 1e-9 * waiting.since_monotonic_ns + SENSOR_RECOVERY_S
+                if now_s >= due_s:
+                    del self._sensor_recovery[name]
+                    self._show(waiting)
+                else:
+                    left.append(due_s - now_s)
+        return min(left, default=None)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -113,20 +168,47 @@ class Health:
         faults: Sequence[ChannelFault] = (),
         message: str = "",
     ) -> None:
-        """Set the state of a sensor; a change of state or faults is published at once."""
+        """Set the state of a sensor; a change of state or faults is published at once.
+
+        Only a lost sensor that delivers again is shown so after ``SENSOR_RECOVERY_S``.
+        """
         status = SensorStatus(name, state, time.monotonic_ns(), tuple(faults), message)
         with self._lock:
-            before = self._sensor_states.get(name)
-            if before is not None and before.state is state:
-                status = replace(status, since_monotonic_ns=before.since_monotonic_ns)
-            self._sensor_states[name] = status
-            same = before is not None and before.state is state and before.faults == status.faults
-        if not same:
+            shown = self._sensor_states.get(name)
+            waiting = self._sensor_recovery.pop(name, None)
+            if shown is None or shown.state is not SensorState.LOST or state not in _DELIVERING:
+                self._show(status)
+            else:
+                if waiting is not None:
+                    status = replace(status, since_monotonic_ns=waiting.since_monotonic_ns)
+                self._sensor_recovery[name] = status
+
+    def _show(self, status: SensorStatus) -> None:
+        """Take over the state of a sensor; the caller holds the lock."""
+        before = self._sensor_states.get(status.name)
+        if before is None or before.state is not status.state:
             self.changed.set()
+        else:
+            status = replace(status, since_monotonic_ns=before.since_monotonic_ns)
+            if before.faults != status.faults:
+                self.changed.set()
+        self._sensor_states[status.name] = status
+
+    def set_processes(self, processes: Sequence[SupervisedProcess]) -> None:
+        """Name the processes that this one, a supervisor, keeps running."""
+        with self._lock:
+            self._processes = tuple(processes)
+
+    def set_models(self, models: Sequence[str]) -> None:
+        """Name the bundles that this process serves, each as ``name:version``."""
+        with self._lock:
+            self._models = tuple(models)
 
     def status(self) -> Status:
         """Everything as a message."""
+        self.settle()
         monotonic_ns, wall_ns = clock.now()
+        usage = self._usage.gauges()
         with self._lock:
             return Status(
                 self.service,
@@ -137,11 +219,13 @@ class Health:
                 time.monotonic() - self._started,
                 self._version,
                 dict(self._counters),
-                dict(self._gauges),
+                {**usage, **self._gauges},
                 self._sensors,
                 self._message,
                 self._last_error,
                 tuple(self._sensor_states.values()),
+                self._processes,
+                self._models,
             )
 
 
@@ -181,17 +265,24 @@ class HealthReporter(Closing):
         return self._health.status()
 
     def _run(self) -> None:
+        allowance, earned_s = float(_BURST), time.monotonic()
         while not self._stop.is_set():
+            self._health.settle()
+            # Cleared before the status is read: a change during the report is published next.
             self._health.changed.clear()
             try:
                 self._publisher.put(self._status())
             except PalpateError as error:
                 if not self._stop.is_set():
                     _log.warning("status not published: %s", error)
-            # States that change faster than this share a report; `changed` is cleared before the
-            # status is read, so that a change during the report is published next.
-            self._stop.wait(_APART_S)
-            self._health.changed.wait(self._period_s)
+            now_s = time.monotonic()
+            allowance = min(_BURST, allowance + _CHANGES_HZ * (now_s - earned_s)) - 1.0
+            earned_s = now_s
+            self._stop.wait(max(_APART_S, -allowance / _CHANGES_HZ))
+            due_s = self._health.settle()
+            self._health.changed.wait(
+                self._period_s if due_s is None else min(self._period_s, due_s + _APART_S)
+            )
 
     def close(self) -> None:
         """Report a last time and stop."""

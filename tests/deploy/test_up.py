@@ -98,19 +98,17 @@ def test_a_station_answers_every_command(
     with Client(link.connect[0], station="test", timeout_s=PATIENCE_S) as robot:
         robot.features("finger", max_age_s=1.0)
 
-    def all_answer() -> bool:
-        # On a busy host one look may come before every process has shown itself or answered.
-        processes = json.loads(palpate("status", *where, "--json").stdout)["processes"]
-        found = {one["service"] for one in processes if one["ready"] and "state" in one}
-        return bool(found == ALL - {"router"})
-
-    wait_until(all_answer, PATIENCE_S, "all are ready and answer")
-
-    def table_is_whole() -> bool:
-        table = palpate("status", *where)
-        return table.returncode == 0 and "features-virtual" in table.stdout
-
-    wait_until(table_is_whole, PATIENCE_S, "the table shows the bundle and no trouble")
+    wait_until(
+        lambda: palpate("status", *where).returncode == 0, PATIENCE_S, "the station is ready"
+    )
+    told = json.loads(palpate("status", *where, "--json").stdout)
+    assert {one["service"] for one in told["processes"] if one["ready"]} == ALL | {"supervisor"}
+    assert {one["service"] for one in told["processes"] if "state" in one} == (
+        ALL - {"router"} | {"supervisor"}
+    )
+    assert told["troubles"] == []
+    assert "on this host" in told["expected_by"]
+    assert "features-virtual" in palpate("status", *where).stdout
     topics = json.loads(palpate("topic", "list", *where, "--json").stdout)["topics"]
     heard = {topic["topic"] for topic in topics if topic["messages"]}
     assert heard >= {"electrodes", "features", "wrench", "pose"}
@@ -132,6 +130,42 @@ def test_a_station_answers_every_command(
     second = palpate("up", "--profile", profile)
     assert second.returncode == 1
     assert "is in use" in second.stderr
+
+
+def test_status_misses_what_should_run(
+    up: subprocess.Popen[bytes],
+    station: tuple[Path, LinkConfig],
+    tmp_path: Path,
+    process_ids: ProcessIds,
+    palpate: Palpate,
+    wait_until: WaitUntil,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    profile, link = station
+    where = ("--connect", link.connect[0], "--station", "test")
+    wait_until(lambda: process_ids(tmp_path).keys() >= ALL, PATIENCE_S, "all processes run")
+    wait_until(
+        lambda: palpate("status", *where).returncode == 0, PATIENCE_S, "the station is ready"
+    )
+    frozen = process_ids(tmp_path)["features"]
+    subprocess.run(["kill", "-STOP", str(frozen)], check=True)
+    try:
+        table = palpate("status", *where)
+        assert table.returncode == 1, table.stdout
+        assert "features: " in table.stdout
+    finally:
+        subprocess.run(["kill", "-CONT", str(frozen)], check=False)
+    wanted = tmp_path / "wanted.toml"
+    text = profile.read_text(encoding="utf-8")
+    processes = 'processes = ["router", "gateway", "features", "recorder", "field"]'
+    wanted.write_text(f"{processes}\n{text}", encoding="utf-8")
+    told = json.loads(palpate("status", "--profile", wanted, "--json").stdout)
+    assert {one["service"]: one["problem"] for one in told["troubles"]}["field"] == "does not run"
+    # Another host, or another user, has no folder of this run: the supervisor says what should run.
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "elsewhere"))
+    told = json.loads(palpate("status", *where, "--json").stdout)
+    assert told["expected_by"] == "the supervisor of the station"
+    assert {one["service"] for one in told["processes"]} == ALL | {"supervisor"}
 
 
 @pytest.mark.parametrize("victim", ["up", "supervisord"])

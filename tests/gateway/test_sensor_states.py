@@ -125,7 +125,9 @@ def test_saturation_under_load_is_told_without_a_cry(
     finger.pressed, finger.fixed = True, {2: 0}
     one = served(has(FaultKind.SATURATED, "E3"))
     assert one.message.startswith("E3 saturated")
-    assert bus.status().state is ServiceState.READY
+    # On a busy host the sensor may have been lost a moment ago, but never for its saturation.
+    error = bus.state(ServiceState.READY).last_error
+    assert error is None or "E3" not in error.message
     finger.pressed, finger.fixed = False, {}
     served(lambda one, now: not one.faults)
 

@@ -23,9 +23,11 @@ from palpate_deploy.cli.options import (
     ProfileOption,
     SensorOption,
     StationOption,
+    WantedOption,
     client_link,
     example,
     group,
+    station_link,
 )
 from palpate_deploy.station.logs import LogFormat, LogLevel, configure
 from palpate_fem.cli.app import fem_app
@@ -100,16 +102,18 @@ def run(
     run_service(service_named(service), load_profile(profile))
 
 
-@app.command(epilog=example("palpate status --json"))
+@app.command(epilog=example("palpate status", "palpate status --profile virtual --json"))
 def status(
+    profile: WantedOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
-    """Processes of a station: state, sensors, counters and last error."""
+    """What should run at a station and what does; fails if anything is missing or not ready."""
     from palpate_deploy.station.status import show_status
 
-    raise typer.Exit(show_status(client_link(connect), station, as_json=json_))
+    link, station = station_link(profile, connect, station)
+    raise typer.Exit(show_status(link, station, as_json=json_, profile=profile))
 
 
 @app.command(epilog=example("palpate doctor --profile virtual"))

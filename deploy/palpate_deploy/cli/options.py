@@ -18,6 +18,15 @@ if TYPE_CHECKING:
 ProfileOption = Annotated[
     str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="A profile by name or path.")
 ]
+WantedOption = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        metavar="NAME|FILE",
+        help="What should run; without it the station's own supervisor says so.",
+    ),
+]
 ConnectOption = Annotated[
     str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
 ]
@@ -72,6 +81,19 @@ def client_link(connect: str) -> LinkConfig:
         {"connect": (connect,), "wait_for_router_s": ROUTER_WAIT_S},
         where="--connect",
     )
+
+
+def station_link(profile: str | None, connect: str, station: str) -> tuple[LinkConfig, str]:
+    """Link and name of a station: those of a profile where the options have their defaults."""
+    if profile is None:
+        return client_link(connect), station
+    from palpate_deploy.station.profile import load_profile
+
+    loaded = load_profile(profile)
+    link = loaded.link.model_copy(update={"wait_for_router_s": ROUTER_WAIT_S})
+    if connect != DEFAULT_CONNECT:
+        link = link.model_copy(update={"connect": (connect,)})
+    return link, loaded.station if station == DEFAULT_STATION else station
 
 
 def existing_file(path: Path) -> Path:

@@ -116,6 +116,15 @@ def new_run_folder(name: str) -> Path:
     return folder
 
 
+def running_folders() -> list[Path]:
+    """Folders of the runs whose process still runs, oldest first."""
+    runs = state_folder() / "runs"
+    try:
+        return sorted(path for path in runs.iterdir() if path.is_dir() and _in_use(path))
+    except OSError:
+        return []
+
+
 def _in_use(folder: Path) -> bool:
     """Whether the process whose id ends the folder's name still runs."""
     pid = folder.name.rpartition("-")[2]

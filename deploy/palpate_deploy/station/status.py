@@ -1,16 +1,19 @@
-"""``palpate status``: which processes run, and what each reports: state, counters, clocks."""
+"""``palpate status``: what should run, what does, and what each process reports of itself."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
-from palpate.bus import AliveService, Session, endpoints
+from palpate.bus import Session, endpoints
+from palpate.census import PATIENCE_S, ROUTER, ProcessReport, take_census
 from palpate.config import LinkConfig
 from palpate.errors import PalpateError
 from palpate.messages import (
@@ -19,7 +22,9 @@ from palpate.messages import (
     ServiceState,
     Status,
 )
+from palpate_deploy.station.expectation import expectation_here, expectation_of
 from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.troubles import Trouble, process_name, troubles
 from palpate_gateway.clock.stamps import ClockQuality
 from palpate_gateway.clock.wall_clock import WallDiscipline
 
@@ -121,30 +126,67 @@ def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status
     return [answer for answer in answers if not isinstance(answer, PalpateError)]
 
 
-def show_status(link: LinkConfig, station: str, *, as_json: bool) -> int:
-    """Print presence and status of a station.
+def show_status(
+    link: LinkConfig,
+    station: str,
+    *,
+    as_json: bool,
+    profile: str | None = None,
+    timeout_s: float = PATIENCE_S,
+) -> int:
+    """Print what should run at a station and what does, with its status.
+
+    What should run is said by ``profile`` (name or path), by the station's supervisor, and by the
+    run of this host that uses this router. A process that does not answer is asked again for
+    ``timeout_s`` [s].
 
     Returns:
-        0; 1 if no process runs, one does not reply, or one is degraded.
+        0; 1 if no process runs, or one is missing, does not answer or is not ready.
 
     Raises:
         LinkError: There is no router.
+        ConfigError: There is no such profile.
     """
-    with Session.open(link, station=station) as session:
-        present = session.alive()
-        answers = {(s.service, s.instance): s for s in ask_status(session)}
+    said = expectation_here(link.connect, station)
+    if profile is not None:
+        said = expectation_of(profile)
+    # Through the router, which knows every process at once.
+    with Session.open(link.model_copy(update={"direct": False}), station=station) as session:
+        expected = frozenset() if said is None else said.processes
+        census = take_census(session, expected=expected, timeout_s=timeout_s)
         router = session.has_router()
+    source = "" if said is None else said.source
+    if not source and any(one.status is not None and one.status.processes for one in census):
+        source = "the supervisor of the station"
+    found = troubles(census)
     if as_json:
-        print(json.dumps(_as_json(station, router, present, answers), indent=2))
+        print(json.dumps(_as_json(station, router, source, census, found), indent=2))
     else:
-        console = Console()
-        console.print(_table(station, present, answers))
-        for status in answers.values():
-            for line in clock_lines(status):
-                console.print(line, markup=False, highlight=False, soft_wrap=True)
-    degraded = any(s.state is ServiceState.DEGRADED for s in answers.values())
-    silent = any((p.service, p.instance) not in answers for p in present)
-    return FAILED if not present or degraded or silent else 0
+        _print(Console(), station, source, census, found)
+    return FAILED if found or not census else 0
+
+
+def _print(
+    console: Console,
+    station: str,
+    source: str,
+    census: Sequence[ProcessReport],
+    found: Sequence[Trouble],
+) -> None:
+    console.print(_table(station, census))
+    for process in census:
+        for line in clock_lines(process.status) if process.status is not None else ():
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    for one in found:
+        problem = f"{process_name(one.service, one.instance)}: {one.problem}"
+        console.print(Text(problem, style="red"), soft_wrap=True)
+        console.print(Text(f"  fix: {one.remedy}"), soft_wrap=True)
+    if census and not source:
+        console.print(
+            "what should run here is not known: no `palpate up` answers; name a --profile",
+            style="yellow",
+            soft_wrap=True,
+        )
 
 
 def shown_counters(status: Status) -> str:
@@ -170,32 +212,27 @@ def duration_text(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def _table(
-    station: str, present: Iterable[AliveService], answers: dict[tuple[str, str], Status]
-) -> Table:
+def _table(station: str, census: Iterable[ProcessReport]) -> Table:
     table = Table(title=f"station {station}", title_justify="left")
     for column in ("process", "ready", "state", "up", "sensors", "says", "counters"):
         table.add_column(column, overflow="fold")
-    for process in present:
-        name = process.service
-        if process.instance != process.service:
-            name += f"/{process.instance}"
+    for process in census:
+        name = process_name(process.service, process.instance)
         ready = "[green]yes[/]" if process.ready else "[yellow]no[/]"
-        status = answers.get((process.service, process.instance))
+        status = process.status
         if status is None:
-            table.add_row(name, ready, "[red]no answer[/]", "", "", "", "")
+            state = "[green]routes[/]" if (process.service, process.instance) == ROUTER else ""
+            if not process.alive:
+                state = "[red]missing[/]"
+            table.add_row(name, ready, state or "[red]no answer[/]", "", "", "", "")
             continue
-        says = escape(status.message)
-        if status.last_error is not None and status.state is ServiceState.DEGRADED:
-            error = status.last_error
-            says = f"{escape(error.message)} [dim](fix: {escape(error.remedy)})[/]"
         table.add_row(
             name,
             ready,
             state_text(status.state),
             duration_text(status.uptime_s),
             _sensors(status),
-            says,
+            escape(status.message),
             shown_counters(status),
         )
     if not table.row_count:
@@ -217,15 +254,22 @@ def _sensors(status: Status) -> str:
 def _as_json(
     station: str,
     router: bool,
-    present: Iterable[AliveService],
-    answers: dict[tuple[str, str], Status],
+    source: str,
+    census: Iterable[ProcessReport],
+    found: Sequence[Trouble],
 ) -> dict[str, Any]:
     processes = []
-    for process in present:
-        status = answers.get((process.service, process.instance))
-        entry = {key: getattr(process, key) for key in ("service", "instance", "ready")}
+    for process in census:
+        entry = {key: getattr(process, key) for key in ("service", "instance", "alive", "ready")}
+        status = process.status
         processes.append(entry | ({} if status is None else _status_json(status)))
-    return {"station": station, "router": router, "processes": processes}
+    return {
+        "station": station,
+        "router": router,
+        "expected_by": source or None,
+        "troubles": [asdict(one) for one in found],
+        "processes": processes,
+    }
 
 
 def _status_json(status: Status) -> dict[str, Any]:
@@ -246,6 +290,8 @@ def _status_json(status: Status) -> dict[str, Any]:
             for sensor in status.sensor_states
         ],
         "message": status.message,
+        "models": list(status.models),
+        "processes": [asdict(one) for one in status.processes],
         "counters": dict(status.counters),
         "gauges": dict(status.gauges),
         "last_error": error

@@ -23,6 +23,7 @@ from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import duration_text, shown_counters, state_text
 from palpate_deploy.station.supervision import ProcessState, Supervisor, SupervisorError
+from palpate_deploy.station.supervisor_report import SupervisorReport
 
 _REFRESH_S = 0.25
 _SILENT_AFTER_S = 3.0
@@ -49,7 +50,8 @@ def run_up(profile: Profile, name: str) -> int:
         )
         with join(profile, wait_s=-1.0) as session:
             statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
-            finished = _watch(console, supervisor, statuses, stop)
+            with SupervisorReport(session, supervisor.logs) as report:
+                finished = _watch(console, supervisor, statuses, report, stop)
         if not stop.is_set() and not finished:
             raise SupervisorError(
                 "supervisord is gone", remedy=f"see {supervisor.logs / 'supervisord.log'}"
@@ -60,7 +62,11 @@ def run_up(profile: Profile, name: str) -> int:
 
 
 def _watch(
-    console: Console, supervisor: Supervisor, statuses: Subscriber[Status], stop: threading.Event
+    console: Console,
+    supervisor: Supervisor,
+    statuses: Subscriber[Status],
+    report: SupervisorReport,
+    stop: threading.Event,
 ) -> int | None:
     """Show the processes until a signal (None) or the end of a finite source (its status)."""
     known: dict[str, tuple[Status, float]] = {}
@@ -70,6 +76,7 @@ def _watch(
         while not stop.is_set() and supervisor.running:
             _take(statuses, known)
             processes = supervisor.processes()
+            report.tell(processes)
             if screen is not None:
                 screen.update(_screen(processes, known), refresh=True)
             else:

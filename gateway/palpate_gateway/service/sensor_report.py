@@ -65,11 +65,13 @@ class SensorReport:
 
     def is_silent(self, silent_s: float) -> None:
         """Nothing has come for a while."""
+        # In whole steps, so that silences that follow one another are the same news.
+        silent = f"silent for {int(1e2 * silent_s)}0 ms"
         error = DeviceTimeout(
-            f"sensor {self._name!r} is lost: silent for {1e3 * silent_s:.0f} ms",
+            f"sensor {self._name!r} is lost: {silent}",
             remedy="check its power and cable; reading goes on by itself",
         )
-        self._set_state(SensorState.LOST, message=f"silent for {1e3 * silent_s:.0f} ms")
+        self._set_state(SensorState.LOST, message=silent)
         self._health.fail(error)
 
     def is_lost(self, error: DeviceError, backoff_s: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self, TypeVar
@@ -24,6 +25,9 @@ from palpate.process import Closing
 
 INDIRECT_WAIT_S = 60.0
 """Without direct links opening blocks until the router answers; it gives up after this time [s]."""
+
+_OBSERVER_WAIT_S = 1.0
+"""How long a session that has joined looks for its router once more [s]."""
 
 LOSSLESS_STALL_S = 60.0
 """How long a lossless (replay) publisher may be blocked before its link is closed."""
@@ -153,9 +157,12 @@ class Session(Closing):
     names of its ``service`` and ``instance``. Where many can be meant, ``"*"`` stands for any.
     """
 
-    def __init__(self, raw: zenoh.Session, station: str) -> None:
+    def __init__(self, raw: zenoh.Session, station: str, link: LinkConfig) -> None:
         self._raw = raw
+        self._link = link
         self.station = station
+        self._observing: Session | None = None
+        self._observing_lock = threading.Lock()
         self._closing: list[Callable[[], None]] = []
 
     @classmethod
@@ -174,7 +181,7 @@ class Session(Closing):
                     raw.close()
                     raise no_router(link)
                 time.sleep(0.02)
-        return cls(raw, station)
+        return cls(raw, station, link)
 
     def publisher(
         self,
@@ -349,8 +356,36 @@ class Session(Closing):
         )
 
     def alive(self, *, station: str | None = None) -> list[AliveService]:
-        """Which processes are alive, and which of them are ready."""
-        return alive(self._raw, self.station if station is None else station)
+        """Which processes are alive, and which of them are ready; complete as soon as it is open.
+
+        A peer learns of the others while its links to them come up, and the router knows them all.
+        Without the router it is what this session has learned.
+        """
+        where = self.station if station is None else station
+        views = [self._raw]
+        with contextlib.suppress(LinkError):  # the router is gone
+            observer = self.observer()
+            if observer is not self:
+                views.append(observer._raw)
+        return alive(views, where)
+
+    def observer(self) -> Session:
+        """A session through which questions reach every process of the station at once.
+
+        Its questions go through the router, which knows every process. It is opened when first
+        needed, and closed with this one, which it may be itself.
+
+        Raises:
+            LinkError: There is no router.
+        """
+        if not self._link.direct or not self._link.connect:
+            return self
+        with self._observing_lock:
+            if self._observing is None:
+                update = {"direct": False, "wait_for_router_s": _OBSERVER_WAIT_S}
+                link = self._link.model_copy(update=update)
+                self._observing = self._keep(Session.open(link, station=self.station))
+            return self._observing
 
     def has_router(self) -> bool:
         """Whether a router is connected at present."""

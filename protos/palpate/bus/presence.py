@@ -6,7 +6,7 @@ import contextlib
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import zenoh
@@ -57,17 +57,20 @@ class Presence(Closing):
         self._alive.undeclare()
 
 
-def alive(session: zenoh.Session, station: str, *, timeout_s: float = 1.0) -> list[AliveService]:
-    """All processes that are alive at a station (``"*"`` = any)."""
+def alive(
+    views: Iterable[zenoh.Session], station: str, *, timeout_s: float = 1.0
+) -> list[AliveService]:
+    """All processes that are alive at a station (``"*"`` = any), by what any of the views knows."""
     found: dict[tuple[str, str, str], bool] = {}
     key = live_key(station, "*", "*", "*")
-    for reply in session.liveliness().get(key, timeout=timeout_s):
-        if reply.ok is None:
-            continue
-        *_, where, service, instance, what = str(reply.ok.key_expr).split("/")
-        # Two tokens of a process come in any order, and "alive" comes alone until it serves.
-        name = (where, service, instance)
-        found[name] = found.get(name, False) or what == "ready"
+    for view in views:
+        for reply in view.liveliness().get(key, timeout=timeout_s):
+            if reply.ok is None:
+                continue
+            *_, where, service, instance, what = str(reply.ok.key_expr).split("/")
+            # Two tokens of a process come in any order, and "alive" comes alone until it serves.
+            name = (where, service, instance)
+            found[name] = found.get(name, False) or what == "ready"
     return [AliveService(*name, ready) for name, ready in sorted(found.items())]
 
 

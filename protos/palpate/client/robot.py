@@ -18,10 +18,11 @@ from typing import Any, TypeVar
 
 from palpate.bus import AliveService, Delivery, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
+from palpate.census import ProcessReport, take_census
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import OnProgress, OnStep, ask_simulation
 from palpate.config import DEFAULT_ROUTER, LinkConfig, TlsConfig
-from palpate.errors import PalpateError, StaleError
+from palpate.errors import StaleError
 from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
@@ -237,11 +238,16 @@ class Client(Closing):
         return self.session.alive()
 
     def status(self) -> list[Status]:
-        """Status of every process of the station; broken answers are left out."""
-        answers = self.session.query_all(
-            endpoints.STATUS, ServiceRequest(), timeout_s=self._timeout_s
-        )
-        return [answer for answer in answers if not isinstance(answer, PalpateError)]
+        """Status of every process of the station that answers; complete as ``census`` is."""
+        return [one.status for one in self.census() if one.status is not None]
+
+    def census(self) -> list[ProcessReport]:
+        """Every process that lives or should live, with its status, or that it does not answer.
+
+        Raises:
+            LinkError: There is no router.
+        """
+        return take_census(self.session, timeout_s=self._timeout_s)
 
     def close(self) -> None:
         """Leave the bus."""

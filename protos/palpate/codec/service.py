@@ -33,6 +33,7 @@ from palpate.messages import (
     ServiceRequest,
     ServiceState,
     Status,
+    SupervisedProcess,
     Tare,
     TareRequest,
     TensorInfo,
@@ -198,6 +199,28 @@ def _error_to_wire(error: ErrorReply) -> service_pb2.Error:
     )
 
 
+def _process_from_wire(msg: service_pb2.SupervisedProcess) -> SupervisedProcess:
+    return SupervisedProcess(
+        check_serial(msg.service, "service"),
+        check_serial(msg.instance, "instance"),
+        check_serial(msg.state, "state of a process"),
+        msg.pid,
+        msg.restarts,
+        msg.uptime_s,
+    )
+
+
+def _process_to_wire(process: SupervisedProcess) -> service_pb2.SupervisedProcess:
+    return service_pb2.SupervisedProcess(
+        service=check_serial(process.service, "service"),
+        instance=check_serial(process.instance, "instance"),
+        state=check_serial(process.state, "state of a process"),
+        pid=process.pid,
+        restarts=process.restarts,
+        uptime_s=process.uptime_s,
+    )
+
+
 def _status_from_wire(msg: service_pb2.Status) -> Status:
     state = _STATES.get(msg.state)
     if state is None:
@@ -216,6 +239,8 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
         _check_text(msg.message, "message"),
         _error_from_wire(msg.last_error) if msg.HasField("last_error") else None,
         tuple(map(sensor_status_from_wire, msg.sensor_states)),
+        tuple(map(_process_from_wire, msg.processes)),
+        tuple(check_serial(model, "model") for model in msg.models),
     )
 
 
@@ -234,6 +259,8 @@ def _status_encode(status: Status) -> bytes:
         message=status.message[:_TEXT_MAX],
         last_error=None if status.last_error is None else _error_to_wire(status.last_error),
         sensor_states=sensor_states_to_wire(status.sensor_states),
+        processes=map(_process_to_wire, status.processes),
+        models=[check_serial(model, "model") for model in status.models],
     ).SerializeToString()
 
 

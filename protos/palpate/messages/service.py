@@ -154,6 +154,27 @@ class ErrorReply:
 
 
 @dataclass(frozen=True, slots=True)
+class SupervisedProcess:
+    """A process as its supervisor sees it.
+
+    Attributes:
+        service: What it serves, e.g. ``gateway``.
+        instance: Name of this process among several of its kind.
+        state: One word: ``running``, ``starting``, ``backoff``, ``exited``, ...
+        pid: Its process id; 0 = it does not run.
+        restarts: How often it was started again.
+        uptime_s: Since its last start [s].
+    """
+
+    service: str
+    instance: str
+    state: str
+    pid: int = 0
+    restarts: int = 0
+    uptime_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Status:
     """State and counters of a process: sent each second, on a change of state, and when asked.
 
@@ -169,6 +190,8 @@ class Status:
         sensors: Sensors it serves.
         message: One line for people.
         sensor_states: Of a gateway: each of its sensors.
+        processes: Of a supervisor: each process that should run.
+        models: Of an estimating service: bundles that it serves, each as ``name:version``.
     """
 
     service: str
@@ -184,6 +207,8 @@ class Status:
     message: str = ""
     last_error: ErrorReply | None = None
     sensor_states: Sequence[SensorStatus] = ()
+    processes: Sequence[SupervisedProcess] = ()
+    models: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -168,8 +168,24 @@ class SensorStatus(_message.Message):
     message: str
     def __init__(self, name: _Optional[str] = ..., state: _Optional[_Union[SensorState, str]] = ..., since_monotonic_ns: _Optional[int] = ..., faults: _Optional[_Iterable[_Union[ChannelFault, _Mapping]]] = ..., message: _Optional[str] = ...) -> None: ...
 
+class SupervisedProcess(_message.Message):
+    __slots__ = ("service", "instance", "state", "pid", "restarts", "uptime_s")
+    SERVICE_FIELD_NUMBER: _ClassVar[int]
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    RESTARTS_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    service: str
+    instance: str
+    state: str
+    pid: int
+    restarts: int
+    uptime_s: float
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., uptime_s: _Optional[float] = ...) -> None: ...
+
 class Status(_message.Message):
-    __slots__ = ("service", "instance", "state", "monotonic_ns", "wall_ns", "uptime_s", "version", "counters", "gauges", "sensors", "message", "last_error", "sensor_states")
+    __slots__ = ("service", "instance", "state", "monotonic_ns", "wall_ns", "uptime_s", "version", "counters", "gauges", "sensors", "message", "last_error", "sensor_states", "processes", "models")
     class CountersEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -197,6 +213,8 @@ class Status(_message.Message):
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     LAST_ERROR_FIELD_NUMBER: _ClassVar[int]
     SENSOR_STATES_FIELD_NUMBER: _ClassVar[int]
+    PROCESSES_FIELD_NUMBER: _ClassVar[int]
+    MODELS_FIELD_NUMBER: _ClassVar[int]
     service: str
     instance: str
     state: ServiceState
@@ -210,7 +228,9 @@ class Status(_message.Message):
     message: str
     last_error: Error
     sensor_states: _containers.RepeatedCompositeFieldContainer[SensorStatus]
-    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., state: _Optional[_Union[ServiceState, str]] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., version: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., sensors: _Optional[_Iterable[str]] = ..., message: _Optional[str] = ..., last_error: _Optional[_Union[Error, _Mapping]] = ..., sensor_states: _Optional[_Iterable[_Union[SensorStatus, _Mapping]]] = ...) -> None: ...
+    processes: _containers.RepeatedCompositeFieldContainer[SupervisedProcess]
+    models: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., state: _Optional[_Union[ServiceState, str]] = ..., monotonic_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., version: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., sensors: _Optional[_Iterable[str]] = ..., message: _Optional[str] = ..., last_error: _Optional[_Union[Error, _Mapping]] = ..., sensor_states: _Optional[_Iterable[_Union[SensorStatus, _Mapping]]] = ..., processes: _Optional[_Iterable[_Union[SupervisedProcess, _Mapping]]] = ..., models: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class TensorInfo(_message.Message):
     __slots__ = ("name", "dtype", "shape", "unit")

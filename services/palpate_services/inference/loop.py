@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -331,7 +332,8 @@ def serve(
             delivery=Delivery(config.delivery),
             depth=config.keep_newest,
         )
-        with HealthReporter(session, health, refresh=lambda: _copy_counters(messages, health)):
+        refresh = partial(_refresh, messages, models, health)
+        with HealthReporter(session, health, refresh=refresh):
             health.set_state(ServiceState.READY, models.describe())
             avoid_pauses()
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
@@ -365,8 +367,9 @@ def _waiting(
     return taken
 
 
-def _copy_counters(messages: Subscriber[M], health: Health) -> None:
-    """Copy what the subscriber counted (drops, losses on the bus) into the service's status."""
+def _refresh(messages: Subscriber[M], models: ServedModels, health: Health) -> None:
+    """Copy what the subscriber counted (drops, losses on the bus), and what is served."""
+    health.set_models(models.labels())
     health.set_counts(
         {
             _RENAMED.get(name, name): count

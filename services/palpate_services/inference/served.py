@@ -40,6 +40,11 @@ class ServedModels:
         own = [f"{sensor} {runtime.label}" for sensor, runtime in sorted(serving.own.items())]
         return "serving " + ", ".join([default, *own])
 
+    def labels(self) -> tuple[str, ...]:
+        """What is served, each bundle once as ``name:version``."""
+        serving = self._serving
+        return tuple(sorted({one.label for one in (serving.default, *serving.own.values()) if one}))
+
     def metadata(self) -> ModelMetadata:
         """Description of the default bundle for clients."""
         runtime = self._serving.default

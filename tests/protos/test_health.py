@@ -1,0 +1,172 @@
+"""States that do not flap: bad news at once, the end of a trouble when it has stayed away."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from itertools import pairwise
+
+import pytest
+
+from palpate import health as health_module
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import STATUS
+from palpate.codec import STATUS as STATUS_CODEC
+from palpate.config import LinkConfig
+from palpate.errors import DeviceTimeout, StreamTimeout
+from palpate.health import Health, HealthReporter
+from palpate.messages import SensorState, ServiceState, SupervisedProcess
+from palpate.usage import ProcessUsage
+
+PATIENCE_S = 20.0
+SILENT = DeviceTimeout("sensor 'finger' is lost: silent for 40 ms", remedy="check its cable")
+
+
+class Time:
+    """A monotonic clock that goes on by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(1e9 * self.now_s)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Time:
+    clock = Time()
+    monkeypatch.setattr(health_module, "time", clock)
+    return clock
+
+
+def test_a_failure_is_told_at_once_and_recovery_takes_its_time(clock: Time) -> None:
+    health = Health("gateway", "gateway")
+    health.set_state(ServiceState.READY, "all sensors deliver")
+    health.changed.clear()
+    health.fail(SILENT)
+    assert (health.state, health.changed.is_set()) == (ServiceState.DEGRADED, True)
+    health.set_state(ServiceState.READY, "all sensors deliver")
+    assert health.state is ServiceState.DEGRADED
+    due_s = health.settle()
+    assert due_s is not None
+    clock.now_s += due_s + 1e-6
+    status = health.status()
+    assert (status.state, status.message) == (ServiceState.READY, "all sensors deliver")
+    assert health.settle() is None
+
+
+def test_every_failure_puts_recovery_off(clock: Time) -> None:
+    health = Health("gateway", "gateway")
+    for _ in range(10):
+        health.fail(SILENT)
+        health.set_state(ServiceState.READY)
+        clock.now_s += 0.9 * health_module.RECOVERY_S
+        assert health.state is ServiceState.DEGRADED
+    clock.now_s += 0.2 * health_module.RECOVERY_S
+    assert health.state is ServiceState.READY
+
+
+def test_the_same_failure_again_is_no_news(clock: Time) -> None:
+    health = Health("gateway", "gateway")
+    health.fail(SILENT)
+    health.changed.clear()
+    health.fail(SILENT)
+    assert not health.changed.is_set()
+    health.fail(DeviceTimeout("sensor 'thumb' is lost", remedy="check its cable"))
+    assert health.changed.is_set()
+
+
+def test_stopping_waits_for_nothing(clock: Time) -> None:
+    health = Health("gateway", "gateway")
+    health.fail(SILENT)
+    health.set_state(ServiceState.READY)
+    health.set_state(ServiceState.STOPPING, "draining")
+    clock.now_s += 10.0
+    assert health.state is ServiceState.STOPPING
+
+
+def test_a_lost_sensor_is_live_when_it_has_delivered_for_a_while(clock: Time) -> None:
+    health = Health("gateway", "gateway")
+
+    def shown() -> SensorState:
+        return health.status().sensor_states[0].state
+
+    health.set_sensor_state("finger", SensorState.LIVE)
+    for _ in range(5):
+        health.set_sensor_state("finger", SensorState.LOST)
+        assert shown() is SensorState.LOST
+        health.set_sensor_state("finger", SensorState.LIVE)
+        clock.now_s += 0.9 * health_module.SENSOR_RECOVERY_S
+        assert shown() is SensorState.LOST
+    back_ns = clock.monotonic_ns()
+    health.set_sensor_state("finger", SensorState.LOST)
+    health.set_sensor_state("finger", SensorState.LIVE)
+    clock.now_s += 0.1
+    health.set_sensor_state("finger", SensorState.LIVE)
+    clock.now_s += health_module.SENSOR_RECOVERY_S
+    assert shown() is SensorState.LIVE
+    assert health.status().sensor_states[0].since_monotonic_ns == back_ns
+    health.set_sensor_state("finger", SensorState.LOST)
+    health.set_sensor_state("finger", SensorState.ENDED)
+    assert shown() is SensorState.ENDED
+
+
+def test_a_station_that_flaps_does_not_flood_the_bus(link: LinkConfig) -> None:
+    """A sensor with 40 ms of jitter: its state changed 36 times a second."""
+    health = Health("gateway", "gateway")
+    stop = threading.Event()
+
+    def flap() -> None:
+        while not stop.wait(0.01):
+            health.set_sensor_state("finger", SensorState.LOST, message="silent for 40 ms")
+            health.fail(DeviceTimeout(f"silent: {time.monotonic_ns()}", remedy="check its cable"))
+            health.set_sensor_state("finger", SensorState.LIVE)
+            health.set_state(ServiceState.READY)
+
+    with Session.open(link) as session, HealthReporter(session, health, period_s=3600.0):
+        states = session.subscriber(STATUS, delivery=Delivery.QUEUE)
+        flapping = threading.Thread(target=flap)
+        flapping.start()
+        began_s = time.monotonic()
+        time.sleep(2.0)
+        stop.set()
+        flapping.join()
+        lasted_s = time.monotonic() - began_s
+        told = [states.next(PATIENCE_S).message]
+        while told[-1].state is not ServiceState.READY:
+            told.append(states.next(PATIENCE_S).message)
+        with pytest.raises(StreamTimeout):
+            states.next(0.3)
+    sensors = [one.sensor_states[0].state for one in told if one.sensor_states]
+    changes = sum(a is not b for a, b in pairwise(sensors))
+    assert (sensors[0], sensors[-1]) == (SensorState.LOST, SensorState.LIVE)
+    assert changes == 1, "lost at once, live when it stays live, and nothing between"
+    # What the rate allows while it flaps; the ends of both troubles; one that was on its way.
+    most = health_module._BURST + health_module._CHANGES_HZ * lasted_s + 3
+    assert len(told) <= most
+
+
+def test_a_status_names_processes_and_models() -> None:
+    health = Health("supervisor", "supervisor")
+    health.set_processes([SupervisedProcess("features", "left", "backoff", 0, 3, 1.5)])
+    health.set_models(["features-twin:1"])
+    status = health.status()
+    assert STATUS_CODEC.decode(STATUS_CODEC.encode(status)) == status
+
+
+def test_a_process_tells_what_it_uses() -> None:
+    usage = ProcessUsage()
+    before = usage.gauges()
+    assert before["process_rss_bytes"] > 1e6
+    assert before["process_threads"] >= 1
+    assert before["process_open_files"] >= 1
+    deadline = time.monotonic() + PATIENCE_S
+    while (share := usage.gauges().get("process_cpu_ratio", 0.0)) == 0.0:
+        sum(range(100_000))
+        assert time.monotonic() < deadline
+    assert share <= (os.cpu_count() or 1) * 1.5
+    assert ProcessUsage(2**22 + 5).gauges() == {}, "there is no such process"
