@@ -2,7 +2,7 @@
 
 A robot needs one name::
 
-    from palpate import Client
+    from palpate import Client        # or AsyncClient, for asyncio
 """
 
 from importlib.metadata import PackageNotFoundError, version
@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from palpate.client import Client
+    from palpate.client.aio import AsyncClient
 
     __version__: str
 
-__all__ = ["Client", "__version__"]
+__all__ = ["AsyncClient", "Client", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -22,6 +23,10 @@ def __getattr__(name: str) -> Any:
         from palpate.client import Client
 
         return Client
+    if name == "AsyncClient":
+        from palpate.client.aio import AsyncClient
+
+        return AsyncClient
     if name == "__version__":
         try:
             return version("palpate")

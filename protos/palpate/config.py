@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import ipaddress
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -67,12 +68,36 @@ class StrictConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", str_strip_whitespace=True)
 
 
+TLS_FILES = {
+    "root_ca_certificate": "ca.pem",
+    "certificate": "cert.pem",
+    "private_key": "key.pem",
+}
+"""What a folder of certificates holds."""
+
+
 class TlsConfig(StrictConfig):
     """Certificates for mutual TLS (Zenoh ``transport/link/tls``)."""
 
     root_ca_certificate: Path
     certificate: Path
     private_key: Path
+
+    @classmethod
+    def of_folder(cls, folder: str | Path) -> TlsConfig:
+        """The certificates of a folder with ``ca.pem``, ``cert.pem`` and ``key.pem``.
+
+        Raises:
+            ConfigError: One of them is missing.
+        """
+        paths = {key: Path(folder) / name for key, name in TLS_FILES.items()}
+        for path in paths.values():
+            if not path.is_file():
+                raise ConfigError(
+                    f"{path} does not exist",
+                    remedy=f"name a folder that holds {', '.join(TLS_FILES.values())}",
+                )
+        return cls(**paths)
 
 
 class LinkConfig(StrictConfig):
@@ -113,6 +138,53 @@ class LinkConfig(StrictConfig):
                     "use tls/HOST:PORT with [link.tls] certificates, or listen on 127.0.0.1"
                 )
         return self
+
+
+CONNECT_VARIABLE = "PALPATE_CONNECT"
+STATION_VARIABLE = "PALPATE_STATION"
+TLS_VARIABLE = "PALPATE_TLS"
+"""Environment variables: router, station and folder of certificates where nothing else is given."""
+
+
+def joining_link(
+    connect: str | None = None,
+    *,
+    wait_s: float,
+    tls: TlsConfig | Path | str | None = None,
+) -> LinkConfig:
+    """Link of a program that joins a running station.
+
+    Args:
+        connect: Endpoint of the router; None = ``$PALPATE_CONNECT``, else the default one.
+        wait_s: How long joining may take [s]; negative = no limit.
+        tls: Certificates, or their folder (``TLS_FILES``); None = ``$PALPATE_TLS``, for an
+            endpoint that begins with ``tls/``.
+
+    Raises:
+        ConfigError: No endpoint, no time, or certificates and endpoint do not fit together.
+    """
+    endpoint = connect or os.environ.get(CONNECT_VARIABLE) or DEFAULT_ROUTER
+    if isinstance(tls, str | Path):
+        tls = TlsConfig.of_folder(tls)
+    given = tls is not None
+    if tls is None and endpoint.startswith("tls/") and os.environ.get(TLS_VARIABLE):
+        tls = TlsConfig.of_folder(os.environ[TLS_VARIABLE])
+    link = parse_config(
+        LinkConfig,
+        {"connect": (endpoint,), "wait_for_router_s": wait_s, "tls": tls},
+        where=f"router {endpoint}",
+    )
+    if endpoint.startswith("tls/") and tls is None:
+        raise ConfigError(
+            f"{endpoint} needs certificates",
+            remedy=f"name their folder: --tls FOLDER, Client(tls=...) or ${TLS_VARIABLE}",
+        )
+    if given and not endpoint.startswith("tls/"):
+        raise ConfigError(
+            f"{endpoint} is not encrypted, although certificates are given",
+            remedy=f"connect to tls/{endpoint.partition('/')[2]}, or leave the certificates out",
+        )
+    return link
 
 
 def endpoint_host_port(endpoint: str) -> tuple[str, int]:

@@ -9,20 +9,34 @@ Five lines::
         print(estimate.force, estimate.contact_location)
 
 Every failure is a ``PalpateError``; no call hangs, and no old reading is returned as a new one.
+Links, subscriptions and streams come back by themselves when a router or a service does.
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
+import os
+import threading
 import time
+from pathlib import Path
 from typing import Any, TypeVar
 
 from palpate.bus import AliveService, Delivery, ReceivedMessage, Session, Subscriber, endpoints
-from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, Topic
+from palpate.bus.query import LONGEST_S
+from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, WRENCH, Topic
 from palpate.census import ProcessReport, take_census
 from palpate.client.robot_poses import RobotPosePublisher
-from palpate.client.simulations import OnProgress, OnStep, ask_simulation
-from palpate.config import DEFAULT_ROUTER, LinkConfig, TlsConfig
-from palpate.errors import StaleError
+from palpate.client.simulations import GRACE_S, OnProgress, OnStep, ask_simulation
+from palpate.client.streams import Stream
+from palpate.config import (
+    STATION_VARIABLE,
+    TlsConfig,
+    check_duration,
+    check_name,
+    joining_link,
+)
+from palpate.errors import ConfigError, StaleError, StreamTimeout
 from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
@@ -38,6 +52,7 @@ from palpate.messages import (
     SynthesisEstimate,
     Tare,
     TareRequest,
+    WrenchFrame,
     WrenchZero,
     WrenchZeroRequest,
     as_field_frame,
@@ -45,6 +60,12 @@ from palpate.messages import (
 from palpate.process import Closing
 
 M = TypeVar("M")
+
+STREAM_AGE_S = 0.2
+"""Age of the oldest reading that a stream delivers by default [s]."""
+
+STREAM_TIMEOUT_S = 10.0
+"""Longest silence of a stream by default [s]: a restarted service is back earlier."""
 
 
 class Client(Closing):
@@ -54,28 +75,36 @@ class Client(Closing):
     None = the client's timeout.
 
     Args:
-        connect: Endpoint of the router.
-        station: Name of the station.
+        connect: Endpoint of the router; None = ``$PALPATE_CONNECT``, else the one on this host.
+        station: Name of the station; None = ``$PALPATE_STATION``, else ``lab``.
         timeout_s: How long joining the bus, and by default a question, may take [s].
-        tls: Certificates, for a router on another host.
+        tls: Certificates or the folder that holds them, for a router ``tls/HOST:PORT`` on another
+            host; None = ``$PALPATE_TLS``.
 
     Raises:
+        ConfigError: One of these is none.
         LinkError: No router at ``connect``.
     """
 
     def __init__(
         self,
-        connect: str = DEFAULT_ROUTER,
+        connect: str | None = None,
         *,
-        station: str = "lab",
+        station: str | None = None,
         timeout_s: float = 2.0,
-        tls: TlsConfig | None = None,
+        tls: TlsConfig | Path | str | None = None,
     ) -> None:
-        self._timeout_s = timeout_s
-        self._subscribers: dict[tuple[str, str], Subscriber[Any]] = {}
+        self._timeout_s = check_duration(timeout_s, "timeout_s", most=LONGEST_S)
+        name = station or os.environ.get(STATION_VARIABLE) or "lab"
+        self._lock = threading.Lock()
+        # By topic and sensor, with a lock each: a subscriber belongs to one thread at a time.
+        self._newest: dict[tuple[str, str], tuple[Subscriber[Any], threading.Lock]] = {}
+        self._unseen: dict[tuple[str, str], Subscriber[Any]] = {}
+        self._streams: list[Stream[Any]] = []
         self._publishers: list[RobotPosePublisher] = []
-        link = LinkConfig(connect=(connect,), wait_for_router_s=timeout_s, tls=tls)
-        self.session = Session.open(link, station=station)
+        self.session = Session.open(
+            joining_link(connect, wait_s=timeout_s, tls=tls), station=check_name(name, "station")
+        )
 
     def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
         """Contact location and force of one finger now.
@@ -99,6 +128,67 @@ class Client(Closing):
     def synthesis(self, sensor: str, *, max_age_s: float = 0.2) -> SynthesisEstimate:
         """Synthesised tared counts now; see ``features``."""
         return self._latest(SYNTHESIS, sensor, max_age_s)
+
+    def stream_features(
+        self,
+        sensor: str,
+        *,
+        max_age_s: float = STREAM_AGE_S,
+        timeout_s: float | None = STREAM_TIMEOUT_S,
+        depth: int = 1,
+    ) -> Stream[FeatureEstimate]:
+        """Contact locations and forces of one finger as they come.
+
+        ``for estimate in robot.stream_features("finger")`` iterates,
+        ``robot.stream_features("finger").call(function)`` calls back. The newest wins: a slow
+        consumer finds the last ``depth`` messages, none older than ``max_age_s``. A silence of
+        ``timeout_s`` is an error; None = wait for ever. See ``Stream``.
+        """
+        return self._stream(FEATURES, sensor, max_age_s, timeout_s, depth)
+
+    def stream_electrodes(
+        self,
+        sensor: str,
+        *,
+        max_age_s: float = STREAM_AGE_S,
+        timeout_s: float | None = STREAM_TIMEOUT_S,
+        depth: int = 1,
+    ) -> Stream[ElectrodeFrame]:
+        """Raw counts of one finger as they come; see ``stream_features``."""
+        return self._stream(ELECTRODES, sensor, max_age_s, timeout_s, depth)
+
+    def stream_field(
+        self,
+        sensor: str,
+        *,
+        max_age_s: float = STREAM_AGE_S,
+        timeout_s: float | None = STREAM_TIMEOUT_S,
+        depth: int = 1,
+    ) -> Stream[FieldEstimate]:
+        """Displacements of each skin node as they come; see ``stream_features``."""
+        return self._stream(FIELD, sensor, max_age_s, timeout_s, depth)
+
+    def stream_synthesis(
+        self,
+        sensor: str,
+        *,
+        max_age_s: float = STREAM_AGE_S,
+        timeout_s: float | None = STREAM_TIMEOUT_S,
+        depth: int = 1,
+    ) -> Stream[SynthesisEstimate]:
+        """Synthesised tared counts as they come; see ``stream_features``."""
+        return self._stream(SYNTHESIS, sensor, max_age_s, timeout_s, depth)
+
+    def stream_wrench(
+        self,
+        sensor: str,
+        *,
+        max_age_s: float = STREAM_AGE_S,
+        timeout_s: float | None = STREAM_TIMEOUT_S,
+        depth: int = 1,
+    ) -> Stream[WrenchFrame]:
+        """Measured forces and torques as they come; see ``stream_features``."""
+        return self._stream(WRENCH, sensor, max_age_s, timeout_s, depth)
 
     def estimate_field(
         self, sensor: str, frame: ElectrodeFrame | None = None, *, timeout_s: float | None = None
@@ -143,7 +233,12 @@ class Client(Closing):
         Raises:
             StreamTimeout: None came in time.
         """
-        return self._subscriber(FEATURES, sensor).next(timeout_s)
+        check_duration(timeout_s, "timeout_s", most=LONGEST_S)
+        key = (FEATURES.name, check_name(sensor, "sensor"))
+        with self._lock:
+            if key not in self._unseen:
+                self._unseen[key] = self.session.subscriber(FEATURES, sensor=sensor)
+        return self._unseen[key].next(timeout_s)
 
     def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
         """A publisher of the poses of a robot's flange: call ``put`` from the control loop.
@@ -151,7 +246,7 @@ class Client(Closing):
         A gateway with the driver ``pose_zenoh``, whose option ``robot`` has the same name, turns
         them into poses of the indenter.
         """
-        self._publishers.append(RobotPosePublisher(self.session, robot))
+        self._publishers.append(RobotPosePublisher(self.session, check_name(robot, "robot")))
         return self._publishers[-1]
 
     def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
@@ -160,8 +255,10 @@ class Client(Closing):
         So many ``frames`` are averaged; 0 = the gateway's own number.
 
         Raises:
+            ConfigError: A negative number.
             RemoteError: The gateway refuses, e.g. because the finger is touched.
         """
+        _check_count(frames, "frames")
         return self.session.query(
             endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
         )
@@ -175,6 +272,7 @@ class Client(Closing):
             LinkError: No gateway serves a force/torque sensor of this name.
             RemoteError: The gateway refuses, e.g. because the load is not still.
         """
+        _check_count(readings, "readings")
         return self.session.query(
             endpoints.ZERO, WrenchZeroRequest(readings=readings), sensor=sensor, timeout_s=timeout_s
         )
@@ -203,6 +301,7 @@ class Client(Closing):
             RemoteError: It refuses (``retry_after_s`` says when to ask again), or cannot go on.
                 Steps that had converged were given to ``on_step``.
         """
+        check_duration(timeout_s, "timeout_s", most=LONGEST_S - GRACE_S)
         return ask_simulation(
             self.session,
             request,
@@ -250,27 +349,57 @@ class Client(Closing):
         return take_census(self.session, timeout_s=self._timeout_s)
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus; streams end."""
         for publisher in self._publishers:
             publisher.close()
+        with self._lock:
+            streams, self._streams = self._streams, []
+        for stream in streams:
+            stream.close()
         self.session.close()
 
-    def _subscriber(self, topic: Topic[M], sensor: str) -> Subscriber[M]:
-        key = (topic.name, sensor)
-        if key not in self._subscribers:
-            self._subscribers[key] = self.session.subscriber(
-                topic, sensor=sensor, delivery=Delivery.NEWEST
-            )
-        return self._subscribers[key]
+    def _stream(
+        self, topic: Topic[M], sensor: str, max_age_s: float, timeout_s: float | None, depth: int
+    ) -> Stream[M]:
+        if depth < 1:
+            raise ConfigError(f"depth = {depth} keeps nothing", remedy="give 1 or more")
+        subscriber = self.session.subscriber(
+            topic, sensor=check_name(sensor, "sensor"), delivery=Delivery.NEWEST, depth=depth
+        )
+        stream = Stream(subscriber, max_age_s=max_age_s, timeout_s=timeout_s)
+        with self._lock:
+            self._streams = [one for one in self._streams if not one.closed]
+            self._streams.append(stream)
+        return stream
 
     def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
-        first = (topic.name, sensor) not in self._subscribers
-        subscriber = self._subscriber(topic, sensor)
-        deadline = time.monotonic() + (self._timeout_s if first else 0.0)
-        while True:
-            try:
-                return subscriber.latest(max_age_s).message
-            except StaleError:
-                if time.monotonic() >= deadline:
-                    raise
-                time.sleep(0.005)
+        check_duration(max_age_s, "max_age_s", most=math.inf)
+        key = (topic.name, check_name(sensor, "sensor"))
+        with self._lock:
+            first = key not in self._newest
+            if first:
+                self._newest[key] = (
+                    self.session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST),
+                    threading.Lock(),
+                )
+            subscriber, lock = self._newest[key]
+        end_s = time.monotonic() + (self._timeout_s if first else 0.0)
+        with lock:
+            while True:
+                try:
+                    message: M = subscriber.latest(max_age_s).message
+                except StaleError:
+                    left_s = end_s - time.monotonic()
+                    if left_s <= 0.0:
+                        raise
+                else:
+                    return message
+                with contextlib.suppress(StreamTimeout):
+                    subscriber.next(left_s)
+
+
+def _check_count(number: int, what: str) -> None:
+    if number < 0:
+        raise ConfigError(
+            f"{what} = {number} is negative", remedy="give 1 or more, or 0 for the gateway's number"
+        )

@@ -1,0 +1,297 @@
+"""The client for asyncio: the same calls with ``await``, streams with ``async for``.
+
+Built on ``Client``: each call runs in a thread of a pool, each stream in one of its own, so that
+nothing blocks the event loop. Cancelling a task cancels its question at the service's side, too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import threading
+from collections import deque
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
+
+from palpate.bus import Cancellation
+from palpate.client.robot import Client
+from palpate.client.simulations import OnProgress, OnStep
+from palpate.client.streams import Stream, Watch
+from palpate.config import TlsConfig
+from palpate.errors import LinkError, PalpateError
+from palpate.messages import SimulationReply, SimulationRequest
+
+M = TypeVar("M")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_AT_ONCE = 32
+"""Calls that run at the same time; more wait for a thread."""
+
+
+class AsyncStream(Generic[M]):
+    """A ``Stream`` for ``async for``: newest wins, errors are raised, and it goes on after them."""
+
+    def __init__(self, client: AsyncClient, stream: Callable[[], Stream[M]], depth: int) -> None:
+        self._client = client
+        self._make = stream
+        self._loop = asyncio.get_running_loop()
+        self._arrived = asyncio.Event()
+        self._lock = threading.Lock()
+        self._items: deque[M | PalpateError] = deque(maxlen=depth)
+        self._skipped = 0
+        self._watch: Watch[M] | None = None
+        self._closed = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has ended."""
+        return self._closed
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Those of the stream, and ``skipped`` messages that the task was too slow for."""
+        counters = {} if self._watch is None else self._watch.counters
+        return {**counters, "skipped": self._skipped}
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> M:
+        """The next message; see ``Stream.__next__``."""
+        if self._watch is None and not self._closed:
+            await self._open()
+        while not self._closed:
+            with self._lock:
+                if self._items:
+                    item = self._items.popleft()
+                    break
+                self._arrived.clear()
+            await self._arrived.wait()
+        else:
+            raise StopAsyncIteration
+        if isinstance(item, PalpateError):
+            raise item
+        return item
+
+    async def _open(self) -> None:
+        def watch() -> Watch[M]:
+            return Watch(self._make(), self._offer, self._offer)
+
+        self._watch = await self._client.in_thread(watch)
+        if self._closed:  # meanwhile
+            await self._client.in_thread(self._watch.close)
+
+    def _offer(self, item: M | PalpateError) -> None:
+        with self._lock:
+            wake = not self._items
+            self._skipped += len(self._items) == self._items.maxlen
+            self._items.append(item)
+        if wake:
+            try:
+                self._loop.call_soon_threadsafe(self._arrived.set)
+            except RuntimeError:  # the loop is closed, and nobody waits any more
+                self._closed = True
+
+    async def aclose(self) -> None:
+        """End the iteration."""
+        if self._closed:
+            return
+        self._closed = True
+        self._arrived.set()
+        if self._watch is not None:
+            await self._client.in_thread(self._watch.close)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+
+def _awaitable(
+    method: Callable[Concatenate[Client, P], R],
+) -> Callable[Concatenate[AsyncClient, P], Coroutine[Any, Any, R]]:
+    """The same method of ``AsyncClient``."""
+
+    @functools.wraps(method)
+    async def call(client: AsyncClient, /, *args: P.args, **options: P.kwargs) -> R:
+        sync = client.sync
+        return await client.in_thread(lambda: method(sync, *args, **options))
+
+    return call
+
+
+def _streaming(
+    method: Callable[Concatenate[Client, P], Stream[M]],
+) -> Callable[Concatenate[AsyncClient, P], AsyncStream[M]]:
+    """The same stream of ``AsyncClient``."""
+
+    @functools.wraps(method)
+    def call(client: AsyncClient, /, *args: P.args, **options: P.kwargs) -> AsyncStream[M]:
+        depth = options.get("depth", 1)
+        assert isinstance(depth, int)
+        sync = client.sync
+        stream = AsyncStream(client, lambda: method(sync, *args, **options), depth)
+        client.keep(stream)
+        return stream
+
+    return call
+
+
+class AsyncClient:
+    """A robot's view of a station, for asyncio; the methods are those of ``Client``.
+
+    Five lines::
+
+        async with AsyncClient() as robot:
+            async for estimate in robot.stream_features("finger"):
+                print(estimate.force)
+
+    Arguments are those of ``Client``; the bus is joined by ``async with``.
+    """
+
+    def __init__(
+        self,
+        connect: str | None = None,
+        *,
+        station: str | None = None,
+        timeout_s: float = 2.0,
+        tls: TlsConfig | Path | str | None = None,
+    ) -> None:
+        self._open = functools.partial(
+            Client, connect, station=station, timeout_s=timeout_s, tls=tls
+        )
+        self._client: Client | None = None
+        self._streams: list[AsyncStream[Any]] = []
+        self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
+
+    features = _awaitable(Client.features)
+    electrodes = _awaitable(Client.electrodes)
+    field = _awaitable(Client.field)
+    synthesis = _awaitable(Client.synthesis)
+    next_features = _awaitable(Client.next_features)
+    estimate_field = _awaitable(Client.estimate_field)
+    synthesise = _awaitable(Client.synthesise)
+    tare = _awaitable(Client.tare)
+    zero = _awaitable(Client.zero)
+    cancel_simulation = _awaitable(Client.cancel_simulation)
+    robot_pose_publisher = _awaitable(Client.robot_pose_publisher)
+    model = _awaitable(Client.model)
+    alive = _awaitable(Client.alive)
+    status = _awaitable(Client.status)
+    census = _awaitable(Client.census)
+
+    stream_features = _streaming(Client.stream_features)
+    stream_electrodes = _streaming(Client.stream_electrodes)
+    stream_field = _streaming(Client.stream_field)
+    stream_synthesis = _streaming(Client.stream_synthesis)
+    stream_wrench = _streaming(Client.stream_wrench)
+
+    async def simulate(
+        self,
+        request: SimulationRequest,
+        *,
+        sensor: str = "twin",
+        timeout_s: float = 60.0,
+        on_progress: OnProgress | None = None,
+        on_step: OnStep | None = None,
+    ) -> SimulationReply:
+        """As ``Client.simulate``; cancelling the task stops the simulation.
+
+        The functions are called in the event loop.
+        """
+        loop = asyncio.get_running_loop()
+
+        def in_loop(function: Callable[P, None] | None) -> Callable[P, None] | None:
+            if function is None:
+                return None
+
+            def call(*args: P.args, **options: P.kwargs) -> None:
+                loop.call_soon_threadsafe(functools.partial(function, *args, **options))
+
+            return call
+
+        sync = self.sync
+        return await self.in_thread(
+            lambda: sync.simulate(
+                request,
+                sensor=sensor,
+                timeout_s=timeout_s,
+                on_progress=in_loop(on_progress),
+                on_step=in_loop(on_step),
+            )
+        )
+
+    @property
+    def sync(self) -> Client:
+        """The client that does the work.
+
+        Raises:
+            LinkError: The bus has not been joined, or has been left.
+        """
+        if self._client is None:
+            raise LinkError(
+                "the client has not joined the bus", remedy="use it inside `async with`"
+            )
+        return self._client
+
+    async def in_thread(self, work: Callable[[], R]) -> R:
+        """The result of ``work``, run in a thread; cancelling cancels the question it asks."""
+        cancellation = Cancellation()
+
+        def run() -> R:
+            with cancellation:
+                return work()
+
+        future = asyncio.get_running_loop().run_in_executor(self._threads, run)
+        try:
+            return await future
+        except asyncio.CancelledError:
+            self._threads.submit(cancellation.cancel)
+            raise
+
+    def keep(self, stream: AsyncStream[Any]) -> None:
+        """Close this stream with the client."""
+        self._streams = [one for one in self._streams if not one.closed]
+        self._streams.append(stream)
+
+    async def aclose(self) -> None:
+        """Leave the bus; streams end."""
+        for stream in self._streams:
+            await stream.aclose()
+        client, self._client = self._client, None
+        if client is not None:
+            await self.in_thread(client.close)
+        self._threads.shutdown(wait=False)
+
+    async def __aenter__(self) -> Self:
+        opening = self._threads.submit(self._open)
+        try:
+            self._client = await asyncio.shield(asyncio.wrap_future(opening))
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close_client)
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+
+def _close_client(opened: Future[Client]) -> None:
+    """Leave the bus that was joined for a task that has been cancelled."""
+    if opened.exception() is None:
+        opened.result().close()

@@ -1,0 +1,195 @@
+"""Streams of a client: messages as an iterator, or given to a callback in a thread of palpate's.
+
+Both go on by themselves when the router, the gateway or the service was gone and is back; what
+was published meanwhile is lost, and old messages are never delivered as new ones.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Generic, Self, TypeVar
+
+from palpate import clock
+from palpate.bus import Subscriber
+from palpate.config import check_duration
+from palpate.errors import LinkError, PalpateError, StaleError, StreamTimeout
+from palpate.process import Closing
+
+M = TypeVar("M")
+T = TypeVar("T")
+
+OnError = Callable[[PalpateError], None]
+
+_log = logging.getLogger(__name__)
+
+_TURN_S = 0.25
+"""How long a stream waits before it looks whether it has been closed [s]."""
+
+_SAY_AGAIN_S = 10.0
+"""How often a failing callback is logged [s]; each failure is counted."""
+
+_END_S = 5.0
+
+
+class Stream(Closing, Generic[M]):
+    """Messages of one sensor, the newest first to come: ``for estimate in stream``.
+
+    Ends when it or its client is closed, and belongs to one thread; ``close`` may be called from
+    any. A consumer that is slower than the sensor skips messages (``dropped``), and so are those
+    older than ``max_age_s`` skipped (``stale``). After ``timeout_s`` without a usable one it
+    raises; asked again, it goes on.
+
+    Args:
+        subscriber: Belongs to this stream from now on.
+        max_age_s: Age of the oldest reading that is delivered [s]; inf = any.
+        timeout_s: Longest silence [s]; None = it waits for ever.
+
+    Raises:
+        ConfigError: A time is not positive.
+    """
+
+    def __init__(
+        self, subscriber: Subscriber[M], *, max_age_s: float, timeout_s: float | None
+    ) -> None:
+        self._max_age_s = check_duration(max_age_s, "max_age_s", most=math.inf)
+        self._timeout_s = (
+            math.inf if timeout_s is None else check_duration(timeout_s, "timeout_s", most=math.inf)
+        )
+        self._subscriber = subscriber
+        self._closed = threading.Event()
+        self._stale = 0
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Those of the subscriber, and ``stale``."""
+        return {**self._subscriber.counters, "stale": self._stale}
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> M:
+        """The next message.
+
+        Raises:
+            StreamTimeout: None came within ``timeout_s``.
+            StaleError: Some came, all of them too old.
+            LinkError: The client is closed.
+        """
+        end_s = time.monotonic() + self._timeout_s
+        oldest_s = 0.0
+        while not self._closed.is_set():
+            left_s = end_s - time.monotonic()
+            if left_s <= 0.0:
+                raise self._silence(oldest_s)
+            try:
+                message = self._subscriber.next(min(left_s, _TURN_S)).message
+            except StreamTimeout:
+                continue
+            except LinkError:
+                if self._closed.is_set():
+                    break
+                raise
+            stamp = self._subscriber.topic.stamp_of(message)
+            age_s = 0.0 if stamp is None else clock.age_s(stamp)
+            if age_s <= self._max_age_s:
+                return message
+            self._stale += 1
+            oldest_s = max(oldest_s, age_s)
+        raise StopIteration
+
+    def _silence(self, oldest_s: float) -> PalpateError:
+        name, key = self._subscriber.topic.name, self._subscriber.key
+        if oldest_s:
+            return StaleError(
+                f"every {name} on {key} within {self._timeout_s:g} s was too old, by up to "
+                f"{oldest_s:.3f} s where {self._max_age_s:g} s is allowed",
+                remedy="do not act on them; check the sensor and its service: palpate status",
+            )
+        return StreamTimeout(
+            f"no {name} on {key} within {self._timeout_s:g} s",
+            remedy="check that its publisher runs: palpate status; the stream goes on when it does",
+        )
+
+    def call(self, callback: Callable[[M], None], *, on_error: OnError | None = None) -> Watch[M]:
+        """Call a function with each message, in a thread of palpate's; see ``Watch``."""
+        return Watch(self, callback, on_error)
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has ended."""
+        return self._closed.is_set()
+
+    def close(self) -> None:
+        """End the iteration."""
+        if not self._closed.is_set():
+            self._closed.set()
+            self._subscriber.close()
+
+
+class Watch(Closing, Generic[M]):
+    """Calls ``callback`` with each message of a stream, in a thread of its own.
+
+    An exception of the callback is logged and counted, and the stream goes on. ``on_error`` is
+    called in the same thread when the stream was silent or stale for its ``timeout_s``, and again
+    for each further one; then, too, it goes on.
+
+    ``counters``: those of the stream, ``called``, ``silences`` and ``callback_errors``.
+    """
+
+    def __init__(
+        self, stream: Stream[M], callback: Callable[[M], None], on_error: OnError | None = None
+    ) -> None:
+        self._stream = stream
+        self._callback = callback
+        self._on_error = on_error
+        self._counts: Counter[str] = Counter({"called": 0, "silences": 0, "callback_errors": 0})
+        self._said_s = -math.inf
+        self._thread = threading.Thread(target=self._run, name="palpate callback", daemon=True)
+        self._thread.start()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Events since it was made."""
+        return {**self._stream.counters, **self._counts}
+
+    def _run(self) -> None:
+        while True:
+            try:
+                message = next(self._stream)
+            except StopIteration:
+                return
+            except (StreamTimeout, StaleError) as error:
+                self._counts["silences"] += 1
+                if self._on_error is not None:
+                    self._call(self._on_error, error)
+            except PalpateError as error:  # the client is closed
+                if self._on_error is not None:
+                    self._call(self._on_error, error)
+                return
+            else:
+                self._counts["called"] += 1
+                self._call(self._callback, message)
+
+    def _call(self, function: Callable[[T], None], argument: T) -> None:
+        try:
+            function(argument)
+        except Exception:
+            # The user's code: nothing of it may end the stream, and nothing of it may vanish.
+            self._counts["callback_errors"] += 1
+            now_s = time.monotonic()
+            if now_s - self._said_s >= _SAY_AGAIN_S:
+                self._said_s = now_s
+                _log.exception(
+                    "callback %r failed, %d times so far", function, self._counts["callback_errors"]
+                )
+
+    def close(self) -> None:
+        """Call no more; waits for a call that is running, except when it is the caller."""
+        self._stream.close()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_END_S)
