@@ -80,7 +80,9 @@ class Station:
             session,  # type: ignore[arg-type]
             FeaturesServiceConfig(**given),
             health,  # type: ignore[arg-type]
-            SimpleNamespace(of=lambda sensor: self.runtimes.get(sensor, self.runtime)),  # type: ignore[arg-type]
+            SimpleNamespace(
+                describe=str, of=lambda sensor: self.runtimes.get(sensor, self.runtime)
+            ),  # type: ignore[arg-type]
             Estimation(self.sample, lambda frame, *_: frame.stamp.sequence),
             rate_hz=rate_hz,
         )

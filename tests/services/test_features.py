@@ -278,3 +278,23 @@ def test_unknown_bundle_lists_what_there_is() -> None:
         run_estimating(
             FeaturesServiceConfig(bundle="no-such"), LinkConfig(), "lab", threading.Event()
         )
+
+
+def test_a_service_without_tares_is_degraded_until_it_gets_one(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    with serve(max_age_s=10.0) as session:
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        sequence = iter(range(1, 1_000_000))
+
+        def state_after_a_frame() -> ServiceState:
+            frames.put(make_frame(next(sequence)))
+            return ask_status(session).state
+
+        until(lambda: state_after_a_frame() is ServiceState.DEGRADED)
+        error = ask_status(session).last_error
+        assert error is not None
+        assert "'finger' is refused (tare_unknown)" in error.message
+        assert "tare" in error.remedy
+        announce(session, "finger", make_tare())
+        until(lambda: state_after_a_frame() is ServiceState.READY)

@@ -30,6 +30,7 @@ from palpate.messages import FloatArray, Origin, ServiceState, Stamp
 from palpate.process import avoid_pauses
 from palpate_services.config import EstimatingConfig
 from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation
+from palpate_services.inference.input_report import InputReport
 from palpate_services.inference.model import BATCH_MOST, Runtime, load
 from palpate_services.inference.repository import resolve
 from palpate_services.inference.served import ServedModels, Serving
@@ -81,6 +82,16 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
         ErrorCode.UNAVAILABLE,
         "no bundle serves this sensor",
         "load one: palpate model load NAME",
+    ),
+    EstimateRefusal.STALE: (
+        ErrorCode.INVALID_REQUEST,
+        "what comes is older than max_age_s",
+        "look at the load of both hosts and at their clocks: palpate top, palpate status",
+    ),
+    EstimateRefusal.REPLAYED: (
+        ErrorCode.INVALID_REQUEST,
+        "what comes was replayed, and this service takes live and simulated frames only",
+        "play it with `palpate replay`, or set accept_replayed in the table of this service",
     ),
     EstimateRefusal.TARE_UNKNOWN: (
         ErrorCode.NOT_FOUND,
@@ -155,6 +166,7 @@ class EstimatePublisher(Generic[M, E]):
         self._rate_limit = RateLimit(rate_hz)
         self._publishers: dict[str, Publisher[E]] = {}
         self._counts: Counter[str] = Counter()
+        self._input = InputReport(health, _ERRORS, models.describe)
         self._latencies_ns: list[int] = []
         self._busy_ns = 0
         self._batches = self._batched = 0
@@ -177,7 +189,7 @@ class EstimatePublisher(Generic[M, E]):
                 runtime = self._models.of(sensor)
                 sample = self._sample(received, runtime)
                 if isinstance(sample, EstimateRefusal):
-                    self._counts[sample.value] += 1
+                    self._refuse(sensor, sample.value)
                 elif runtime is not None:
                     samples.setdefault(runtime, []).append((received, sample))
             for runtime, taken in samples.items():
@@ -206,24 +218,29 @@ class EstimatePublisher(Generic[M, E]):
         outputs_of = runtime.run_all([sample for _, sample in taken])
         for (received, sample), outputs in zip(taken, outputs_of, strict=True):
             if outputs is None:
-                self._counts[EstimateRefusal.NON_FINITE.value] += 1
+                self._refuse(received.sensor, EstimateRefusal.NON_FINITE.value)
                 continue
             message = received.message
             estimate = self._estimation.complete(message, sample, outputs, runtime)
             try:
                 self._publisher(received.sensor).put(estimate)
             except WireError as error:  # finite, and still not allowed by the message contract
-                self._counts[f"unpublishable_{error.reason}"] += 1
+                self._refuse(received.sensor, f"unpublishable_{error.reason}")
                 continue
             stamp = self._stamp_of(received)
             self._rate_limit.note(received.sensor, stamp)
             self._counts["estimates_published"] += 1
+            self._input.answered(received.sensor)
             # Latency counts from the reading, so that it holds the way through gateway and bus.
             # Only where the stamp is of another clock, or long past (a replay), it counts from the
             # arrival.
             live = stamp.origin is not Origin.REPLAYED and stamp.clock_id == clock.CLOCK_ID
             since_ns = stamp.monotonic_ns if live else received.received_monotonic_ns
             self._latencies_ns.append(time.monotonic_ns() - since_ns)
+
+    def _refuse(self, sensor: str, reason: str) -> None:
+        self._counts[reason] += 1
+        self._input.refused(sensor, reason)
 
     def _stamp_of(self, received: ReceivedMessage[M]) -> Stamp:
         stamp = self._route.source.stamp_of(received.message)
@@ -247,6 +264,8 @@ class EstimatePublisher(Generic[M, E]):
             counts, self._counts = self._counts, Counter()
             for name, count in counts.items():
                 self._health.count(name, count)
+            if not last:
+                self._input.report()
         period_ns = now_ns - self._gauged_ns
         if last or period_ns >= _GAUGE_PERIOD_NS:
             self._gauged_ns = now_ns

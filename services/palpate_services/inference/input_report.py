@@ -1,0 +1,100 @@
+"""Tells health when an estimating service refuses everything that a sensor sends, and why."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from palpate.errors import ErrorCode, RemoteError
+from palpate.health import Health
+from palpate.messages import ServiceState
+from palpate_services.inference.estimates import EstimateRefusal
+
+REFUSED_S = 1.0
+"""A sensor whose messages are all refused for longer than this is a trouble [s]: a finger needs the
+first half second after its start for its tare."""
+
+_REFUSED_LEAST = 3
+_SILENT_S = 1.0  # nothing came for this long: there is nothing to answer
+_SENSORS_MOST = 256
+
+
+@dataclass(slots=True)
+class _Refusals:
+    """Refusals of one sensor since its last estimate."""
+
+    count: int
+    since_s: float
+    last_s: float
+    reason: str
+
+
+class InputReport:
+    """Makes a service DEGRADED while a sensor gets only refusals, and READY again afterwards.
+
+    READY means: what came was answered, or nothing came. Use from one thread.
+
+    Args:
+        health: Of the service.
+        errors: Code, problem and remedy of each refusal.
+        describe: One line for people when all is well.
+    """
+
+    def __init__(
+        self,
+        health: Health,
+        errors: Mapping[EstimateRefusal, tuple[ErrorCode, str, str]],
+        describe: Callable[[], str],
+    ) -> None:
+        self._health, self._errors, self._describe = health, errors, describe
+        self._refused: dict[str, _Refusals] = {}
+        self._in_trouble = False
+
+    def answered(self, sensor: str) -> None:
+        """An estimate of this sensor was published."""
+        self._refused.pop(sensor, None)
+
+    def refused(self, sensor: str, reason: str) -> None:
+        """A message got no estimate; ``reason`` is the name of its counter."""
+        if reason == EstimateRefusal.SKIPPED_RATE:
+            return
+        now_s = time.monotonic()
+        found = self._refused.get(sensor)
+        if found is not None:
+            found.count, found.last_s, found.reason = found.count + 1, now_s, reason
+        elif len(self._refused) < _SENSORS_MOST:
+            self._refused[sensor] = _Refusals(1, now_s, now_s, reason)
+
+    def report(self) -> None:
+        """Tell health; call it a few times a second."""
+        now_s = time.monotonic()
+        for sensor, found in list(self._refused.items()):
+            if now_s > found.last_s + _SILENT_S:
+                del self._refused[sensor]
+        wrong = {
+            sensor: found
+            for sensor, found in self._refused.items()
+            if found.count >= _REFUSED_LEAST and now_s > found.since_s + REFUSED_S
+        }
+        if wrong:
+            self._in_trouble = True
+            self._health.fail(self._error(wrong))
+        elif self._in_trouble:
+            self._in_trouble = False
+            self._health.set_state(ServiceState.READY, self._describe())
+
+    def _error(self, wrong: Mapping[str, _Refusals]) -> RemoteError:
+        sensors = sorted(wrong)
+        reason = wrong[sensors[0]].reason
+        try:
+            code, problem, remedy = self._errors[EstimateRefusal(reason)]
+        except (KeyError, ValueError):
+            code, problem = ErrorCode.INTERNAL, "the estimates break the message contract"
+            remedy = "serve another bundle, and report this one to its maker"
+        more = f" and {len(sensors) - 1} more" if len(sensors) > 1 else ""
+        return RemoteError(
+            f"everything of sensor {sensors[0]!r}{more} is refused ({reason}): {problem}",
+            remedy=remedy,
+            code=code,
+        )
