@@ -6,6 +6,7 @@ import time
 import zlib
 from pathlib import Path
 
+from palpate.errors import ClockSkewError
 from palpate.messages import Stamp
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -26,6 +27,15 @@ CLOCK_ID = _clock_id()
 """Names this host's monotonic clock in ``Stamp.clock_id``."""
 
 
+SAME_HOST_AHEAD_S = 0.005
+"""A reading of this host may be so far in the future [s]: its time is an estimate from its device's
+clock, and a thread may be woken a little early."""
+
+WALL_CLOCK_ERROR_S = 0.05
+"""By default two hosts' wall clocks differ by no more than this [s]: ten times what NTP keeps in a
+laboratory."""
+
+
 def now() -> tuple[int, int]:
     """Monotonic and wall clock of this host [ns], read together."""
     return time.monotonic_ns(), time.time_ns()
@@ -41,3 +51,34 @@ def age_s(stamp: Stamp, *, monotonic_ns: int | None = None, wall_ns: int | None 
         return (now_ns - stamp.monotonic_ns) * 1e-9
     now_ns = time.time_ns() if wall_ns is None else wall_ns
     return (now_ns - stamp.wall_ns) * 1e-9
+
+
+def checked_age_s(stamp: Stamp, *, wall_clock_error_s: float = WALL_CLOCK_ERROR_S) -> float:
+    """Age of a reading [s], see ``age_s``, which is not in the future.
+
+    A stamp in the future must not pass as a fresh one: it would do so until its time has come. The
+    age may be as much below zero as clocks may differ: ``SAME_HOST_AHEAD_S`` on this host,
+    ``wall_clock_error_s`` for another.
+
+    Raises:
+        ClockSkewError: It is farther in the future.
+    """
+    age = age_s(stamp)
+    here = stamp.clock_id == CLOCK_ID
+    allowed_s = SAME_HOST_AHEAD_S if here else wall_clock_error_s
+    if age >= -allowed_s:
+        return age
+    if here:
+        raise ClockSkewError(
+            f"the reading was stamped {-age:.3f} s in the future by the clock of this host, "
+            f"{allowed_s:g} s is allowed",
+            remedy="do not act on it; its sender is broken: restart that gateway",
+            skew_s=-age,
+        )
+    raise ClockSkewError(
+        f"the reading was stamped {-age:.3f} s in the future: the wall clocks of its host and of "
+        f"this one differ by at least that, {allowed_s:g} s is allowed",
+        remedy="do not act on it; synchronise both clocks by NTP or PTP (docs/time.md), or state "
+        "how far they may differ: link.wall_clock_error_s",
+        skew_s=-age,
+    )

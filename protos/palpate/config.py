@@ -111,6 +111,8 @@ class LinkConfig(StrictConfig):
             up. A lossless replay needs that.
         wait_for_router_s: How long opening waits for a router [s]; negative = no limit (services).
         lease_s: A peer silent for this long is gone [s].
+        wall_clock_error_s: How far the wall clock of another host may be from this host's [s]. A
+            reading that seems to come from farther in the future is refused.
         tls: Certificates; required for any listener that is not loopback.
     """
 
@@ -119,6 +121,7 @@ class LinkConfig(StrictConfig):
     direct: bool = True
     wait_for_router_s: float = Field(default=-1.0, le=86_400.0, allow_inf_nan=False)
     lease_s: float = Field(default=2.0, gt=0.1, le=600.0, allow_inf_nan=False)
+    wall_clock_error_s: float = Field(default=0.05, ge=0, le=10, allow_inf_nan=False)
     tls: TlsConfig | None = None
 
     @field_validator("connect", "listen")

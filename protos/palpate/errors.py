@@ -119,6 +119,18 @@ class StaleError(PalpateError, TimeoutError):
     code = ErrorCode.DEADLINE_EXCEEDED
 
 
+class ClockSkewError(StaleError):
+    """The newest message was stamped in the future, so that its age is not known.
+
+    Attributes:
+        skew_s: How far in the future [s].
+    """
+
+    def __init__(self, problem: str, *, remedy: str, skew_s: float) -> None:
+        super().__init__(problem, remedy=remedy)
+        self.skew_s = skew_s
+
+
 class BundleError(PalpateError, ValueError):
     """A model bundle breaks its contract."""
 

@@ -68,7 +68,7 @@ class Station:
         def count(name: str, by: int = 1) -> None:
             self.counts[name] += by
 
-        session = SimpleNamespace(publisher=publisher)
+        session = SimpleNamespace(publisher=publisher, wall_clock_error_s=0.05)
         health = SimpleNamespace(
             count=count,
             gauge=self.gauges.__setitem__,

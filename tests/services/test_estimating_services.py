@@ -178,6 +178,7 @@ class TestEstimatingService:
             wanted: dict[str, int] = {}
             spoiled: dict[str, dict[str, Any]] = {
                 "stale": {"age_s": 60.0},
+                "clock_skew": {"age_s": -3600.0},
                 "replayed_refused": {"origin": Origin.REPLAYED},
             }
             for name, changes in spoiled.items():

@@ -139,6 +139,7 @@ def test_refuses_what_it_must_and_counts_it(
         # One sensor each, so that newest-wins and the order of stamps play no part.
         spoiled: dict[str, dict[str, Any]] = {
             "stale": {"age_s": 60.0},
+            "clock_skew": {"age_s": -3600.0},
             "untared": {"tare_id": 0},
             "invalid_channels": {"validity": good ^ 1},
             "replayed_refused": {"origin": Origin.REPLAYED},

@@ -161,6 +161,7 @@ class Session(Closing):
         self._raw = raw
         self._link = link
         self.station = station
+        self.wall_clock_error_s = link.wall_clock_error_s
         self._observing: Session | None = None
         self._observing_lock = threading.Lock()
         self._closing: list[Callable[[], None]] = []
@@ -219,7 +220,15 @@ class Session(Closing):
         """
         key = self._key(topic, sensor, service, instance, station)
         return self._keep(
-            Subscriber(self._raw, topic, key, delivery=delivery, capacity=capacity, depth=depth)
+            Subscriber(
+                self._raw,
+                topic,
+                key,
+                delivery=delivery,
+                capacity=capacity,
+                depth=depth,
+                wall_clock_error_s=self.wall_clock_error_s,
+            )
         )
 
     def tap(

@@ -282,9 +282,11 @@ class Subscriber(Generic[M], Closing):
         delivery: Delivery,
         capacity: int,
         depth: int = 1,
+        wall_clock_error_s: float = clock.WALL_CLOCK_ERROR_S,
     ) -> None:
         self.topic = topic
         self.key = key
+        self._wall_clock_error_s = wall_clock_error_s
         self._counters: Counter[str] = Counter()
         self._waiting: DeliveryQueue[tuple[zenoh.Sample, int]] = queue_for(
             delivery, capacity, self._counters, depth=depth
@@ -336,11 +338,12 @@ class Subscriber(Generic[M], Closing):
     def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
         """The newest message (of a sensor), if it is not older than ``max_age_s``.
 
-        Nothing is consumed. The age counts from the stamp (when the sensor was read), not from
-        arrival.
+        Nothing is consumed. The age counts from the stamp (when the sensor was read); it is never
+        less than the time since arrival.
 
         Raises:
             StaleError: It is older, invalid, or none ever came.
+            ClockSkewError: It was stamped in the future (a kind of ``StaleError``).
         """
         candidates = [
             item
@@ -360,7 +363,10 @@ class Subscriber(Generic[M], Closing):
                 f"the newest {self.topic.name} is invalid: {error.problem}", remedy=error.remedy
             ) from error
         stamp = self.topic.stamp_of(received.message)
-        age_s = (time.monotonic_ns() - received_ns) * 1e-9 if stamp is None else clock.age_s(stamp)
+        age_s = (time.monotonic_ns() - received_ns) * 1e-9
+        if stamp is not None:
+            stamped_s = clock.checked_age_s(stamp, wall_clock_error_s=self._wall_clock_error_s)
+            age_s = max(age_s, stamped_s)
         if age_s > max_age_s:
             raise StaleError(
                 f"the newest {self.topic.name} is {age_s:.3f} s old, {max_age_s:g} s is allowed",

@@ -19,7 +19,7 @@ import numpy as np
 from palpate import clock
 from palpate.bus import Session
 from palpate.bus.tares import TareBook
-from palpate.errors import ErrorCode, PalpateError, RemoteError
+from palpate.errors import ClockSkewError, ErrorCode, PalpateError, RemoteError
 from palpate.health import Health
 from palpate.messages import (
     NO_TARE,
@@ -76,6 +76,9 @@ class EstimateRefusal(StrEnum):
 
     STALE = "stale"
     """The message is older than ``max_age_s``."""
+
+    CLOCK_SKEW = "clock_skew"
+    """The message was stamped in the future, so that its age is not known."""
 
     REPLAYED = "replayed_refused"
     """The message was replayed, and the service accepts only live and simulated ones."""
@@ -243,10 +246,14 @@ class Estimation(Generic[M, E]):
 
 
 class AgeLimit:
-    """Decides by ``max_age_s`` and ``accept_replayed`` whether a message may be answered."""
+    """Decides by ``max_age_s`` and ``accept_replayed`` whether a message may be answered.
 
-    def __init__(self, config: EstimatingConfig) -> None:
+    ``wall_clock_error_s`` is how far the wall clocks of other hosts may be from this host's [s].
+    """
+
+    def __init__(self, config: EstimatingConfig, wall_clock_error_s: float) -> None:
         self._limit_s = config.max_age_s
+        self._wall_clock_error_s = wall_clock_error_s
         self._accept_replayed = config.accept_replayed
 
     def refusal(self, stamp: Stamp) -> EstimateRefusal | None:
@@ -255,9 +262,13 @@ class AgeLimit:
         if stamp.origin is Origin.REPLAYED:
             return None if self._accept_replayed else EstimateRefusal.REPLAYED
         limit_s = self._limit_s
-        if limit_s is not None and clock.age_s(stamp) > limit_s:
-            return EstimateRefusal.STALE
-        return None
+        if limit_s is None:
+            return None
+        try:
+            age_s = clock.checked_age_s(stamp, wall_clock_error_s=self._wall_clock_error_s)
+        except ClockSkewError:
+            return EstimateRefusal.CLOCK_SKEW
+        return EstimateRefusal.STALE if age_s > limit_s else None
 
 
 class TareLookup:
@@ -323,7 +334,7 @@ class TaredSamples:
     ) -> None:
         book = TareBook(session, query_timeout_s=config.tare_timeout_s)
         self._tares = TareLookup(book, wait=config.delivery == "every")
-        self._age_limit = None if any_age else AgeLimit(config)
+        self._age_limit = None if any_age else AgeLimit(config, session.wall_clock_error_s)
         self._health = health
         self._wrong_sensors: set[tuple[str, bytes]] = set()
 

@@ -162,7 +162,7 @@ class EstimatePublisher(Generic[M, E]):
         self._estimation = estimation
         self._lossless = config.delivery == "every"
         self._sensors = frozenset(config.sensors)
-        self._age_limit = AgeLimit(config)
+        self._age_limit = AgeLimit(config, session.wall_clock_error_s)
         self._rate_limit = RateLimit(rate_hz)
         self._publishers: dict[str, Publisher[E]] = {}
         self._counts: Counter[str] = Counter()
