@@ -105,3 +105,16 @@ def faults(
     from palpate_deploy.bench.faults import run_faults
 
     raise typer.Exit(run_faults(seconds=seconds, only=only, as_json=json_, save=save, out=out))
+
+
+@bench_app.command(epilog=example("palpate bench status --out docs/results/status.json"))
+def status(
+    count: Annotated[int, typer.Option(min=1, help="How often to ask.")] = 200,
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Ask for the status of a station whose cores are all loaded; each answer must be complete."""
+    from palpate_deploy.bench.census import run_status_bench
+
+    raise typer.Exit(run_status_bench(count=count, as_json=json_, save=save, out=out))

@@ -1,0 +1,54 @@
+"""The benchmark of ``palpate status``: that it runs, and that an incomplete answer counts."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from palpate_deploy.bench import census
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+WANTED = frozenset({"router", "gateway", "features"})
+
+
+@pytest.mark.parametrize(
+    ("told", "code", "complete", "ready"),
+    [
+        (("gateway", "features"), 0, True, True),
+        (("gateway", "features"), 1, True, False),
+        (("gateway",), 0, False, True),
+        (None, 1, False, False),
+    ],
+)
+def test_an_answer_is_complete_if_it_tells_every_state(
+    monkeypatch: pytest.MonkeyPatch,
+    told: tuple[str, ...] | None,
+    code: int,
+    complete: bool,
+    ready: bool,
+) -> None:
+    processes: list[dict[str, Any]] = [{"service": "router"}, {"service": "recorder"}]
+    processes += [{"service": name, "state": "ready"} for name in told or ()]
+    text = json.dumps({"router": True, "troubles": [], "processes": processes})
+    answer = SimpleNamespace(stdout="" if told is None else text, stderr="no", returncode=code)
+    monkeypatch.setattr(census.subprocess, "run", lambda *_, **__: answer)
+    call = census._call((), WANTED)
+    assert (call.complete, call.ready) == (complete, ready)
+
+
+@pytest.mark.slow
+def test_it_runs(palpate: Palpate, tmp_path: Path) -> None:
+    out = tmp_path / "status.json"
+    done = palpate("bench", "status", "--count", "2", "--out", out, "--json", timeout=300)
+    assert done.returncode == 0, done.stderr + done.stdout
+    told = json.loads(out.read_text(encoding="utf-8"))
+    assert told["status"]["calls"] == told["status"]["complete"] == 2
+    assert told["status"]["processes"] == 7
+    assert json.loads(done.stdout)["status.goal_met"] is True
