@@ -16,7 +16,8 @@ from palpate.bus import TapSample
 from palpate.bus.topics import ELECTRODES, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ErrorCode
-from palpate.files.record import RecordWriter, check_readable, read_record
+from palpate.files import record as record_module
+from palpate.files.record import RecordWriter, check_readable, read_record, summarise
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, ServiceState
 from palpate_services.config import RecorderConfig
@@ -27,12 +28,12 @@ Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
 
 
-def sample_of(payload: bytes) -> TapSample:
-    key = sensor_key("lab", "finger", "electrodes")
+def sample_of(payload: bytes, sensor: str = "finger") -> TapSample:
+    key = sensor_key("lab", sensor, "electrodes")
     return TapSample(
         "electrodes",
         "lab",
-        "finger",
+        sensor,
         key,
         ELECTRODES.encoding,
         payload,
@@ -86,6 +87,19 @@ def test_broken_payload_is_kept_and_counted(open_files: Any, tmp_path: Path) -> 
     (record,) = (tmp_path / "runs").iterdir()
     assert [item.payload for item in read_record(record)] == [b"\xff" * 30]
     assert health.counters["invalid_parse"] == 1
+
+
+def test_invented_names_are_counted_and_cost_the_others_nothing(
+    open_files: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_module, "CHANNELS_MAX", 10)
+    with open_files() as (files, health):
+        for number in range(100):
+            files.write(sample_of(b"x", f"finger{number}"))
+        files.write(sample_of(b"y", "finger3"))
+    assert health.counters["rejected_channels"] == 90
+    (record,) = (tmp_path / "runs").iterdir()
+    assert sum(summarise(record).counts.values()) == 11
 
 
 def test_rotation_by_size_loses_nothing(

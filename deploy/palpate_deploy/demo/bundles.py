@@ -17,6 +17,7 @@ from palpate.bus.topics import ELECTRODES, TOPICS, sensor_key
 from palpate.errors import BundleError, PalpateError
 from palpate.files.bundle import read_bundle
 from palpate.files.record import RecordWriter
+from palpate.printable import printable
 from palpate.process import require
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
@@ -61,10 +62,16 @@ def list_models(*, as_json: bool) -> None:
         table.add_column(column, overflow="fold")
     for row in rows:
         if "error" in row:
-            table.add_row(str(row["bundle"]), "[red]broken[/]", "", escape(str(row["error"])), "")
+            table.add_row(
+                escape(printable(str(row["bundle"]))),
+                "[red]broken[/]",
+                "",
+                escape(printable(str(row["error"]))),
+                "",
+            )
             continue
         table.add_row(
-            str(row["bundle"]),
+            escape(printable(str(row["bundle"]))),
             str(row["task"]),
             str(row["sha256"])[:12],
             escape(str(row["trained_on"])),
@@ -89,7 +96,8 @@ def verify_model(name: str) -> None:
     load(proven(bundle, bundle.manifest.task), bundle.manifest.task)
     manifest = bundle.manifest
     rows = next(iter(bundle.golden.values())).shape[0]
-    print(f"ok  {manifest.name}:{manifest.version}  task {manifest.task}  {bundle.folder}")
+    folder = printable(str(bundle.folder))
+    print(f"ok  {manifest.name}:{manifest.version}  task {manifest.task}  {folder}")
     print(f"    digest {bundle.sha256.hex()}")
     print(f"    {rows} golden rows reproduced; trained on {manifest.trained_on}")
 

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate.bus import Session
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
+from palpate.printable import printable
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.status import duration_text
 
@@ -97,13 +99,13 @@ def print_contents(path: Path) -> RecordSummary:
         check_readable(path)
     seconds = max(0, summary.end_wall_ns - summary.start_wall_ns) * 1e-9
     began = datetime.fromtimestamp(summary.start_wall_ns * 1e-9, UTC)
-    table = Table(title=str(path), title_justify="left")
+    table = Table(title=escape(printable(str(path))), title_justify="left")
     table.add_column("stream", overflow="fold")
     table.add_column("messages", justify="right")
     table.add_column("Hz", justify="right")
     for key, count in sorted(summary.counts.items()):
         rate = f"{(count - 1) / seconds:.2f}" if seconds and count > 1 else "-"
-        table.add_row(key, f"{count:,}", rate)
+        table.add_row(escape(printable(key)), f"{count:,}", rate)
     table.caption = (
         f"{path.stat().st_size / 1e6:.2f} MB, from {began:%Y-%m-%d %H:%M:%S} UTC, "
         f"{duration_text(seconds)}" + ("" if summary.complete else ", cut off: palpate recover")
@@ -145,7 +147,7 @@ def review_path(
         from palpate_services.viewer.record_view import review
 
         written = review(path, view, bundles=bundles)
-        print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
+        print(f"{printable(str(written))}  ({written.stat().st_size / 1e6:.1f} MB)")
         if picture is not None:
             from palpate_services.viewer.plot import plot_record
 
@@ -174,7 +176,7 @@ def _review_store(
             most=most,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    print(f"{written}  ({written.stat().st_size / 1e6:.1f} MB)")
+    print(f"{printable(str(written))}  ({written.stat().st_size / 1e6:.1f} MB)")
     if picture is not None:
         _draw_store(path, picture, trajectories)
         print(picture)

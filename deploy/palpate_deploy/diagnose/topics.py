@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate import clock
@@ -24,6 +25,7 @@ from palpate.bus.topics import TOPICS, Topic
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, StreamTimeout, WireError
 from palpate.messages import Stamp
+from palpate.printable import printable
 from palpate_deploy.station.logs import FAILED
 
 
@@ -80,7 +82,7 @@ def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool
         table.add_row(
             name,
             topic.codec.schema.rpartition(".")[2],
-            " ".join(sorted(sources[name])) or "[dim]-[/]",
+            escape(printable(" ".join(sorted(sources[name])))) or "[dim]-[/]",
             f"{rates_hz[name]:.1f}" if messages[name] else "[dim]-[/]",
             f"{topic.rate_hz:g}" if topic.rate_hz else "events",
             topic.doc,
@@ -124,7 +126,8 @@ def echo_topic(
                             remedy="the publisher speaks another contract: compare its version",
                         ) from error
                     raise
-                print(_json(received) if as_json else _text(topic, received), flush=True)
+                text = _json(received) if as_json else printable(_text(topic, received), keep="\n")
+                print(text, flush=True)
                 done += 1
         except KeyboardInterrupt:
             pass
@@ -296,6 +299,7 @@ def print_rates(topic: Topic[object], rates: dict[str, StreamRate]) -> None:
         print(f"no {topic.name} came; see what runs: palpate status", file=sys.stderr, flush=True)
     for source, rate in sorted(rates.items()):
         numbers = rate.summary()
+        source = printable(source)
         if numbers["rate_hz"] is None:
             print(f"{source}: {rate.messages} message", flush=True)
             continue

@@ -14,45 +14,52 @@ import stat
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-_READ_BYTES = 1 << 20
 _ARRAYS_MAX = 64
 _HEADER_BYTES_MAX = 1 << 12
 _RANK_MAX = 8
 _KINDS = "biuf"  # truth values and numbers: no objects, no records, no texts
 
 
-def read_regular(path: Path, most_bytes: int) -> bytes:
-    """All bytes of a regular file.
+def open_regular(path: Path, *, follow: bool = True) -> BinaryIO:
+    """Open a regular file to read it; ``follow`` allows a link to one.
 
-    A link, a FIFO, a device or a socket is refused without being read: reading it could block, or
-    never end.
+    A FIFO, a device or a socket is refused without being read: that could block, or never end.
+
+    Raises:
+        OSError: It cannot be opened.
+        ValueError: It is no regular file.
+    """
+    if not follow and path.is_symlink():
+        raise ValueError("it is a symbolic link, not a regular file")
+    # O_NONBLOCK: to open a FIFO would wait for its writer. It changes nothing for a file.
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow else os.O_NOFOLLOW)
+    number = os.open(path, flags)
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise ValueError("it is not a regular file")
+    return open(number, "rb")
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """All bytes of a regular file that is no link.
 
     Raises:
         OSError: It cannot be opened.
         ValueError: It is no regular file, or has more than ``most_bytes``.
     """
-    # O_NONBLOCK: to open a FIFO would wait for its writer. It changes nothing for a file.
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
-    if path.is_symlink():
-        raise ValueError("it is a symbolic link, not a regular file")
-    with open(os.open(path, flags), "rb", buffering=0) as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise ValueError("it is not a regular file")
-        if status.st_size > most_bytes:
-            raise ValueError(f"it has {status.st_size:,} bytes, {most_bytes:,} are allowed")
-        parts, left = [], most_bytes + 1
-        while left > 0 and (part := file.read(min(left, _READ_BYTES))):
-            parts.append(part)
-            left -= len(part)
-    if left <= 0:  # it has grown since its size was asked
-        raise ValueError(f"it has more than {most_bytes:,} bytes")
-    return b"".join(parts)
+    with open_regular(path, follow=False) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most_bytes:
+            raise ValueError(f"it has {size:,} bytes, {most_bytes:,} are allowed")
+        data = file.read(size + 1)
+    if len(data) > size:
+        raise ValueError("it grows while it is read")
+    return data
 
 
 def parse_json(text: bytes) -> Any:

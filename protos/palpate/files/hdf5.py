@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 SENSOR_FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
 """Frame of every file, and the text of its attribute ``frame``."""
 
+_FREE_BYTES = 64 << 20
+_RATIO_MAX = 100  # of what an array may expand to; those of palpate expand to ten times at most
+
 COPY_AGAIN = "make it again, or copy it again and compare its size"
 
 
@@ -149,6 +152,12 @@ def read_array(
         raise DatasetError(
             f"{where}: {name} is in {found or 'no stated unit'!r}, expected {unit!r}",
             remedy=f"convert {name} to {unit} and set its attribute unit",
+        )
+    stored = group.file.id.get_filesize()
+    if dataset.nbytes > _FREE_BYTES + _RATIO_MAX * stored:
+        raise DatasetError(
+            f"{where}: {name} says that it has {dataset.nbytes:,} bytes, its file has {stored:,}",
+            remedy=COPY_AGAIN,
         )
     array: npt.NDArray[Any] = dataset[()]
     if dtype is str:

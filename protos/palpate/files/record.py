@@ -24,13 +24,14 @@ import zstandard
 from google.protobuf import descriptor_pb2
 from google.protobuf.message import Message as PbMessage
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Channel, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
 from palpate.errors import ConfigError, RecordingError, WireError
+from palpate.files.bounded import open_regular
+from palpate.files.mcap_stream import CHANNELS_MAX, McapMessage, check_summary, parts_of
+from palpate.printable import printable
 
 FLUSH_S = 0.1
 """Messages reach the operating system after this time [s]; kill -9 costs no more than this."""
@@ -113,7 +114,7 @@ class RecordWriter:
         """Add a message; flushes when ``FLUSH_S`` has passed since the last time.
 
         Raises:
-            WireError: A schema that the contract does not know.
+            WireError: A schema that the contract does not know, or one stream too many.
             RecordingError: The disk is full or gone.
         """
         channel = self._channels.get((key, schema))
@@ -142,6 +143,12 @@ class RecordWriter:
                 f"schema {schema!r} is not of contract v{CONTRACT_VERSION}",
                 remedy="record with the palpate that knows it",
                 reason="schema",
+            )
+        if len(self._channels) >= CHANNELS_MAX:
+            raise WireError(
+                f"{self.part} has {CHANNELS_MAX} streams, no more are recorded",
+                remedy="see who invents names of sensors: palpate topic list",
+                reason="channels",
             )
         if schema not in self._schemas:
             self._schemas[schema] = self._writer.register_schema(
@@ -213,8 +220,7 @@ class RecordWriter:
             self.abandon()
 
 
-_RECORD_BYTES_MAX = 64 << 20
-# What the MCAP reader raises on bytes that are not MCAP.
+# What the reader raises on bytes that are not MCAP.
 _DAMAGED = (
     McapError,
     zstandard.ZstdError,
@@ -224,6 +230,7 @@ _DAMAGED = (
     LookupError,
     OverflowError,
     MemoryError,
+    RuntimeError,  # of LZ4
     OSError,
 )
 
@@ -264,25 +271,24 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
     count = 0
     complete = False
     try:
-        with open(path, "rb") as stream:
-            for record in _reader(stream).records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    if record.id not in channels:
-                        channels[record.id] = _channel(path, record, schemas)
-                elif isinstance(record, Message):
-                    key, address, schema = channels[record.channel_id]
+        with open_regular(path) as stream:
+            for part in parts_of(stream):
+                if isinstance(part, McapMessage):
+                    key, address, schema = channels[part.channel_id]
                     count += 1
                     yield RecordItem(
                         key,
                         address,
                         schema,
-                        record.data,
-                        record.log_time,
-                        record.publish_time,
-                        record.sequence,
+                        part.data,
+                        part.log_time_ns,
+                        part.publish_time_ns,
+                        part.sequence,
                     )
+                elif isinstance(part, Schema):
+                    schemas[part.id] = part
+                elif isinstance(part, Channel) and part.id not in channels:
+                    channels[part.id] = _channel(path, part, schemas)
         complete = True
     except FileNotFoundError as error:
         raise RecordingError(f"{path} does not exist", remedy="check the path") from error
@@ -293,7 +299,8 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
             raise
         if not (allow_partial and channels):
             raise RecordingError(
-                f"{path} is damaged or cut off after {count} messages: {error or 'end is missing'}",
+                f"{path} is damaged or cut off after {count} messages: "
+                f"{printable(str(error)) or type(error).__name__}",
                 remedy="recover the whole messages with `palpate recover`",
             ) from error
     if complete and not channels and not allow_partial:
@@ -383,18 +390,14 @@ def summarise(path: Path) -> RecordSummary:
     return RecordSummary(metadata_of(path), counts, start, end, complete)
 
 
-def _reader(stream: IO[bytes]) -> StreamReader:
-    return StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_BYTES_MAX)
-
-
 def metadata_of(path: Path) -> dict[str, str]:
     """Facts written at the start; empty where the file is too damaged to read them."""
     try:
-        with open(path, "rb") as stream:
-            for record in _reader(stream).records:
-                if isinstance(record, Metadata) and record.name == METADATA:
-                    return dict(record.metadata)
-                if isinstance(record, Message):
+        with open_regular(path) as stream:
+            for part in parts_of(stream):
+                if isinstance(part, Metadata) and part.name == METADATA:
+                    return dict(part.metadata)
+                if isinstance(part, McapMessage):
                     break
     except _DAMAGED:
         return {}
@@ -402,18 +405,16 @@ def metadata_of(path: Path) -> dict[str, str]:
 
 
 def check_readable(path: Path) -> None:
-    """Check with MCAP's own seeking reader that the index of a finished record is sound.
+    """Check that the index of a finished record, by which others seek in it, is sound.
 
     Raises:
         RecordingError: It is not.
     """
     try:
-        with open(path, "rb") as stream:
-            summary = make_reader(stream).get_summary()
+        with open_regular(path) as stream:
+            check_summary(stream)
     except _DAMAGED as error:
         raise RecordingError(f"{path}: {error}", remedy="recover it") from error
-    if summary is None or summary.statistics is None:
-        raise RecordingError(f"{path} has no summary", remedy="recover it")
 
 
 def is_being_written(part: Path) -> bool:

@@ -216,6 +216,9 @@ class RecordFiles:
                 publish_time_ns=wall_ns,
                 sequence=sequence,
             )
+        except WireError as error:
+            self._counts[f"rejected_{error.reason}"] += 1
+            return
         except RecordingError as error:
             # Lost with it: samples that the writer still held in its buffer.
             self._unflushed += 1

@@ -1,0 +1,257 @@
+"""Reads the parts of an MCAP file one after another, each within bounds.
+
+A file of a stranger may say that a record has a petabyte, or expand to a thousand times its size.
+So every size is checked before anything is read or expanded, and what all chunks together expand to
+is bounded by the size of the file. At no time more than one chunk is in memory.
+
+Errors are ``ValueError`` with what is wrong and where, and ``EOFError`` where the file ends early.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from typing import IO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, Metadata, Schema, Statistics
+
+CHUNK_BYTES_MAX = 32 << 20
+"""Size of a chunk, packed and expanded [bytes]; palpate's have 1 MiB and one message."""
+
+CHANNELS_MAX = 4096
+"""Channels, and schemas, of a file: twenty for each of two hundred sensors."""
+
+SUMMARY_BYTES_MAX = 32 << 20
+
+_FREE_BYTES = 64 << 20
+_RATIO_MAX = 400  # of untouched fields, which are zeros; measured data expand to three times
+_MESSAGE_COST = 256  # bytes; an empty message takes time, too
+
+_BYTES_MAX = {
+    Opcode.HEADER: 64 << 10,
+    Opcode.FOOTER: 64,
+    Opcode.SCHEMA: 1 << 20,
+    Opcode.CHANNEL: 64 << 10,
+    Opcode.MESSAGE: CHUNK_BYTES_MAX,
+    Opcode.CHUNK: CHUNK_BYTES_MAX,
+    Opcode.METADATA: 1 << 20,
+    Opcode.STATISTICS: 1 << 20,
+    Opcode.CHUNK_INDEX: 1 << 20,
+}
+"""Largest record of each kind that is read [bytes]; others are passed over without being read."""
+
+_MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_TIME_MAX_NS = 2**63  # the year 2262; later ones do not fit the arrays of times
+_END_BYTES = _HEAD.size + 20 + len(_MAGIC)  # footer and magic
+
+
+class McapMessage(NamedTuple):
+    """A message: channel, sequence, log and publish time [ns], payload."""
+
+    channel_id: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+Part = Schema | Channel | McapMessage | Metadata
+
+
+def parts_of(file: IO[bytes]) -> Iterator[Part]:
+    """Schemas, channels, messages and metadata in order of writing; schemas without their data.
+
+    Raises:
+        ValueError: It is no MCAP file, is damaged, or exceeds a bound.
+        EOFError: The end is missing.
+    """
+    budget = _Budget(os.fstat(file.fileno()).st_size)
+    if file.read(len(_MAGIC)) != _MAGIC:
+        raise ValueError("it is no MCAP file")
+    for opcode, data, at in _records(file):
+        if opcode == Opcode.CHUNK:
+            yield from _of_chunk(_chunk(data, at), at, budget)
+        elif opcode == Opcode.MESSAGE:
+            budget.spend(_MESSAGE_COST, at)
+            yield _message(data, at)
+        elif opcode == Opcode.SCHEMA:
+            yield budget.schema(data, at)
+        elif opcode == Opcode.CHANNEL:
+            yield budget.channel(data, at)
+        elif opcode == Opcode.METADATA:
+            yield Metadata.read(ReadDataStream(BytesIO(data)))
+        elif opcode == Opcode.FOOTER:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise EOFError("the end is missing")
+            return
+
+
+def check_summary(file: IO[bytes]) -> None:
+    """Check that the index at the end of a finished file is there and agrees with the file.
+
+    Raises:
+        ValueError: It does not.
+        EOFError: It is missing.
+    """
+    size = file.seek(0, os.SEEK_END)
+    if size < 2 * len(_MAGIC) + _END_BYTES:
+        raise EOFError("the end is missing")
+    file.seek(size - _END_BYTES)
+    opcode, data, _ = next(_records(file))
+    if opcode != Opcode.FOOTER or file.read(len(_MAGIC)) != _MAGIC:
+        raise EOFError("the end is missing")
+    start = Footer.read(ReadDataStream(BytesIO(data))).summary_start
+    if not len(_MAGIC) < start < size - _END_BYTES:
+        raise ValueError("it has no summary")
+    if size - start > SUMMARY_BYTES_MAX:
+        raise ValueError(f"its summary has {size - start:,} bytes")
+    file.seek(start)
+    statistics: Statistics | None = None
+    chunks = 0
+    for opcode, data, at in _records(file):
+        if opcode == Opcode.FOOTER:
+            break
+        if opcode == Opcode.STATISTICS:
+            statistics = Statistics.read(ReadDataStream(BytesIO(data)))
+        elif opcode == Opcode.CHUNK_INDEX:
+            index = ChunkIndex.read(ReadDataStream(BytesIO(data)))
+            chunks += 1
+            if index.chunk_start_offset + index.chunk_length > start:
+                raise ValueError(f"an index at byte {at:,} points behind the data")
+    if statistics is None:
+        raise ValueError("it has no statistics")
+    if statistics.chunk_count != chunks:
+        raise ValueError(f"it has {statistics.chunk_count} chunks and {chunks} indices of chunks")
+
+
+class _Budget:
+    """What may still be expanded, and the channels and schemas so far."""
+
+    def __init__(self, file_bytes: int) -> None:
+        self._allowed = _FREE_BYTES + _RATIO_MAX * file_bytes
+        self._left = self._allowed
+        self._schemas: set[int] = set()
+        self._channels: set[int] = set()
+
+    def spend(self, size: int, at: int) -> None:
+        self._left -= size
+        if self._left < 0:
+            raise ValueError(
+                f"its chunks expand to more than {self._allowed:,} bytes, found at byte {at:,}"
+            )
+
+    def schema(self, data: bytes, at: int) -> Schema:
+        found = Schema.read(ReadDataStream(BytesIO(data)))
+        _note(self._schemas, found.id, "schemas", at)
+        return Schema(id=found.id, data=b"", encoding=found.encoding, name=found.name)
+
+    def channel(self, data: bytes, at: int) -> Channel:
+        found = Channel.read(ReadDataStream(BytesIO(data)))
+        _note(self._channels, found.id, "channels", at)
+        return found
+
+
+def _note(known: set[int], number: int, what: str, at: int) -> None:
+    known.add(number)
+    if len(known) > CHANNELS_MAX:
+        raise ValueError(f"it has more than {CHANNELS_MAX} {what}, found at byte {at:,}")
+
+
+def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes, int]]:
+    """Opcode, content and place of each record; content only of the kinds in ``_BYTES_MAX``."""
+    while True:
+        at = file.tell()
+        head = file.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            raise EOFError("the end is missing")
+        opcode, size = _HEAD.unpack(head)
+        if opcode == 0:
+            raise ValueError(f"there is no record at byte {at:,}")
+        most = _BYTES_MAX.get(opcode)
+        if most is None:
+            # Attachments and indices; to read them would take as long as they say they are.
+            file.seek(size, os.SEEK_CUR)
+            continue
+        if size > most:
+            raise ValueError(
+                f"the record at byte {at:,} says that it has {size:,} bytes, {most:,} are allowed"
+            )
+        data = file.read(size)
+        if len(data) < size:
+            raise EOFError("the end is missing")
+        yield opcode, data, at
+
+
+def _chunk(data: bytes, at: int) -> Chunk:
+    chunk = Chunk.read(ReadDataStream(BytesIO(data)))
+    if chunk.uncompressed_size > CHUNK_BYTES_MAX:
+        raise ValueError(
+            f"the chunk at byte {at:,} says that it expands to {chunk.uncompressed_size:,} bytes, "
+            f"{CHUNK_BYTES_MAX:,} are allowed"
+        )
+    return chunk
+
+
+def _of_chunk(chunk: Chunk, at: int, budget: _Budget) -> Iterator[Part]:
+    budget.spend(chunk.uncompressed_size, at)
+    data = _expanded(chunk, at)
+    place, end = 0, len(data)
+    while place < end:
+        if end - place < _HEAD.size:
+            raise ValueError(f"the chunk at byte {at:,} ends within a record")
+        opcode, size = _HEAD.unpack_from(data, place)
+        place += _HEAD.size
+        if size > end - place:
+            raise ValueError(f"a record in the chunk at byte {at:,} is longer than the chunk")
+        content = data[place : place + size]
+        place += size
+        if opcode == Opcode.MESSAGE:
+            budget.spend(_MESSAGE_COST, at)
+            yield _message(content, at)
+        elif opcode == Opcode.SCHEMA:
+            yield budget.schema(content, at)
+        elif opcode == Opcode.CHANNEL:
+            yield budget.channel(content, at)
+        else:
+            raise ValueError(f"the chunk at byte {at:,} holds a record of kind {opcode}")
+
+
+def _message(content: bytes, at: int) -> McapMessage:
+    if len(content) < _MESSAGE.size:
+        raise ValueError(f"a message at byte {at:,} is too short")
+    channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(content)
+    if max(log_time_ns, publish_time_ns) >= _TIME_MAX_NS:
+        raise ValueError(f"a message at byte {at:,} is of the time {log_time_ns} ns")
+    return McapMessage(channel, sequence, log_time_ns, publish_time_ns, content[_MESSAGE.size :])
+
+
+def _expanded(chunk: Chunk, at: int) -> bytes:
+    size = chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        # As a stream, which allocates no more than is asked for, whatever the packed data say.
+        unpacker = zstandard.ZstdDecompressor(max_window_size=CHUNK_BYTES_MAX)
+        with unpacker.stream_reader(chunk.data) as reader:
+            data = reader.read(size + 1)
+    elif chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"the chunk at byte {at:,} is packed by {chunk.compression[:20]!r}")
+    if len(data) != size:
+        raise ValueError(
+            f"the chunk at byte {at:,} says that it expands to {size:,} bytes, and does not"
+        )
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError(f"the checksum of the chunk at byte {at:,} is wrong")
+    return data
