@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-h5py = pytest.importorskip("h5py")
-
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import opened, read_array
+
+h5py = pytest.importorskip("h5py")
 
 
 def test_an_array_that_nobody_wrote_is_not_allocated(tmp_path: Path) -> None:

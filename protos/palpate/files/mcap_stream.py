@@ -154,7 +154,7 @@ class _Budget:
         return Schema(id=found.id, data=b"", encoding=found.encoding, name=found.name)
 
     def channel(self, data: bytes, at: int) -> Channel:
-        found = Channel.read(ReadDataStream(BytesIO(data)))
+        found: Channel = Channel.read(ReadDataStream(BytesIO(data)))
         _note(self._channels, found.id, "channels", at)
         return found
 
@@ -191,7 +191,7 @@ def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes, int]]:
 
 
 def _chunk(data: bytes, at: int) -> Chunk:
-    chunk = Chunk.read(ReadDataStream(BytesIO(data)))
+    chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(data)))
     if chunk.uncompressed_size > CHUNK_BYTES_MAX:
         raise ValueError(
             f"the chunk at byte {at:,} says that it expands to {chunk.uncompressed_size:,} bytes, "
