@@ -20,6 +20,9 @@ TareMode = Literal["still", "first", "query"]
 TARE_FRAMES = 50
 """Frames averaged by default: half a second at 100 Hz."""
 
+TARE_LEAST = 2
+"""Frames averaged at least: whether something moves shows between two halves."""
+
 _KEPT = 1024
 _STILL = StillLimits()
 
@@ -228,7 +231,9 @@ class TareAttempts:
             if isinstance(tare, Tare):
                 tares.append(tare)
         with self._lock:
-            requested = list(self._requested)
+            # A tare that nobody waits for any more must not come into force.
+            requested = [one for one in self._requested if not one[1].cancelled()]
+            self._requested = list(requested)
         for collector, future in requested:
             result = self._try(collector, frame)
             if result is None:
@@ -246,6 +251,16 @@ class TareAttempts:
             self._over = why = "the recording has ended"
             requested, self._requested = self._requested, []
         error = DeviceError(f"not tared: {why}", remedy="tare while the sensor delivers")
+        for _, future in requested:
+            _answer(future, error)
+
+    def give_up(self, why: str) -> None:
+        """The sensor is away: requests fail, and no tare averages frames of before and after."""
+        with self._lock:
+            requested, self._requested = self._requested, []
+        if self._own is not None:
+            self._own = TareCollector(self.frames, self._limits)
+        error = DeviceError(f"not tared: {why}", remedy="tare when the sensor delivers again")
         for _, future in requested:
             _answer(future, error)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.bus import Session, endpoints
+from palpate.bus import Session
+from palpate.client.tares import ask_tare, ask_zero
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
-from palpate.messages import FloatArray, Tare, TareRequest, WrenchZero, WrenchZeroRequest
+from palpate.messages import FloatArray, Tare, WrenchZero
 
 
 def take_tare(
@@ -22,14 +23,11 @@ def take_tare(
     """
     with Session.open(link, station=station) as session:
         try:
-            tare = session.query(
-                endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
-            )
+            tare = ask_tare(session, sensor, frames=frames, timeout_s=timeout_s)
         except LinkError as not_found:
             # A force/torque sensor has a zero instead of a tare.
-            request = WrenchZeroRequest(readings=frames)
             try:
-                zero = session.query(endpoints.ZERO, request, sensor=sensor, timeout_s=timeout_s)
+                zero = ask_zero(session, sensor, readings=frames, timeout_s=timeout_s)
             except LinkError:
                 raise not_found from None
             _print_zero(sensor, zero)

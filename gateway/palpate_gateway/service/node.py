@@ -24,6 +24,7 @@ from palpate_gateway.config import GatewayConfig, SensorConfig
 from palpate_gateway.device import BusDevice, Device
 from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.requests import with_caller
 from palpate_gateway.service.sensor_key import ClaimedKey
 from palpate_gateway.service.worker import SensorWorker
 from palpate_gateway.wrench.device import WrenchDevice
@@ -71,7 +72,7 @@ def run(
     health = Health(SERVICE, instance)
     health.set_sensors(tuple(sensor.name for sensor in config.sensors))
     with Session.open(link, station=station) as session:
-        workers = []
+        workers: list[SensorWorker] = []
         claims = session.claims(session_id=session_id, instance=instance, lease_s=link.lease_s)
         for sensor, device in zip(config.sensors, devices, strict=True):
             # A live source must never wait for a slow subscriber, whatever the pace of others.
@@ -92,17 +93,21 @@ def run(
             )
             workers.append(worker)
             if isinstance(device, WrenchDevice):
-                session.queryable(endpoints.ZERO, worker.answer_zero, sensor=sensor.name)
+                session.stream_queryable(
+                    endpoints.ZERO, with_caller(station, worker.answer_zero), sensor=sensor.name
+                )
                 continue  # without electrodes there is no baseline
             if sensor.of is not None:
                 continue  # its finger answers such requests
-            session.queryable(
-                endpoints.TARE,
-                worker.answer_tare,
-                sensor=sensor.name,
-                # Taring takes half a second; looking up a known tare must not wait for it.
-                workers=2,
+            session.stream_queryable(
+                endpoints.TARE, with_caller(station, worker.answer_tare), sensor=sensor.name
             )
+
+        def caller_gone(caller: str, when_s: float) -> None:
+            for worker in workers:
+                worker.caller_gone(caller, when_s)
+
+        session.watch_callers(caller_gone)
         refresh = partial(_refresh, health, workers, wall)
         presence = session.presence(SERVICE, instance=instance)
         with HealthReporter(session, health, refresh=refresh):

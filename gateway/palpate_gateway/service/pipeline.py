@@ -113,6 +113,8 @@ class Pipeline:
     def ask_tare(self, frames: int) -> Future[Tare]:
         """Tare with the next frames (0 = the usual number); may be called from any thread.
 
+        A request that is cancelled before it has its frames leaves no tare.
+
         Raises:
             DeviceError: No further frames will come to be averaged.
         """
@@ -122,6 +124,10 @@ class Pipeline:
             sensor=self._serial or "the sensor",
             never="it is a record, which brings its own tares" if is_record else "",
         )
+
+    def give_up(self, why: str) -> None:
+        """The sensor is away: nobody waits for its frames to tare."""
+        self._tares.give_up(why)
 
     def push(self, readings: Iterable[Reading], arrival_ns: int) -> list[DueMessage]:
         """Stamp and tare readings.

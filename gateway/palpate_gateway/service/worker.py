@@ -10,19 +10,16 @@ import logging
 import threading
 import time
 from collections import Counter
-from concurrent.futures import Future
 from math import inf
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-from palpate.bus import Publisher
+from palpate.bus import Publisher, QueryAnswer
 from palpate.errors import (
     DeviceError,
     DeviceLost,
     DeviceTimeout,
-    ErrorCode,
     LinkError,
     PalpateError,
-    RemoteError,
     SensorTaken,
 )
 from palpate.health import Health
@@ -33,10 +30,12 @@ from palpate_gateway.clock.wall_clock import WallClock
 from palpate_gateway.device import Device
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.publication import LATE_S, MessagePublisher
+from palpate_gateway.service.requests import SensorRequests
 from palpate_gateway.service.sensor_key import SensorKey
 from palpate_gateway.service.sensor_report import SensorReport
+from palpate_gateway.tare import TARE_LEAST
 from palpate_gateway.wrench.device import WrenchDevice
-from palpate_gateway.wrench.zeroing import Zeroing
+from palpate_gateway.wrench.zeroing import ZERO_LEAST, Zeroing
 
 _log = logging.getLogger(__name__)
 
@@ -60,8 +59,6 @@ still; what came meanwhile has not been read yet."""
 _SHORTEST_S = 1e-3
 
 _REMEDY = "look at palpate status; tare when it is back"
-
-Result = TypeVar("Result")
 
 
 class SilenceTimer:
@@ -164,6 +161,13 @@ class SensorWorker:
         self._wrench = device if isinstance(device, WrenchDevice) else None
         self.zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
         """Takes the zero of a force/torque sensor on request; None = another kind of sensor."""
+        rate_hz = device.info.rate_hz
+        self._tares: SensorRequests[Tare] = SensorRequests(
+            name, what="tare", readings="frames", rate_hz=rate_hz
+        )
+        self._zeros: SensorRequests[WrenchZero] = SensorRequests(
+            name, what="zero", readings="readings", rate_hz=rate_hz
+        )
         self._thread = threading.Thread(target=self._run, name=f"sensor {name}", daemon=True)
 
     def start(self) -> None:
@@ -319,53 +323,59 @@ class SensorWorker:
         return True
 
     def _give_up(self, why: str) -> None:
-        """Fail the requests for a zero: they must not wait for a sensor that is gone."""
+        """Fail the requests: they must not wait for a sensor that is gone."""
+        self.pipeline.give_up(why)
         if self.zeroing is not None:
             self.zeroing.give_up(why)
 
-    def answer_tare(self, request: TareRequest) -> Tare:
-        """Look a tare up, or tare with the next frames; may be called from any thread.
+    def answer_tare(self, request: TareRequest, answer: QueryAnswer[Tare], caller: str) -> None:
+        """Look a tare up at once, or tare with the next frames; may be called from any thread.
+
+        ``caller`` is the ``caller_key`` of the caller, empty = it has none.
 
         Raises:
-            RemoteError: The id is not known (NOT_FOUND), or the sensor did not deliver in time.
-            DeviceError: The sensor does not deliver, is touched, or a channel is invalid.
+            RemoteError: The id is not known (NOT_FOUND), too many frames are wanted
+                (INVALID_REQUEST), or too many requests wait (RESOURCE_EXHAUSTED).
+            DeviceError: The sensor does not deliver.
         """
         if request.tare_id != NO_TARE:
-            return self.pipeline.ledger.find(request.tare_id)
+            answer.send(self.pipeline.ledger.find(request.tare_id))
+            answer.end()
+            return
+        usual = self.pipeline.tare_frames
+        frames = self._tares.check_count(request.frames, least=TARE_LEAST, usual=usual)
         self._check_serving()
-        frames = request.frames or self.pipeline.tare_frames
-        wait_s = 2.0 + 2.0 * frames / self.device.info.rate_hz
-        future = self.pipeline.ask_tare(request.frames)
-        return self._result(future, f"{frames} good frames", wait_s)
+        self._tares.serve(
+            answer,
+            lambda: self.pipeline.ask_tare(frames),
+            caller=caller,
+            readings=frames,
+            in_turn=False,
+            slack_s=2.0 + frames / self.device.info.rate_hz,
+        )
 
-    def answer_zero(self, request: WrenchZeroRequest) -> WrenchZero:
-        """Take the load of a force/torque sensor as zero; may be called from any thread.
-
-        Raises:
-            DeviceError: The sensor does not deliver, is moved or overloaded, or refuses.
-            RemoteError: It did not deliver in time.
-        """
+    def answer_zero(
+        self, request: WrenchZeroRequest, answer: QueryAnswer[WrenchZero], caller: str
+    ) -> None:
+        """Take the load of a force/torque sensor as zero; as ``answer_tare`` otherwise."""
         assert self.zeroing is not None, "only a force/torque sensor has a zero"
+        zeroing = self.zeroing
+        count = self._zeros.check_count(request.readings, least=ZERO_LEAST, usual=zeroing.usual)
         self._check_serving()
-        count = self.zeroing.count(request.readings)
-        wait_s = 10.0 + 4.0 * count / self.device.info.rate_hz
-        what = f"{count} readings before and after its zero"
-        return self._result(self.zeroing.ask(count), what, wait_s)
+        self._zeros.serve(
+            answer,
+            lambda: zeroing.ask(count),
+            caller=caller,
+            readings=2 * count,
+            in_turn=True,
+            slack_s=10.0 + 2.0 * count / self.device.info.rate_hz,
+        )
+
+    def caller_gone(self, caller: str, when_s: float) -> None:
+        """Drop the requests of a caller that has left; see ``Session.watch_callers``."""
+        self._tares.caller_gone(caller, when_s)
+        self._zeros.caller_gone(caller, when_s)
 
     def _check_serving(self) -> None:
         if not self.serving:
             raise DeviceError(f"sensor {self.name!r} does not deliver at present", remedy=_REMEDY)
-
-    def _result(self, future: Future[Result], what: str, wait_s: float) -> Result:
-        try:
-            return future.result(timeout=wait_s)
-        except TimeoutError as error:
-            if isinstance(error, PalpateError):  # the answer itself is an error of this kind
-                raise
-            future.cancel()
-            raise RemoteError(
-                f"sensor {self.name!r} did not deliver {what} within {wait_s:.1f} s",
-                remedy=_REMEDY,
-                code=ErrorCode.DEADLINE_EXCEEDED,
-                retry_after_s=1.0,
-            ) from error

@@ -16,7 +16,9 @@ from palpate_gateway.readings import Reading, WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice
 
 _MEAN_S = 0.5
-_COUNT_MIN, _COUNT_MAX = 5, 20_000
+
+ZERO_LEAST = 5
+"""Readings in each mean, at least."""
 
 _Wrenches = npt.NDArray[np.float64]
 
@@ -40,10 +42,10 @@ class Zeroing:
         self._lock = threading.Lock()
         self._requests: list[_ZeroRequest] = []
 
-    def count(self, readings: int) -> int:
-        """Readings in each mean for a request of ``readings``; 0 = those of half a second."""
-        wanted = readings or round(_MEAN_S * self._device.info.rate_hz)
-        return min(max(wanted, _COUNT_MIN), _COUNT_MAX)
+    @property
+    def usual(self) -> int:
+        """Readings in each mean unless a request says otherwise: those of half a second."""
+        return max(round(_MEAN_S * self._device.info.rate_hz), ZERO_LEAST)
 
     def ask(self, count: int) -> Future[WrenchZero]:
         """Request a zero; from any thread."""

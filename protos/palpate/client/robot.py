@@ -29,6 +29,7 @@ from palpate.census import ProcessReport, take_census
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import GRACE_S, OnProgress, OnStep, ask_simulation
 from palpate.client.streams import Stream
+from palpate.client.tares import ask_tare, ask_zero
 from palpate.config import (
     STATION_VARIABLE,
     TlsConfig,
@@ -51,10 +52,8 @@ from palpate.messages import (
     Status,
     SynthesisEstimate,
     Tare,
-    TareRequest,
     WrenchFrame,
     WrenchZero,
-    WrenchZeroRequest,
     as_field_frame,
 )
 from palpate.process import Closing
@@ -259,9 +258,7 @@ class Client(Closing):
             RemoteError: The gateway refuses, e.g. because the finger is touched.
         """
         _check_count(frames, "frames")
-        return self.session.query(
-            endpoints.TARE, TareRequest(frames=frames), sensor=sensor, timeout_s=timeout_s
-        )
+        return ask_tare(self.session, sensor, frames=frames, timeout_s=timeout_s)
 
     def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
         """Take the present load of a force/torque sensor as zero.
@@ -273,9 +270,7 @@ class Client(Closing):
             RemoteError: The gateway refuses, e.g. because the load is not still.
         """
         _check_count(readings, "readings")
-        return self.session.query(
-            endpoints.ZERO, WrenchZeroRequest(readings=readings), sensor=sensor, timeout_s=timeout_s
-        )
+        return ask_zero(self.session, sensor, readings=readings, timeout_s=timeout_s)
 
     def simulate(
         self,

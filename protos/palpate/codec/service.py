@@ -133,11 +133,17 @@ def _zero_encode(zero: WrenchZero) -> bytes:
     return msg.SerializeToString()
 
 
+def _check_request_id(request_id: str) -> str:
+    return check_serial(request_id, "request_id") if request_id else ""
+
+
 WRENCH_ZERO = codec_of(service_pb2.WrenchZero, _zero_encode, _zero_from_wire)
 WRENCH_ZERO_REQUEST: Codec[WrenchZeroRequest] = codec_of(
     service_pb2.WrenchZeroRequest,
-    lambda r: service_pb2.WrenchZeroRequest(readings=r.readings).SerializeToString(),
-    lambda msg: WrenchZeroRequest(msg.readings),
+    lambda r: service_pb2.WrenchZeroRequest(
+        readings=r.readings, request_id=_check_request_id(r.request_id)
+    ).SerializeToString(),
+    lambda msg: WrenchZeroRequest(msg.readings, _check_request_id(msg.request_id)),
 )
 
 
@@ -355,8 +361,10 @@ def _metadata_encode(metadata: ModelMetadata) -> bytes:
 TARE = codec_of(service_pb2.Tare, _tare_encode, _tare_from_wire)
 TARE_REQUEST: Codec[TareRequest] = codec_of(
     service_pb2.TareRequest,
-    lambda r: service_pb2.TareRequest(tare_id=r.tare_id, frames=r.frames).SerializeToString(),
-    lambda msg: TareRequest(msg.tare_id, msg.frames),
+    lambda r: service_pb2.TareRequest(
+        tare_id=r.tare_id, frames=r.frames, request_id=_check_request_id(r.request_id)
+    ).SerializeToString(),
+    lambda msg: TareRequest(msg.tare_id, msg.frames, _check_request_id(msg.request_id)),
 )
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()

@@ -64,10 +64,12 @@ class SensorStatus:
 class WrenchZeroRequest:
     """Take the present load of a force/torque sensor as zero.
 
-    ``readings`` are averaged before it and after it; 0 = the gateway's own number.
+    ``readings`` are averaged before it and after it; 0 = the gateway's own number. ``request_id``
+    is as in ``TareRequest``.
     """
 
     readings: int = 0
+    request_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,10 +124,16 @@ class Tare:
 
 @dataclass(frozen=True, slots=True)
 class TareRequest:
-    """Tare now (``tare_id = NO_TARE``), or look up the tare of this id."""
+    """Tare now (``tare_id = NO_TARE``), or look up the tare of this id.
+
+    Attributes:
+        frames: How many are averaged; 0 = the gateway's own number.
+        request_id: Names the token that the caller holds while it waits; empty = it holds none.
+    """
 
     tare_id: int = NO_TARE
     frames: int = 0
+    request_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,18 +107,22 @@ class Tare(_message.Message):
     def __init__(self, tare_id: _Optional[int] = ..., stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., electrodes: _Optional[_Iterable[float]] = ..., electrodes_sd: _Optional[_Iterable[float]] = ..., pdc: _Optional[float] = ..., pac: _Optional[float] = ..., tac: _Optional[float] = ..., tdc: _Optional[float] = ..., frames_averaged: _Optional[int] = ...) -> None: ...
 
 class TareRequest(_message.Message):
-    __slots__ = ("tare_id", "frames")
+    __slots__ = ("tare_id", "frames", "request_id")
     TARE_ID_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     tare_id: int
     frames: int
-    def __init__(self, tare_id: _Optional[int] = ..., frames: _Optional[int] = ...) -> None: ...
+    request_id: str
+    def __init__(self, tare_id: _Optional[int] = ..., frames: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
 
 class WrenchZeroRequest(_message.Message):
-    __slots__ = ("readings",)
+    __slots__ = ("readings", "request_id")
     READINGS_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     readings: int
-    def __init__(self, readings: _Optional[int] = ...) -> None: ...
+    request_id: str
+    def __init__(self, readings: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
 
 class WrenchZero(_message.Message):
     __slots__ = ("sensor_serial", "device", "monotonic_ns", "wall_ns", "force_before", "torque_before", "force_after", "torque_after", "readings_averaged")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -181,7 +182,7 @@ def test_who_waits_hears_when_the_sensor_goes(bus: Any) -> None:
         sensor(bus, SensorState.LIVE)
         emulator.inject("silence", 30.0)
         with pytest.raises(RemoteError, match=r"took no zero|does not deliver at present"):
-            ask_zero(bus, readings=20_000)
+            ask_zero(bus, readings=5_000)
 
 
 def test_a_wrench_is_not_asked_for_a_baseline_nor_a_finger_for_a_zero(bus: Any) -> None:
@@ -216,3 +217,41 @@ def test_one_command_tares_whichever_sensor_it_is(
             assert capsys.readouterr().out.startswith("tared finger (VIRTUAL")
             with pytest.raises(LinkError, match="answers on palpate/@v1/lab/nobody/tare"):
                 take_tare(bus.link, "lab", "nobody", frames=2, timeout_s=20.0)
+
+
+@pytest.mark.parametrize("readings", [4, 5_001, 2**32 - 1])
+def test_a_zero_over_more_than_ten_seconds_is_refused(bus: Any, readings: int) -> None:
+    with (
+        Kms40Emulator(fakes.constant) as emulator,
+        bus.gateway(gateway("wrench_kms40", kms_options(emulator))),
+    ):
+        sensor(bus, SensorState.LIVE)
+        with pytest.raises(RemoteError, match=r"'ft' averages 5 to 5000 readings") as caught:
+            ask_zero(bus, readings=readings)
+        assert caught.value.code is ErrorCode.INVALID_REQUEST
+        assert ask_zero(bus, readings=5).readings_averaged == 5
+
+
+def test_a_zero_of_a_caller_that_left_is_not_taken(bus: Any) -> None:
+    with (
+        Kms40Emulator(fakes.constant) as emulator,
+        bus.gateway(gateway("wrench_kms40", kms_options(emulator))),
+    ):
+        sensor(bus, SensorState.LIVE)
+        token = bus.session.caller_token("gone")
+        left = threading.Thread(
+            target=lambda: bus.session.query_all(
+                endpoints.ZERO,
+                WrenchZeroRequest(5_000, "gone"),
+                sensor="ft",
+                timeout_s=20.0,
+            )
+        )
+        left.start()
+        bus.until(lambda: any(t.name == "zero of ft" for t in threading.enumerate()))
+        token.close()
+        # The next one need not wait ten seconds for the readings of the first.
+        assert ask_zero(bus, readings=5).readings_averaged == 5
+        left.join(20.0)
+        assert not left.is_alive()
+        assert bus.state(ServiceState.READY).counters["zeros"] == 1
