@@ -93,6 +93,9 @@ class Device(ABC):
     options_class: ClassVar[type[StrictConfig]]
     """Options of the driver, checked before the device is made."""
 
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Optional packages that it imports when it is opened; those of the extra ``gateway``."""
+
     gone_s: ClassVar[float] = 2.0
     """A live device that has been silent for so long is closed and opened again [s]."""
 

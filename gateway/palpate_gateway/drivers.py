@@ -14,6 +14,7 @@ from typing import Any, cast
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError, MissingExtraError
+from palpate.process import check_installed
 from palpate_gateway.device import Device
 
 ENTRY_POINTS = "palpate.devices"
@@ -74,6 +75,8 @@ def load_driver(name: str) -> type[Device]:
             f"driver {name!r} names {target!r}, which is no device class",
             remedy="name a subclass of palpate_gateway.device.Device as 'module:Class'",
         )
+    for module_name in device.needs:
+        check_installed(module_name, extra="gateway")
     return device
 
 

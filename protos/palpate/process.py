@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import importlib.util
 import shlex
 import sys
 from abc import ABC, abstractmethod
@@ -46,6 +47,20 @@ def require(module: str, *, extra: str) -> ModuleType:
         if error.name is not None and not module.startswith(error.name):
             raise
         raise MissingExtraError(module, extra=extra) from error
+
+
+def check_installed(module: str, *, extra: str) -> None:
+    """Check that an optional dependency is there, without importing it.
+
+    Raises:
+        MissingExtraError: It is not installed; ``extra`` of palpate installs it.
+    """
+    try:
+        found = importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the package around it is missing
+        found = False
+    if not found:
+        raise MissingExtraError(module, extra=extra)
 
 
 def typed_command() -> str:

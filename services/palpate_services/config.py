@@ -102,7 +102,8 @@ class RecorderConfig(StrictConfig):
         min_free_bytes: Recording pauses while the disk has less free than this [bytes].
         rotate_bytes: Start a new record at this size [bytes]; None = never.
         rotate_s: Start a new record after this time [s]; None = never.
-        drain_s: How long a stopping recorder still writes messages that have arrived [s].
+        drain_s: How long a stopping recorder still writes messages that have arrived [s]; a
+            lossless replay needs longer than a live station.
     """
 
     out: Path = Path("runs")
@@ -116,4 +117,4 @@ class RecorderConfig(StrictConfig):
     min_free_bytes: int = Field(default=256 * 1024**2, ge=0)
     rotate_bytes: int | None = Field(default=None, ge=64 * 1024)
     rotate_s: float | None = Field(default=None, ge=1)
-    drain_s: float = Field(default=5.0, ge=0, le=60)
+    drain_s: float = Field(default=2.0, ge=0, le=60)

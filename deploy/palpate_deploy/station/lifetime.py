@@ -13,9 +13,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
+
+from palpate.heartbeat import without_watch
 
 PARENT_PID = "_PALPATE_PARENT_PID"
 """Environment variable with the process id of the parent; a process without it ends alone."""
@@ -40,21 +42,29 @@ def environment_for_children() -> dict[str, str]:
     """This process's environment for children that must end with it.
 
     Without the variables that change a profile: children read the resolved profile from a file, and
-    the same variables applied twice would undo what a command changed in it.
+    the same variables applied twice would undo what a command changed in it. Without those of a
+    watch over this process, for which its children must not answer.
     """
-    kept = {k: v for k, v in os.environ.items() if not k.upper().startswith("PALPATE_")}
+    kept = {
+        k: v for k, v in without_watch(os.environ).items() if not k.upper().startswith("PALPATE_")
+    }
     return {**kept, PARENT_PID: str(os.getpid())}
 
 
-def start_child(command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
-    """Start a process that ends with this one and writes into a log of its own."""
+def start_child(
+    command: Sequence[str], log: Path, variables: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start a process that ends with this one and writes into a log of its own.
+
+    ``variables`` are added to its environment.
+    """
     with open(log, "ab") as output:
         return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            env=environment_for_children(),
+            env={**environment_for_children(), **(variables or {})},
             # Ctrl-C must reach only the command itself, which stops its children in order.
             start_new_session=True,
         )
@@ -63,6 +73,8 @@ def start_child(command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
 def stop_child(process: subprocess.Popen[bytes], timeout_s: float) -> int:
     """Stop a process with ``SIGTERM``, after the timeout with ``SIGKILL``; its exit status."""
     process.terminate()
+    # A stopped process (SIGSTOP) gets no SIGTERM before it goes on.
+    process.send_signal(signal.SIGCONT)
     try:
         return process.wait(timeout_s)
     except subprocess.TimeoutExpired:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
+import signal
 import subprocess
 import sys
 import threading
@@ -12,6 +14,7 @@ from pathlib import Path
 from typing import Self
 
 from palpate.errors import ConfigError, PalpateError
+from palpate.process import check_installed
 from palpate_deploy.station import logs
 from palpate_deploy.station.host import new_run_folder, write_profile
 from palpate_deploy.station.lifetime import (
@@ -48,6 +51,8 @@ def run_service(service: Service, profile: Profile) -> None:
         PalpateError: It cannot start or go on; the process ends and the supervisor restarts it.
     """
     logs.configure(profile.log.level, profile.log.format)
+    # Where a process hangs that is about to be killed, its log must show.
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
     stop = stop_on_signals()
     end_with_parent()
     _log.info("%s starts, station %s", service, profile.station)
@@ -87,6 +92,35 @@ def _entry_point(service: Service) -> Callable[..., None]:
     return run_estimating
 
 
+_NEEDED: dict[str, tuple[str, tuple[str, ...]]] = {
+    "features": ("services", ("onnxruntime",)),
+    "field": ("services", ("onnxruntime",)),
+    "synthesis": ("services", ("onnxruntime",)),
+    "fem": ("fem", ("warp", "scipy", "pymetis", "threadpoolctl", "h5py")),
+}
+"""Optional packages without which a process cannot start, and the extra that installs them."""
+
+
+def check_packages(profile: Profile) -> None:
+    """Check that every process of a profile finds its packages, without importing them.
+
+    Raises:
+        ConfigError: A sensor's driver does not exist.
+        MissingExtraError: One is not installed; names the extra.
+    """
+    for service in profile.processes:
+        extra, modules = _NEEDED.get(service, ("", ()))
+        if service == "recorder" and profile.recorder.rrd:
+            extra, modules = "services", ("rerun",)
+        for module in modules:
+            check_installed(module, extra=extra)
+    if "gateway" in profile.processes:
+        from palpate_gateway.drivers import load_driver
+
+        for sensor in profile.gateway.sensors:
+            load_driver(sensor.driver)
+
+
 def service_named(name: str) -> Service:
     """A service by name; a ``ConfigError`` lists what there is."""
     for service in START_ORDER:
@@ -107,6 +141,18 @@ class ProcessEnded(PalpateError, RuntimeError):
     def __init__(self, problem: str, *, remedy: str, status: int) -> None:
         super().__init__(problem, remedy=remedy)
         self.status = status
+
+
+def ended_error(name: str, status: int, log: Path) -> ProcessEnded:
+    """The error of a process that ended: the last one in its log, if there is one."""
+    problem, remedy = f"ended with status {status}", f"see {log}"
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+        if line.startswith("error: "):
+            problem = line.removeprefix("error: ")
+            if following.startswith("  fix: "):
+                remedy = following.removeprefix("  fix: ")
+    return ProcessEnded(f"{name}: {problem}", remedy=remedy, status=status)
 
 
 class FiniteRun:
@@ -156,14 +202,7 @@ class FiniteRun:
 
     def ended(self, name: str, status: int) -> ProcessEnded:
         """The error of a process that ended: the one in its log, if there is one."""
-        problem, remedy = f"ended with status {status}", f"see {self.log(name)}"
-        lines = self.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
-        for line, following in zip(lines, [*lines[1:], ""], strict=True):
-            if line.startswith("error: "):
-                problem = line.removeprefix("error: ")
-                if following.startswith("  fix: "):
-                    remedy = following.removeprefix("  fix: ")
-        return ProcessEnded(f"{name}: {problem}", remedy=remedy, status=status)
+        return ended_error(name, status, self.log(name))
 
     def log(self, name: str) -> Path:
         """Log of a process."""

@@ -1,32 +1,45 @@
-"""The processes of a station under supervisord, which restarts one that ends."""
+"""The processes of a station under supervisord, which restarts one that ends or hangs."""
 
 from __future__ import annotations
 
 import configparser
+import contextlib
 import http.client
 import io
 import os
 import shlex
 import shutil
+import signal
 import socket
 import sys
 import tempfile
 import time
 import xmlrpc.client
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from supervisor.states import getProcessStateDescription
+
 from palpate.errors import PalpateError
+from palpate.heartbeat import FILE_VARIABLE, read_pulse
 from palpate_deploy.station.host import check_free, new_run_folder, write_profile
 from palpate_deploy.station.lifetime import start_child, stop_child
+from palpate_deploy.station.logs import DEVICE
 from palpate_deploy.station.processes import START_ORDER, command_line
 from palpate_deploy.station.profile import Profile, Service
+from palpate_deploy.station.supervisord import WATCH_FOLDER
 
 STOP_WAIT_S = 10
 """A process that still runs this long after SIGTERM is killed [s]."""
 
 _START_WAIT_S = 10.0
+_ANSWER_S = 5.0
+_MUTE_STOP_S = 15.0
+"""A supervisord that does not answer has this long to stop all processes before it is killed."""
+
+_MEMORY = Path("/dev/shm")
 _RPC_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error)
 
 
@@ -38,9 +51,10 @@ class SupervisorError(PalpateError, RuntimeError):
 class ProcessState:
     """One supervised process.
 
-    ``state`` is named by supervisord: ``RUNNING``, ``STARTING``, ``BACKOFF``, ``EXITED``, ...;
-    ``pid`` is 0 if it does not run; ``uptime_s`` counts from its last start [s]; ``restarts`` are
-    those that were observed; ``exit_status`` is that of its last run.
+    ``state`` is named by supervisord: ``STARTING`` until the first heartbeat, ``RUNNING``,
+    ``BACKOFF``, ``EXITED``, ...; ``pid`` is 0 if it does not run; ``uptime_s`` counts from its last
+    start [s]; ``hangs`` are the restarts because it hung; ``served`` says whether a run of it has
+    ever beaten; ``exit_status`` (negative = a signal) and ``why`` are of the run that ended last.
     """
 
     service: Service
@@ -48,7 +62,10 @@ class ProcessState:
     pid: int
     uptime_s: float
     restarts: int
+    hangs: int
+    served: bool
     exit_status: int
+    why: str
 
 
 class Supervisor:
@@ -64,16 +81,19 @@ class Supervisor:
             check_free(profile.router.listen)
         self.profile = profile
         self.folder = new_run_folder(name)
-        self._pids: dict[str, int] = {}
-        self._restarts: dict[str, int] = {}
-        # The path of a Unix socket is limited to 107 bytes: a folder in /tmp is short enough.
-        self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        self._mute = False
+        # The path of a Unix socket is limited to 107 bytes: a folder there is short enough. In
+        # memory, because a heartbeat must never wait for a disk.
+        in_memory = _MEMORY if os.access(_MEMORY, os.W_OK) else None
+        self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-", dir=in_memory))
         self._socket = self._socket_folder / "supervisor.sock"
         config = self.folder / "supervisord.conf"
         config.write_text(self._config_text(write_profile(profile, self.folder)), encoding="utf-8")
         command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
         command += ["-n", "-s", "-c", str(config)]
-        self._process = start_child(command, self.logs / "supervisord.out")
+        self._process = start_child(
+            command, self.logs / "supervisord.out", {WATCH_FOLDER: str(self._socket_folder)}
+        )
         self._rpc = xmlrpc.client.ServerProxy(
             "http://127.0.0.1", transport=_transport(self._socket)
         )
@@ -97,40 +117,60 @@ class Supervisor:
         """State of each process, in the profile's order.
 
         Raises:
-            SupervisorError: supervisord is gone.
+            SupervisorError: supervisord is gone, or hangs.
         """
         try:
-            answers: Any = self._rpc.supervisor.getAllProcessInfo()
+            answers: Any = self._rpc.palpate.processes()
         except _RPC_ERRORS as error:
+            if not self.running:
+                raise self._gone() from error
+            self._mute = True
             raise SupervisorError(
                 f"supervisord does not answer: {error}",
                 remedy=f"see {self.logs / 'supervisord.log'}; start again with `palpate up`",
             ) from error
-        found = {info["name"]: self._state(info) for info in answers}
+        states = (
+            ProcessState(
+                service=info.pop("name"),
+                state=getProcessStateDescription(info.pop("state")),
+                **info,
+            )
+            for info in answers
+        )
+        found = {state.service: state for state in states}
         return [found[name] for name in self.profile.processes]
 
-    def _state(self, info: dict[str, Any]) -> ProcessState:
-        name, pid = info["name"], int(info["pid"])
-        # supervisord does not count restarts; a new process id between two looks is one.
-        if pid and pid != self._pids.get(name, pid):
-            self._restarts[name] = self._restarts.get(name, 0) + 1
-        if pid:
-            self._pids[name] = pid
-        uptime_s = float(info["now"] - info["start"]) if pid else 0.0
-        return ProcessState(
-            name,
-            str(info["statename"]),
-            pid,
-            uptime_s,
-            self._restarts.get(name, 0),
-            int(info["exitstatus"]),
-        )
+    def _gone(self) -> SupervisorError:
+        return SupervisorError("supervisord is gone", remedy=f"see {self.logs / 'supervisord.log'}")
 
     def stop(self) -> None:
         """Stop all processes in reverse order of starting, then supervisord; may be repeated."""
-        # If it has to be killed, its processes notice that and end (lifetime.end_with_parent).
-        stop_child(self._process, STOP_WAIT_S * len(self.profile.processes) + 5)
+        orderly_s = _MUTE_STOP_S if self._mute else STOP_WAIT_S * len(self.profile.processes) + 5
+        stop_child(self._process, orderly_s)
+        self._end_leftovers()
         shutil.rmtree(self._socket_folder, ignore_errors=True)
+
+    def _end_leftovers(self) -> None:
+        """End what a supervisord that was killed left behind.
+
+        Its processes get SIGTERM from the kernel (``lifetime.end_with_parent``), but one that
+        hangs, or is stopped, does not follow it.
+        """
+        deadline = time.monotonic() + STOP_WAIT_S
+        while left := list(self._leftovers()):
+            for pid in left:
+                number = signal.SIGCONT if time.monotonic() < deadline else signal.SIGKILL
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, number)
+            time.sleep(0.1)
+
+    def _leftovers(self) -> Iterator[int]:
+        """Processes of this run that have beaten and still run."""
+        for service in self.profile.processes:
+            pulse = read_pulse(self._socket_folder / service)
+            # Another process may have the id meanwhile: ours names the run's folder.
+            if pulse is not None and str(self.folder) in _command_of(pulse.pid):
+                yield pulse.pid
 
     def log_tail(self, service: str, lines: int = 5) -> str:
         """The last lines of a process's log."""
@@ -154,6 +194,11 @@ class Supervisor:
                 "rpcinterface:supervisor": {
                     "supervisor.rpcinterface_factory": (
                         "supervisor.rpcinterface:make_main_rpcinterface"
+                    )
+                },
+                "rpcinterface:palpate": {
+                    "supervisor.rpcinterface_factory": (
+                        "palpate_deploy.station.watch:make_interface"
                     )
                 },
                 "supervisord": {
@@ -186,9 +231,9 @@ class Supervisor:
             "priority": str(priority),
             "autostart": "true",
             "autorestart": "unexpected" if finite else "true",
-            "exitcodes": "0",
-            # A process that ends within a second is restarted after pauses that grow.
-            "startsecs": "1",
+            # A damaged recording has been delivered as far as it goes.
+            "exitcodes": f"0,{DEVICE}",
+            "environment": f'{FILE_VARIABLE}="{_escaped(str(self._socket_folder / service))}"',
             "startretries": "1000000",
             "stopsignal": "TERM",
             "stopwaitsecs": str(STOP_WAIT_S),
@@ -220,6 +265,14 @@ class Supervisor:
         )
 
 
+def _command_of(pid: int) -> str:
+    """Command line of a process; empty if it has ended, or if this system does not tell."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
+    except OSError:
+        return ""
+
+
 def _escaped(text: str) -> str:
     """Text for supervisord's configuration, in which ``%`` starts an expansion."""
     return text.replace("%", "%%")
@@ -227,7 +280,7 @@ def _escaped(text: str) -> str:
 
 class _UnixConnection(http.client.HTTPConnection):
     def __init__(self, path: Path) -> None:
-        super().__init__("localhost", timeout=5)
+        super().__init__("localhost", timeout=_ANSWER_S)
         self._path = path
 
     def connect(self) -> None:

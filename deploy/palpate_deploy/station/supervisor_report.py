@@ -55,12 +55,12 @@ class SupervisorReport(Closing):
         )
         self._measure_router(processes)
         down = [one for one in processes if one.state not in _FINE]
-        # A process is "starting" for its first second.
+        # A process is "starting" until its first heartbeat.
         if any(one.state != "STARTING" or one.restarts for one in down):
             first = next(one for one in down if one.state != "STARTING" or one.restarts)
             self._health.fail(
                 ProcessDown(
-                    f"{first.service} does not run: {first.state.lower()}",
+                    f"{first.service} does not run: {first.why or first.state.lower()}",
                     remedy=f"it is started again by itself; see {self._logs / first.service}.log",
                 )
             )

@@ -1,41 +1,73 @@
 """The process manager's process: supervisord, bound to the ``palpate`` that started it.
 
-``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with two
-differences: it stops, and stops its processes, when its parent is gone; and it notices a dead
-process within a tenth of a second instead of a second, which is a third of the time a restart may
-take.
+``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with three
+differences: it stops, and stops its processes, when its parent is gone; it notices a dead process
+within a tenth of a second instead of a second, which is a third of the time a restart may take; and
+it kills a process that hangs (``station/watch.py``).
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+from supervisor.medusa import asyncore_25 as asyncore
 from supervisor.options import ServerOptions
 from supervisor.poller import Poller
-from supervisor.supervisord import go
+from supervisor.supervisord import Supervisor
 
 from palpate_deploy.station.lifetime import PARENT_PID, end_with_parent
+from palpate_deploy.station.watch import Watch
+
+WATCH_FOLDER = "_PALPATE_WATCH"
+"""Environment variable with the folder of the processes' heartbeats."""
 
 _WAIT_S = 0.1
 
 
-class _PromptPoller(Poller):  # type: ignore[misc]  # supervisor has no types
+class _WatchfulPoller(Poller):  # type: ignore[misc]  # supervisor has no types
     def poll(self, timeout: float) -> Any:
+        self.options.watch.look()
         return super().poll(min(timeout, _WAIT_S))
+
+
+class _Options(ServerOptions):  # type: ignore[misc]
+    watch: Watch
+
+    def waitpid(self) -> tuple[int | None, int | None]:
+        pid, status = super().waitpid()
+        process = self.pidhistory.get(pid) if pid else None
+        if process is not None and status is not None:
+            self.watch.ended(process, status)
+        return pid, status
+
+
+def _processes(supervisord: Supervisor) -> Iterator[Any]:
+    for group in (supervisord.process_groups or {}).values():
+        yield from group.processes.values()
 
 
 def main() -> None:
     """Run supervisord with the arguments of this process."""
     end_with_parent()
     os.environ[PARENT_PID] = str(os.getpid())  # its processes live by it
-    options = ServerOptions()
-    options.poller = _PromptPoller(options)
+    options = _Options()
+    options.poller = _WatchfulPoller(options)
     options.realize(sys.argv[1:], doc=__doc__)
     options.first = True
     options.test = False
-    go(options)
+    supervisord = Supervisor(options)
+    options.watch = Watch(
+        Path(os.environ.pop(WATCH_FOLDER)),
+        lambda: _processes(supervisord),
+        lambda line: options.logger.warn(line),
+    )
+    with contextlib.suppress(asyncore.ExitNow):
+        supervisord.main()
     options.close_httpservers()
     options.close_logger()
 

@@ -15,18 +15,25 @@ from rich.text import Text
 
 from palpate.bus import Delivery, Subscriber
 from palpate.bus.topics import STATUS
-from palpate.errors import StreamTimeout
+from palpate.errors import ConfigError, StreamTimeout
+from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status
 from palpate_deploy.station.host import join
 from palpate_deploy.station.lifetime import stop_on_signals
-from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.logs import print_error
+from palpate_deploy.station.processes import check_packages, ended_error
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import duration_text, shown_counters, state_text
 from palpate_deploy.station.supervision import ProcessState, Supervisor, SupervisorError
 from palpate_deploy.station.supervisor_report import SupervisorReport
+from palpate_deploy.station.watch import cannot_serve
 
 _REFRESH_S = 0.25
 _SILENT_AFTER_S = 3.0
+_RECENT_S = 300.0
+"""How long the table says why a process was started again [s]."""
+
+_STARTED = ("RUNNING", "EXITED")
 
 _STATE_COLOURS = {"RUNNING": "green", "STARTING": "yellow", "STOPPING": "yellow"}
 
@@ -35,14 +42,18 @@ def run_up(profile: Profile, name: str) -> int:
     """Run a station until a signal, or until its finite source has ended; the exit code.
 
     Raises:
+        ConfigError: A process cannot serve what the profile says.
         LinkError: The router's port is in use.
-        SupervisorError: supervisord does not start, or dies.
+        MissingExtraError: A process needs a package that is not installed.
+        SupervisorError: supervisord does not start, dies or hangs.
     """
+    check_packages(profile)
     console = Console()
+    manager = ServiceManager()
     stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     with Supervisor(profile, name) as supervisor:
         console.print(
-            f"station {profile.station!r} is up: {', '.join(profile.processes)}\n"
+            f"station {profile.station!r} starts: {', '.join(profile.processes)}\n"
             f"router {', '.join(profile.link.connect)}   logs {supervisor.logs}\n"
             "Ctrl-C stops it",
             soft_wrap=True,
@@ -51,40 +62,106 @@ def run_up(profile: Profile, name: str) -> int:
         with join(profile, wait_s=-1.0) as session:
             statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
             with SupervisorReport(session, supervisor.logs) as report:
-                finished = _watch(console, supervisor, statuses, report, stop)
-        if not stop.is_set() and not finished:
-            raise SupervisorError(
-                "supervisord is gone", remedy=f"see {supervisor.logs / 'supervisord.log'}"
-            )
+                shown = _Screen(console, supervisor, statuses, manager, report)
+                finished = shown.watch(stop)
+        manager.say("STOPPING=1")
         console.print("stopping ...")
     console.print("stopped")
-    return 0 if finished in (None, 0) else FAILED
+    return 0 if finished is None else finished
 
 
-def _watch(
-    console: Console,
-    supervisor: Supervisor,
-    statuses: Subscriber[Status],
-    report: SupervisorReport,
-    stop: threading.Event,
-) -> int | None:
-    """Show the processes until a signal (None) or the end of a finite source (its status)."""
-    known: dict[str, tuple[Status, float]] = {}
-    before: dict[str, tuple[str, int]] = {}
-    screen = Live(console=console, auto_refresh=False) if console.is_terminal else None
-    with screen or contextlib.nullcontext():
-        while not stop.is_set() and supervisor.running:
-            _take(statuses, known)
-            processes = supervisor.processes()
-            report.tell(processes)
-            if screen is not None:
-                screen.update(_screen(processes, known), refresh=True)
-            else:
-                _print_changes(console, processes, before)
-            if (finished := _finished(supervisor, processes)) is not None:
-                return finished
-            stop.wait(_REFRESH_S)
-    return None
+class _Screen:
+    """What `palpate up` shows, in a terminal, in a log, and to systemd."""
+
+    def __init__(
+        self,
+        console: Console,
+        supervisor: Supervisor,
+        statuses: Subscriber[Status],
+        manager: ServiceManager,
+        report: SupervisorReport,
+    ) -> None:
+        self._console = console
+        self._supervisor = supervisor
+        self._statuses = statuses
+        self._manager = manager
+        self._report = report
+        self._known: dict[str, tuple[Status, float]] = {}
+        self._before: dict[str, tuple[str, int]] = {}
+        self._up = False
+        self._running = -1
+
+    def watch(self, stop: threading.Event) -> int | None:
+        """Show the processes until a signal (None) or the end of a finite source (its status).
+
+        Raises:
+            ConfigError: A process cannot serve what the profile says.
+            SupervisorError: supervisord is gone, or does not answer.
+        """
+        terminal = self._console.is_terminal
+        screen = Live(console=self._console, auto_refresh=False) if terminal else None
+        with screen or contextlib.nullcontext():
+            while not stop.is_set():
+                _take(self._statuses, self._known)
+                processes = self._processes()
+                self._report.tell(processes)
+                if screen is not None:
+                    screen.update(_table(processes, self._known), refresh=True)
+                else:
+                    _print_changes(self._console, processes, self._before)
+                self._check(processes)
+                self._tell(processes)
+                if (finished := self._finished(processes)) is not None:
+                    return finished
+                stop.wait(_REFRESH_S)
+        return None
+
+    def _processes(self) -> list[ProcessState]:
+        try:
+            return self._supervisor.processes()
+        except SupervisorError:  # on a busy host one answer may be late
+            return self._supervisor.processes()
+
+    def _check(self, processes: list[ProcessState]) -> None:
+        for process in processes:
+            status, why = process.exit_status, process.why
+            if cannot_serve(served=process.served, exit_status=status, why=why):
+                log = self._supervisor.logs / f"{process.service}.log"
+                error = ended_error(process.service, status, log)
+                raise ConfigError(error.problem, remedy=error.remedy)
+
+    def _tell(self, processes: list[ProcessState]) -> None:
+        """Tell systemd that the station is up, and alive."""
+        running = sum(process.state == "RUNNING" for process in processes)
+        # One that comes and goes must not keep the others from being up.
+        if not self._up and all(p.state in _STARTED or p.restarts for p in processes):
+            self._up = True
+            self._console.print(f"station {self._supervisor.profile.station!r} is up", markup=False)
+        if self._up:
+            self._manager.alive(time.monotonic_ns())
+        if running != self._running:
+            self._running = running
+            self._manager.say(f"STATUS={running} of {len(processes)} processes run")
+
+    def _finished(self, processes: list[ProcessState]) -> int | None:
+        """Exit status of a gateway that has come to the end of its recordings; None otherwise."""
+        if not self._supervisor.profile.gateway.exit_at_end:
+            return None
+        for process in processes:
+            if process.service == "gateway" and process.state == "EXITED":
+                if process.exit_status:
+                    log = self._supervisor.logs / "gateway.log"
+                    print_error(ended_error("gateway", process.exit_status, log))
+                else:
+                    self._console.print(f"gateway: {_last_words(self._known)}", markup=False)
+                return process.exit_status
+        return None
+
+
+def _last_words(known: dict[str, tuple[Status, float]]) -> str:
+    status, _ = known.get("gateway", (None, 0.0))
+    ended = status is not None and status.state is ServiceState.FINISHED
+    return status.message if status is not None and ended else "all sources have ended"
 
 
 def _print_changes(
@@ -98,18 +175,11 @@ def _print_changes(
             console.print(
                 f"{time.strftime('%H:%M:%S')} {process.service}: {process.state.lower()}"
                 + (f", pid {process.pid}" if process.pid else "")
-                + (f", restart {process.restarts}" if process.restarts else ""),
+                + (f", restart {process.restarts}" if process.restarts else "")
+                + (f" ({process.why})" if process.why else ""),
                 highlight=False,
+                markup=False,
             )
-
-
-def _finished(supervisor: Supervisor, processes: list[ProcessState]) -> int | None:
-    """Exit status of a gateway that has come to the end of its recording; None otherwise."""
-    if supervisor.profile.gateway.exit_at_end:
-        for process in processes:
-            if process.service == "gateway" and process.state == "EXITED":
-                return process.exit_status
-    return None
 
 
 def _take(statuses: Subscriber[Status], known: dict[str, tuple[Status, float]]) -> None:
@@ -122,12 +192,14 @@ def _take(statuses: Subscriber[Status], known: dict[str, tuple[Status, float]]) 
             known[status.service] = (status, time.monotonic())
 
 
-def _screen(processes: list[ProcessState], known: dict[str, tuple[Status, float]]) -> Group:
+def _table(processes: list[ProcessState], known: dict[str, tuple[Status, float]]) -> Group:
     table = Table(expand=True)
     for column in ("process", "runs", "pid", "up", "restarts", "says", "counters"):
         table.add_column(column, overflow="fold")
     problems: list[str] = []
     for process in processes:
+        if process.why and (process.state != "RUNNING" or process.uptime_s < _RECENT_S):
+            problems.append(f"{process.service}: {process.why}")
         colour = _STATE_COLOURS.get(process.state, "red")
         status, heard_s = known.get(process.service, (None, 0.0))
         says = counters = ""
@@ -144,8 +216,14 @@ def _screen(processes: list[ProcessState], known: dict[str, tuple[Status, float]
             f"[{colour}]{process.state.lower()}[/]",
             str(process.pid or "-"),
             duration_text(process.uptime_s),
-            str(process.restarts or "-"),
+            _restarts(process),
             says,
             counters,
         )
     return Group(table, *(Text(problem, style="red") for problem in problems))
+
+
+def _restarts(process: ProcessState) -> str:
+    if not process.restarts:
+        return "-"
+    return str(process.restarts) + (f" ({process.hangs} hung)" if process.hangs else "")

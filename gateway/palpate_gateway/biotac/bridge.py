@@ -232,6 +232,7 @@ class BiotacBridge(FingerDevice):
     """One BioTac of a bridge; several of one bridge share its line."""
 
     options_class = BridgeOptions
+    needs = ("serial",)
 
     def __init__(self, options: BridgeOptions) -> None:
         super().__init__("biotac_bridge", f"BioTac behind bridge {options.line}", options)

@@ -130,6 +130,7 @@ class BiotacCan(FingerDevice):
     """One BioTac of a CAN bus; several of one bus share it."""
 
     options_class = CanOptions
+    needs = ("can",)
 
     def __init__(self, options: CanOptions) -> None:
         super().__init__("biotac_can", f"BioTac on CAN {options.channel}", options)

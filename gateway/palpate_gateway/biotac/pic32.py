@@ -71,6 +71,7 @@ class BiotacPic32(Device):
     """
 
     options_class = Pic32Options
+    needs = ("serial",)
 
     def __init__(self, options: Pic32Options) -> None:
         if options.sensor_type == "biotac_sp":

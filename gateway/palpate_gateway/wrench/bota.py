@@ -89,6 +89,7 @@ class WrenchBota(WrenchDevice):
     """A SensONE or Rokubi."""
 
     options_class = BotaOptions
+    needs = ("serial",)
 
     def __init__(self, options: BotaOptions) -> None:
         self._sinc = sinc_of(options.rate_hz)

@@ -195,6 +195,7 @@ class WrenchRobotous(WrenchDevice):
     """An RFT sensor."""
 
     options_class = RobotousOptions
+    needs = ("serial", "can")
 
     def __init__(self, options: RobotousOptions) -> None:
         self._line = _line_of(options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 import threading
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ import zenoh
 
 from palpate.bus.link import open_zenoh, zenoh_config
 from palpate.config import LinkConfig
-from palpate.heartbeat import beat
+from palpate.heartbeat import FILE_VARIABLE, beat
 from palpate.process import Closing
 
 _PERIOD_S = 0.5
@@ -31,7 +32,9 @@ def run_router(
     """
     base = link or LinkConfig()
     config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
-    with tempfile.TemporaryDirectory(prefix="palpate-router-") as folder:
+    # Beside its heartbeat, where its supervisor clears up after a router that is killed.
+    beside = os.path.dirname(os.environ.get(FILE_VARIABLE, "")) or None
+    with tempfile.TemporaryDirectory(prefix="palpate-router-", dir=beside) as folder:
         door = f"unixsock-stream/{Path(folder) / 'door'}"
         raw = open_zenoh(config, "router", also_listen=(door,))
         try:
