@@ -25,13 +25,18 @@ from palpate.errors import ConfigError
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 
 
+def is_name(text: str) -> bool:
+    """Whether a text may be one part of a key."""
+    return _NAME.fullmatch(text) is not None
+
+
 def check_name(name: str, what: str = "name") -> str:
     """Check that a name may be part of a key, and return it; ``what`` says what it names.
 
     Raises:
         ConfigError: It may not be; the error names it and the rule.
     """
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise ConfigError(
             f"{what} {name!r} cannot stand in a Zenoh key",
             remedy="use 1-63 of a-z, 0-9, '-', '_', starting with a letter or digit",

@@ -7,7 +7,7 @@ A node serves an endpoint with ``Session.queryable`` (one reply) or ``Session.st
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from palpate import codec
 from palpate.codec import Codec
@@ -68,3 +68,8 @@ ESTIMATE_FIELD = Endpoint(
 SYNTHESISE = Endpoint(
     "synthesise", codec.FIELD_FRAME, codec.SYNTHESIS_ESTIMATE, "tared counts of one field", True
 )
+
+ENDPOINTS: dict[str, Endpoint[Any, Any]] = {
+    name.lower(): value for name, value in tuple(globals().items()) if isinstance(value, Endpoint)
+}
+"""All questions above by the name of their constant: services may share the last part of a key."""

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 import zenoh
 
 from palpate import clock
-from palpate.bus.topics import StreamAddress, Topic, check_schema, parse_key
+from palpate.bus.topics import StreamAddress, Topic, check_schema, check_size, parse_key
 from palpate.codec import STAGE_TIMINGS
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import Origin, StageTimings
@@ -187,8 +187,10 @@ class Publisher(Generic[M], Closing):
         """Publish a payload that is already encoded; of an estimate, with its timings.
 
         Raises:
+            WireError: It is larger than a message may be and would be lost (reason ``"size"``).
             LinkError: The session is closed.
         """
+        check_size(payload, self.topic.codec.schema, remedy="publish a smaller message")
         try:
             self._publisher.put(payload, attachment=attachment)
         except zenoh.ZError as error:

@@ -22,7 +22,7 @@ from typing import Any, Generic, TypeVar
 
 from palpate import codec
 from palpate.codec import Codec
-from palpate.config import check_name
+from palpate.config import check_name, is_name
 from palpate.errors import WireError
 from palpate.messages import Stamp
 
@@ -287,10 +287,12 @@ def parse_key(key: str) -> StreamAddress:
         WireError: It is not a key of this contract (reason ``"key"``).
     """
     chunks = key.split("/")
-    if len(chunks) == 5 and key.startswith(ROOT):
-        return StreamAddress(chunks[2], chunks[3], chunks[4])
-    if len(chunks) == 7 and key.startswith(ROOT) and chunks[3] == "@service":
-        return StreamAddress(chunks[2], f"{chunks[4]}/{chunks[5]}", chunks[6])
+    # Zenoh lets anybody publish to a wildcard: names are checked, or "*" would be a sensor.
+    if key.startswith(f"{ROOT}/") and all(map(is_name, (*chunks[2:3], *chunks[4:]))):
+        if len(chunks) == 5 and is_name(chunks[3]):
+            return StreamAddress(chunks[2], chunks[3], chunks[4])
+        if len(chunks) == 7 and chunks[3] == "@service":
+            return StreamAddress(chunks[2], f"{chunks[4]}/{chunks[5]}", chunks[6])
     raise WireError(
         f"key {key!r} is not {ROOT}/<station>/<sensor>/<stream>",
         remedy="publish under the keys of docs/adr/0004-keys-and-qos.md",
