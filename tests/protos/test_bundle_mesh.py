@@ -142,10 +142,15 @@ def test_bytes_that_are_no_mesh(data: bytes) -> None:
         mesh_from_bytes(data, "mesh.npz")
 
 
-@given(st.integers(1, 10_000), st.booleans())
-def test_any_number_of_nodes_is_a_width(nodes: int, optional: bool) -> None:
+OPTIONAL = ("displacement_sd", "contact_force", "coefficients")
+
+
+@given(st.integers(1, 10_000), st.sets(st.sampled_from(OPTIONAL)), st.integers(1, 200))
+def test_any_number_of_nodes_and_modes_is_a_width(
+    nodes: int, optional: set[str], modes: int
+) -> None:
     for task in ("field", "synthesis"):
-        inputs, outputs = tensors_of(task, nodes, optional=optional)
+        inputs, outputs = tensors_of(task, nodes, optional=optional, modes=modes)
         contract, found = check_tensors(task, inputs, outputs, "test")
         assert contract is TASKS[task]
         assert found == nodes
@@ -163,7 +168,24 @@ def test_a_width_that_is_no_field_is_refused(width: int) -> None:
 
 
 def test_deviations_must_be_for_the_same_nodes() -> None:
-    inputs, outputs = tensors_of("field", 5, optional=True)
+    inputs, outputs = tensors_of("field", 5, optional=("displacement_sd",))
     wrong = (outputs[0], dataclasses.replace(outputs[1], shape=(-1, 6)))
     with pytest.raises(BundleError, match=r"displacement_sd float32\[-1, 6\]"):
         check_tensors("field", inputs, wrong, "test")
+
+
+@pytest.mark.parametrize("width", [-2, -1, 0])
+def test_coefficients_have_a_number_of_modes(width: int) -> None:
+    inputs, outputs = tensors_of("field", 5, optional=("coefficients",), modes=7)
+    wrong = (outputs[0], dataclasses.replace(outputs[1], shape=(-1, width)))
+    with pytest.raises(BundleError, match="task 'field'"):
+        check_tensors("field", inputs, wrong, "test")
+
+
+def test_optional_outputs_keep_their_order_and_their_company() -> None:
+    inputs, outputs = tensors_of("field", 5, optional=OPTIONAL, modes=7)
+    with pytest.raises(BundleError, match="task 'field'"):
+        check_tensors("field", inputs, outputs[::-1], "test")
+    features = TASKS["features"]
+    with pytest.raises(BundleError, match="task 'features'"):
+        check_tensors("features", features.inputs, features.outputs + features.optional[:1], "test")

@@ -1,9 +1,9 @@
 """The bundle: a model as it is shipped, served and checked (docs/adr/0008-bundle.md).
 
 A folder of three files. ``manifest.json`` says what the model is and holds the digests of
-``model.onnx`` and ``golden.npz`` (inputs and the outputs they must give); a model of fields has a
-fourth, ``mesh.npz``. The bundle's own digest is the SHA-256 of the manifest's bytes and travels
-with each estimate.
+``model.onnx`` and ``golden.npz`` (inputs and the outputs they must give). A model of fields also
+has ``mesh.npz``, and one that knows its training inputs ``range.npz``. The bundle's own digest is
+the SHA-256 of the manifest's bytes and travels with each estimate.
 """
 
 from __future__ import annotations
@@ -27,7 +27,14 @@ from palpate.config import check_name
 from palpate.errors import BundleError, ConfigError
 from palpate.files.bounded import arrays_of_npz, parse_json, read_regular
 from palpate.files.tasks import SENSOR_TYPE, TaskContract, check_tensors
-from palpate.messages import FloatArray, SensorType, TensorInfo
+from palpate.files.training_range import (
+    RANGE_BYTES_MAX,
+    KnownInputs,
+    known_inputs_from_bytes,
+    known_inputs_to_bytes,
+    parse_training_range,
+)
+from palpate.messages import FloatArray, SensorType, TensorInfo, TrainingRange
 from palpate.printable import printable
 
 BUNDLE_CONTRACT_VERSION = 1
@@ -68,6 +75,10 @@ class Manifest:
         contract_version: Of the bundle contract.
         mesh_sha256: Content hash of the mesh of its fields, hex; empty = no fields.
         mesh_file_sha256: Digest of ``mesh.npz``, hex; empty = no fields.
+        training_range: What it was trained on; None = not known.
+        range_file_sha256: Digest of ``range.npz``, hex; empty = no such file.
+        basis: Names of the constants ``mean`` (3V) [m] and ``modes`` (K, 3V) in the graph, so that
+            displacement = mean + coefficients x modes; empty = no output ``coefficients``.
     """
 
     name: str
@@ -89,6 +100,13 @@ class Manifest:
     contract_version: int = BUNDLE_CONTRACT_VERSION
     mesh_sha256: str = ""
     mesh_file_sha256: str = ""
+    training_range: TrainingRange | None = None
+    range_file_sha256: str = ""
+    basis: Mapping[str, str] = field(default_factory=dict)
+
+
+_LATER_KEYS = ("mesh_sha256", "mesh_file_sha256", "training_range", "range_file_sha256", "basis")
+"""Manifests were written before these keys; one that says nothing of them must keep its bytes."""
 
 
 def check_task(manifest: Manifest, where: str) -> TaskContract:
@@ -145,7 +163,12 @@ def parse_manifest(text: bytes, where: Path) -> Manifest:
         _check_values(values)
         for key in ("inputs", "outputs"):
             values[key] = _tensors(values[key], key)
+        if values.get("training_range") is not None:
+            values["training_range"] = parse_training_range(
+                values["training_range"], values["inputs"], values["outputs"]
+            )
         manifest = Manifest(**values)
+        _check_later_keys(manifest)
         if manifest.contract_version != BUNDLE_CONTRACT_VERSION:
             raise ValueError(f"contract_version {manifest.contract_version!r} is not known")
         if manifest.sensor_type not in SensorType.__members__:
@@ -158,6 +181,25 @@ def parse_manifest(text: bytes, where: Path) -> Manifest:
             remedy="export the bundle again",
         ) from error
     return manifest
+
+
+def _check_later_keys(manifest: Manifest) -> None:
+    """Check the keys that belong together.
+
+    Raises:
+        ValueError: One comes without the other.
+    """
+    known = manifest.training_range
+    if bool(manifest.range_file_sha256) != (known is not None and known.combinations):
+        raise ValueError("training_range.combinations and range_file_sha256 do not agree")
+    outputs = {tensor.name for tensor in manifest.outputs}
+    names = {"mean", "modes"} if "coefficients" in outputs else set()
+    if set(manifest.basis) != names:
+        raise ValueError(
+            f"basis names {sorted(manifest.basis)}, with these outputs it has {sorted(names)}"
+        )
+    if not all(isinstance(name, str) and name for name in manifest.basis.values()):
+        raise ValueError("basis does not name constants of the graph")
 
 
 def _check_values(values: Mapping[str, Any]) -> None:
@@ -176,8 +218,10 @@ def _check_values(values: Mapping[str, Any]) -> None:
     _check_number(values, "contact_threshold_n", 0.0, THRESHOLD_MAX_N)
     for key in ("training_data_sha256", "model_sha256", "golden_sha256"):
         _check_digest(values[key], key)
-    for key in ("mesh_sha256", "mesh_file_sha256"):
+    for key in ("mesh_sha256", "mesh_file_sha256", "range_file_sha256"):
         _check_digest(values.get(key, ""), key)
+    if not isinstance(values.get("basis", {}), dict):
+        raise ValueError("basis is not an object")
     metrics = values["metrics"]
     if not isinstance(metrics, dict) or len(metrics) > _METRICS_MAX:
         raise ValueError(f"metrics are no object of at most {_METRICS_MAX} numbers")
@@ -310,6 +354,7 @@ def mesh_from_bytes(data: bytes, where: str) -> FieldMesh:
 
 
 MODEL, MANIFEST, GOLDEN, MESH = "model.onnx", "manifest.json", "golden.npz", "mesh.npz"
+RANGE = "range.npz"
 _MODEL_BYTES_MAX = 256 << 20
 _MANIFEST_BYTES_MAX = 1 << 20
 _GOLDEN_BYTES_MAX = 64 << 20
@@ -319,6 +364,7 @@ _BYTES_MAX = {
     MANIFEST: _MANIFEST_BYTES_MAX,
     GOLDEN: _GOLDEN_BYTES_MAX,
     MESH: _MESH_BYTES_MAX,
+    RANGE: RANGE_BYTES_MAX,
 }
 """Size of each file, and of what its arrays expand to; those that ship have 1 % of it [bytes]."""
 
@@ -333,6 +379,7 @@ class Bundle:
         sha256: Digest of the manifest, 32 bytes.
         folder: Where it came from.
         mesh: Mesh of its fields; None for a task without.
+        known_inputs: Representatives of its training inputs; None = not known.
     """
 
     manifest: Manifest
@@ -341,6 +388,7 @@ class Bundle:
     sha256: bytes
     folder: Path
     mesh: FieldMesh | None = None
+    known_inputs: KnownInputs | None = None
 
 
 def sha256_hex(data: bytes) -> str:
@@ -385,10 +433,12 @@ def write_bundle(
     golden: Mapping[str, npt.NDArray[np.float32]],
     manifest: Manifest,
     mesh: FieldMesh | None = None,
+    known_inputs: KnownInputs | None = None,
 ) -> bytes:
     """Write a bundle; the folder appears complete or not at all, and is never overwritten.
 
     ``golden`` holds an array for each input and output; digests of the manifest are filled in here.
+    ``known_inputs`` belong to a manifest with a training range.
 
     Returns:
         The bundle's digest, 32 bytes.
@@ -418,12 +468,13 @@ def write_bundle(
         "model_sha256": sha256_hex(model),
         "golden_sha256": sha256_hex(golden_bytes),
     }
-    if mesh is None:
-        # Manifests were written before there were meshes; theirs must keep their bytes.
-        del values["mesh_sha256"], values["mesh_file_sha256"]
-    else:
+    if mesh is not None:
         files[MESH] = mesh_to_bytes(mesh)
         values["mesh_file_sha256"] = sha256_hex(files[MESH])
+    if known_inputs is not None:
+        files[RANGE] = known_inputs_to_bytes(known_inputs)
+        values["range_file_sha256"] = sha256_hex(files[RANGE])
+    values = {key: value for key, value in values.items() if value or key not in _LATER_KEYS}
     text = (json.dumps(values, indent=2, sort_keys=True) + "\n").encode()
     parse_manifest(text, folder / MANIFEST)  # what would be refused is not written
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -452,7 +503,8 @@ def read_bundle(folder: Path) -> Bundle:
     model = _read_checked(folder, MODEL, manifest.model_sha256)
     golden = _read_golden(_read_checked(folder, GOLDEN, manifest.golden_sha256), folder)
     mesh = _read_mesh(folder, manifest)
-    return Bundle(manifest, model, golden, hashlib.sha256(text).digest(), folder, mesh)
+    known = _read_known_inputs(folder, manifest)
+    return Bundle(manifest, model, golden, hashlib.sha256(text).digest(), folder, mesh, known)
 
 
 def read_mesh(folder: Path) -> FieldMesh | None:
@@ -471,6 +523,13 @@ def _read_mesh(folder: Path, manifest: Manifest) -> FieldMesh | None:
         mesh = mesh_from_bytes(data, str(folder / MESH))
     check_bundle_mesh(mesh, manifest, str(folder))
     return mesh
+
+
+def _read_known_inputs(folder: Path, manifest: Manifest) -> KnownInputs | None:
+    if not manifest.range_file_sha256:
+        return None
+    data = _read_checked(folder, RANGE, manifest.range_file_sha256)
+    return known_inputs_from_bytes(data, manifest.inputs[0].shape[1], str(folder / RANGE))
 
 
 def _read_checked(folder: Path, name: str, sha256: str) -> bytes:

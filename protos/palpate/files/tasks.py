@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 from palpate.errors import BundleError
@@ -14,13 +14,17 @@ SENSOR_TYPE = SensorType.BIOTAC
 BY_MESH = 0
 """Stands for a width that depends on the number of nodes of the bundle's mesh."""
 
+BY_BASIS = -2
+"""Stands for a width that is the number of modes of the bundle's basis."""
+
 
 @dataclass(frozen=True, slots=True)
 class TaskContract:
     """Inputs and outputs of a model of this task.
 
     Attributes:
-        optional: Outputs that may be absent together.
+        optional: Outputs that may be absent, in the order in which they follow the others.
+        together: Names of optional outputs that come together or not at all.
         per_node: Values per node of the tensors whose width is ``BY_MESH``; empty for a task
             without a mesh. A field's tensor is flat: x y z of node 0, x y z of node 1, ...
     """
@@ -28,6 +32,7 @@ class TaskContract:
     inputs: tuple[TensorInfo, ...]
     outputs: tuple[TensorInfo, ...]
     optional: tuple[TensorInfo, ...] = ()
+    together: tuple[tuple[str, ...], ...] = ()
     per_node: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -42,12 +47,17 @@ TASKS: dict[str, TaskContract] = {
         inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
         outputs=(_tensor("force", 3, "N"), _tensor("force_sd", 3, "N")),
         optional=(_tensor("contact_location", 3, "m"), _tensor("contact_location_sd", 3, "m")),
+        together=(("contact_location", "contact_location_sd"),),
     ),
     "field": TaskContract(
         inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
         outputs=(_tensor("displacement", BY_MESH, "m"),),
-        optional=(_tensor("displacement_sd", BY_MESH, "m"),),
-        per_node={"displacement": 3, "displacement_sd": 1},
+        optional=(
+            _tensor("displacement_sd", BY_MESH, "m"),
+            _tensor("contact_force", BY_MESH, "N"),
+            _tensor("coefficients", BY_BASIS, "m"),
+        ),
+        per_node={"displacement": 3, "displacement_sd": 1, "contact_force": 3},
     ),
     "synthesis": TaskContract(
         inputs=(_tensor("displacement", BY_MESH, "m"),),
@@ -62,15 +72,15 @@ TASKS: dict[str, TaskContract] = {
 
 
 def tensors_of(
-    task: str, nodes: int, *, optional: bool = False
+    task: str, nodes: int, *, optional: Collection[str] = (), modes: int = 0
 ) -> tuple[tuple[TensorInfo, ...], tuple[TensorInfo, ...]]:
     """Inputs and outputs of a task on a mesh of so many nodes, for a manifest.
 
-    With ``optional`` its optional outputs are given, too.
+    ``optional`` names the optional outputs that are given; ``modes`` is the number of coefficients.
     """
     contract = TASKS[task]
-    outputs = contract.outputs + (contract.optional if optional else ())
-    return _sized(contract.inputs, contract, nodes), _sized(outputs, contract, nodes)
+    outputs = contract.outputs + tuple(one for one in contract.optional if one.name in optional)
+    return _sized(contract.inputs, contract, nodes), _sized(outputs, contract, nodes, modes)
 
 
 def check_tensors(
@@ -92,9 +102,15 @@ def check_tensors(
             remedy="upgrade palpate, or train a bundle for one of these tasks",
         )
     nodes = _nodes(contract, (*inputs, *outputs))
-    fits = inputs == _sized(contract.inputs, contract, nodes) and outputs in (
-        _sized(contract.outputs, contract, nodes),
-        _sized(contract.outputs + contract.optional, contract, nodes),
+    given = {tensor.name: tensor for tensor in outputs}
+    expected = contract.outputs + tuple(one for one in contract.optional if one.name in given)
+    shape = given["coefficients"].shape if "coefficients" in given else ()
+    modes = shape[1] if len(shape) == 2 and shape[1] > 0 else 0
+    fits = (
+        ("coefficients" in given) == bool(modes)
+        and inputs == _sized(contract.inputs, contract, nodes)
+        and outputs == _sized(expected, contract, nodes, modes)
+        and all(len(given.keys() & set(group)) in (0, len(group)) for group in contract.together)
     )
     if not fits or (contract.per_node and not nodes):
         widths = ", ".join(f"{name} {each}V" for name, each in contract.per_node.items())
@@ -118,15 +134,18 @@ def _nodes(contract: TaskContract, tensors: tuple[TensorInfo, ...]) -> int | Non
 
 
 def _sized(
-    tensors: tuple[TensorInfo, ...], contract: TaskContract, nodes: int | None
+    tensors: tuple[TensorInfo, ...], contract: TaskContract, nodes: int | None, modes: int = 0
 ) -> tuple[TensorInfo, ...]:
-    """The tensors with the widths that this number of nodes gives."""
-    return tuple(
-        replace(tensor, shape=(-1, contract.per_node[tensor.name] * nodes))
-        if nodes is not None and tensor.name in contract.per_node
-        else tensor
-        for tensor in tensors
-    )
+    """The tensors with the widths that these numbers of nodes and modes give."""
+
+    def width(tensor: TensorInfo) -> int:
+        if tensor.shape[1] == BY_BASIS and modes:
+            return modes
+        if nodes is not None and tensor.name in contract.per_node:
+            return contract.per_node[tensor.name] * nodes
+        return tensor.shape[1]
+
+    return tuple(replace(tensor, shape=(-1, width(tensor))) for tensor in tensors)
 
 
 def _names(tensors: tuple[TensorInfo, ...]) -> str:

@@ -18,7 +18,8 @@ from palpate import __version__
 from palpate.errors import BundleError
 from palpate.files.bundle import FieldMesh, Manifest, write_bundle
 from palpate.files.tasks import TASKS, tensors_of
-from palpate.messages import SensorType, TensorInfo
+from palpate.files.training_range import KnownInputs
+from palpate.messages import SensorType, TensorInfo, TrainingRange
 from palpate.process import require
 from palpate_training.datasets.experiment import SkinMesh
 from palpate_training.learning.networks import FeaturesGraph, FieldGraph, SynthesisGraph
@@ -135,7 +136,12 @@ def export_fields(
         BundleError: Parity or contract fails; nothing is left on disk.
     """
     task: Literal["field", "synthesis"] = "field" if isinstance(graph, FieldGraph) else "synthesis"
-    takes, gives = tensors_of(task, len(mesh.nodes), optional=True)
+    takes, gives = tensors_of(
+        task,
+        len(mesh.nodes),
+        optional=("displacement_sd", "coefficients"),
+        modes=graph.modes.shape[0],
+    )
     inputs = np.ascontiguousarray(inputs, np.float32)
     return _export(
         folder,
@@ -146,6 +152,7 @@ def export_fields(
         inputs,
         inputs[:GOLDEN_ROWS],
         lambda i, right: np.float64(np.abs(right).max()) or 1.0,
+        basis={"mean": "mean", "modes": "modes"} if task == "field" else {},
         mesh=FieldMesh(
             nodes=mesh.nodes.astype(np.float32),
             outer_faces=mesh.outer_faces.astype(np.int32),
@@ -174,6 +181,9 @@ def _export(
     normalisation: Mapping[str, Any] | None = None,
     contact_threshold_n: float = 0.0,
     mesh: FieldMesh | None = None,
+    basis: Mapping[str, str] | None = None,
+    training_range: TrainingRange | None = None,
+    known_inputs: KnownInputs | None = None,
 ) -> bytes:
     """Export, compare, write."""
     names = [tensor.name for tensor in gives]
@@ -199,9 +209,18 @@ def _export(
         palpate_version=__version__,
         opset=OPSET,
         normalisation=dict(normalisation or {}),
+        training_range=training_range,
+        basis=dict(basis or {}),
     )
     golden = {input_name: golden_inputs} | dict(zip(names, answers, strict=True))
-    digest = write_bundle(folder, model=model, golden=golden, manifest=manifest, mesh=mesh)
+    digest = write_bundle(
+        folder,
+        model=model,
+        golden=golden,
+        manifest=manifest,
+        mesh=mesh,
+        known_inputs=known_inputs,
+    )
     _log.info("wrote %s, parity %.1g", folder, worst)
     return digest
 

@@ -151,7 +151,7 @@ class FeaturesGraph(nn.Module):
 
 
 class FieldGraph(nn.Module):
-    """Tared counts ``(N, 19)`` -> nodal displacement ``(N, 3V)`` [m] and its spread ``(N, V)``.
+    """Tared counts ``(N, 19)`` -> nodal displacement ``(N, 3V)`` [m], its spread, coefficients.
 
     Args:
         net: Tared counts -> coefficients [m], shape ``(N, K)``.
@@ -170,11 +170,11 @@ class FieldGraph(nn.Module):
         _register(self, modes=code.modes, scale=code.scale, mean=code.mean)
         _register(self, node_spread=node_sd.astype(np.float32))
 
-    def forward(self, electrodes: Tensor) -> tuple[Tensor, Tensor]:
-        """Displacement ``(N, 3V)`` and standard deviation ``(N, V)``, both [m]."""
+    def forward(self, electrodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Displacement ``(N, 3V)``, standard deviation ``(N, V)``, coefficients ``(N, K)``, [m]."""
         coefficients = self.net(electrodes) * self.scale  # (N, K)
         field = coefficients @ self.modes.to(torch.float32) + self.mean  # (N, 3V)
-        return field, self.node_spread.expand(electrodes.shape[0], -1)
+        return field, self.node_spread.expand(electrodes.shape[0], -1), coefficients
 
 
 class FilmNet(nn.Module):

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.messages import COUNTS_MAX
+from palpate.messages import COUNTS_MAX, TrainingRange
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.datasets.features import FeatureDataset, open_dataset
 from palpate_training.learning import baselines
@@ -35,6 +35,7 @@ from palpate_training.learning.metrics import (
     rms,
 )
 from palpate_training.learning.networks import FeaturesGraph, Mlp, predict
+from palpate_training.learning.ranges import ends_of, known_inputs
 from palpate_training.learning.splits import (
     Rows,
     RowSplit,
@@ -177,9 +178,28 @@ def train_features(
             f" are estimated below it; at least {MIN_CONTACT_THRESHOLD_N} N",
         },
         seed=seed,
+        training_range=_training_range(data, split),
+        known_inputs=known_inputs(x[split.train]),
     )
     return FeaturesReport(
         digest, metrics, (len(split.train), len(split.validation), len(split.test))
+    )
+
+
+def _training_range(data: FeatureDataset, split: RowSplit) -> TrainingRange:
+    """What the networks have seen; contact locations of rows in contact only."""
+    rows = split.train
+    outputs = [ends_of("force", "N", data.force[rows])]
+    if data.contact_location is not None and data.in_contact is not None:
+        where = data.contact_location[rows[data.in_contact[rows]]]
+        outputs.append(replace(ends_of("contact_location", "m", where), length_max=0.0))
+    return TrainingRange(
+        source=f"{len(rows)} training rows of {data.provenance.source}",
+        data_sha256=data.content_sha256(),
+        rows=len(rows),
+        inputs=(ends_of("electrodes", "tared counts", data.tared_counts[rows]),),
+        outputs=tuple(outputs),
+        combinations=True,
     )
 
 

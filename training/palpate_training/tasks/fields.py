@@ -13,7 +13,7 @@ number of nodes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from palpate.messages import COUNTS_MAX
+from palpate.messages import COUNTS_MAX, TrainingRange
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
@@ -31,6 +31,7 @@ from palpate_training.learning.field_code import FieldCode, fit_code
 from palpate_training.learning.fit import FitConfig, OnEpoch, fit
 from palpate_training.learning.metrics import field_errors, field_summary, join
 from palpate_training.learning.networks import FieldGraph, Mlp, predict
+from palpate_training.learning.ranges import ends_of, known_inputs, longest_of
 from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.results import (
     ALL,
@@ -80,6 +81,12 @@ class FieldFitConfig(FitConfig):
         """How many untouched rows are added to some training rows."""
         return math.ceil(self.rest_share * len(train))
 
+    def untouched_rows(self, train: Rows, seed: int) -> FloatArray:
+        """Tared counts of untouched rows, shape (N, 19)."""
+        shape = (self.rest_rows(train), ELECTRODES)
+        noise = np.random.default_rng(seed).normal(0, self.rest_noise_counts, shape)
+        return noise.astype(np.float32)
+
 
 @dataclass(frozen=True, slots=True)
 class FieldModel:
@@ -124,12 +131,11 @@ def fit_field(
     torch.manual_seed(seed)
     net = Mlp(config.widths, ELECTRODES, outputs=code.size)
     net.normalise_from(x[split.train], y[split.train])
-    rest = config.rest_rows(split.train)
-    noise = np.random.default_rng(seed).normal(0, config.rest_noise_counts, (rest, ELECTRODES))
+    untouched = config.untouched_rows(split.train, seed)
     fit_on_norms(
         net,
-        np.vstack([x[split.train], noise.astype(np.float32)]),
-        np.vstack([y[split.train], np.repeat(zero, rest, axis=0)]),
+        np.vstack([x[split.train], untouched]),
+        np.vstack([y[split.train], np.repeat(zero, len(untouched), axis=0)]),
         (x[split.validation], y[split.validation]),
         scale=1e3 / math.sqrt(code.nodes),
         floor=0.01,
@@ -302,6 +308,9 @@ def field_bundle(
     untouched = code.decode(model.coefficients(np.zeros((1, counts.shape[1]), np.float32)))
     metrics["untouched_nodal_all_m"] = float(np.linalg.norm(untouched, axis=2).mean())
     metrics |= truncation_metrics(code)
+    seen = np.vstack(
+        [counts[split.train], (config or FieldFitConfig()).untouched_rows(split.train, seed)]
+    )
     export_fields(
         folder,
         FieldGraph(model.net, code, _node_sd(data, split.validation, estimate)),
@@ -317,8 +326,24 @@ def field_bundle(
             "displacement": f"{code.size} modes of the training rows, half precision in the graph",
             "displacement_sd": "constant per node: rms length of the error on validation rows",
         },
+        training_range=TrainingRange(
+            source=f"{len(seen)} training rows, untouched ones included, of"
+            f" {data.experiment.provenance.source}",
+            data_sha256=content_sha256(data),
+            rows=len(seen),
+            inputs=(ends_of("electrodes", "tared counts", seen),),
+            outputs=(longest_of("displacement", "m", fields_of(data, split.train)),),
+            combinations=True,
+        ),
+        known_inputs=known_inputs(seen),
     )
     return metrics
+
+
+def fields_of(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:
+    """Fields of rows in small parts, each of shape (N, V, 3)."""
+    for start in range(0, len(rows), _CHUNK_ROWS):
+        yield data.displacement(rows[start : start + _CHUNK_ROWS])
 
 
 def truncation_metrics(code: FieldCode) -> dict[str, float]:

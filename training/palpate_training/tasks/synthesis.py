@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from palpate.messages import TrainingRange
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning import baselines
@@ -23,9 +24,11 @@ from palpate_training.learning.field_code import FieldCode, FilmPooling, fit_cod
 from palpate_training.learning.fit import OnEpoch
 from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
 from palpate_training.learning.networks import FilmNet, Mlp, SynthesisGraph, predict
+from palpate_training.learning.ranges import ends_of, longest_of
 from palpate_training.learning.splits import RowSplit, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.fields import (
     FieldFitConfig,
+    fields_of,
     fit_on_norms,
     spread_rows,
     tared_counts,
@@ -224,5 +227,12 @@ def synthesis_bundle(
             " inside the graph",
             "tared_counts_sd": "constant per electrode: rms residual on validation rows",
         },
+        training_range=TrainingRange(
+            source=f"{len(split.train)} training rows of {data.experiment.provenance.source}",
+            data_sha256=content_sha256(data),
+            rows=len(split.train),
+            inputs=(longest_of("displacement", "m", fields_of(data, split.train)),),
+            outputs=(ends_of("tared_counts", "tared counts", counts[split.train]),),
+        ),
     )
     return metrics
