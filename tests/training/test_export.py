@@ -148,6 +148,17 @@ def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
     assert metrics["location_distance_median_m"] < metrics["constant_location_distance_median_m"]
     assert metrics["contact_found_share"] > 0.8
     assert 0.05 <= bundle.manifest.contact_threshold_n < 1.0
+    known = bundle.manifest.training_range
+    assert known is not None
+    assert known.rows == report.rows[0]
+    assert known.data_sha256 == data.content_sha256()
+    assert bundle.known_inputs is not None
+    force, location = known.outputs
+    assert 0 < force.length_max <= np.linalg.norm(data.force, axis=1).max() * 1.00001
+    assert data.contact_location is not None
+    low, high = np.nanmin(data.contact_location, axis=0), np.nanmax(data.contact_location, axis=0)
+    assert (np.array(location.low) >= low - 1e-6).all()
+    assert (np.array(location.high) <= high + 1e-6).all()
     with pytest.raises(BundleError, match="immutable"):
         train_features(tmp_path / "presses.h5", tmp_path / "bundle", config=QUICK)
 

@@ -101,10 +101,15 @@ def test_graphs_compute_what_the_models_do(
     counts, rows = tared_counts(mixed), held.test[:5]
     sd = np.arange(len(mixed.mesh.nodes), dtype=np.float32)
     with torch.inference_mode():
-        field, spread = FieldGraph(model.net, model.code, sd)(torch.from_numpy(counts[rows]))
+        field, spread, coefficients = FieldGraph(model.net, model.code, sd)(
+            torch.from_numpy(counts[rows])
+        )
     wanted = model.code.decode(model.coefficients(counts[rows])).reshape(5, -1)
     np.testing.assert_allclose(field.numpy(), wanted, atol=1e-6 * np.abs(wanted).max())
     np.testing.assert_array_equal(spread.numpy(), np.tile(sd, (5, 1)))
+    modes = model.code.modes.astype(np.float32)
+    decoded = coefficients.numpy() @ modes + model.code.mean
+    np.testing.assert_allclose(decoded, wanted, atol=1e-6 * np.abs(wanted).max())
 
     fitted = fit_synthesis(mixed, held, config=quick)
     graph = SynthesisGraph(fitted.net, fitted.code, fitted.pooling, np.ones(19, np.float32))
@@ -142,6 +147,37 @@ def test_field_bundle(mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path
         field_bundle(mixed, tmp_path / "f", config=quick)
 
 
+def test_field_bundle_has_its_basis_and_knows_its_rows(
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, tmp_path: Path
+) -> None:
+    field_bundle(mixed, tmp_path / "f", config=quick)
+    bundle = read_bundle(tmp_path / "f")
+    constants = {
+        one.name: onnx.numpy_helper.to_array(one).astype(np.float32)
+        for one in onnx.load_from_string(bundle.model).graph.initializer
+    }
+    basis = {name: constants[where] for name, where in bundle.manifest.basis.items()}
+    decoded = basis["mean"] + bundle.golden["coefficients"] @ basis["modes"]
+    wanted = bundle.golden["displacement"]
+    np.testing.assert_allclose(decoded, wanted, atol=1e-5 * np.abs(wanted).max())
+
+    known, rows = bundle.known_inputs, bundle.manifest.training_range
+    assert known is not None
+    assert rows is not None
+    units = of_units(mixed.experiment, by_trajectory(mixed.experiment), ["biotac-1", "biotac-2"])
+    seen = tared_counts(mixed)[units.train]
+    compressed = np.arcsinh(seen / known.scale)
+    nearest = np.linalg.norm(compressed[:, None] - known.prototypes[None], axis=2).min(axis=1)
+    assert nearest.max() <= known.distance_max  # no training row is unlike the training rows
+    (electrodes,) = rows.inputs
+    assert (seen >= np.array(electrodes.low) - 0.01).all()
+    assert (seen <= np.array(electrodes.high) + 0.01).all()
+    (displacement,) = rows.outputs
+    longest = np.linalg.norm(mixed.displacement(units.train), axis=2).max()
+    assert displacement.length_max == pytest.approx(longest, rel=1e-5)
+    assert rows.rows == len(units.train) + quick.rest_rows(units.train)
+
+
 def test_synthesis_bundle_is_of_one_unit(
     mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path
 ) -> None:
@@ -150,6 +186,10 @@ def test_synthesis_bundle_is_of_one_unit(
     assert bundle.manifest.task == "synthesis"
     assert ": biotac-2;" in bundle.manifest.trained_on
     assert metrics["skill_rmse"] > 0.5
+    known = bundle.manifest.training_range
+    assert known is not None
+    assert [one.name for one in (*known.inputs, *known.outputs)] == ["displacement", "tared_counts"]
+    assert not known.combinations
     assert metrics["untouched_max_counts"] < 100
     split = by_trajectory(mixed.experiment)
     rows = of_units(mixed.experiment, split, ["biotac-2"])
@@ -175,7 +215,7 @@ def test_modes_are_stored_in_half_precision(model: FieldModel, mixed: MixedDatas
         mean=np.resize(model.code.mean, wide * 3),
     )
     graph = FieldGraph(model.net, code, np.ones(wide, np.float32))
-    data = onnx_bytes(graph, "electrodes", torch.zeros(4, 19), ["displacement", "sd"])
+    data = onnx_bytes(graph, "electrodes", torch.zeros(4, 19), ["displacement", "sd", "k"])
     stored = {
         tuple(one.dims): one.data_type for one in onnx.load_from_string(data).graph.initializer
     }
@@ -188,7 +228,7 @@ def test_a_model_that_differs_is_refused(
 ) -> None:
     sd = np.ones(len(mixed.mesh.nodes), np.float32)
     scaled = replace(model.code, scale=model.code.scale * np.float32(1.001))
-    names = ["displacement", "displacement_sd"]
+    names = ["displacement", "displacement_sd", "coefficients"]
     wrong = onnx_bytes(FieldGraph(model.net, scaled, sd), "electrodes", torch.zeros(4, 19), names)
     monkeypatch.setattr(export, "onnx_bytes", lambda *_: wrong)
     with pytest.raises(BundleError, match=r"differs from torch by .* in displacement"):

@@ -152,7 +152,6 @@ def export_fields(
         inputs,
         inputs[:GOLDEN_ROWS],
         lambda i, right: np.float64(np.abs(right).max()) or 1.0,
-        basis={"mean": "mean", "modes": "modes"} if task == "field" else {},
         mesh=FieldMesh(
             nodes=mesh.nodes.astype(np.float32),
             outer_faces=mesh.outer_faces.astype(np.int32),
@@ -181,7 +180,6 @@ def _export(
     normalisation: Mapping[str, Any] | None = None,
     contact_threshold_n: float = 0.0,
     mesh: FieldMesh | None = None,
-    basis: Mapping[str, str] | None = None,
     training_range: TrainingRange | None = None,
     known_inputs: KnownInputs | None = None,
 ) -> bytes:
@@ -210,7 +208,7 @@ def _export(
         opset=OPSET,
         normalisation=dict(normalisation or {}),
         training_range=training_range,
-        basis=dict(basis or {}),
+        basis=_basis_of(model, dict(zip(names, gives, strict=True))),
     )
     golden = {input_name: golden_inputs} | dict(zip(names, answers, strict=True))
     digest = write_bundle(
@@ -223,6 +221,29 @@ def _export(
     )
     _log.info("wrote %s, parity %.1g", folder, worst)
     return digest
+
+
+def _basis_of(model: bytes, outputs: Mapping[str, TensorInfo]) -> dict[str, str]:
+    """Names of the constants of the graph that are the basis of its coefficients, if it has some.
+
+    They are found by their shapes: the exporter folds the cast of small modes and renames them.
+    """
+    if "coefficients" not in outputs:
+        return {}
+    onnx = require("onnx", extra="training")
+    modes, width = outputs["coefficients"].shape[1], outputs["displacement"].shape[1]
+    wanted = {"mean": (width,), "modes": (modes, width)}
+    found: dict[str, str] = {}
+    for constant in onnx.load_from_string(model).graph.initializer:
+        for name, shape in wanted.items():
+            if tuple(constant.dims) == shape:
+                found.setdefault(name, constant.name)
+    if len(found) < len(wanted):
+        raise BundleError(
+            f"the exported graph has no constants of the shapes {wanted}",
+            remedy="nothing was written; report this with the torch version",
+        )
+    return found
 
 
 def onnx_bytes(
