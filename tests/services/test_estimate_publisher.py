@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import time
 from collections import Counter
@@ -16,12 +17,13 @@ import pytest
 from palpate import clock
 from palpate.bus import Delivery, ReceivedMessage, Session
 from palpate.bus.topics import ELECTRODES, FEATURES
+from palpate.codec import STAGE_TIMINGS
 from palpate.config import LinkConfig
 from palpate.health import Health
-from palpate.messages import ElectrodeFrame, FeatureEstimate, Origin
+from palpate.messages import ElectrodeFrame, FeatureEstimate, Origin, StageTimings
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import loop
-from palpate_services.inference.estimates import EstimateRefusal, Estimation
+from palpate_services.inference.estimates import EstimateRefusal, Estimation, Sample
 from palpate_services.inference.loop import EstimatePublisher, ServiceRoute
 
 MS = 1_000_000
@@ -36,7 +38,8 @@ class Station:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_ns = START_NS
-        self.work_ns = 0
+        self.work_ns = self.tare_ns = self.encode_ns = 0
+        self.timings: list[StageTimings] = []
         self.put: list[tuple[str, int]] = []
         self.counts: Counter[str] = Counter()
         self.gauges: dict[str, float] = {}
@@ -49,7 +52,12 @@ class Station:
         monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic_ns=lambda: self.now_ns))
 
     def sample(self, sensor: str, frame: ElectrodeFrame, runtime: object) -> Any:
-        return self.refused or np.zeros(19, np.float32)
+        self.now_ns += self.tare_ns
+        return self.refused or Sample(np.zeros(19, np.float32))
+
+    def encode(self, estimate: Any) -> Any:
+        self.now_ns += self.encode_ns
+        return estimate
 
     def run_all(self, samples: list[Any]) -> list[dict[str, Any]]:
         self.now_ns += self.work_ns
@@ -63,7 +71,12 @@ class Station:
         def publisher(topic: object, *, sensor: str, lossless: bool) -> object:
             assert topic is FEATURES
             assert not lossless
-            return SimpleNamespace(put=lambda estimate: self.put.append((sensor, estimate)))
+
+            def put_payload(estimate: Any, *, attachment: bytes) -> None:
+                self.put.append((sensor, estimate))
+                self.timings.append(STAGE_TIMINGS.decode(attachment))
+
+            return SimpleNamespace(encode=self.encode, put_payload=put_payload)
 
         def count(name: str, by: int = 1) -> None:
             self.counts[name] += by
@@ -234,7 +247,7 @@ def test_what_has_come_is_answered_before_it_leaves(
         def slow(sensor: str, frame: ElectrodeFrame, runtime: object) -> Any:
             begun.set()
             assert go.wait(20)
-            return np.zeros(19, np.float32)
+            return Sample(np.zeros(19, np.float32))
 
         def complete(frame: ElectrodeFrame, *_: object) -> FeatureEstimate:
             place = np.zeros(3, np.float32)
@@ -267,3 +280,28 @@ def test_what_has_come_is_answered_before_it_leaves(
         service.join(20)
         assert [estimates.next(5.0).message.source.sequence for _ in range(5)] == [1, 2, 3, 4, 5]
     assert kept[0].counters["estimates_published"] == 5
+
+
+def test_timings_say_where_the_time_went(station: Station, came: Came) -> None:
+    publisher = station.make()
+    station.tare_ns, station.work_ns, station.encode_ns = 2 * MS, 5 * MS, MS
+    station.now_ns = START_NS + 10 * MS
+    arrived = dataclasses.replace(came(1, START_NS, arrived_ns=START_NS + 3 * MS), decode_s=0.0005)
+    publisher.take([arrived])
+    (timings,) = station.timings
+    found = [round(getattr(timings, name) * 1e3, 3) for name in timings.__slots__]
+    assert found == [3.0, 6.5, 0.5, 2.0, 5.0, 1.0]
+
+
+@pytest.mark.parametrize("origin", [Origin.REPLAYED, Origin.SIMULATED])
+def test_an_age_by_a_clock_that_says_nothing_of_it_is_none(
+    station: Station, came: Came, origin: Origin
+) -> None:
+    publisher = station.make()
+    message = came(1, START_NS, origin=origin)
+    if origin is Origin.SIMULATED:
+        stamp = dataclasses.replace(message.message.stamp, clock_id=clock.CLOCK_ID ^ 1)
+        frame = dataclasses.replace(message.message, stamp=stamp)
+        message = dataclasses.replace(message, message=frame)
+    publisher.take([message])
+    assert station.timings[0].age_at_arrival_s is None

@@ -12,7 +12,8 @@ import pytest
 
 from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import Bundle, read_bundle
-from palpate_services.inference.model import Runtime, has_external_data, load
+from palpate_services.inference.model import Runtime, load
+from palpate_services.inference.onnx_file import has_external_data
 from palpate_services.inference.repository import available, resolve
 
 onnx = pytest.importorskip("onnx")

@@ -233,28 +233,38 @@ def _synthesis_encode(estimate: SynthesisEstimate) -> bytes:
     return payload + tail.SerializeToString()
 
 
-_STAGES = ("waiting_s", "decode_s", "tare_s", "infer_s", "encode_s")
+def _checked(timings: StageTimings) -> StageTimings:
+    stages = (
+        timings.waiting_s, timings.decode_s, timings.tare_s, timings.infer_s, timings.encode_s,
+    )  # fmt: skip
+    if not isfinite(sum(stages) + (timings.age_at_arrival_s or 0.0)) or min(stages) < 0:
+        reject("timings", f"{timings} are not finite, or negative")
+    return timings
 
 
 def _timings_from_wire(msg: estimates_pb2.StageTimings) -> StageTimings:
-    stages = [getattr(msg, name) for name in _STAGES]
-    age_s = msg.age_at_arrival_s if msg.HasField("age_at_arrival_s") else None
-    if not isfinite(sum(stages) + (age_s or 0.0)) or min(stages) < 0:
-        reject("timings", f"timings {stages} with age {age_s} are not finite, or negative")
-    return StageTimings(age_s, *stages)
+    return _checked(
+        StageTimings(
+            msg.age_at_arrival_s if msg.HasField("age_at_arrival_s") else None,
+            msg.waiting_s,
+            msg.decode_s,
+            msg.tare_s,
+            msg.infer_s,
+            msg.encode_s,
+        )
+    )
 
 
 def _timings_encode(timings: StageTimings) -> bytes:
-    msg = estimates_pb2.StageTimings(
+    _checked(timings)
+    return estimates_pb2.StageTimings(
         age_at_arrival_s=timings.age_at_arrival_s,
         waiting_s=timings.waiting_s,
         decode_s=timings.decode_s,
         tare_s=timings.tare_s,
         infer_s=timings.infer_s,
         encode_s=timings.encode_s,
-    )
-    _timings_from_wire(msg)
-    return msg.SerializeToString()
+    ).SerializeToString()
 
 
 FEATURE_ESTIMATE = codec_of(estimates_pb2.FeatureEstimate, _features_encode, _features_from_wire)

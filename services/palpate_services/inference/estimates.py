@@ -8,7 +8,7 @@ be found) is in the classes below them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import StrEnum
 from math import sqrt
@@ -22,6 +22,7 @@ from palpate.bus.tares import TareBook
 from palpate.errors import ClockSkewError, ErrorCode, PalpateError, RemoteError
 from palpate.health import Health
 from palpate.messages import (
+    COUNTS_MAX,
     NO_TARE,
     ElectrodeFrame,
     FeatureEstimate,
@@ -29,6 +30,7 @@ from palpate.messages import (
     FieldFrame,
     FloatArray,
     Origin,
+    QualityFlag,
     Stamp,
     SynthesisEstimate,
     Tare,
@@ -50,6 +52,11 @@ REPLAY_WAIT_S = 2.0
 """How long a lossless replay waits for a tare that arrives later than its first frame [s]."""
 
 _MISSES_KEPT = 256
+
+TARE_TDC_COUNTS = 45
+"""A tare whose TDC lies farther from the frame's may not hold any more [counts]: about 1 K by the
+maker's formula at 30 to 35 degrees C, and with it about 20 counts of each electrode (the
+conductivity of the fluid changes by 2 % a kelvin), twice what a gateway calls drift."""
 
 
 class EstimateRefusal(StrEnum):
@@ -90,6 +97,19 @@ class EstimateRefusal(StrEnum):
     """The estimate of this period was already published (``rate_hz``)."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What a model gets of a message, and what is known against it before the model runs.
+
+    Attributes:
+        values: The model's one input without batch axis.
+        quality: Flags in ascending order.
+    """
+
+    values: FloatArray
+    quality: tuple[QualityFlag, ...] = ()
+
+
 def tared_counts(frame: ElectrodeFrame, tare: Tare) -> FloatArray:
     """Electrodes minus baseline [counts], float32, shape ``(19,)``."""
     return np.subtract(frame.electrodes, tare.electrodes, dtype=np.float32)
@@ -125,13 +145,13 @@ def synthesise(
 
 def _completed(
     message: M,
-    sample: FloatArray | EstimateRefusal,
+    sample: Sample | EstimateRefusal,
     runtime: Runtime,
-    complete: Callable[[M, FloatArray, Outputs, Runtime], E],
+    complete: Callable[[M, Sample, Outputs, Runtime], E],
 ) -> E | EstimateRefusal:
     if isinstance(sample, EstimateRefusal):
         return sample
-    outputs = runtime.run(sample)
+    outputs = runtime.run(sample.values)
     return (
         EstimateRefusal.NON_FINITE
         if outputs is None
@@ -145,22 +165,37 @@ def _completed(
 
 def sample_of_frame(
     frame: ElectrodeFrame, tare: Tare | None, runtime: Runtime
-) -> FloatArray | EstimateRefusal:
+) -> Sample | EstimateRefusal:
     """What the model of a bundle gets of a frame: tared counts; or why it gets nothing."""
     if frame.sensor_type is not runtime.sensor_type:
         return EstimateRefusal.WRONG_SENSOR
     if tare is None or frame.tare_id == NO_TARE or tare.tare_id != frame.tare_id:
         return EstimateRefusal.UNTARED
-    if tare.electrodes.shape != frame.electrodes.shape:  # of a finger that was exchanged
+    if (
+        tare.electrodes.shape != frame.electrodes.shape
+        or tare.sensor_serial != frame.sensor_serial  # of a finger that was exchanged
+    ):
         return EstimateRefusal.UNTARED
     if not frame.electrodes_valid:
         return EstimateRefusal.INVALID_CHANNELS
-    return tared_counts(frame, tare)
+    return Sample(tared_counts(frame, tare), quality_of_frame(frame, tare))
+
+
+def quality_of_frame(frame: ElectrodeFrame, tare: Tare) -> tuple[QualityFlag, ...]:
+    """What is to be said against a frame and its tare, whatever the model."""
+    flags: tuple[QualityFlag, ...] = ()
+    # In 12 bits only 0 and 4095, the ends of the converter's range, are multiples of 4095.
+    if not (frame.electrodes % COUNTS_MAX).all():
+        flags = (QualityFlag.SATURATED,)
+    tdc_valid = frame.validity >> frame.sensor_type.layout.tdc_bit & 1
+    if tdc_valid and abs(frame.tdc - tare.tdc) > TARE_TDC_COUNTS:
+        flags = (*flags, QualityFlag.UNTARED)
+    return flags
 
 
 def sample_of_field(
     field: FieldFrame | FieldEstimate, runtime: Runtime
-) -> FloatArray | EstimateRefusal:
+) -> Sample | EstimateRefusal:
     """What the model of a bundle gets of a field: its displacements; or why it gets nothing."""
     known = as_field_frame(field)
     sample = known.displacement.reshape(-1)
@@ -169,11 +204,22 @@ def sample_of_field(
     # The network may hide a NaN: a rectifier (max(x, 0)) turns it into 0 on some machines.
     if not np.isfinite(sample).all():
         return EstimateRefusal.NON_FINITE
-    return sample
+    # A doubtful field makes doubtful electrodes.
+    return Sample(sample, field.quality if isinstance(field, FieldEstimate) else ())
+
+
+def _quality(
+    sample: Sample, outputs: Outputs, runtime: Runtime, *, without: Collection[str] = ()
+) -> tuple[QualityFlag, ...]:
+    """All flags of an estimate, in ascending order, each once."""
+    found = runtime.range.flags(sample.values, outputs, without=without)
+    if not sample.quality:
+        return found
+    return tuple(sorted({*sample.quality, *found}))
 
 
 def features_of(
-    frame: ElectrodeFrame, sample: FloatArray, outputs: Outputs, runtime: Runtime
+    frame: ElectrodeFrame, sample: Sample, outputs: Outputs, runtime: Runtime
 ) -> FeatureEstimate:
     """The features of a frame, from its sample and what the model made of it."""
     force = outputs["force"]
@@ -190,13 +236,20 @@ def features_of(
         force_sd=outputs["force_sd"],
         contact_location=outputs.get("contact_location") if in_contact else None,
         contact_location_sd=outputs.get("contact_location_sd") if in_contact else None,
+        quality=_quality(sample, outputs, runtime, without=() if in_contact else _LOCATION),
+        bundle_name=runtime.manifest.name,
+        bundle_version=runtime.manifest.version,
     )
 
 
+_LOCATION = ("contact_location", "contact_location_sd")
+
+
 def field_of(
-    frame: ElectrodeFrame, sample: FloatArray, outputs: Outputs, runtime: Runtime
+    frame: ElectrodeFrame, sample: Sample, outputs: Outputs, runtime: Runtime
 ) -> FieldEstimate:
     """The field of a frame, from its sample and what the model made of it."""
+    force = outputs.get("contact_force")
     return FieldEstimate(
         source=frame.stamp,
         sensor_serial=frame.sensor_serial,
@@ -205,11 +258,17 @@ def field_of(
         mesh_sha256=runtime.mesh_sha256,
         displacement=outputs["displacement"].reshape(-1, 3),
         displacement_sd=outputs.get("displacement_sd"),
+        contact_force=None if force is None else force.reshape(-1, 3),
+        quality=_quality(sample, outputs, runtime),
+        bundle_name=runtime.manifest.name,
+        bundle_version=runtime.manifest.version,
+        coefficients=outputs.get("coefficients"),
+        basis_sha256=b"" if runtime.basis is None else runtime.basis.sha256,
     )
 
 
 def synthesis_of(
-    field: FieldFrame | FieldEstimate, sample: FloatArray, outputs: Outputs, runtime: Runtime
+    field: FieldFrame | FieldEstimate, sample: Sample, outputs: Outputs, runtime: Runtime
 ) -> SynthesisEstimate:
     """The electrodes of a field, from its sample and what the model made of it."""
     known = as_field_frame(field)
@@ -220,6 +279,9 @@ def synthesis_of(
         mesh_sha256=runtime.mesh_sha256,
         tared_counts=outputs["tared_counts"],
         tared_counts_sd=outputs["tared_counts_sd"],
+        quality=_quality(sample, outputs, runtime),
+        bundle_name=runtime.manifest.name,
+        bundle_version=runtime.manifest.version,
     )
 
 
@@ -234,8 +296,8 @@ class Estimation(Generic[M, E]):
             estimate.
     """
 
-    sample: Callable[[str, M, Runtime], FloatArray | EstimateRefusal]
-    complete: Callable[[M, FloatArray, Outputs, Runtime], E]
+    sample: Callable[[str, M, Runtime], Sample | EstimateRefusal]
+    complete: Callable[[M, Sample, Outputs, Runtime], E]
 
     def one(self, sensor: str, message: M, runtime: Runtime | None) -> E | EstimateRefusal:
         """The estimate of one message, or why there is none; without a bundle there is none."""
@@ -340,7 +402,7 @@ class TaredSamples:
 
     def take(
         self, sensor: str, frame: ElectrodeFrame, runtime: Runtime
-    ) -> FloatArray | EstimateRefusal:
+    ) -> Sample | EstimateRefusal:
         """The sample of a frame for the model of a bundle, or why there is no estimate."""
         if frame.sensor_type is not runtime.sensor_type:
             self._report_wrong_sensor(sensor, frame, runtime)

@@ -21,15 +21,16 @@ import numpy as np
 from palpate import clock
 from palpate.bus import Delivery, Publisher, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.topics import Topic
+from palpate.codec import STAGE_TIMINGS
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.files.bundle import read_bundle
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
-from palpate.messages import FloatArray, Origin, ServiceState, Stamp
+from palpate.messages import Origin, ServiceState, StageTimings, Stamp
 from palpate.process import avoid_pauses
 from palpate_services.config import EstimatingConfig
-from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation
+from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation, Sample
 from palpate_services.inference.input_report import InputReport
 from palpate_services.inference.model import BATCH_MOST, Runtime, load
 from palpate_services.inference.repository import resolve
@@ -137,6 +138,26 @@ class RateLimit:
             self._last[sensor] = stamp.monotonic_ns // self._period_ns
 
 
+@dataclass(frozen=True, slots=True)
+class _Taken(Generic[M]):
+    """A message with its sample, and when [ns, monotonic] that was begun and done."""
+
+    received: ReceivedMessage[M]
+    sample: Sample
+    taken_ns: int
+    sampled_ns: int
+
+
+def arrival_age_s(stamp: Stamp, arrived_ns: int) -> float | None:
+    """Time from a reading to an arrival on this host [s]; None where the stamp does not say.
+
+    The stamp of a replay, or of another clock, says nothing of it.
+    """
+    if stamp.origin is Origin.REPLAYED or stamp.clock_id != clock.CLOCK_ID:
+        return None
+    return (arrived_ns - stamp.monotonic_ns) * 1e-9
+
+
 class EstimatePublisher(Generic[M, E]):
     """Publishes an estimate for each message, or counts why there is none. Use from one thread.
 
@@ -179,7 +200,7 @@ class EstimatePublisher(Generic[M, E]):
         """
         began_ns = time.monotonic_ns()
         for tick in _without_repetition(messages):
-            samples: dict[Runtime, list[tuple[ReceivedMessage[M], FloatArray]]] = {}
+            samples: dict[Runtime, list[_Taken[M]]] = {}
             for received in tick:
                 sensor = received.sensor
                 if self._sensors and sensor not in self._sensors:
@@ -187,18 +208,22 @@ class EstimatePublisher(Generic[M, E]):
                 self._counts[self._route.received] += 1
                 # One bundle makes all of an estimate, whichever is loaded meanwhile.
                 runtime = self._models.of(sensor)
+                taken_ns = time.monotonic_ns()
                 sample = self._sample(received, runtime)
                 if isinstance(sample, EstimateRefusal):
                     self._refuse(sensor, sample.value)
                 elif runtime is not None:
-                    samples.setdefault(runtime, []).append((received, sample))
+                    sampled_ns = time.monotonic_ns()
+                    samples.setdefault(runtime, []).append(
+                        _Taken(received, sample, taken_ns, sampled_ns)
+                    )
             for runtime, taken in samples.items():
                 self._run(runtime, taken)
         self._busy_ns += time.monotonic_ns() - began_ns
 
     def _sample(
         self, received: ReceivedMessage[M], runtime: Runtime | None
-    ) -> FloatArray | EstimateRefusal:
+    ) -> Sample | EstimateRefusal:
         """What the model gets of a message, or why it gets nothing."""
         stamp = self._stamp_of(received)
         if (refusal := self._age_limit.refusal(stamp)) is not None:
@@ -209,33 +234,45 @@ class EstimatePublisher(Generic[M, E]):
             return EstimateRefusal.NO_MODEL
         return self._estimation.sample(received.sensor, received.message, runtime)
 
-    def _run(
-        self, runtime: Runtime, taken: Sequence[tuple[ReceivedMessage[M], FloatArray]]
-    ) -> None:
+    def _run(self, runtime: Runtime, taken: Sequence[_Taken[M]]) -> None:
         """Run a model on samples, and publish the estimates or count why there are none."""
         self._batches += 1
         self._batched += len(taken)
-        outputs_of = runtime.run_all([sample for _, sample in taken])
-        for (received, sample), outputs in zip(taken, outputs_of, strict=True):
+        began_ns = time.monotonic_ns()
+        outputs_of = runtime.run_all([one.sample.values for one in taken])
+        infer_s = (time.monotonic_ns() - began_ns) * 1e-9
+        for one, outputs in zip(taken, outputs_of, strict=True):
             if outputs is None:
-                self._refuse(received.sensor, EstimateRefusal.NON_FINITE.value)
+                self._refuse(one.received.sensor, EstimateRefusal.NON_FINITE.value)
                 continue
-            message = received.message
-            estimate = self._estimation.complete(message, sample, outputs, runtime)
+            received = one.received
+            estimate = self._estimation.complete(received.message, one.sample, outputs, runtime)
+            publisher = self._publisher(received.sensor)
+            began_ns = time.monotonic_ns()
             try:
-                self._publisher(received.sensor).put(estimate)
+                payload = publisher.encode(estimate)
             except WireError as error:  # finite, and still not allowed by the message contract
                 self._refuse(received.sensor, f"unpublishable_{error.reason}")
                 continue
+            encode_s = (time.monotonic_ns() - began_ns) * 1e-9
             stamp = self._stamp_of(received)
+            age_s = arrival_age_s(stamp, received.received_monotonic_ns)
+            waited_s = (one.taken_ns - received.received_monotonic_ns) * 1e-9
+            timings = StageTimings(
+                age_s,
+                max(0.0, waited_s - received.decode_s),
+                received.decode_s,
+                (one.sampled_ns - one.taken_ns) * 1e-9,
+                infer_s,
+                encode_s,
+            )
+            publisher.put_payload(payload, attachment=STAGE_TIMINGS.encode(timings))
             self._rate_limit.note(received.sensor, stamp)
             self._counts["estimates_published"] += 1
             self._input.answered(received.sensor)
             # Latency counts from the reading, so that it holds the way through gateway and bus.
-            # Only where the stamp is of another clock, or long past (a replay), it counts from the
-            # arrival.
-            live = stamp.origin is not Origin.REPLAYED and stamp.clock_id == clock.CLOCK_ID
-            since_ns = stamp.monotonic_ns if live else received.received_monotonic_ns
+            # Only where the stamp says nothing of that it counts from the arrival.
+            since_ns = received.received_monotonic_ns if age_s is None else stamp.monotonic_ns
             self._latencies_ns.append(time.monotonic_ns() - since_ns)
 
     def _refuse(self, sensor: str, reason: str) -> None:

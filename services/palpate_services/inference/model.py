@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from types import ModuleType
 from typing import Any
@@ -20,6 +20,9 @@ from palpate.errors import BundleError
 from palpate.files.bundle import Bundle, Manifest
 from palpate.messages import FloatArray, ModelMetadata, SensorType
 from palpate.process import require
+from palpate_services.inference.basis import basis_of
+from palpate_services.inference.onnx_file import has_external_data
+from palpate_services.inference.training_range import RangeCheck
 
 _log = logging.getLogger(__name__)
 
@@ -40,19 +43,6 @@ _ALIGN = 16  # float32 values to a 64-byte cache line, the alignment ONNX Runtim
 _REMEDY = "export the bundle again with palpate_training, or serve another one"
 
 _DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(int64)": "int64"}
-
-# Message type -> field number -> type of that field; numbers of onnx.proto, which never change.
-_NESTED: dict[str, dict[int, str]] = {
-    "model": {7: "graph", 20: "training", 25: "function"},
-    "training": {1: "graph", 2: "graph"},
-    "function": {7: "node", 11: "attribute"},
-    "graph": {1: "node", 5: "tensor", 15: "sparse"},
-    "node": {5: "attribute"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
-    "sparse": {1: "tensor", 2: "tensor"},
-}
-_EXTERNAL_DATA, _DATA_LOCATION = 13, 14  # fields of TensorProto
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 
 
 def load(bundle: Bundle, task: str) -> Runtime:
@@ -86,6 +76,8 @@ class Runtime:
         contact_threshold_n: Net force above which there is contact [N].
         mesh: Mesh of its fields; None for a task without.
         mesh_sha256: Content hash of that mesh, 32 bytes; empty for a task without.
+        range: Compares samples and outputs with what it was trained on.
+        basis: Basis of its coefficients; None for a model without.
     """
 
     def __init__(self, bundle: Bundle, task: str) -> None:
@@ -95,6 +87,7 @@ class Runtime:
         self.contact_threshold_n = float(manifest.contact_threshold_n)
         self.mesh = bundle.mesh
         self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
+        self.range = RangeCheck.of(bundle)
         self._lock = threading.Lock()
         self.label = f"{manifest.name}:{manifest.version}"
         self._label = f"bundle {self.label}"
@@ -108,6 +101,7 @@ class Runtime:
         self._session = _open_session(bundle.model, self._label)
         _check_model(manifest, self._session, self._label)
         self._check_golden(bundle.golden)
+        self.basis = basis_of(bundle)
         self._bind()
         self._warm_up()
         self.batch_most = self._equal_batches(bundle.golden[manifest.inputs[0].name])
@@ -206,6 +200,10 @@ class Runtime:
             training_data_sha256=manifest.training_data_sha256,
             metrics=dict(manifest.metrics),
             trained_on=manifest.trained_on,
+            training_range=manifest.training_range,
+            mesh_sha256=self.mesh_sha256,
+            basis_sha256=b"" if self.basis is None else self.basis.sha256,
+            modes=0 if self.basis is None else len(self.basis.modes),
         )
 
     def _check_golden(self, golden: Mapping[str, npt.NDArray[np.float32]]) -> None:
@@ -360,59 +358,3 @@ def _describe(tensors: dict[str, tuple[str, tuple[int, ...]]]) -> str:
 def _first_line(error: Exception) -> str:
     """First line of ONNX Runtime's message, without the source paths of its build."""
     return str(error).splitlines()[0].split(" : ")[-1][:200]
-
-
-def has_external_data(model: bytes) -> bool:
-    """Whether a model keeps weights outside its own bytes.
-
-    No digest covers such weights, and ONNX Runtime reads them from the working directory even for a
-    model that was loaded from bytes. The ``onnx`` package is no dependency of the services, so the
-    protobuf is read by hand: only its length prefixes, never the weights.
-
-    Raises:
-        ValueError: The bytes are no protobuf.
-    """
-    waiting = [("model", memoryview(model))]
-    while waiting:
-        kind, data = waiting.pop()
-        for number, value in _fields(data):
-            if kind == "tensor":
-                if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0):
-                    return True
-            elif isinstance(value, memoryview) and number in _NESTED[kind]:
-                waiting.append((_NESTED[kind][number], value))
-    return False
-
-
-def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """Fields of one message: number, and a number or the bytes inside."""
-    at = 0
-    while at < len(data):
-        tag, at = _varint(data, at)
-        number, wire_type = tag >> 3, tag & 7
-        if wire_type == _VARINT:
-            value, at = _varint(data, at)
-            yield number, value
-            continue
-        if wire_type == _BYTES:
-            size, at = _varint(data, at)
-        elif wire_type in (_FIXED64, _FIXED32):
-            size = 8 if wire_type == _FIXED64 else 4
-        else:
-            raise ValueError(f"wire type {wire_type} at byte {at}")
-        if at + size > len(data):
-            raise ValueError(f"field {number} exceeds its message at byte {at}")
-        yield number, data[at : at + size]
-        at += size
-
-
-def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while at < len(data) and shift < 70:
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-        shift += 7
-    raise ValueError(f"number cut off at byte {at}")
