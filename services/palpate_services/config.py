@@ -3,21 +3,37 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from palpate.config import Name, StrictConfig
+from palpate.folders import data_folder, state_folder
 
 DEFAULT_BUNDLE = "features-virtual"
+
+
+class ModelsConfig(StrictConfig):
+    """Where bundles are, beside the packaged ones, and what is remembered of them.
+
+    Attributes:
+        folder: The user's bundles: ``<name>/<version>/``.
+        state: Where a station remembers what it serves, and keeps its admin token.
+    """
+
+    folder: Annotated[Path, AfterValidator(Path.expanduser)] = Field(
+        default_factory=lambda: data_folder() / "models"
+    )
+    state: Annotated[Path, AfterValidator(Path.expanduser)] = Field(default_factory=state_folder)
 
 
 class EstimatingConfig(StrictConfig):
     """What all estimating services have in common.
 
     Attributes:
-        bundle: Name of a packaged bundle (newest version), ``name:version``, or the path of a
-            bundle's folder.
+        bundle: Name of a bundle (newest version), ``name:version``, or the path of a bundle's
+            folder.
+        bundles: The same for sensors with a bundle of their own, by sensor.
         sensors: Sensors to serve; empty = every sensor of the station.
         delivery: ``newest`` takes the newest message and counts those it skipped (live);
             ``every`` takes each and slows the source down (lossless replay).
@@ -32,6 +48,7 @@ class EstimatingConfig(StrictConfig):
     """
 
     bundle: str
+    bundles: dict[Name, str] = Field(default_factory=dict, max_length=256)
     sensors: tuple[Name, ...] = ()
     delivery: Literal["newest", "every"] = "newest"
     keep_newest: int = Field(default=3, ge=1, le=100)

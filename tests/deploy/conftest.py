@@ -27,6 +27,7 @@ Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No run folder of a test lands in the user's state, no setting of the user in a test."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setenv("COLUMNS", "160")
     for name in [name for name in os.environ if name.upper().startswith("PALPATE_")]:
         monkeypatch.delenv(name)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from palpate.errors import ConfigError
-from palpate_services.inference.repository import available, resolve
+from palpate.errors import BundleError, ConfigError
+from palpate.files.bundle import Bundle, read_bundle
+from palpate_services.inference.repository import Repository, available, resolve
 
 
 @pytest.fixture
@@ -40,3 +43,88 @@ def test_what_is_not_there(models: Path, name: str) -> None:
 def test_folder_without_a_bundle(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no manifest\.json in"):
         resolve(str(tmp_path), tmp_path)
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Repository:
+    return Repository(tmp_path / "mine", packaged=tmp_path / "packaged")
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_an_imported_bundle_is_found_by_its_own_name(
+    repository: Repository, make_bundle: Callable[..., Path]
+) -> None:
+    made = make_bundle(name="mine", version=7)
+    (made / "notes.txt").write_text("not part of a bundle")
+    label, folder = repository.add(made, read_bundle)
+    assert label == "mine:7"
+    assert repository.available() == repository.available("features") == ["mine:7"]
+    assert repository.available("field") == []
+    assert repository.resolve("mine") == folder
+    assert read_bundle(folder).sha256 == read_bundle(made).sha256
+    assert repository.folder is not None
+    assert names(repository.folder) == [
+        "mine",
+        "mine/7",
+        *(f"mine/7/{name}" for name in ("golden.npz", "manifest.json", "model.onnx")),
+    ]
+    assert repository.add(made, read_bundle) == (label, folder), "the same once more is no error"
+
+
+def test_what_the_check_refuses_leaves_nothing_behind(
+    repository: Repository, make_bundle: Callable[..., Path]
+) -> None:
+    made = make_bundle()
+
+    def refuse(folder: Path) -> Bundle:
+        raise BundleError(f"{folder} is bad", remedy="export it again")
+
+    with pytest.raises(BundleError, match="is bad"):
+        repository.add(made, refuse)
+    assert repository.folder is not None
+    assert names(repository.folder) == []
+
+
+def test_a_version_never_changes(repository: Repository, make_bundle: Callable[..., Path]) -> None:
+    repository.add(make_bundle(name="mine"), read_bundle)
+    with pytest.raises(BundleError, match="another bundle mine:1 is in"):
+        repository.add(make_bundle(name="mine", trained_on="other data"), read_bundle)
+
+
+def test_a_packaged_version_is_not_hidden_by_an_imported_one(
+    tmp_path: Path, make_bundle: Callable[..., Path]
+) -> None:
+    shutil.copytree(make_bundle(name="p"), tmp_path / "packaged" / "p" / "1")
+    repository = Repository(tmp_path / "mine", packaged=tmp_path / "packaged")
+    with pytest.raises(BundleError, match="another bundle p:1"):
+        repository.add(make_bundle(name="p", trained_on="other data"), read_bundle)
+    repository.add(make_bundle(name="p", version=2), read_bundle)
+    assert repository.available() == ["p:1", "p:2"]
+
+
+def test_links_and_devices_are_not_imported(
+    repository: Repository, make_bundle: Callable[..., Path]
+) -> None:
+    made = make_bundle()
+    (made / "golden.npz").unlink()
+    (made / "golden.npz").symlink_to("/dev/zero")
+    with pytest.raises(BundleError, match="symbolic link"):
+        repository.add(made, read_bundle)
+
+
+def test_a_folder_that_cannot_be_written(make_bundle: Callable[..., Path], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be copied"):
+        Repository(tmp_path / "file").add(make_bundle(), read_bundle)
+    with pytest.raises(ConfigError, match="no folder for imported bundles"):
+        Repository(None).add(make_bundle(), read_bundle)
+
+
+@pytest.mark.parametrize("name", ["x/0", "x/01", "x/1a", "X/1", ".x/1", "x/9999999999", "x/٣"])
+def test_folders_that_are_no_bundles(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir(parents=True)
+    (tmp_path / name / "manifest.json").touch()
+    assert available(tmp_path) == []

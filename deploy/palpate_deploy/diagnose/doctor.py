@@ -19,7 +19,8 @@ from rich.console import Console
 
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import LinkError, PalpateError
-from palpate_deploy.station.host import check_free, join, state_folder
+from palpate.folders import state_folder
+from palpate_deploy.station.host import check_free, join
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile, load_profile
 
@@ -162,17 +163,23 @@ def _bundle(profile: Profile) -> Found:
         "field": profile.field,
         "synthesis": profile.synthesis,
     }
-    served = {task: table.bundle for task, table in tables.items() if task in profile.processes}
+    served = [
+        (task, name)
+        for task, table in tables.items()
+        if task in profile.processes
+        for name in dict.fromkeys([table.bundle, *table.bundles.values()])
+    ]
     if not served:
         return "ok", "no service of this profile needs one", ""
     from palpate.files.bundle import read_bundle
     from palpate_services.inference.model import load
-    from palpate_services.inference.repository import resolve
+    from palpate_services.inference.repository import Repository
     from palpate_services.inference.trial import proven
 
+    repository = Repository(profile.models.folder)
     names = []
-    for task, name in served.items():
-        manifest = load(proven(read_bundle(resolve(name)), task), task).manifest
+    for task, name in served:
+        manifest = load(proven(read_bundle(repository.resolve(name)), task), task).manifest
         names.append(f"{manifest.name}:{manifest.version}")
     what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
     return "ok", f"{', '.join(names)} {what}", ""

@@ -16,6 +16,7 @@ import tomli_w
 from palpate.bus import Session
 from palpate.config import endpoint_host_port
 from palpate.errors import ConfigError, LinkError
+from palpate.folders import state_folder
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
 
 
@@ -86,12 +87,6 @@ def _bind(host: str, port: int) -> None:
 
 KEPT_RUNS = 20
 """Older folders are removed; records are never stored there."""
-
-
-def state_folder() -> Path:
-    """Folder of the runs' profiles and logs (XDG base directories)."""
-    base = os.environ.get("XDG_STATE_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "palpate"
 
 
 def new_run_folder(name: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import functools
 import logging
 import signal
 import subprocess
@@ -70,10 +71,11 @@ def _run(service: Service, profile: Profile, stop: threading.Event) -> None:
         from palpate_gateway.one_core import stay_on_one_core
 
         stay_on_one_core(profile.gateway.core)
-    _entry_point(service)(getattr(profile, service), profile.link, profile.station, stop)
+    run = _entry_point(service, profile)
+    run(getattr(profile, service), profile.link, profile.station, stop)
 
 
-def _entry_point(service: Service) -> Callable[..., None]:
+def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
     """The function that runs a service, of which only its own room is imported."""
     if service == "gateway":
         from palpate_gateway.service import node as gateway
@@ -89,7 +91,7 @@ def _entry_point(service: Service) -> Callable[..., None]:
         return run_recorder
     from palpate_services.inference.services import run_estimating
 
-    return run_estimating
+    return functools.partial(run_estimating, models=profile.models)
 
 
 _NEEDED: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -176,7 +178,9 @@ class FiniteRun:
 
     def start_profile(self, profile: Profile) -> None:
         """Start every process of a profile in ``START_ORDER``."""
-        path = write_profile(profile, self.folder)
+        # What a bench or a replay serves is nothing that a station should remember.
+        models = profile.models.model_copy(update={"state": self.folder})
+        path = write_profile(profile.model_copy(update={"models": models}), self.folder)
         for service in START_ORDER:
             if service in profile.processes:
                 self.start(service, command_line(service, path))

@@ -37,6 +37,7 @@ from palpate_gateway.config import GatewayConfig
 from palpate_services.config import (
     FeaturesServiceConfig,
     FieldServiceConfig,
+    ModelsConfig,
     RecorderConfig,
     SynthesisServiceConfig,
 )
@@ -94,6 +95,7 @@ class Profile(StrictConfig):
         field: Electrodes to displacement fields, if ``processes`` names ``field``.
         synthesis: Displacement fields to electrodes, if ``processes`` names ``synthesis``.
         recorder: What is recorded, and where.
+        models: The user's bundles, and what is remembered of those that serve.
         fem: How simulations are served, if ``processes`` names ``fem``.
         log: What the processes write into their logs.
     """
@@ -107,6 +109,7 @@ class Profile(StrictConfig):
     field: FieldServiceConfig = FieldServiceConfig()
     synthesis: SynthesisServiceConfig = SynthesisServiceConfig()
     recorder: RecorderConfig = RecorderConfig()
+    models: ModelsConfig = Field(default_factory=ModelsConfig)
     fem: FemConfig = FemConfig()
     log: LogConfig = LogConfig()
 

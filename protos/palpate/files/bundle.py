@@ -497,7 +497,7 @@ def read_bundle(folder: Path) -> Bundle:
     Raises:
         BundleError: Names the folder and what is wrong.
     """
-    text = _read(folder, MANIFEST)
+    text = read_file(folder, MANIFEST)
     manifest = parse_manifest(text, folder / MANIFEST)
     check_task(manifest, str(folder))
     model = _read_checked(folder, MODEL, manifest.model_sha256)
@@ -507,13 +507,22 @@ def read_bundle(folder: Path) -> Bundle:
     return Bundle(manifest, model, golden, hashlib.sha256(text).digest(), folder, mesh, known)
 
 
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of a bundle and nothing else.
+
+    Raises:
+        BundleError: Names the file and what is wrong.
+    """
+    return parse_manifest(read_file(folder, MANIFEST), folder / MANIFEST)
+
+
 def read_mesh(folder: Path) -> FieldMesh | None:
     """Read the mesh of a bundle and nothing else; None for a bundle without.
 
     Raises:
         BundleError: Names the folder and what is wrong.
     """
-    return _read_mesh(folder, parse_manifest(_read(folder, MANIFEST), folder / MANIFEST))
+    return _read_mesh(folder, read_manifest(folder))
 
 
 def _read_mesh(folder: Path, manifest: Manifest) -> FieldMesh | None:
@@ -533,7 +542,7 @@ def _read_known_inputs(folder: Path, manifest: Manifest) -> KnownInputs | None:
 
 
 def _read_checked(folder: Path, name: str, sha256: str) -> bytes:
-    data = _read(folder, name)
+    data = read_file(folder, name)
     if sha256_hex(data) != sha256:
         raise BundleError(
             f"{folder / name} is not the file its manifest was written for (digest differs)",
@@ -542,7 +551,12 @@ def _read_checked(folder: Path, name: str, sha256: str) -> bytes:
     return data
 
 
-def _read(folder: Path, name: str) -> bytes:
+def read_file(folder: Path, name: str) -> bytes:
+    """Read one file of a bundle, by its name.
+
+    Raises:
+        BundleError: It is no regular file, is larger than it may be, or cannot be read.
+    """
     path = folder / name
     try:
         return read_regular(path, _BYTES_MAX[name])

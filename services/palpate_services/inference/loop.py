@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import Counter
@@ -19,23 +20,26 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from palpate import clock
+from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Publisher, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.topics import Topic
 from palpate.codec import STAGE_TIMINGS
 from palpate.config import LinkConfig
-from palpate.errors import ErrorCode, RemoteError, StreamTimeout, WireError
-from palpate.files.bundle import read_bundle
+from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import Origin, ServiceState, StageTimings, Stamp
 from palpate.process import avoid_pauses
-from palpate_services.config import EstimatingConfig
+from palpate_services.config import EstimatingConfig, ModelsConfig
+from palpate_services.inference.commands import show, take_commands
 from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation, Sample
 from palpate_services.inference.input_report import InputReport
-from palpate_services.inference.model import BATCH_MOST, Runtime, load
-from palpate_services.inference.repository import resolve
-from palpate_services.inference.served import ServedModels, Serving
-from palpate_services.inference.trial import proven
+from palpate_services.inference.model import BATCH_MOST, Runtime
+from palpate_services.inference.remembered import RememberedFile
+from palpate_services.inference.repository import Repository
+from palpate_services.inference.served import ServedModels
+
+_log = logging.getLogger(__name__)
 
 M = TypeVar("M")
 E = TypeVar("E")
@@ -360,6 +364,7 @@ def serve(
     *,
     instance: str | None,
     prepare: Prepare[M, E],
+    kept: ModelsConfig | None = None,
     rate_hz: float | None = None,
 ) -> None:
     """Serve until ``stop`` is set; then withdraw, answer what has already come, and leave.
@@ -370,14 +375,14 @@ def serve(
     """
     instance = instance or route.service
     # Before the bus is joined: no message may wait while the model loads and warms up.
-    bundle = proven(read_bundle(resolve(config.bundle)), route.service)
-    models = ServedModels(Serving(load(bundle, route.service)))
+    models, token = _models(route.service, config, kept, station, instance)
     health = Health(route.service, instance)
     with Session.open(link, station=station) as session:
         presence = session.presence(route.service, instance=instance)
         session.queryable(
             endpoints.MODEL, lambda _: models.metadata(), service=route.service, instance=instance
         )
+        take_commands(session, models, health, token)
         estimation = prepare(session, models, health)
         publisher = EstimatePublisher(
             route, session, config, health, models, estimation, rate_hz=rate_hz
@@ -390,7 +395,7 @@ def serve(
         )
         refresh = partial(_refresh, messages, models, health)
         with HealthReporter(session, health, refresh=refresh):
-            health.set_state(ServiceState.READY, models.describe())
+            show(models, health)
             avoid_pauses()
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
@@ -406,6 +411,21 @@ def serve(
                 publisher.take(left)
             messages.close()
             publisher.report(last=True)
+
+
+def _models(
+    task: str, config: EstimatingConfig, kept: ModelsConfig | None, station: str, instance: str
+) -> tuple[ServedModels, bytes | None]:
+    """The bundles of a service, and the token of those who may change them."""
+    if kept is None:
+        return ServedModels(task, config, Repository(None)), None
+    file = RememberedFile(kept.state / "stations" / station / f"{task}.{instance}.json")
+    models = ServedModels(task, config, Repository(kept.folder), file)
+    try:
+        return models, make_token(token_file(kept.state, station))
+    except ConfigError as error:
+        _log.warning("no commands are taken: %s", error)
+        return models, None
 
 
 def _waiting(
@@ -426,6 +446,8 @@ def _waiting(
 def _refresh(messages: Subscriber[M], models: ServedModels, health: Health) -> None:
     """Copy what the subscriber counted (drops, losses on the bus), and what is served."""
     health.set_models(models.labels())
+    if models.problem is not None:
+        health.fail(models.problem)
     health.set_counts(
         {
             _RENAMED.get(name, name): count

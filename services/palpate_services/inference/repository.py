@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from palpate.config import check_name
 from palpate.errors import BundleError, ConfigError
-from palpate.files.bundle import FieldMesh, read_mesh
+from palpate.files.bundle import (
+    GOLDEN,
+    MANIFEST,
+    MESH,
+    MODEL,
+    Bundle,
+    FieldMesh,
+    read_bundle,
+    read_file,
+    read_manifest,
+    read_mesh,
+)
 
 _log = logging.getLogger(__name__)
 
-MANIFEST = "manifest.json"
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+_VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 PACKAGED = Path(__file__).parent.parent / "models"
 """Bundles that ship with palpate: ``<name>/<version>/{model.onnx,manifest.json,golden.npz}``."""
@@ -19,41 +35,138 @@ PACKAGED = Path(__file__).parent.parent / "models"
 
 def available(models: Path = PACKAGED) -> list[str]:
     """Bundles of a repository's folder as ``name:version``, oldest version first."""
-    found = [
-        (folder.parent.name, int(folder.name))
-        for folder in models.glob("*/*")
-        if folder.name.isdigit() and (folder / MANIFEST).is_file()
-    ]
-    return [f"{name}:{version}" for name, version in sorted(found)]
+    return Repository(None, packaged=models).available()
 
 
 def resolve(bundle: str, models: Path = PACKAGED) -> Path:
-    """Find a bundle's folder by ``name`` (newest version), ``name:version``, or its own path.
+    """Find a packaged bundle, or one by its path, as ``Repository.resolve`` does.
 
     Raises:
         ConfigError: There is no such bundle; the error lists what exists.
     """
-    # Only a slash or a leading dot makes it a path: a folder in the working directory must not
-    # replace a packaged bundle of the same name without notice.
-    if "/" in bundle or bundle.startswith("."):
-        folder = Path(bundle).expanduser()
-        if (folder / MANIFEST).is_file():
-            return folder
+    return Repository(None, packaged=models).resolve(bundle)
+
+
+class Repository:
+    """Bundles by name and version: those that ship with palpate, and those in a user's folder.
+
+    Both have the layout ``<name>/<version>/``. A version never changes and is never in both.
+    """
+
+    def __init__(self, folder: Path | None, *, packaged: Path = PACKAGED) -> None:
+        self.folder = folder
+        self._folders = [packaged] if folder is None else [packaged, folder]
+
+    def available(self, task: str | None = None) -> list[str]:
+        """Bundles (of a task) as ``name:version``, oldest version first."""
+        return [
+            f"{name}:{version}"
+            for (name, version), folder in sorted(self._found().items())
+            if task is None or _task_of(folder) == task
+        ]
+
+    def resolve(self, bundle: str) -> Path:
+        """Find a bundle's folder by ``name`` (newest version), ``name:version``, or its own path.
+
+        Raises:
+            ConfigError: There is no such bundle; the error lists what exists.
+        """
+        # Only a slash or a leading dot makes it a path: a folder in the working directory must not
+        # replace a packaged bundle of the same name without notice.
+        if "/" in bundle or bundle.startswith("."):
+            folder = Path(bundle).expanduser()
+            if (folder / MANIFEST).is_file():
+                return folder
+            raise ConfigError(
+                f"bundle {bundle!r}: no {MANIFEST} in {folder.absolute()}",
+                remedy="give the folder that holds model.onnx, manifest.json and golden.npz",
+            )
+        found = self._found()
+        name, _, version = bundle.partition(":")
+        versions = [number for known, number in found if known == name]
+        if versions and not version:
+            return found[name, max(versions)]
+        if version.isascii() and version.isdigit() and int(version) in versions:
+            return found[name, int(version)]
         raise ConfigError(
-            f"bundle {bundle!r}: no {MANIFEST} in {folder.absolute()}",
-            remedy="give the folder that holds model.onnx, manifest.json and golden.npz",
+            f"bundle {bundle!r} is not in the repository {', '.join(map(str, self._folders))}",
+            remedy=f"available: {', '.join(self.available())}"
+            if found
+            else "make one with: make bundle",
         )
-    known = available(models)
-    name, _, version = bundle.partition(":")
-    versions = [int(entry.partition(":")[2]) for entry in known if entry.startswith(f"{name}:")]
-    if versions and not version:
-        return models / name / str(max(versions))
-    if version.isdigit() and int(version) in versions:
-        return models / name / str(int(version))
-    raise ConfigError(
-        f"bundle {bundle!r} is not in the repository {models}",
-        remedy=f"available: {', '.join(known)}" if known else "make one with: make bundle",
-    )
+
+    def add(self, source: Path, check: Callable[[Path], Bundle]) -> tuple[str, Path]:
+        """Copy a bundle into the user's folder; it appears there complete and checked, or not.
+
+        ``check`` reads the copy and raises what is wrong with it. Returns ``name:version`` and the
+        folder; a bundle that is there already, the same by its digest, stays.
+
+        Raises:
+            BundleError: ``check`` found something, or another bundle has its name and version.
+            ConfigError: There is no user's folder, or it cannot be written.
+        """
+        if self.folder is None:
+            raise ConfigError(
+                "there is no folder for imported bundles", remedy="set [models] folder"
+            )
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix=".import.", dir=self.folder) as temporary:
+                return self._move_in(_copied(source, Path(temporary) / "bundle"), check)
+        except OSError as error:
+            raise ConfigError(
+                f"{source} cannot be copied into {self.folder}: {error.strerror or error}",
+                remedy="check the rights and the free space of that folder: [models] folder",
+            ) from error
+
+    def _move_in(self, copy: Path, check: Callable[[Path], Bundle]) -> tuple[str, Path]:
+        bundle = check(copy)
+        manifest = bundle.manifest
+        label = f"{manifest.name}:{manifest.version}"
+        assert self.folder is not None
+        target = self.folder / check_name(manifest.name) / str(manifest.version)
+        there = self._found().get((manifest.name, manifest.version))
+        if there is not None:
+            if read_bundle(there).sha256 == bundle.sha256:
+                return label, there
+            raise BundleError(
+                f"another bundle {label} is in {there}, and bundles never change",
+                remedy="export it again as the next version",
+            )
+        target.parent.mkdir(exist_ok=True)
+        copy.chmod(0o755)
+        os.rename(copy, target)
+        return label, target
+
+    def _found(self) -> dict[tuple[str, int], Path]:
+        """Folders by name and version; what does not look like a bundle's folder is no bundle."""
+        found: dict[tuple[str, int], Path] = {}
+        for models in self._folders:
+            for folder in models.glob("*/*"):
+                name, version = folder.parent.name, folder.name
+                if not (_VERSION.fullmatch(version) and _NAME.fullmatch(name)):
+                    continue
+                if (folder / MANIFEST).is_file():
+                    found.setdefault((name, int(version)), folder)
+        return found
+
+
+def _task_of(folder: Path) -> str | None:
+    """Task that a bundle's manifest names; None for a broken one."""
+    try:
+        return read_manifest(folder).task
+    except BundleError:
+        return None
+
+
+def _copied(source: Path, target: Path) -> Path:
+    """Copy the files of a bundle, and nothing else that lies there."""
+    target.mkdir()
+    for name in (MODEL, MANIFEST, GOLDEN, MESH):
+        if name == MESH and not (source / name).exists():
+            continue
+        (target / name).write_bytes(read_file(source, name))
+    return target
 
 
 class MeshLibrary:

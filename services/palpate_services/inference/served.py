@@ -1,44 +1,212 @@
-"""Which bundle makes the estimates of which sensor, and changing that while frames come."""
+"""Which bundle makes the estimates of which sensor, and changing that while frames come.
+
+A service has one bundle for all sensors, and may have others for single ones. A change is prepared
+beside the serving bundles (read, digests, trial, golden vectors, warm-up) and takes effect by
+replacing one reference between two frames; the bundle from before stays loaded for a roll back
+(docs/adr/0020-models.md).
+"""
 
 from __future__ import annotations
 
+import logging
+import threading
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from typing import NoReturn
 
-from palpate.messages import ModelMetadata
-from palpate_services.inference.model import Runtime
+from palpate.errors import BundleError, ConfigError, ErrorCode, PalpateError, RemoteError
+from palpate.files.bundle import read_bundle
+from palpate.messages import (
+    ModelAction,
+    ModelCommand,
+    ModelInventory,
+    ModelMetadata,
+    ServedModel,
+)
+from palpate_services.config import EstimatingConfig
+from palpate_services.inference.model import Runtime, load
+from palpate_services.inference.remembered import Remembered, RememberedFile
+from palpate_services.inference.repository import Repository
+from palpate_services.inference.trial import proven
+
+_log = logging.getLogger(__name__)
+
+SENSORS_MOST = 256
+"""Sensors with a bundle of their own."""
+
+LOADED_MOST = 32
+"""Different bundles in memory, with those kept for a roll back."""
+
+DEFAULT = ""
+"""Stands for all sensors without a bundle of their own."""
 
 
 @dataclass(frozen=True, slots=True)
-class Serving:
-    """Bundles that serve at one moment; never changed, only replaced as a whole.
+class Choice:
+    """A bundle that was chosen.
 
     Attributes:
-        default: The bundle of sensors without one of their own; None = there is none.
-        own: Bundles of sensors that have their own, by sensor.
+        source: Finds it in the repository: ``name:version``, or a path.
+        sha256: Its digest, 32 bytes.
+        runtime: Itself; None = not loaded since this process began, or no longer to be had.
     """
 
-    default: Runtime | None
-    own: Mapping[str, Runtime] = field(default_factory=dict)
+    source: str
+    sha256: bytes
+    runtime: Runtime | None
 
 
-class ServedModels:
-    """The bundles of one service. Safe to use from several threads."""
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """What serves a sensor, and what served it before the last change; None = nothing.
 
-    def __init__(self, serving: Serving) -> None:
-        self._serving = serving
+    ``since_wall_ns`` is when it began to serve [ns since the Unix epoch]; ``changed`` whether there
+    was a change that can be rolled back.
+    """
+
+    current: Choice | None
+    since_wall_ns: int
+    previous: Choice | None = None
+    changed: bool = False
+
+
+class Serving:
+    """What serves at one moment; never changed, only replaced as a whole."""
+
+    __slots__ = ("_default", "_own", "assigned")
+
+    def __init__(self, assigned: Mapping[str, Assignment]) -> None:
+        self.assigned = assigned
+        own = {
+            sensor: one.current.runtime
+            for sensor, one in assigned.items()
+            if one.current is not None
+        }
+        self._default = own.pop(DEFAULT, None)
+        self._own = own
 
     def of(self, sensor: str) -> Runtime | None:
         """The bundle of a sensor; None = there is none."""
-        serving = self._serving
-        return serving.own.get(sensor, serving.default)
+        # A sensor whose own bundle is not to be had gets no other: nobody has chosen that one.
+        return self._own.get(sensor, self._default)
+
+
+class ServedModels:
+    """The bundles of one service. Safe to use from several threads.
+
+    Args:
+        task: Task of the service.
+        config: Names the bundles to begin with.
+        repository: Where bundles are.
+        file: Remembers what is served beyond the end of this process; None = nothing does.
+
+    Raises:
+        ConfigError: A bundle that the profile names does not exist.
+        BundleError: It breaks its contract.
+        MissingExtraError: ONNX Runtime is not installed.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        config: EstimatingConfig,
+        repository: Repository,
+        file: RememberedFile | None = None,
+    ) -> None:
+        self._task = task
+        self._repository = repository
+        self._file = file
+        self._changing = threading.Lock()
+        self._problems: dict[str, PalpateError] = {}
+        wanted = {DEFAULT: config.bundle, **config.bundles}
+        assigned: dict[str, Assignment] = {}
+        self._serving = Serving(assigned)
+        try:
+            remembered = None if file is None else file.recall(wanted)
+        except ConfigError as error:
+            self._problems[DEFAULT] = error
+            return
+        if remembered is None:
+            for sensor, bundle in wanted.items():
+                assigned[sensor] = Assignment(self._open(bundle), time.time_ns())
+        else:
+            for sensor, one in remembered.items():
+                assigned[sensor] = self._restored(sensor, one)
+        self._serving = Serving(assigned)
+        try:
+            self._remember()
+        except ConfigError as error:  # a full disk is no reason not to serve
+            _log.warning("%s", error)
+
+    @property
+    def problem(self) -> PalpateError | None:
+        """Why a bundle that was served before a restart does not serve; None = all do."""
+        return next(iter(self._problems.values()), None)
+
+    def of(self, sensor: str) -> Runtime | None:
+        """The bundle of a sensor; None = there is none."""
+        return self._serving.of(sensor)
+
+    def obey(self, command: ModelCommand, instance: str) -> ModelInventory:
+        """Carry out a command that is permitted; what serves, and what could.
+
+        ``instance`` is the name of this process.
+
+        Raises:
+            ConfigError: There is no such bundle, or the change cannot be remembered.
+            BundleError: It breaks its contract; what served still serves.
+            RemoteError: There is nothing to unload or to roll back, or too much is loaded.
+        """
+        began_s = time.monotonic()
+        changed_s = None
+        if command.action is not ModelAction.LIST:
+            with self._changing:
+                changed_s = self._change(command)
+        return ModelInventory(
+            instance,
+            _listed(self._serving),
+            tuple(self._repository.available(self._task)),
+            0.0 if changed_s is None else changed_s - began_s,
+        )
+
+    def _change(self, command: ModelCommand) -> float | None:
+        """Carry out a command; when it took effect [s, monotonic], None = it changed nothing."""
+        sensor, assigned = command.sensor, self._serving.assigned
+        one = assigned.get(sensor, Assignment(None, 0))
+        before = one.current
+        if command.action is ModelAction.LOAD:
+            if "/" in command.bundle or command.bundle.startswith("."):
+                _refuse("a bundle is loaded by name, not by path", "palpate model import FOLDER")
+            if sensor not in assigned and len(assigned) > SENSORS_MOST:
+                _refuse_more(f"{SENSORS_MOST} sensors have a bundle of their own")
+            choice: Choice | None = self._open(command.bundle)
+        elif command.action is ModelAction.UNLOAD:
+            if before is None:
+                _refuse(f"{_whose(sensor)} no bundle to unload", "palpate model served")
+            choice = None
+        else:
+            if not one.changed:
+                _refuse(f"{_whose(sensor)} no bundle from before", "palpate model load NAME")
+            choice = one.previous and self._again(one.previous)
+        if choice is not None and before is not None and before.runtime is choice.runtime:
+            return None
+        changed = Assignment(choice, time.time_ns(), before, changed=True)
+        self._serving = Serving({**assigned, sensor: changed})
+        swapped_s = time.monotonic()
+        _log.info("%s: %s -> %s", sensor or "all sensors", _name(before), _name(choice))
+        self._problems.pop(sensor, None)
+        self._remember()
+        return swapped_s
 
     def describe(self) -> str:
         """One line for people."""
-        serving = self._serving
-        default = "no bundle" if serving.default is None else serving.default.label
-        own = [f"{sensor} {runtime.label}" for sensor, runtime in sorted(serving.own.items())]
-        return "serving " + ", ".join([default, *own])
+        names = [
+            f"{sensor} {_name(one.current)}" if sensor else _name(one.current)
+            for sensor, one in sorted(self._serving.assigned.items())
+            if one.current is not None or sensor == DEFAULT
+        ]
+        return f"serving {', '.join(names) or 'no bundle'}"
 
     def labels(self) -> tuple[str, ...]:
         """What is served, each bundle once as ``name:version``."""
@@ -46,7 +214,129 @@ class ServedModels:
         return tuple(sorted({one.label for one in (serving.default, *serving.own.values()) if one}))
 
     def metadata(self) -> ModelMetadata:
-        """Description of the default bundle for clients."""
-        runtime = self._serving.default
-        assert runtime is not None
-        return runtime.metadata()
+        """Description of the first bundle for clients, and which bundle serves which sensor.
+
+        Raises:
+            RemoteError: No bundle serves.
+        """
+        serving = self._serving
+        for _, one in sorted(serving.assigned.items()):
+            if one.current is not None and one.current.runtime is not None:
+                return replace(one.current.runtime.metadata(), served=_listed(serving))
+        raise RemoteError(
+            "no bundle serves: it was unloaded, or is not to be had since a restart",
+            remedy="load one: palpate model load NAME",
+            code=ErrorCode.UNAVAILABLE,
+        )
+
+    def _open(self, source: str) -> Choice:
+        """Load a bundle until it could serve; one that is loaded is taken as it is."""
+        folder = self._repository.resolve(source)
+        bundle = read_bundle(folder)
+        label = f"{bundle.manifest.name}:{bundle.manifest.version}"
+        by_path = "/" in source or source.startswith(".")
+        if not by_path and label != f"{folder.parent.name}:{folder.name}":
+            raise BundleError(
+                f"{folder} holds the bundle {label}",
+                remedy="bundles stand in <name>/<version>: palpate model import FOLDER",
+            )
+        loaded = self._loaded()
+        runtime = loaded.get(bundle.sha256)
+        if runtime is None:
+            if len(loaded) >= LOADED_MOST:
+                _refuse_more(f"{LOADED_MOST} bundles are loaded")
+            runtime = load(proven(bundle, self._task), self._task)
+        return Choice(str(folder.absolute()) if by_path else label, bundle.sha256, runtime)
+
+    def _again(self, choice: Choice) -> Choice:
+        """A bundle that served before, loaded, and still the same."""
+        if choice.runtime is not None:
+            return choice
+        found = self._open(choice.source)
+        if found.sha256 != choice.sha256:
+            raise BundleError(
+                f"bundle {choice.source} has changed since it served: its digest was "
+                f"{choice.sha256.hex()[:12]} and is {found.sha256.hex()[:12]}",
+                remedy="bundles never change: restore it, or load another version",
+            )
+        return found
+
+    def _loaded(self) -> dict[bytes, Runtime]:
+        return {
+            choice.sha256: choice.runtime
+            for one in self._serving.assigned.values()
+            for choice in (one.current, one.previous)
+            if choice is not None and choice.runtime is not None
+        }
+
+    def _restored(self, sensor: str, remembered: Remembered) -> Assignment:
+        """What served a sensor before this process began, loaded again."""
+        current = None
+        if remembered.bundle:
+            current = Choice(remembered.bundle, remembered.sha256, None)
+            try:
+                current = self._again(current)
+            except PalpateError as error:
+                _log.error("%s: not served again: %s", sensor or "all sensors", error)
+                self._problems[sensor] = error
+        previous = (
+            Choice(remembered.previous, remembered.previous_sha256, None)
+            if remembered.previous
+            else None
+        )
+        return Assignment(current, time.time_ns(), previous, remembered.changed)
+
+    def _remember(self) -> None:
+        if self._file is None:
+            return
+        self._file.keep(
+            {
+                sensor: Remembered(*_found_by(one.current), *_found_by(one.previous), one.changed)
+                for sensor, one in self._serving.assigned.items()
+            }
+        )
+
+
+def _listed(serving: Serving) -> tuple[ServedModel, ...]:
+    return tuple(
+        ServedModel(
+            sensor,
+            *_identity(one.current),
+            one.since_wall_ns,
+            _name(one.previous) if one.previous else "",
+        )
+        for sensor, one in sorted(serving.assigned.items())
+    )
+
+
+def _name(choice: Choice | None) -> str:
+    if choice is None:
+        return "no bundle"
+    return choice.source if choice.runtime is None else choice.runtime.label
+
+
+def _identity(choice: Choice | None) -> tuple[str, int, bytes]:
+    if choice is None or choice.runtime is None:
+        return "", 0, b""
+    manifest = choice.runtime.manifest
+    return manifest.name, manifest.version, choice.sha256
+
+
+def _found_by(choice: Choice | None) -> tuple[str, bytes]:
+    return ("", b"") if choice is None else (choice.source, choice.sha256)
+
+
+def _whose(sensor: str) -> str:
+    return f"sensor {sensor!r} has" if sensor else "the service has"
+
+
+def _refuse(problem: str, remedy: str) -> NoReturn:
+    raise RemoteError(problem, remedy=f"see {remedy}", code=ErrorCode.INVALID_REQUEST)
+
+
+def _refuse_more(problem: str) -> NoReturn:
+    raise RemoteError(
+        problem,
+        remedy="unload some: palpate model unload --sensor NAME",
+        code=ErrorCode.RESOURCE_EXHAUSTED,
+    )

@@ -15,6 +15,7 @@ from palpate_services.config import (
     EstimatingConfig,
     FeaturesServiceConfig,
     FieldServiceConfig,
+    ModelsConfig,
     SynthesisServiceConfig,
 )
 from palpate_services.inference.estimates import (
@@ -43,13 +44,16 @@ def run_estimating(
     stop: threading.Event,
     *,
     instance: str | None = None,
+    models: ModelsConfig | None = None,
 ) -> None:
     """Serve the service whose table of the profile ``config`` is, until ``stop`` is set.
 
     Features are estimated from electrodes, as are fields, at a limited rate; synthesis goes from
     fields to tared counts. The endpoint ``estimate`` of the field service replies with the field of
     the frame in a request; ``synthesise`` with the tared counts of the field in a request.
-    ``instance`` names this process among several of its kind; None = like the service.
+    ``instance`` names this process among several of its kind; None = like the service. ``models``
+    says where the user's bundles are and what is remembered; None = packaged bundles only, which
+    nobody can change.
 
     Raises:
         ConfigError: There is no such bundle.
@@ -57,7 +61,15 @@ def run_estimating(
         MissingExtraError: ONNX Runtime is not installed.
         LinkError: The bus cannot be joined.
     """
-    run = partial(serve, config=config, link=link, station=station, stop=stop, instance=instance)
+    run = partial(
+        serve,
+        config=config,
+        link=link,
+        station=station,
+        stop=stop,
+        instance=instance,
+        kept=models,
+    )
     if isinstance(config, FeaturesServiceConfig):
         run(_FEATURES, prepare=partial(_features, config))
     elif isinstance(config, FieldServiceConfig):
