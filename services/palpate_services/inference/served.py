@@ -210,8 +210,8 @@ class ServedModels:
 
     def labels(self) -> tuple[str, ...]:
         """What is served, each bundle once as ``name:version``."""
-        serving = self._serving
-        return tuple(sorted({one.label for one in (serving.default, *serving.own.values()) if one}))
+        current = [one.current for one in self._serving.assigned.values()]
+        return tuple(sorted({one.runtime.label for one in current if one and one.runtime}))
 
     def metadata(self) -> ModelMetadata:
         """Description of the first bundle for clients, and which bundle serves which sensor.
