@@ -158,7 +158,7 @@ def test_questions_without_an_answer_say_why(
     for frame, code, word in (
         (make_frame(tare_id=0), ErrorCode.INVALID_REQUEST, "before any tare"),
         (make_frame(validity=good ^ 1), ErrorCode.INVALID_REQUEST, "marked bad"),
-        (make_frame(tare_id=6), ErrorCode.INVALID_REQUEST, "before any tare"),
+        (make_frame(tare_id=6), ErrorCode.NOT_FOUND, "no gateway knows the tare"),
     ):
         with pytest.raises(RemoteError, match=word) as caught:
             station.estimate_field("finger", frame)

@@ -7,7 +7,6 @@ be found) is in the classes below them.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import StrEnum
@@ -41,12 +40,6 @@ from palpate_services.inference.model import Outputs, Runtime
 
 M = TypeVar("M")
 E = TypeVar("E")
-
-FIRST_RETRY_S = 0.5
-"""After a first miss, the gateway is not asked for the same tare again for this long [s]."""
-
-LAST_RETRY_S = 5.0
-"""The pause doubles with every further miss, up to this [s]."""
 
 REPLAY_WAIT_S = 2.0
 """How long a lossless replay waits for a tare that arrives later than its first frame [s]."""
@@ -336,45 +329,37 @@ class AgeLimit:
 class TareLookup:
     """Finds the tares that frames name in the station's ``book``. Use from one thread.
 
-    A tare that is not found is not asked for again at once, because every question blocks the
-    thread that serves all sensors. With ``wait`` a tare that is not known yet is waited for up to
-    ``REPLAY_WAIT_S`` (lossless replay, in which frames can arrive before their tare).
+    A frame that names a tare for the first time waits for it for up to ``wait_s`` [s]. If that was
+    in vain, later frames do not wait, because that would block the thread that serves all sensors;
+    the book goes on asking for it. In a ``replay`` a frame may arrive before its tare. With
+    ``again`` each frame waits: right for a request.
     """
 
-    def __init__(self, book: TareBook, *, wait: bool) -> None:
+    def __init__(
+        self, book: TareBook, *, wait_s: float, replay: bool = False, again: bool = False
+    ) -> None:
         self._book = book
-        self._wait = wait
-        # By sensor and tare id: when to ask again [s, monotonic], and the pause before that [s].
-        self._misses: dict[tuple[str, int], tuple[float, float]] = {}
+        self._wait_s, self._replay, self._again = wait_s, replay, again
+        self._in_vain: dict[tuple[str, int], None] = {}
 
     def find(self, sensor: str, tare_id: int) -> tuple[Tare | None, bool]:
         """The tare that a frame names by ``tare_id``, which is not ``NO_TARE``; None if unknown.
 
         The second value says whether the search may have taken time.
         """
-        key = (sensor, tare_id)
-        miss = self._misses.get(key) if self._misses else None
-        if miss is not None and time.monotonic() < miss[0]:
-            return None, False
-        began_s = time.monotonic()
-        while True:
-            try:
-                tare = self._book.baseline(sensor, tare_id)
-            except PalpateError:
-                if self._wait and miss is None and time.monotonic() - began_s < REPLAY_WAIT_S:
-                    time.sleep(0.02)
-                    continue
-                self._remember_miss(key, FIRST_RETRY_S if miss is None else 2 * miss[1])
-                return None, True
-            if miss is not None:
-                del self._misses[key]
-            return tare, time.monotonic() - began_s > 1e-3
-
-    def _remember_miss(self, key: tuple[str, int], pause_s: float) -> None:
-        pause_s = min(pause_s, LAST_RETRY_S)
-        self._misses[key] = (time.monotonic() + pause_s, pause_s)
-        while len(self._misses) > _MISSES_KEPT:
-            self._misses.pop(next(iter(self._misses)))
+        tare = self._book.find(sensor, tare_id)
+        if tare is not None or (sensor, tare_id) in self._in_vain:
+            return tare, False
+        try:
+            tare = self._book.baseline(
+                sensor, tare_id, timeout_s=self._wait_s, patient=self._replay
+            )
+        except PalpateError:
+            if not self._again:
+                self._in_vain[sensor, tare_id] = None
+                while len(self._in_vain) > _MISSES_KEPT:
+                    self._in_vain.pop(next(iter(self._in_vain)))
+        return tare, True
 
 
 class TaredSamples:
@@ -394,8 +379,9 @@ class TaredSamples:
         *,
         any_age: bool = False,
     ) -> None:
-        book = TareBook(session, query_timeout_s=config.tare_timeout_s)
-        self._tares = TareLookup(book, wait=config.delivery == "every")
+        replay = config.delivery == "every"
+        wait_s = REPLAY_WAIT_S if replay else config.tare_timeout_s
+        self._tares = TareLookup(TareBook(session), wait_s=wait_s, replay=replay, again=any_age)
         self._age_limit = None if any_age else AgeLimit(config, session.wall_clock_error_s)
         self._health = health
         self._wrong_sensors: set[tuple[str, bytes]] = set()
