@@ -187,7 +187,8 @@ def joining_link(
             f"{endpoint} needs certificates",
             remedy=f"name their folder: --tls FOLDER, Client(tls=...) or ${TLS_VARIABLE}",
         )
-    if given and not endpoint.startswith("tls/"):
+    exposed = not is_loopback(endpoint_host_port(endpoint)[0])
+    if given and exposed and not endpoint.startswith("tls/"):
         raise ConfigError(
             f"{endpoint} is not encrypted, although certificates are given",
             remedy=f"connect to tls/{endpoint.partition('/')[2]}, or leave the certificates out",

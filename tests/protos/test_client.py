@@ -21,6 +21,7 @@ from palpate.bus.topics import FEATURES
 from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
 from palpate.errors import (
+    ClockSkewError,
     ConfigError,
     LinkError,
     PalpateError,
@@ -120,9 +121,15 @@ def test_a_stream_says_that_it_is_silent_and_goes_on(finger: Finger, robot: Clie
 def test_a_stream_never_delivers_an_old_reading(finger: Finger, robot: Client) -> None:
     finger.delay_ns = 60_000_000_000
     with robot.stream_features("finger", max_age_s=5.0, timeout_s=0.5) as stream:
-        with pytest.raises(StaleError, match=r"too old, by up to 6\d\.\d+ s where 5 s is allowed"):
+        with pytest.raises(StaleError, match=r"too old, the last one 6\d\.\d+ s where 5 s"):
             list(stream)
         assert stream.counters["stale"] > 0
+    finger.delay_ns = -60_000_000_000
+    with (
+        robot.stream_features("finger", max_age_s=5.0, timeout_s=0.5) as stream,
+        pytest.raises(ClockSkewError, match="in the future"),
+    ):
+        list(stream)
 
 
 def test_closing_the_client_ends_its_streams(link: LinkConfig, finger: Finger) -> None:

@@ -23,6 +23,7 @@ from palpate_deploy.cli.options import (
     ProfileOption,
     SensorOption,
     StationOption,
+    TlsOption,
     WantedOption,
     client_link,
     example,
@@ -106,13 +107,14 @@ def run(
 def status(
     profile: WantedOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
     """What should run at a station and what does; fails if anything is missing or not ready."""
     from palpate_deploy.station.status import show_status
 
-    link, station = station_link(profile, connect, station)
+    link, station = station_link(profile, connect, station, tls)
     raise typer.Exit(show_status(link, station, as_json=json_, profile=profile))
 
 
@@ -133,12 +135,13 @@ def tare(
     ] = 0,
     timeout_s: Annotated[float, typer.Option(help="Longest time to wait [s].")] = 5.0,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
 ) -> None:
     """Tare an untouched finger, or zero a force/torque sensor at its present load."""
     from palpate_deploy.station.tare import take_tare
 
-    take_tare(client_link(connect), station, sensor, frames=frames, timeout_s=timeout_s)
+    take_tare(client_link(connect, tls), station, sensor, frames=frames, timeout_s=timeout_s)
 
 
 @app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))
@@ -165,13 +168,14 @@ TopicArgument = Annotated[str, typer.Argument(metavar="TOPIC", help="E.g. electr
 def list_(
     seconds: Annotated[float, typer.Option(min=0.1, help="How long to listen [s].")] = 1.5,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
     """All streams, and which of them have messages now."""
     from palpate_deploy.diagnose.topics import list_topics
 
-    list_topics(client_link(connect), station, seconds, as_json=json_)
+    list_topics(client_link(connect, tls), station, seconds, as_json=json_)
 
 
 @topic_app.command(
@@ -182,13 +186,16 @@ def hz(
     sensor: SensorOption = "*",
     seconds: Annotated[float, typer.Option(min=0, help="Duration [s]; 0 = until Ctrl-C.")] = 0,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
     """Rate, jitter, bandwidth and losses of a stream, once a second."""
     from palpate_deploy.diagnose.topics import measure
 
-    raise typer.Exit(measure(client_link(connect), station, topic, sensor, seconds, as_json=json_))
+    raise typer.Exit(
+        measure(client_link(connect, tls), station, topic, sensor, seconds, as_json=json_)
+    )
 
 
 @topic_app.command(epilog=example("palpate topic echo features --count 3"))
@@ -200,6 +207,7 @@ def echo(
         float, typer.Option(help="Stop if no message comes for this long [s].")
     ] = 10.0,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
@@ -207,7 +215,7 @@ def echo(
     from palpate_deploy.diagnose.topics import echo_topic
 
     echo_topic(
-        client_link(connect),
+        client_link(connect, tls),
         station,
         topic,
         sensor,

@@ -15,6 +15,7 @@ from palpate_deploy.cli.options import (
     ReplayPace,
     SensorOption,
     StationOption,
+    TlsOption,
     client_link,
     example,
     existing_file,
@@ -33,13 +34,14 @@ def record(
     sensor: SensorOption = "*",
     rrd: Annotated[bool, typer.Option(help="Also write a Rerun view.")] = True,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
 ) -> None:
     """Record a running station, independently of its own recorder."""
     from palpate_deploy.diagnose.records import record_station
 
     record_station(
-        client_link(connect),
+        client_link(connect, tls),
         station,
         {"out": str(out), "topics": tuple(topic or ()), "sensor": sensor, "rrd": rrd},
         duration_s=duration_s,

@@ -13,7 +13,7 @@ from palpate.errors import PalpateError
 from palpate_deploy.station.logs import exit_code, print_error
 
 if TYPE_CHECKING:
-    from palpate.config import LinkConfig
+    from palpate.config import LinkConfig, TlsConfig
 
 ProfileOption = Annotated[
     str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="A profile by name or path.")
@@ -28,9 +28,23 @@ WantedOption = Annotated[
     ),
 ]
 ConnectOption = Annotated[
-    str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
+    str,
+    typer.Option(
+        "--connect", metavar="ENDPOINT", envvar="PALPATE_CONNECT", help="The station's router."
+    ),
 ]
-StationOption = Annotated[str, typer.Option("--station", help="Name of the station.")]
+StationOption = Annotated[
+    str, typer.Option("--station", envvar="PALPATE_STATION", help="Name of the station.")
+]
+TlsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--tls",
+        metavar="FOLDER",
+        envvar="PALPATE_TLS",
+        help="Certificates for a router tls/HOST:PORT: ca.pem, cert.pem, key.pem.",
+    ),
+]
 SensorOption = Annotated[str, typer.Option("--sensor", help="Name of a sensor; * = all.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
@@ -72,27 +86,25 @@ def example(*lines: str) -> str:
     return "Example: " + "  or  ".join(lines)
 
 
-def client_link(connect: str) -> LinkConfig:
+def client_link(connect: str, tls: TlsConfig | Path | None = None) -> LinkConfig:
     """Link of a command to a running station, with a short wait for its router."""
-    from palpate.config import LinkConfig, parse_config
+    from palpate.config import joining_link
 
-    return parse_config(
-        LinkConfig,
-        {"connect": (connect,), "wait_for_router_s": ROUTER_WAIT_S},
-        where="--connect",
-    )
+    return joining_link(connect, wait_s=ROUTER_WAIT_S, tls=tls)
 
 
-def station_link(profile: str | None, connect: str, station: str) -> tuple[LinkConfig, str]:
+def station_link(
+    profile: str | None, connect: str, station: str, tls: Path | None = None
+) -> tuple[LinkConfig, str]:
     """Link and name of a station: those of a profile where the options have their defaults."""
     if profile is None:
-        return client_link(connect), station
+        return client_link(connect, tls), station
     from palpate_deploy.station.profile import load_profile
 
     loaded = load_profile(profile)
     link = loaded.link.model_copy(update={"wait_for_router_s": ROUTER_WAIT_S})
     if connect != DEFAULT_CONNECT:
-        link = link.model_copy(update={"connect": (connect,)})
+        link = client_link(connect, tls or (link.tls if connect.startswith("tls/") else None))
     return link, loaded.station if station == DEFAULT_STATION else station
 
 

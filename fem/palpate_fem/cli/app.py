@@ -311,9 +311,23 @@ def validate(
 @fem_app.command(epilog=_example("palpate fem serve --workers 2"))
 def serve(
     connect: Annotated[
-        str, typer.Option("--connect", metavar="ENDPOINT", help="The station's router.")
+        str,
+        typer.Option(
+            "--connect", metavar="ENDPOINT", envvar="PALPATE_CONNECT", help="The station's router."
+        ),
     ] = "tcp/127.0.0.1:7447",
-    station: Annotated[str, typer.Option("--station", help="Name of the station.")] = "lab",
+    tls: Annotated[
+        Path | None,
+        typer.Option(
+            "--tls",
+            metavar="FOLDER",
+            envvar="PALPATE_TLS",
+            help="Certificates for a router tls/HOST:PORT: ca.pem, cert.pem, key.pem.",
+        ),
+    ] = None,
+    station: Annotated[
+        str, typer.Option("--station", envvar="PALPATE_STATION", help="Name of the station.")
+    ] = "lab",
     sensor: Annotated[str, typer.Option("--sensor", help="Sensor name of the service.")] = "twin",
     workers: WorkersOption = 0,
     waiting: Annotated[int, typer.Option(min=0, help="Most requests that wait.")] = 8,
@@ -344,6 +358,7 @@ def serve(
     serve_command(
         model,
         connect=connect,
+        tls=tls,
         station=station,
         sensor=sensor,
         workers=workers,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import typer
 
-from palpate.config import LinkConfig, parse_config
+from palpate.config import joining_link, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
 from palpate.process import typed_command
@@ -232,6 +232,7 @@ def serve_command(
     model: FingertipModel,
     *,
     connect: str,
+    tls: Path | None,
     station: str,
     sensor: str,
     workers: int,
@@ -258,11 +259,7 @@ def serve_command(
         },
         where="command line",
     )
-    link = parse_config(
-        LinkConfig,
-        {"connect": (connect,), "wait_for_router_s": _ROUTER_WAIT_S},
-        where="--connect",
-    )
+    link = joining_link(connect, wait_s=_ROUTER_WAIT_S, tls=tls)
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
-from palpate.config import check_name, endpoint_host_port
+from palpate.config import TlsConfig, check_name, endpoint_host_port
 from palpate.errors import ConfigError
 from palpate.process import require
 from palpate_gateway.cli.key_values import parse_key_values
@@ -275,6 +275,8 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
             raise ConfigError(
                 f"--connect: {error}", remedy="name the router as palpate status shows it"
             ) from error
+    tls = options["tls"]
+    certificates = None if tls is None else TlsConfig.of_folder(tls).model_dump(mode="json")
     tip, indenter = scene.tip()
     emulator = RobotEmulator(tip, robot=name, **options)
 
@@ -285,6 +287,7 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
             "station": emulator.station,
             "rate_hz": emulator.rate_hz,
             "indenter": indenter,
+            **({} if certificates is None else {"tls": certificates}),
         }
         for key, pose in (("base_sensor", BASE_SENSOR), ("flange_indenter", FLANGE_INDENTER)):
             sensor[key] = {"position_m": pose.position, "orientation_wxyz": pose.orientation}

@@ -12,11 +12,12 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import ClassVar
 
 from palpate.bus import Publisher, Session, run_router
 from palpate.bus.topics import ROBOT_POSE
-from palpate.config import LinkConfig
+from palpate.config import joining_link
 from palpate.errors import LinkError
 from palpate.messages import Pose, RobotPoseFrame
 from palpate.rigid import compose, inverse
@@ -72,6 +73,7 @@ class RobotEmulator(Emulator):
         robot: str = "arm",
         rate_hz: float = 250.0,
         connect: str = "",
+        tls: Path | None = None,
         port: int = 0,
         station: str = "lab",
         drift_ppm: float = 200.0,
@@ -79,7 +81,7 @@ class RobotEmulator(Emulator):
         super().__init__(rate_hz)
         self.robot, self.station = robot, station
         self._tip, self._drift = tip, drift_ppm * 1e-6
-        self._connect, self._port = connect, port
+        self._connect, self._tls, self._port = connect, tls, port
         self._router: threading.Thread | None = None
         self._session: Session | None = None
         self._publisher: Publisher[RobotPoseFrame] | None = None
@@ -113,7 +115,7 @@ class RobotEmulator(Emulator):
             raise
 
     def _join(self) -> None:
-        link = LinkConfig(connect=(self.address,), wait_for_router_s=_JOIN_S)
+        link = joining_link(self.address, wait_s=_JOIN_S, tls=self._tls)
         self._session = Session.open(link, station=self.station)
         self._publisher = self._session.publisher(ROBOT_POSE, sensor=self.robot)
 

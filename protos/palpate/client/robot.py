@@ -361,7 +361,12 @@ class Client(Closing):
         subscriber = self.session.subscriber(
             topic, sensor=check_name(sensor, "sensor"), delivery=Delivery.NEWEST, depth=depth
         )
-        stream = Stream(subscriber, max_age_s=max_age_s, timeout_s=timeout_s)
+        stream = Stream(
+            subscriber,
+            max_age_s=max_age_s,
+            timeout_s=timeout_s,
+            wall_clock_error_s=self.session.wall_clock_error_s,
+        )
         with self._lock:
             self._streams = [one for one in self._streams if not one.closed]
             self._streams.append(stream)

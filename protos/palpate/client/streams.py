@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Generic, Self, TypeVar
 
 from palpate import clock
-from palpate.bus import Subscriber
+from palpate.bus import ReceivedMessage, Subscriber
 from palpate.config import check_duration
 from palpate.errors import LinkError, PalpateError, StaleError, StreamTimeout
 from palpate.process import Closing
@@ -48,18 +48,25 @@ class Stream(Closing, Generic[M]):
         subscriber: Belongs to this stream from now on.
         max_age_s: Age of the oldest reading that is delivered [s]; inf = any.
         timeout_s: Longest silence [s]; None = it waits for ever.
+        wall_clock_error_s: How far another host's wall clock may be from this one's [s].
 
     Raises:
         ConfigError: A time is not positive.
     """
 
     def __init__(
-        self, subscriber: Subscriber[M], *, max_age_s: float, timeout_s: float | None
+        self,
+        subscriber: Subscriber[M],
+        *,
+        max_age_s: float,
+        timeout_s: float | None,
+        wall_clock_error_s: float = clock.WALL_CLOCK_ERROR_S,
     ) -> None:
         self._max_age_s = check_duration(max_age_s, "max_age_s", most=math.inf)
         self._timeout_s = (
             math.inf if timeout_s is None else check_duration(timeout_s, "timeout_s", most=math.inf)
         )
+        self._wall_clock_error_s = wall_clock_error_s
         self._subscriber = subscriber
         self._closed = threading.Event()
         self._stale = 0
@@ -77,41 +84,49 @@ class Stream(Closing, Generic[M]):
 
         Raises:
             StreamTimeout: None came within ``timeout_s``.
-            StaleError: Some came, all of them too old.
+            StaleError: Some came, all of them too old, or stamped in the future.
             LinkError: The client is closed.
         """
         end_s = time.monotonic() + self._timeout_s
-        oldest_s = 0.0
+        stale: StaleError | None = None
         while not self._closed.is_set():
             left_s = end_s - time.monotonic()
             if left_s <= 0.0:
-                raise self._silence(oldest_s)
+                raise stale or self._silence()
             try:
-                message = self._subscriber.next(min(left_s, _TURN_S)).message
+                received = self._subscriber.next(min(left_s, _TURN_S))
+                self._check_age(received)
             except StreamTimeout:
                 continue
+            except StaleError as error:
+                self._stale += 1
+                stale = error
             except LinkError:
                 if self._closed.is_set():
                     break
                 raise
-            stamp = self._subscriber.topic.stamp_of(message)
-            age_s = 0.0 if stamp is None else clock.age_s(stamp)
-            if age_s <= self._max_age_s:
-                return message
-            self._stale += 1
-            oldest_s = max(oldest_s, age_s)
+            else:
+                return received.message
         raise StopIteration
 
-    def _silence(self, oldest_s: float) -> PalpateError:
-        name, key = self._subscriber.topic.name, self._subscriber.key
-        if oldest_s:
-            return StaleError(
-                f"every {name} on {key} within {self._timeout_s:g} s was too old, by up to "
-                f"{oldest_s:.3f} s where {self._max_age_s:g} s is allowed",
+    def _check_age(self, received: ReceivedMessage[M]) -> None:
+        stamp = self._subscriber.topic.stamp_of(received.message)
+        age_s = (time.monotonic_ns() - received.received_monotonic_ns) * 1e-9
+        if stamp is not None:
+            stamped_s = clock.checked_age_s(stamp, wall_clock_error_s=self._wall_clock_error_s)
+            age_s = max(age_s, stamped_s)
+        if age_s > self._max_age_s:
+            name, key = self._subscriber.topic.name, self._subscriber.key
+            raise StaleError(
+                f"every {name} on {key} within {self._timeout_s:g} s was too old, the last one "
+                f"{age_s:.3f} s where {self._max_age_s:g} s is allowed",
                 remedy="do not act on them; check the sensor and its service: palpate status",
             )
+
+    def _silence(self) -> StreamTimeout:
         return StreamTimeout(
-            f"no {name} on {key} within {self._timeout_s:g} s",
+            f"no {self._subscriber.topic.name} on {self._subscriber.key} within "
+            f"{self._timeout_s:g} s",
             remedy="check that its publisher runs: palpate status; the stream goes on when it does",
         )
 
