@@ -38,7 +38,7 @@ def test_an_answer_is_complete_if_it_tells_every_state(
     processes += [{"service": name, "state": "ready"} for name in told or ()]
     text = json.dumps({"router": True, "troubles": [], "processes": processes})
     answer = SimpleNamespace(stdout="" if told is None else text, stderr="no", returncode=code)
-    monkeypatch.setattr(census.subprocess, "run", lambda *_, **__: answer)
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
     call = census._call((), WANTED)
     assert (call.complete, call.ready) == (complete, ready)
 
