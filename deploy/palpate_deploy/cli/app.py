@@ -118,6 +118,24 @@ def status(
     raise typer.Exit(show_status(link, station, as_json=json_, profile=profile))
 
 
+@app.command(epilog=example("palpate top", "palpate top --once", "palpate top --json"))
+def top(
+    period_s: Annotated[float, typer.Option(min=0.1, help="Time between two pictures [s].")] = 1.0,
+    once: Annotated[bool, typer.Option("--once", help="Print one picture and end.")] = False,
+    profile: WantedOption = None,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Rates, latencies, losses, memory of every process and sensor, live; q quits."""
+    from palpate_deploy.station.top import run_top
+
+    link, station = station_link(profile, connect, station)
+    raise typer.Exit(
+        run_top(link, station, profile=profile, period_s=period_s, once=once, as_json=json_)
+    )
+
+
 @app.command(epilog=example("palpate doctor --profile virtual"))
 def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -> None:
     """Check what a station needs on this host; each check is ok, warn or fail, with a fix."""

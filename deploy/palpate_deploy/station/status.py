@@ -114,10 +114,11 @@ _SHOWN_COUNTERS = (
     "recorded_field",
     "simulations_complete",
 )
-_TROUBLE = (
+TROUBLE = (
     "lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown", "failed",
-    "wrong", "silences", "stuck", "dead",
+    "wrong", "silences", "stuck", "dead", "untared",
 )  # fmt: skip
+"""Parts of the names of counters that count what went wrong."""
 
 
 def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status]:
@@ -194,7 +195,7 @@ def shown_counters(status: Status) -> str:
     return "  ".join(
         f"{name} {count:,}"
         for name, count in sorted(status.counters.items())
-        if name in _SHOWN_COUNTERS or (count and any(word in name for word in _TROUBLE))
+        if name in _SHOWN_COUNTERS or (count and any(word in name for word in TROUBLE))
     )
 
 

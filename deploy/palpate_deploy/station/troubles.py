@@ -49,6 +49,8 @@ def _wrong(report: ProcessReport, supervised: SupervisedProcess | None) -> tuple
     if status is None and not report.alive:
         if supervised is None:
             return "does not run", "start it with `palpate up`, or take it out of the profile"
+        if supervised.state == "exited":  # a finite source at its end: others are started again
+            return None
         times = f", started again {supervised.restarts} times" if supervised.restarts else ""
         return (
             f"does not serve: its supervisor says {supervised.state}{times}",
