@@ -118,3 +118,19 @@ def status(
     from palpate_deploy.bench.census import run_status_bench
 
     raise typer.Exit(run_status_bench(count=count, as_json=json_, save=save, out=out))
+
+
+@bench_app.command(epilog=example("palpate bench restart --times 3 --only features"))
+def restart(
+    times: Annotated[
+        int, typer.Option(min=1, help="How often each process, with each fault.")
+    ] = 20,
+    only: Annotated[str, typer.Option(help="Only this process, e.g. features or fem.")] = "",
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Kill each process of a station and let it hang; measure when it publishes again."""
+    from palpate_deploy.bench.restart import run_restart
+
+    raise typer.Exit(run_restart(times=times, only=only, as_json=json_, save=save, out=out))
