@@ -1,4 +1,4 @@
-"""A sensor's driver that does not return: the gateway stops beating, and says which sensor it is."""
+"""A driver that does not return: the gateway stops beating, and says which sensor it is."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from palpate.bus import Delivery
 from palpate.bus.topics import ELECTRODES
 from palpate.messages import ServiceState
+from palpate_gateway.clock.stamps import DueMessage
 from palpate_gateway.service import node, worker
 from palpate_gateway.virtual.finger import VirtualFinger
 
@@ -26,9 +27,7 @@ def _two_fingers() -> dict[str, Any]:
     }
 
 
-def test_a_driver_that_hangs_stops_the_heartbeat(
-    bus: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_driver_that_hangs_stops_the_heartbeat(bus: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     beats, returns = threading.Semaphore(0), threading.Event()
     returns.set()
     read = VirtualFinger._read
@@ -67,10 +66,14 @@ def test_a_recording_with_a_long_pause_does_not_hang() -> None:
     turns = worker.Turns()
     turns.next(-1.0)
     publisher = worker.MessagePublisher(
-        {}, None, stop=stop, claim=lambda stream: None, turns=turns  # type: ignore[arg-type]
+        {},
+        None,
+        stop=stop,
+        claim=lambda stream: None,
+        turns=turns,  # type: ignore[arg-type]
     )
     due_ns = time.monotonic_ns() + 600 * 1_000_000_000
-    item = node_item(due_ns)
+    item = DueMessage("electrodes", b"", due_ns)
     waits = threading.Thread(target=publisher.put, args=([item],))
     waits.start()
     deadline = time.monotonic() + PATIENCE_S
@@ -80,9 +83,3 @@ def test_a_recording_with_a_long_pause_does_not_hang() -> None:
     stop.set()
     waits.join(PATIENCE_S)
     assert not waits.is_alive()
-
-
-def node_item(due_ns: int) -> Any:
-    from palpate_gateway.clock.stamps import DueMessage
-
-    return DueMessage("electrodes", b"", due_ns)

@@ -299,3 +299,28 @@ def test_a_service_without_tares_is_degraded_until_it_gets_one(
         assert "tare" in error.remedy
         announce(session, "finger", make_tare())
         until(lambda: state_after_a_frame() is ServiceState.READY)
+
+
+def test_a_model_that_hangs_stops_the_heartbeat(
+    serve: Serve, make_frame: Frames, make_tare: Tares, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beats, returns = threading.Semaphore(0), threading.Event()
+    run = Runtime.run_all
+
+    def run_or_hang(runtime: Runtime, *values: Any) -> Any:
+        assert returns.wait(20)
+        return run(runtime, *values)
+
+    with serve(max_age_s=60.0) as session:
+        monkeypatch.setattr("palpate_services.inference.loop.beat", lambda *_: beats.release())
+        for _ in range(3):
+            assert beats.acquire(timeout=20), "it beats although nothing comes"
+        monkeypatch.setattr(Runtime, "run_all", run_or_hang)
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        announce(session, "finger", make_tare())
+        session.publisher(ELECTRODES, sensor="finger").put(make_frame(1))
+        while beats.acquire(timeout=0.5):
+            pass
+        returns.set()
+        estimates.next(20)
+        assert beats.acquire(timeout=20)

@@ -22,15 +22,16 @@ import numpy as np
 from palpate import clock
 from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Publisher, ReceivedMessage, Session, Subscriber, endpoints
+from palpate.bus.link import LOSSLESS_STALL_S
 from palpate.bus.topics import Topic
 from palpate.codec import STAGE_TIMINGS
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.health import Health, HealthReporter
-from palpate.heartbeat import beat
+from palpate.heartbeat import LIMIT_S, beat
 from palpate.messages import Origin, ServiceState, StageTimings, Stamp
 from palpate.process import avoid_pauses
-from palpate_services.config import EstimatingConfig, ModelsConfig
+from palpate_services.config import ElectrodesConfig, EstimatingConfig, ModelsConfig
 from palpate_services.inference.commands import show, take_commands
 from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation, Sample
 from palpate_services.inference.input_report import InputReport
@@ -186,6 +187,7 @@ class EstimatePublisher(Generic[M, E]):
         self._models = models
         self._estimation = estimation
         self._lossless = config.delivery == "every"
+        self._turn_s = LIMIT_S + _longest_wait_s(config)
         self._sensors = frozenset(config.sensors)
         self._age_limit = AgeLimit(config, session.wall_clock_error_s)
         self._rate_limit = RateLimit(rate_hz)
@@ -203,9 +205,11 @@ class EstimatePublisher(Generic[M, E]):
         The model runs once for messages of different sensors that have the same bundle.
         """
         began_ns = time.monotonic_ns()
+        beat(self._turn_s)
         for tick in _without_repetition(messages):
             samples: dict[Runtime, list[_Taken[M]]] = {}
             for received in tick:
+                beat(self._turn_s)
                 sensor = received.sensor
                 if self._sensors and sensor not in self._sensors:
                     continue
@@ -400,7 +404,6 @@ def serve(
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
             while not stop.is_set():
-                beat()
                 publisher.take(_waiting(messages, _WAIT_S, config.batch_wait_s))
                 publisher.report()
             # Withdrawn first, so that no client relies on this service while it drains.
@@ -426,6 +429,12 @@ def _models(
     except ConfigError as error:
         _log.warning("no commands are taken: %s", error)
         return models, None
+
+
+def _longest_wait_s(config: EstimatingConfig) -> float:
+    """How long the loop may wait for others before it has answered one message [s]."""
+    tare_s = config.tare_timeout_s if isinstance(config, ElectrodesConfig) else 0.0
+    return tare_s + (LOSSLESS_STALL_S if config.delivery == "every" else 0.0)
 
 
 def _waiting(
