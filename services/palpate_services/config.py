@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from palpate.config import Name, StrictConfig
 from palpate.folders import data_folder, state_folder
@@ -102,6 +102,9 @@ class SynthesisServiceConfig(EstimatingConfig):
     source: Literal["truth", "estimate"] = "truth"
 
 
+_LEAST_ROTATION = {"rotate_bytes": 64 * 1024, "rotate_s": 1}
+
+
 class RecorderConfig(StrictConfig):
     """What is recorded, and where.
 
@@ -117,8 +120,14 @@ class RecorderConfig(StrictConfig):
         bundles: Bundles, by name or folder, that hold the meshes of the fields to draw, beside the
             packaged ones.
         min_free_bytes: Recording pauses while the disk has less free than this [bytes].
-        rotate_bytes: Start a new record at this size [bytes]; None = never.
-        rotate_s: Start a new record after this time [s]; None = never.
+        field_rate_hz: Fields (topics ``field`` and ``field_truth``) recorded a second, topic and
+            sensor [Hz], by the clock of the frames; 0 = all. One takes 82 kB that do not compress;
+            those of the field service can be computed again from the recorded electrodes.
+        rotate_bytes: Start a new record at this size [bytes]; 0 = never.
+        rotate_s: Start a new record after this time [s]; 0 = never.
+        keep_bytes: The oldest records are removed while all that this recorder wrote, with their
+            views, are larger than this [bytes]; 0 = never. See ``recorder.retention``.
+        keep_s: Records are removed when they are older than this [s]; 0 = never.
         drain_s: How long a stopping recorder still writes messages that have arrived [s]; a
             lossless replay needs longer than a live station.
     """
@@ -132,6 +141,36 @@ class RecorderConfig(StrictConfig):
     rrd_max_bytes: int = Field(default=2 * 1024**3, ge=1024**2)
     bundles: tuple[str, ...] = ()
     min_free_bytes: int = Field(default=256 * 1024**2, ge=0)
-    rotate_bytes: int | None = Field(default=None, ge=64 * 1024)
-    rotate_s: float | None = Field(default=None, ge=1)
+    field_rate_hz: float = Field(default=1.0, ge=0, le=1000)
+    rotate_bytes: int = Field(default=512 * 1024**2, ge=0)
+    rotate_s: float = Field(default=3600.0, ge=0)
+    keep_bytes: int = Field(default=20 * 1024**3, ge=0)
+    keep_s: float = Field(default=14 * 86400.0, ge=0)
     drain_s: float = Field(default=2.0, ge=0, le=60)
+
+    @field_validator("rotate_bytes", "rotate_s")
+    @classmethod
+    def _not_tiny(cls, value: float, info: ValidationInfo) -> float:
+        least = _LEAST_ROTATION[str(info.field_name)]
+        if 0 < value < least:
+            raise ValueError(f"a record has at least {least}; 0 = never")
+        return value
+
+    @model_validator(mode="after")
+    def _rotates_to_be_kept(self) -> Self:
+        if self.keep_bytes and not 0 < self.rotate_bytes <= self.keep_bytes // 2:
+            raise ValueError(
+                "keep_bytes removes whole records: rotate_bytes must be at most half of it, "
+                "or keep_bytes = 0"
+            )
+        return self
+
+
+EVERYTHING: dict[str, float] = {
+    "field_rate_hz": 0,
+    "rotate_bytes": 0,
+    "rotate_s": 0,
+    "keep_bytes": 0,
+    "keep_s": 0,
+}
+"""Keys of a recorder that keeps every message, in one record, and removes nothing."""

@@ -8,10 +8,12 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 from palpate.bus.topics import sensor_key
 from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
@@ -227,3 +229,30 @@ def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, A
     kept = [item.sequence for item in read_record(target)]
     assert kept == list(range(1, len(kept) + 1))
     assert written - len(kept) <= 30
+
+
+def test_a_long_record_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None:
+    """MCAP's writer keeps an object for each chunk until the end: 50 MB an hour."""
+    with RecordWriter(tmp_path / "long.mcap") as writer:
+
+        def flushed(count: int) -> int:
+            for number in range(count):
+                for key in (KEY, f"{KEY}2", f"{KEY}3"):
+                    writer.write(key, ELECTRODE_FRAME.schema, b"x", log_time_ns=number)
+                writer.flush()
+            return tracemalloc.get_traced_memory()[0]
+
+        tracemalloc.start()
+        try:
+            grown = -flushed(200) + flushed(2000)
+        finally:
+            tracemalloc.stop()
+    assert grown < 100_000  # 2000 objects of 1 kB would be 2 MB
+    check_readable(tmp_path / "long.mcap")
+    with open(tmp_path / "long.mcap", "rb") as file:
+        reader = make_reader(file)  # MCAP's own, which seeks by the index
+        summary = reader.get_summary()
+        assert summary is not None
+        assert len(summary.chunk_indexes) == 2200
+        late = list(reader.iter_messages(starting_at=1990, ending_before=2000, topics=[KEY]))
+    assert [message.log_time for _, _, message in late] == list(range(1990, 2000))

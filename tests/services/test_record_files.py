@@ -126,6 +126,7 @@ def test_too_little_space_is_reported_and_recording_resumes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     free = [10**9]
+    monkeypatch.setattr("palpate.health.RECOVERY_S", 0.0)
     monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
     monkeypatch.setattr(writer_module, "RETRY_S", 0.0)
     monkeypatch.setattr(writer_module, "free_bytes", lambda _: free[0])

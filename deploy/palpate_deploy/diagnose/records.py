@@ -44,10 +44,10 @@ def record_station(
         ConfigError: An unknown topic.
         RecordingError: The folder cannot be made.
     """
-    from palpate_services.config import RecorderConfig
+    from palpate_services.config import EVERYTHING, RecorderConfig
     from palpate_services.recorder.service import run_recorder
 
-    config = parse_config(RecorderConfig, settings, where="command line")
+    config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
     Session.open(link, station=station).close()  # raises at once if there is no router
     before = set(config.out.glob("*.mcap"))
     stop = stop_on_signals()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
@@ -14,13 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from palpate.bus import TapSample
-from palpate.bus.topics import TOPICS, Topic
+from palpate.bus.topics import FIELD, FIELD_TRUTH, TOPICS, Topic
 from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import RecordWriter, is_being_written, recover
 from palpate.health import Health
 from palpate.messages import ServiceState
 from palpate_services.config import RecorderConfig
+from palpate_services.inference.loop import RateLimit
 from palpate_services.inference.repository import MeshLibrary
+from palpate_services.recorder import retention
 from palpate_services.viewer.record_view import LiveView, RerunView
 from palpate_services.viewer.timeline import SensorTimeline
 
@@ -158,6 +161,9 @@ RETRY_S = 1.0
 """Time between two attempts to open a record on a disk that refused one [s]."""
 
 
+_FIELDS = (FIELD, FIELD_TRUTH)
+
+
 class RecordFiles:
     """Writes samples to the present record, and draws them into its view. Use from one thread.
 
@@ -180,6 +186,9 @@ class RecordFiles:
         self._tried_s = float("-inf")
         self._recovery = RecordRecovery(config.out, health)
         self._meshes = MeshLibrary(config.bundles)
+        self._retention = retention.Retention(config, station, health)
+        self._kept_s = float("-inf")
+        self._field_rate = RateLimit(config.field_rate_hz or None)
 
     def start(self) -> None:
         """Make the folder, recover what a killed run left behind, open the first record.
@@ -206,15 +215,21 @@ class RecordFiles:
         if topic is None or topic.codec.schema != sample.schema:
             self._counts["rejected_schema"] += 1
             return
-        message, wall_ns, sequence = self._decode(topic, sample)
+        message = self._decode(topic, sample)
+        stamp = None if message is None else topic.stamp_of(message)
+        stream = f"{sample.sensor}/{sample.topic}"
+        field_stamp = stamp if topic in _FIELDS else None
+        if field_stamp is not None and self._field_rate.reached(stream, field_stamp):
+            self._counts["skipped_field_rate"] += 1
+            return
         try:
             self._writer.write(
                 sample.key,
                 sample.schema,
                 sample.payload,
                 log_time_ns=sample.received_wall_ns,
-                publish_time_ns=wall_ns,
-                sequence=sequence,
+                publish_time_ns=sample.received_wall_ns if stamp is None else stamp.wall_ns,
+                sequence=0 if stamp is None else stamp.sequence,
             )
         except WireError as error:
             self._counts[f"rejected_{error.reason}"] += 1
@@ -229,25 +244,23 @@ class RecordFiles:
         size = self._writer.bytes_written
         self._unflushed = self._unflushed + 1 if size == self._size else 0
         self._size = size
+        if field_stamp is not None:
+            self._field_rate.note(stream, field_stamp)
         self._counts[f"recorded_{sample.topic}"] += 1
         self._counts["recorded_bytes"] += len(sample.payload)
         if self._view is not None and message is not None and sample.topic in SensorTimeline.TOPICS:
             self._view.offer(sample.sensor, message)
 
-    def _decode(self, topic: Topic[Any], sample: TapSample) -> tuple[Any, int, int]:
-        """Message, wall clock [ns] and sequence of its stamp; no message if it cannot be decoded.
+    def _decode(self, topic: Topic[Any], sample: TapSample) -> Any:
+        """The message; None if it cannot be decoded.
 
         Such a payload is recorded all the same, so that its cause can be found.
         """
         try:
-            message = topic.codec.decode(sample.payload)
+            return topic.codec.decode(sample.payload)
         except WireError as error:
             self._counts[f"invalid_{error.reason}"] += 1
-            return None, sample.received_wall_ns, 0
-        stamp = topic.stamp_of(message)
-        if stamp is None:
-            return message, sample.received_wall_ns, 0
-        return message, stamp.wall_ns, stamp.sequence
+            return None
 
     def tick(self, *, idle: bool = False) -> None:
         """Check disk, size and age of the record every ``CHECK_S``; call it more often.
@@ -262,7 +275,19 @@ class RecordFiles:
             self._try_to_resume(now_s)
         else:
             self._check(self._writer, now_s, idle=idle)
+        if now_s - self._kept_s >= retention.CHECK_S:
+            self._keep(now_s)
         self.report()
+
+    def _keep(self, now_s: float) -> None:
+        """Remove old records, within what the present one has left of the room."""
+        self._kept_s = now_s
+        present = 0
+        if self._writer is not None:
+            present = self._writer.bytes_written
+            with contextlib.suppress(OSError):  # a view is there after its first update, if at all
+                present += self._writer.path.with_suffix(".rrd").stat().st_size
+        self._retention.apply(present)
 
     def report(self) -> None:
         """Hand the counters to health."""
@@ -291,7 +316,8 @@ class RecordFiles:
         try:
             self._check_room(self._config.min_free_bytes)
             path = self._new_path()
-            self._writer = RecordWriter(path, {"station": self._station})
+            facts = {"station": self._station, **self._retention.facts}
+            self._writer = RecordWriter(path, facts)
         except RecordingError as error:
             self._fail(error.problem)
             return
@@ -331,14 +357,15 @@ class RecordFiles:
         except RecordingError as error:
             self._pause(error.problem)
             return
-        full = config.rotate_bytes is not None and writer.bytes_written >= config.rotate_bytes
-        over = config.rotate_s is not None and now_s - self._opened_s >= config.rotate_s
+        full = 0 < config.rotate_bytes <= writer.bytes_written
+        over = 0 < config.rotate_s <= now_s - self._opened_s
         if full or over:
             problem = self._close_files()
             if problem is not None:
                 self._fail(problem)
             else:
                 self._open()
+            self._keep(now_s)  # the closed record is one of those that count
 
     def _flush(self, writer: RecordWriter) -> None:
         """Write the last messages before a silence of the streams."""

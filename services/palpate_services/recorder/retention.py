@@ -1,0 +1,141 @@
+"""Which old records a recorder removes, so that it never fills a disk by itself.
+
+Only whole files that a recorder with retention has written: named by it, in its folder, with the
+fact ``retention`` at their start. A record that is renamed or moved is kept, as is every other
+file. A record that is open somewhere stays readable there until it is closed, as files do on Linux.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from palpate.errors import RecordingError
+from palpate.files.record import is_being_written, metadata_of
+from palpate.health import Health
+from palpate_services.config import RecorderConfig
+
+_log = logging.getLogger(__name__)
+
+FACT = "retention"
+"""Key of the fact in a record that allows its removal."""
+
+OLDEST_FIRST = "oldest first"
+
+CHECK_S = 60.0
+"""Time between two looks at the folder [s]."""
+
+STEADY_S = 600.0
+"""How long the wall clock must have run without a jump before ages are believed [s]: that of a host
+that has just started may be years off."""
+
+_JUMP_S = 60.0
+_NAME = re.compile(r"(?P<stem>.+-\d{8}T\d{6}\.\d{3}Z)(?:\.recovered)?\.mcap(?:\.part)?")
+
+
+@dataclass(frozen=True, slots=True)
+class OldRecord:
+    """A closed record: its file, the view beside it, bytes of both, and when it ended (wall, s)."""
+
+    path: Path
+    view: Path
+    size: int
+    ended_s: float
+
+
+class Retention:
+    """Removes the oldest records of a folder. Use from one thread.
+
+    Counters: ``removed_records``, ``removed_bytes``, ``removal_failures``. Gauge:
+    ``kept_records_bytes``, the closed records that may be removed.
+    """
+
+    def __init__(self, config: RecorderConfig, station: str, health: Health) -> None:
+        self._config = config
+        self._station = station
+        self._health = health
+        self._mine: dict[tuple[str, int], bool] = {}  # by name and inode: files never change
+        self._clocks = self._read_clocks()
+        self._steady_since_s = self._clocks[0]
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Facts to write into a new record."""
+        on = self._config.keep_bytes or self._config.keep_s
+        return {FACT: OLDEST_FIRST} if on else {}
+
+    def apply(self, present_bytes: int = 0) -> None:
+        """Remove what is too old or too much; ``present_bytes`` is the size of the open record."""
+        if not self.facts:
+            return
+        records = self._records()
+        total = sum(record.size for record in records) + present_bytes
+        oldest_s = self._oldest_allowed_s()
+        for record in records:
+            if record.ended_s < oldest_s:
+                why = f"it is older than {self._config.keep_s / 86400:g} days"
+            elif self._config.keep_bytes and total > self._config.keep_bytes:
+                why = f"all records have more than {self._config.keep_bytes:,} bytes"
+            else:
+                continue
+            if self._remove(record, why):
+                total -= record.size
+        self._health.gauge("kept_records_bytes", float(total - present_bytes))
+
+    def _oldest_allowed_s(self) -> float:
+        """Wall time [s] before which a record must not have ended."""
+        now, before = self._read_clocks(), self._clocks
+        self._clocks = now
+        if abs((now[1] - before[1]) - (now[0] - before[0])) > _JUMP_S:
+            self._steady_since_s = now[0]
+        if not self._config.keep_s or now[0] - self._steady_since_s < STEADY_S:
+            return float("-inf")
+        return now[1] - self._config.keep_s
+
+    @staticmethod
+    def _read_clocks() -> tuple[float, float]:
+        return time.monotonic(), time.time()
+
+    def _records(self) -> list[OldRecord]:
+        """Closed records that this station's recorder may remove, oldest first."""
+        return sorted(self._found(), key=lambda record: (record.ended_s, record.path.name))
+
+    def _found(self) -> Iterator[OldRecord]:
+        seen: set[tuple[str, int]] = set()
+        for path in self._config.out.glob(f"{self._station}-*.mcap*"):
+            match = _NAME.fullmatch(path.name)
+            # A file can be renamed, recovered or removed by others at any time.
+            with contextlib.suppress(OSError, RecordingError):
+                if match is None or path.is_symlink() or not path.is_file():
+                    continue
+                status = path.stat()
+                key = path.name, status.st_ino
+                if path.suffix == ".part" and is_being_written(path):
+                    continue
+                if key not in self._mine:
+                    self._mine[key] = metadata_of(path).get(FACT) == OLDEST_FIRST
+                seen.add(key)
+                if not self._mine[key]:
+                    continue
+                view = path.with_name(f"{match['stem']}.rrd")
+                size = status.st_size + (view.stat().st_size if view.is_file() else 0)
+                yield OldRecord(path, view, size, status.st_mtime)
+        self._mine = {key: mine for key, mine in self._mine.items() if key in seen}
+
+    def _remove(self, record: OldRecord, why: str) -> bool:
+        try:
+            record.view.unlink(missing_ok=True)
+            record.path.unlink()
+        except OSError as error:
+            _log.warning("%s cannot be removed: %s", record.path, error.strerror or error)
+            self._health.count("removal_failures", 1)
+            return False
+        _log.info("removed %s (%d bytes): %s", record.path, record.size, why)
+        self._health.count("removed_records", 1)
+        self._health.count("removed_bytes", record.size)
+        return True
