@@ -132,7 +132,9 @@ def test_recorded_and_drawn(
 
     mine = str(bundles.write(tmp_path / "mine", "field"))
     stop = threading.Event()
-    config = RecorderConfig(out=tmp_path / "runs", bundles=(mine,), min_free_bytes=0)
+    config = RecorderConfig(
+        out=tmp_path / "runs", bundles=(mine,), min_free_bytes=0, field_rate_hz=0
+    )
     node = threading.Thread(target=run_recorder, args=(config, link, "lab", stop))
     node.start()
     stamp = make_frame().stamp

@@ -330,6 +330,7 @@ class RecordFiles:
                 title=path.stem,
                 max_bytes=self._config.rrd_max_bytes,
                 meshes=self._meshes,
+                live=True,
             )
             self._view = LiveView(make)
             self._views.append(self._view)

@@ -126,6 +126,9 @@ class RerunView:
     """Writes one ``.rrd``, which is closed at ``max_bytes``. Use from one thread.
 
     ``title`` is shown as the recording's name; ``meshes`` None = those of the packaged bundles.
+    A ``live`` view may go on for days and takes less. Of the PAC samples, 2,200 a second and
+    sensor, it draws the smallest and the largest of each frame. It has no footer, whose parts Rerun
+    would keep in memory until the end, 5 MB a minute; viewers read the whole file instead.
     """
 
     def __init__(
@@ -135,8 +138,10 @@ class RerunView:
         title: str,
         max_bytes: int | None = None,
         meshes: MeshLibrary | None = None,
+        live: bool = False,
     ) -> None:
         self._rr = require("rerun", extra="services")
+        self._live = live
         self.path = path
         self.full = False
         self._max_bytes = max_bytes
@@ -229,7 +234,7 @@ class RerunView:
         if self._open:
             self._stream.send_blueprint(layout)
         else:
-            self._stream.save(self.path, default_blueprint=layout)
+            self._stream.save(self.path, default_blueprint=layout, write_footer=not self._live)
             self._stream.send_recording_name(self._title)
             self._open = True
         for sensor in new:
@@ -281,12 +286,18 @@ class RerunView:
             self._send(entity, rows, columns.partition(np.array(there, int)))
 
     def _send_pac(self, entity: str, rows: list[TimelineRow]) -> None:
-        """All PAC samples at their own times: electrode, PAC, electrode, PAC, ..."""
-        slots = 2 * np.arange(len(rows[0].values) - 1, dtype=np.int64) + 1
-        times_ns = np.concatenate([row.time_ns + slots * row.slot_period_ns for row in rows])
-        sequence = np.repeat([row.sequence for row in rows], len(slots))
-        samples = np.concatenate([row.values[1:] for row in rows]).astype(np.float64)
-        self._send_at(entity, times_ns, sequence, self._rr.Scalars.columns(scalars=samples))
+        """PAC samples at their own times: electrode, PAC, electrode, PAC, ..."""
+        samples = np.stack([row.values[1:] for row in rows]).astype(np.float64)
+        shown = np.tile(np.arange(samples.shape[1]), (len(rows), 1))
+        if self._live:
+            shown = _extremes(samples)
+        begin_ns = np.array([[row.time_ns] for row in rows], np.int64)
+        period_ns = np.array([[row.slot_period_ns] for row in rows], np.int64)
+        times_ns = begin_ns + (2 * shown + 1) * period_ns
+        sequence = np.repeat([row.sequence for row in rows], shown.shape[1])
+        values = np.take_along_axis(samples, shown, axis=1)
+        columns = self._rr.Scalars.columns(scalars=values.reshape(-1))
+        self._send_at(entity, times_ns.reshape(-1), sequence, columns)
 
     def _send(self, entity: str, rows: list[Any], columns: Iterable[Any]) -> None:
         times_ns = np.array([row.time_ns for row in rows], np.int64)
@@ -299,6 +310,13 @@ class RerunView:
             rr.TimeColumn(SEQUENCE, sequence=sequence),
         ]
         self._stream.send_columns(entity, times, columns)
+
+
+def _extremes(samples: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Where the smallest and the largest of each row are, in order of time, shape ``(N, 2)``."""
+    least = np.where(np.isnan(samples), np.inf, samples).argmin(axis=1)
+    most = np.where(np.isnan(samples), -np.inf, samples).argmax(axis=1)
+    return np.sort(np.stack([least, most], axis=1), axis=1)
 
 
 def _points(values: list[Any]) -> FloatArray:
