@@ -30,6 +30,7 @@ _log = logging.getLogger(__name__)
 
 START_ORDER: tuple[Service, ...] = (
     "router",
+    "metrics",
     "recorder",
     "synthesis",
     "field",
@@ -89,12 +90,17 @@ def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
         from palpate_services.recorder.service import run_recorder
 
         return run_recorder
+    if service == "metrics":
+        from palpate_deploy.station.metrics import run_metrics
+
+        return run_metrics
     from palpate_services.inference.services import run_estimating
 
     return functools.partial(run_estimating, models=profile.models)
 
 
 _NEEDED: dict[str, tuple[str, tuple[str, ...]]] = {
+    "metrics": ("metrics", ("prometheus_client",)),
     "features": ("services", ("onnxruntime",)),
     "field": ("services", ("onnxruntime",)),
     "synthesis": ("services", ("onnxruntime",)),

@@ -48,7 +48,9 @@ PROFILES = Path(__file__).parent.parent / "profiles"
 ENV_PREFIX = "PALPATE_"
 ENV_NESTED = "__"
 
-Service = Literal["router", "gateway", "features", "field", "synthesis", "recorder", "fem"]
+Service = Literal[
+    "router", "gateway", "features", "field", "synthesis", "recorder", "fem", "metrics"
+]
 SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
 """What a station runs by default; a profile names the others if it needs them."""
 
@@ -67,6 +69,28 @@ class RouterConfig(StrictConfig):
     def _endpoints(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for endpoint in value:
             endpoint_host_port(endpoint)
+        return value
+
+
+class MetricsConfig(StrictConfig):
+    """Metrics for Prometheus.
+
+    Attributes:
+        listen: ``HOST:PORT`` of this host's loopback; a Prometheus on another host needs a proxy
+            with TLS in front.
+    """
+
+    listen: str = "127.0.0.1:9464"
+
+    @field_validator("listen")
+    @classmethod
+    def _loopback(cls, value: str) -> str:
+        try:
+            host, port = endpoint_host_port(f"tcp/{value}")
+        except ValueError:
+            raise ValueError(f"{value!r} is not HOST:PORT") from None
+        if not is_loopback(host) or port == 0:
+            raise ValueError(f"{value!r} is not a port of loopback, e.g. 127.0.0.1:9464")
         return value
 
 
@@ -97,6 +121,7 @@ class Profile(StrictConfig):
         recorder: What is recorded, and where.
         models: The user's bundles, and what is remembered of those that serve.
         fem: How simulations are served, if ``processes`` names ``fem``.
+        metrics: Where Prometheus finds metrics, if ``processes`` names ``metrics``.
         log: What the processes write into their logs.
     """
 
@@ -111,6 +136,7 @@ class Profile(StrictConfig):
     recorder: RecorderConfig = RecorderConfig()
     models: ModelsConfig = Field(default_factory=ModelsConfig)
     fem: FemConfig = FemConfig()
+    metrics: MetricsConfig = MetricsConfig()
     log: LogConfig = LogConfig()
 
     @field_validator("processes")
