@@ -36,7 +36,8 @@ class CanOptions(FingerOptions):
         interface: python-can's kind of bus.
         channel: Which bus.
         bitrate: [bit/s]; 0 = as the bus is set up.
-        bus_options: Further options of python-can.
+        bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
+            address of the network that is joined: without it only this host is heard.
         can_id: Identifier of the BioTacs' frames; None = any frame that holds a sampled channel.
         fingers: Words in each frame.
         slot_rate_hz: Slots each second.

@@ -68,11 +68,16 @@ def _fingers(most: int, help_: str) -> Parameter:
     return _option("fingers", 3, help_, min=1, max=most)
 
 
-_HOST = _option("host", "127.0.0.1", "Address to listen at.")
+_HOST = _option("host", "127.0.0.1", "Address to listen at.", "--listen", "--host")
 _PORT = _option("port", 0, "Port to listen at; 0 = any free one.", min=0, max=65535)
 _LINE = "Name of the serial line; else a new one."
 _LINK = _option("link", None, _LINE, type_=Path | None, metavar="PATH")
 _CHANNEL = _option("channel", MULTICAST, "Name of the bus.")
+_LISTEN = _option(
+    "listen",
+    "127.0.0.1",
+    "Of udp_multicast: this host's address in the network that hears it; else only this host does.",
+)
 _SLOT_RATE = _option(
     "slot_rate_hz", 4400, "Sampled channels each second.", type_=float, min=1, max=10_000
 )
@@ -149,6 +154,7 @@ COMMANDS = {
             _baud(115200, "Speed of the serial line [bit/s]."),
             _option("interface", "", "python-can's kind of bus; on a serial line without it."),
             _CHANNEL,
+            _LISTEN,
             _option("model", "RFT64-SB01", "The model that it reports."),
             _option("serial", "RFT-1", "Its serial number."),
             *_ON_WRENCH,
@@ -170,6 +176,7 @@ COMMANDS = {
                 "python-can's kind of bus; udp_multicast needs no hardware.",
             ),
             _CHANNEL,
+            _LISTEN,
             _many("bus", "KEY=VALUE", "More options of python-can; repeatable."),
             _fingers(3, "BioTacs on the bus."),
             _option("can_id", 1, "Identifier of frames.", min=0, max=0x7FF),
@@ -237,10 +244,13 @@ COMMANDS = {
 def _add(name: str, command: EmulateCommand) -> None:
     def run(**values: Any) -> None:
         from palpate_gateway.cli.emulate_devices import make_emulated
-        from palpate_gateway.cli.emulate_run import run_emulator
+        from palpate_gateway.cli.emulate_run import parse_faults, run_emulator
 
         faults, seconds = values.pop("fault") or [], values.pop("seconds")
-        run_emulator(name, make_emulated(name, values), faults, seconds)
+        # Before the twin is computed, which takes long.
+        on_can = name == "robotous" and values["interface"]
+        plan = parse_faults(faults, FAULTS["robotous on CAN" if on_can else name])
+        run_emulator(name, make_emulated(name, values), plan, seconds)
 
     # Typer reads a command's options from the signature of its function.
     vars(run).update(__signature__=Signature(command.options), __doc__=None)

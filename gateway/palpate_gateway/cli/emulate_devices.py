@@ -15,6 +15,7 @@ from palpate.errors import ConfigError
 from palpate.process import require
 from palpate_gateway.cli.key_values import parse_key_values
 from palpate_gateway.emulators.emulator import Emulator, WrenchSource, no_load, slow_press
+from palpate_gateway.ports.multicast import LOOPBACK, MULTICAST
 
 if TYPE_CHECKING:
     from palpate_gateway.emulators.biotac_slots import CountSource
@@ -155,6 +156,7 @@ def _robotous(
     baud: int,
     interface: str,
     channel: str,
+    listen: str,
     **options: Any,
 ) -> EmulatedDevice:
     from palpate_gateway.emulators import robotous
@@ -166,7 +168,9 @@ def _robotous(
         )
     if interface:
         where: Options = {"interface": interface, "channel": channel}
-        emulator = robotous.RobotousCanEmulator(scene.wrench(), **where, **options)
+        more = _bus_options({}, interface, listen)
+        emulator = robotous.RobotousCanEmulator(scene.wrench(), **where, options=more, **options)
+        where |= {"bus_options": more} if more else {}
         sensor = ("wrench", {**where, "rate_hz": 200})
         return EmulatedDevice(emulator, "wrench_robotous", lambda: [sensor], _can_failures())
     _check_baud(baud, sorted(robotous.MOST_HZ))
@@ -198,11 +202,12 @@ def _biotac_can(
     bus: Sequence[str] | None,
     fingers: int,
     electrodes: str,
+    listen: str,
     **options: Any,
 ) -> EmulatedDevice:
     from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
 
-    more = parse_key_values(bus or [])
+    more = _bus_options(parse_key_values(bus or []), options["interface"], listen)
     emulator = BiotacCanEmulator(
         **options,
         counts=scene.counts(fingers),
@@ -322,6 +327,12 @@ def _sequence(electrodes: str, *, pac_first: bool) -> Options:
 def _host_port(emulator: Emulator) -> Options:
     host, _, port = emulator.address.rpartition(":")
     return {"host": host, "port": int(port)}
+
+
+def _bus_options(more: Options, interface: str, listen: str) -> Options:
+    """python-can's options, and where its bus over UDP is heard, if not on this host alone."""
+    elsewhere = interface == MULTICAST and listen != LOOPBACK
+    return {**more, "listen": listen} if elsewhere else more
 
 
 def _can_failures() -> Failures:

@@ -59,15 +59,15 @@ def parse_faults(texts: Iterable[str], known: Collection[str]) -> list[Scheduled
     return sorted(faults)
 
 
-def run_emulator(name: str, device: EmulatedDevice, faults: Sequence[str], seconds: float) -> None:
-    """Serve until ``seconds`` have passed (0 = Ctrl-C).
+def run_emulator(
+    name: str, device: EmulatedDevice, plan: Sequence[ScheduledFault], seconds: float
+) -> None:
+    """Serve with the faults of a plan until ``seconds`` have passed (0 = Ctrl-C).
 
     Raises:
-        ConfigError: A fault is unknown.
         LinkError: The address is not available.
         DeviceError: The emulator failed, e.g. its bus is gone.
     """
-    plan = parse_faults(faults, device.emulator.faults)
     console = Console(stderr=True)
     with until_signal(), _crashes() as crashes:
         try:

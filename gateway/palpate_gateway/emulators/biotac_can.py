@@ -17,6 +17,7 @@ from palpate_gateway.emulators.biotac_slots import (
 )
 from palpate_gateway.emulators.emulator import Emulator, set_lead
 from palpate_gateway.emulators.lines import BUS_ERROR, BUS_OFF, RESTARTED, error_frame
+from palpate_gateway.ports.multicast import open_can
 
 _TICK_S = 1e-3
 _BLOCK_SLOTS = 440
@@ -81,7 +82,7 @@ class BiotacCanEmulator(Emulator):
 
     def _listen(self) -> None:
         self._can = require("can", extra="gateway")
-        self._bus = self._can.Bus(**self._arguments)
+        self._bus = open_can(self._arguments)
         # To make a message costs as much as to send it, so one message serves for all data frames.
         self._message = self._can.Message(arbitration_id=self._can_id, is_extended_id=False)
 

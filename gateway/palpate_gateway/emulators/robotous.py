@@ -29,6 +29,7 @@ from palpate_gateway.emulators.lines import (
     SerialLine,
     error_frame,
 )
+from palpate_gateway.ports.multicast import open_can
 
 FORCE_DIVISOR = 50.0
 """Counts per N, all models."""
@@ -265,21 +266,22 @@ class RobotousCanEmulator(RobotousEmulator):
         *,
         interface: str = "virtual",
         channel: str = "robotous",
+        options: dict[str, Any] | None = None,
         **more: Any,
     ) -> None:
         super().__init__(source, **more)
         self._off = False
-        self._where = {"interface": interface, "channel": channel}
+        self._where = {**(options or {}), "interface": interface, "channel": channel}
         self._can: Any = require("can", extra="gateway")
         self._bus: Any = None
 
     @property
     def address(self) -> str:
         """Kind of bus and its name."""
-        return ":".join(self._where.values())
+        return f"{self._where['interface']}:{self._where['channel']}"
 
     def _listen(self) -> None:
-        self._bus = self._can.Bus(**self._where)
+        self._bus = open_can(self._where)
 
     def _hang_up(self) -> None:
         self._bus.shutdown()

@@ -32,6 +32,7 @@ from palpate_gateway.ports.can_frames import (
     from_socketcan,
 )
 from palpate_gateway.ports.datagrams import BATCH, Datagrams, available
+from palpate_gateway.ports.multicast import open_can
 from palpate_gateway.ports.port import silent
 
 _BUFFER = 4 << 20
@@ -65,7 +66,7 @@ class CanBus:
         interface: Kind of bus as python-can names it, e.g. ``socketcan``.
         channel: E.g. ``can0``.
         bitrate: [bit/s]; 0 = as the bus is set up.
-        options: More of python-can's options.
+        options: More of python-can's options, and ``listen``; see ``open_can``.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class CanBus:
         self._can = can = require("can", extra="gateway")
         self.counters = dict.fromkeys(self.counters, 0)
         try:
-            self._bus = can.Bus(**self._arguments)
+            self._bus = open_can(self._arguments)
         except (can.CanInterfaceNotImplementedError, TypeError, ValueError) as error:
             raise ConfigError(
                 f"{self.name}: {error}",

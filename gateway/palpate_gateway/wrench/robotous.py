@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pydantic import Field, model_validator
 
@@ -137,6 +138,8 @@ class RobotousOptions(WrenchOptions):
         interface: python-can's name of the kind of bus, e.g. ``socketcan``.
         channel: Its name, e.g. ``can0``.
         bitrate: Bit rate of the bus [bit/s]; 0 = leave its setting.
+        bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
+            address of the network that is joined: without it only this host is heard.
         request_id: CAN identifier of requests.
         first_id: CAN identifier of the first half of an answer.
         second_id: CAN identifier of the second half.
@@ -152,6 +155,7 @@ class RobotousOptions(WrenchOptions):
     interface: str = ""
     channel: str = ""
     bitrate: int = Field(default=0, ge=0)
+    bus_options: dict[str, Any] = Field(default_factory=dict)
     request_id: int = Field(default=REQUEST_ID, ge=1, le=255)
     first_id: int = Field(default=FIRST_ID, ge=1, le=255)
     second_id: int = Field(default=SECOND_ID, ge=1, le=255)
@@ -183,7 +187,12 @@ def _line_of(options: RobotousOptions) -> RobotousSerialLine | RobotousCanLine:
     if options.port:
         return RobotousSerialLine(options.port, options.baud)
     return RobotousCanLine(
-        CanBus(options.interface, options.channel, bitrate=options.bitrate),
+        CanBus(
+            options.interface,
+            options.channel,
+            bitrate=options.bitrate,
+            options=options.bus_options,
+        ),
         request_id=options.request_id,
         first_id=options.first_id,
         second_id=options.second_id,

@@ -249,3 +249,23 @@ def test_an_emulator_that_dies_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     result = CliRunner().invoke(app, ["emulate", "kms40"])
     assert result.exit_code == 3
     assert "no more" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["kms40", "--fault", "fire@1"],
+        ["biotac-can", "--fault", "silence@-1"],
+        ["robotous", "--interface", "virtual", "--fault", "crc@1"],
+    ],
+)
+def test_a_fault_is_checked_before_the_twin_is_computed(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def computed(*_: Any, **__: Any) -> None:
+        raise AssertionError("the twin was computed first")
+
+    monkeypatch.setattr("palpate_gateway.emulators.twin.make_loop", computed)
+    result = CliRunner().invoke(app, ["emulate", *words])
+    assert result.exit_code == 2, result.output
+    assert "--fault" in str(result.output) + str(result.stderr)

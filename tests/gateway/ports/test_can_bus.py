@@ -168,6 +168,7 @@ def test_whatever_else_comes_over_the_network_is_counted(
         b"\xdf\xff\xff\xff\xff",
     ]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         for one in junk:
             link.sendto(one, (where["channel"], where["port"]))
     with can.Bus(**where) as sender:
