@@ -151,7 +151,9 @@ class LinkConfig(StrictConfig):
 CONNECT_VARIABLE = "PALPATE_CONNECT"
 STATION_VARIABLE = "PALPATE_STATION"
 TLS_VARIABLE = "PALPATE_TLS"
-"""Environment variables: router, station and folder of certificates where nothing else is given."""
+JOINING_VARIABLES = (CONNECT_VARIABLE, STATION_VARIABLE, TLS_VARIABLE)
+"""Environment variables of who joins a running station: its router, its name and the folder of
+certificates, where nothing else is given."""
 
 
 def joining_link(

@@ -138,3 +138,10 @@ def test_every_command_that_joins_a_bus_takes_certificates() -> None:
             assert "--tls" in options, f"{name} joins a bus and has no option --tls"
             assert options["--tls"].envvar == "PALPATE_TLS", name
     assert joining >= 8
+
+
+def test_variables_of_who_joins_do_not_disturb_a_profile() -> None:
+    variables = {"PALPATE_CONNECT": "tls/192.0.2.1:7447", "PALPATE_TLS": "/no/such/folder"}
+    result = CliRunner().invoke(app, ["up", "--print-config"], env=variables)
+    assert result.exit_code == 0, result.output
+    assert "tcp/127.0.0.1:7447" in result.stdout

@@ -23,6 +23,7 @@ from pydantic_settings import (
 
 from palpate.config import (
     DEFAULT_ROUTER,
+    JOINING_VARIABLES,
     LinkConfig,
     Name,
     StrictConfig,
@@ -279,7 +280,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 def _check_environment() -> None:
     """Raise an error for a misspelt variable, which would otherwise have no effect at all."""
     for variable in os.environ:
-        if not variable.upper().startswith(ENV_PREFIX):
+        if not variable.upper().startswith(ENV_PREFIX) or variable in JOINING_VARIABLES:
             continue
         field = variable[len(ENV_PREFIX) :].lower().split(ENV_NESTED)[0]
         if field not in Profile.model_fields:
