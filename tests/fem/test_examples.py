@@ -29,6 +29,18 @@ def test_a_press_is_shown_step_by_step(
     assert last.strip() == "complete"
 
 
+def test_a_simulation_is_watched_and_stopped(
+    root: Path, service: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PALPATE_CONNECT", service.link.connect[0])
+    runpy.run_path(str(root / "docs/examples/simulate_cancel.py"), run_name="__main__")
+    *progress, last = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("indenting") for line in progress)
+    outcome, steps = last.split(": ")
+    assert outcome in ("cancelled", "complete")
+    assert 0 < int(steps.split()[0]) <= 40
+
+
 def test_without_a_station_it_says_what_to_do(
     example: str, free_port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -480,7 +480,9 @@ def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
         asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 
-def test_joining_without_a_router_fails_and_may_be_cancelled(free_port: int) -> None:
+def test_joining_without_a_router_fails_and_may_be_cancelled(
+    free_port: int, wait_until: WaitUntil
+) -> None:
     async def scene() -> None:
         with pytest.raises(LinkError, match="no router"):
             async with AsyncClient(f"tcp/127.0.0.1:{free_port}", timeout_s=0.2):
@@ -494,3 +496,7 @@ def test_joining_without_a_router_fails_and_may_be_cancelled(free_port: int) -> 
             await joining
 
     asyncio.run(asyncio.wait_for(scene(), LIVE_S))
+    wait_until(
+        lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
+        timeout_s=LIVE_S,
+    )

@@ -280,6 +280,9 @@ class AsyncClient:
         except asyncio.CancelledError:
             opening.add_done_callback(_close_client)
             raise
+        finally:
+            if self._client is None:
+                self._threads.shutdown(wait=False)
         return self
 
     async def __aexit__(

@@ -74,7 +74,7 @@ class Stream(Closing, Generic[M]):
     @property
     def counters(self) -> dict[str, int]:
         """Those of the subscriber, and ``stale``."""
-        return {**self._subscriber.counters, "stale": self._stale}
+        return {"dropped": 0, **self._subscriber.counters, "stale": self._stale}
 
     def __iter__(self) -> Self:
         return self
