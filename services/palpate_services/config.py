@@ -94,12 +94,19 @@ class SynthesisServiceConfig(EstimatingConfig):
     Attributes:
         source: ``truth`` takes the known fields of a simulation (topic ``field_truth``),
             ``estimate`` those of the field service (topic ``field``).
+        simulations: Questions that may wait for the finite-element service at the same time.
+        simulation_s: Longest time for one of them [s].
+        fluid_volume_m3: Fill of the finger that described contacts are simulated on [m^3]; that of
+            the shipped bundle's training. None = the finite-element service's own.
     """
 
     bundle: str = "synthesis-twin"
     keep_newest: int = Field(default=1, ge=1, le=100)
     max_age_s: float | None = Field(default=0.2, gt=0)
     source: Literal["truth", "estimate"] = "truth"
+    simulations: int = Field(default=2, ge=1, le=16)
+    simulation_s: float = Field(default=120.0, gt=0, le=3600)
+    fluid_volume_m3: float | None = Field(default=0.6e-6, gt=0, le=5e-6)
 
 
 _LEAST_ROTATION = {"rotate_bytes": 64 * 1024, "rotate_s": 1}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,17 +45,43 @@ def weights(name: str, rows: int, columns: int, scale: float) -> FloatArray:
     return np.random.default_rng(seed).normal(0, scale, (rows, columns)).astype(np.float32)
 
 
-def matrices(task: str, *, deviation: bool = True) -> dict[str, FloatArray]:
+MODES = 7
+WHOLE = ("contact_force", "coefficients")
+"""Optional outputs of a field bundle that has all there is."""
+
+
+def matrices(
+    task: str, *, deviation: bool = True, more: Sequence[str] = ()
+) -> dict[str, FloatArray]:
     """Output name -> matrix that the input is multiplied with."""
     if task == "field":
         found = {"displacement": weights("displacement", 19, 3 * NODES, 1e-6)}
+        if "coefficients" in more:
+            found["displacement"] = weights("coefficients", 19, MODES, 1e-6) @ modes()
         if deviation:
             found["displacement_sd"] = weights("displacement_sd", 19, NODES, 1e-7)
+        if "contact_force" in more:
+            found["contact_force"] = weights("contact_force", 19, 3 * NODES, 1e-3)
+        if "coefficients" in more:
+            found["coefficients"] = weights("coefficients", 19, MODES, 1e-6)
         return found
     return {name: weights(name, 3 * NODES, 19, 1e4) for name in ("tared_counts", "tared_counts_sd")}
 
 
-def model(task: str, *, deviation: bool = True, signed: bool = False, extra: int = 0) -> bytes:
+def modes() -> FloatArray:
+    """Modes of the coefficients, shape ``(K, 3V)``."""
+    found = weights("modes", MODES, 3 * NODES, 0.3)
+    return found.astype(np.float16).astype(np.float32)
+
+
+def model(
+    task: str,
+    *,
+    deviation: bool = True,
+    signed: bool = False,
+    extra: int = 0,
+    more: Sequence[str] = (),
+) -> bytes:
     """The graph: each output is ``input @ W``; a deviation is its magnitude.
 
     Args:
@@ -62,10 +89,11 @@ def model(task: str, *, deviation: bool = True, signed: bool = False, extra: int
         deviation: Whether the optional deviation of a field is given.
         signed: Leave the sign of deviations as it comes.
         extra: Columns more than the mesh has.
+        more: Further optional outputs of a field.
     """
     source = "electrodes" if task == "field" else "displacement"
     nodes, constants, outputs = [], [], []
-    for name, matrix in matrices(task, deviation=deviation).items():
+    for name, matrix in matrices(task, deviation=deviation, more=more).items():
         wide = np.pad(matrix, ((0, 0), (0, extra)))
         constants.append(onnx.numpy_helper.from_array(wide, f"w_{name}"))
         raw = f"raw_{name}" if name.endswith("_sd") and not signed else name
@@ -74,6 +102,10 @@ def model(task: str, *, deviation: bool = True, signed: bool = False, extra: int
             nodes.append(helper.make_node("Abs", [raw], [name]))
         outputs.append(_value(name, wide.shape[1]))
     rows = matrix.shape[0]
+    if "coefficients" in more:  # as the exporter leaves them: in half precision, by any name
+        half = onnx.numpy_helper.from_array(modes().astype(np.float16), "some_modes")
+        mean = onnx.numpy_helper.from_array(np.zeros(3 * NODES, np.float32), "some_mean")
+        constants += [half, mean]
     graph = helper.make_graph(nodes, "test", [_value(source, rows)], outputs, constants)
     built = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
     built.ir_version = 10
@@ -85,10 +117,14 @@ def _value(name: str, width: int) -> Any:
     return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", width])
 
 
-def manifest_of(task: str, *, deviation: bool = True, **changes: Any) -> Manifest:
+def manifest_of(
+    task: str, *, deviation: bool = True, more: Sequence[str] = (), **changes: Any
+) -> Manifest:
     """A good manifest; its digests come with writing."""
-    optional = ("displacement_sd",) if deviation and task == "field" else ()
-    inputs, outputs = tensors_of(task, NODES, optional=optional)
+    optional = (*(("displacement_sd",) if deviation and task == "field" else ()), *more)
+    inputs, outputs = tensors_of(task, NODES, optional=optional, modes=MODES)
+    if "coefficients" in more:
+        changes = {"basis": {"mean": "some_mean", "modes": "some_modes"}, **changes}
     manifest = Manifest(
         name=f"{task}-test",
         version=1,
@@ -115,6 +151,7 @@ def write(
     *,
     mesh: FieldMesh | None = None,
     spoiled: bytes | None = None,
+    manifest: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Path:
     """Write a bundle of fields.
@@ -124,11 +161,12 @@ def write(
         task: ``field`` or ``synthesis``.
         mesh: Of its fields; None = ``skin()``.
         spoiled: Another model than the manifest claims.
+        manifest: Changes of the manifest.
         more: For ``model``.
     """
-    deviation = more.get("deviation", True)
+    deviation, outputs = more.get("deviation", True), more.get("more", ())
     source = "electrodes" if task == "field" else "displacement"
-    found = matrices(task, deviation=deviation)
+    found = matrices(task, deviation=deviation, more=outputs)
     rng = np.random.default_rng(7)
     scale = 100 if task == "field" else 1e-3
     rows = next(iter(found.values())).shape[0]
@@ -141,7 +179,7 @@ def write(
         folder,
         model=model(task, **more) if spoiled is None else spoiled,
         golden=golden,
-        manifest=manifest_of(task, deviation=deviation),
+        manifest=manifest_of(task, deviation=deviation, more=outputs, **(manifest or {})),
         mesh=skin() if mesh is None else mesh,
     )
     return folder

@@ -62,11 +62,33 @@ MODELS = Endpoint(
     "list, load, unload or roll back bundles; needs the station's admin token",
     True,
 )
+ESTIMATE_FEATURES = Endpoint(
+    "estimate",
+    codec.FEATURE_REQUEST,
+    codec.FEATURE_ESTIMATE,
+    "features of one electrode frame",
+    True,
+)
 ESTIMATE_FIELD = Endpoint(
     "estimate", codec.FIELD_REQUEST, codec.FIELD_ESTIMATE, "field of one electrode frame", True
 )
 SYNTHESISE = Endpoint(
     "synthesise", codec.FIELD_FRAME, codec.SYNTHESIS_ESTIMATE, "tared counts of one field", True
+)
+
+SYNTHESISE_FROM = Endpoint(
+    "synthesise_from",
+    codec.SYNTHESIS_REQUEST,
+    codec.SYNTHESIS_REPLY,
+    "tared counts of a field, a contact or a simulation; several replies",
+    True,
+)
+BASIS = Endpoint(
+    "basis",
+    codec.BASIS_REQUEST,
+    codec.FIELD_BASIS,
+    "basis of the coefficients of fields; several replies",
+    True,
 )
 
 ENDPOINTS: dict[str, Endpoint[Any, Any]] = {

@@ -18,6 +18,7 @@ from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presenc
 from palpate.bus.pubsub import Delivery, Publisher, Subscriber, Tap
 from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
 from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
+from palpate.bus.timings import OnTimings
 from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
 from palpate.config import LinkConfig, check_name
 from palpate.errors import LinkError, PalpateError
@@ -271,12 +272,17 @@ class Session(Closing):
         endpoint: Endpoint[Q, R],
         handler: Callable[[Q, QueryAnswer[R]], None],
         *,
-        sensor: str,
+        sensor: str | None = None,
+        service: str = "",
+        instance: str = "",
         capacity: int = 16,
+        workers: int = 1,
     ) -> Queryable:
-        """Answer each question about a sensor with several replies, from any thread."""
-        key = self._key(endpoint, sensor, "", "")
-        return self._keep(Queryable(self._raw, key, endpoint, handler, capacity=capacity))
+        """Answer each question with several replies, or with their timings; from any thread."""
+        key = self._key(endpoint, sensor, service, instance)
+        return self._keep(
+            Queryable(self._raw, key, endpoint, handler, capacity=capacity, workers=workers)
+        )
 
     def query(
         self,
@@ -287,10 +293,12 @@ class Session(Closing):
         service: str = "*",
         instance: str = "*",
         timeout_s: float = 1.0,
+        on_timings: OnTimings | None = None,
     ) -> R:
         """Ask an endpoint of one sensor, or of a service.
 
-        A refusal that says when to ask again is followed within ``timeout_s``.
+        A refusal that says when to ask again is followed within ``timeout_s``. ``on_timings`` is
+        called with the timings of an estimate, if the service says them.
 
         Raises:
             ConfigError: Not the name of one sensor, no time, or values that cannot be sent.
@@ -304,7 +312,15 @@ class Session(Closing):
         key = self._key(endpoint, sensor, service, instance)
 
         def once(left_s: float) -> R:
-            replies = ask(self._raw, key, endpoint, request, timeout_s=left_s, everyone=True)
+            replies = ask(
+                self._raw,
+                key,
+                endpoint,
+                request,
+                timeout_s=left_s,
+                everyone=True,
+                on_timings=on_timings,
+            )
             return first_reply(list(replies), lambda: no_reply(self._raw, key))
 
         return ask_again(once, timeout_s)
@@ -325,13 +341,22 @@ class Session(Closing):
         return list(replies)
 
     def query_stream(
-        self, endpoint: Endpoint[Q, R], request: Q, *, sensor: str, timeout_s: float
+        self,
+        endpoint: Endpoint[Q, R],
+        request: Q,
+        *,
+        sensor: str | None = None,
+        service: str = "*",
+        instance: str = "*",
+        timeout_s: float,
     ) -> Iterator[R]:
-        """The replies of a sensor's endpoint as they come; raises the errors of ``query``.
+        """The replies of an endpoint as they come; raises the errors of ``query``.
 
         A refusal is raised at once, however soon one may ask again.
         """
-        key = self._key(endpoint, check_name(sensor, "sensor"), "", "")
+        if sensor is not None:
+            check_name(sensor, "sensor")
+        key = self._key(endpoint, sensor, service, instance)
         replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=False)
         return raise_errors(replies, lambda: no_reply(self._raw, key))
 

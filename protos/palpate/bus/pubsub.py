@@ -18,8 +18,8 @@ from typing import Any, Generic, TypeVar
 import zenoh
 
 from palpate import clock
+from palpate.bus.timings import timings_of
 from palpate.bus.topics import StreamAddress, Topic, check_schema, check_size, parse_key
-from palpate.codec import STAGE_TIMINGS
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import Origin, StageTimings
 from palpate.process import Closing
@@ -206,19 +206,6 @@ class Publisher(Generic[M], Closing):
     def close(self) -> None:
         """Undeclare."""
         self._publisher.undeclare()
-
-
-def timings_of(attachment: bytes) -> StageTimings | None:
-    """The timings in the attachment of an estimate; None if there are none, or of another kind.
-
-    They are read only when asked for, and what cannot be read costs no message.
-    """
-    if not attachment:
-        return None
-    try:
-        return STAGE_TIMINGS.decode(attachment)
-    except WireError:
-        return None
 
 
 @dataclass(frozen=True, slots=True)

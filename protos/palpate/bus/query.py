@@ -18,6 +18,7 @@ import zenoh
 
 from palpate.bus.deadline import attachment_of
 from palpate.bus.endpoints import Endpoint
+from palpate.bus.timings import OnTimings, timings_of
 from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
 from palpate.codec import ERROR
 from palpate.config import check_duration
@@ -98,6 +99,7 @@ def ask(
     *,
     timeout_s: float,
     everyone: bool,
+    on_timings: OnTimings | None = None,
 ) -> Iterator[R | PalpateError]:
     """Replies to a query as they come; typed errors are yielded as exceptions, not raised.
 
@@ -143,6 +145,11 @@ def ask(
                 except WireError as error:
                     yield error
                 else:
+                    attachment = item.ok.attachment
+                    if on_timings is not None and attachment is not None:
+                        timings = timings_of(attachment.to_bytes())
+                        if timings is not None:
+                            on_timings(timings)
                     yield reply
     finally:
         stopped.cancel()

@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import zenoh
@@ -20,9 +21,9 @@ import zenoh
 from palpate.bus.deadline import deadline_of
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.topics import ENCODING_PREFIX, check_schema, check_size
-from palpate.codec import ERROR, Codec
+from palpate.codec import ERROR, STAGE_TIMINGS, Codec
 from palpate.errors import ErrorCode, PalpateError, RemoteError, WireError
-from palpate.messages import ErrorReply
+from palpate.messages import ErrorReply, StageTimings
 from palpate.process import Closing
 
 Q = TypeVar("Q")
@@ -69,6 +70,8 @@ class QueryAnswer(Generic[R]):
 
     Attributes:
         deadline_s: When the caller stops waiting [s, monotonic]; inf = it did not say.
+        arrived_ns: When the question arrived, host monotonic clock [ns].
+        decode_s: How long its decoding took [s].
     """
 
     def __init__(
@@ -80,22 +83,31 @@ class QueryAnswer(Generic[R]):
         self._codec = codec
         self._lock = threading.Lock()
         self.deadline_s = deadline_s
+        self.arrived_ns = time.monotonic_ns()
+        self.decode_s = 0.0
 
-    def send(self, reply: R) -> None:
+    def send(self, reply: R, *, timings: StageTimings | None = None) -> None:
         """Send a reply; does nothing if the caller is gone or the answer has ended.
+
+        ``timings`` of an estimate travel beside it; how long it takes to encode is added here.
 
         Raises:
             WireError: The reply breaks the contract, or is larger than a message may be (reason
                 ``"size"``).
         """
+        began_ns = time.monotonic_ns()
         payload = self._codec.encode(reply)
+        attachment = None
+        if timings is not None:
+            encode_s = (time.monotonic_ns() - began_ns) * 1e-9
+            attachment = STAGE_TIMINGS.encode(replace(timings, encode_s=encode_s))
         check_size(payload, self._codec.schema, remedy="ask for less in one answer")
         encoding = zenoh.Encoding(ENCODING_PREFIX + self._codec.schema)
         with self._lock:
             if self._query is None:
                 return
             try:
-                self._query.reply(self._key, payload, encoding=encoding)
+                self._query.reply(self._key, payload, encoding=encoding, attachment=attachment)
             except zenoh.ZError:
                 _log.warning("the caller of %s is gone", self._key)
 
@@ -242,6 +254,7 @@ class Queryable(Closing):
                 continue
             try:
                 request = self._decode(query)
+                answer.decode_s = time.monotonic() - began_s
             except PalpateError as error:
                 self._reject(answer, error)
                 continue

@@ -24,8 +24,10 @@ from typing import Any, TypeVar
 
 from palpate.bus import AliveService, Delivery, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.query import LONGEST_S
+from palpate.bus.timings import OnTimings
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, WRENCH, Topic
 from palpate.census import ProcessReport, take_census
+from palpate.client.estimates import OnSynthesis, ask_basis, ask_synthesis
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import GRACE_S, OnProgress, OnStep, ask_simulation
 from palpate.client.streams import Stream
@@ -39,8 +41,11 @@ from palpate.config import (
 )
 from palpate.errors import ConfigError, StaleError, StreamTimeout
 from palpate.messages import (
+    ContactDescription,
     ElectrodeFrame,
     FeatureEstimate,
+    FeatureRequest,
+    FieldBasis,
     FieldEstimate,
     FieldFrame,
     FieldRequest,
@@ -51,6 +56,8 @@ from palpate.messages import (
     SimulationRequest,
     Status,
     SynthesisEstimate,
+    SynthesisReply,
+    SynthesisRequest,
     Tare,
     WrenchFrame,
     WrenchZero,
@@ -189,24 +196,73 @@ class Client(Closing):
         """Measured forces and torques as they come; see ``stream_features``."""
         return self._stream(WRENCH, sensor, max_age_s, timeout_s, depth)
 
-    def estimate_field(
-        self, sensor: str, frame: ElectrodeFrame | None = None, *, timeout_s: float | None = None
-    ) -> FieldEstimate:
-        """Ask for the displacement of each skin node of one frame, however old it is.
+    def estimate_features(
+        self,
+        sensor: str,
+        frame: ElectrodeFrame | None = None,
+        *,
+        timeout_s: float | None = None,
+        on_timings: OnTimings | None = None,
+    ) -> FeatureEstimate:
+        """Ask for the features of one frame, however old it is; old ones are flagged ``STALE``.
 
-        Without a frame it is the sensor's newest, see ``electrodes``.
+        Without a frame it is the sensor's newest, see ``electrodes``. ``on_timings`` is told where
+        the time went.
+
+        Raises:
+            LinkError: No features service runs.
+            RemoteError: It has no estimate for this frame, e.g. because the frame is not tared.
+            StaleError: No frame is given and none is young enough.
+        """
+        return self.session.query(
+            endpoints.ESTIMATE_FEATURES,
+            FeatureRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
+            service="features",
+            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+            on_timings=on_timings,
+        )
+
+    def estimate_field(
+        self,
+        sensor: str,
+        frame: ElectrodeFrame | None = None,
+        *,
+        reduced: bool = False,
+        timeout_s: float | None = None,
+        on_timings: OnTimings | None = None,
+    ) -> FieldEstimate:
+        """Ask for the displacement of each skin node of one frame; see ``estimate_features``.
+
+        With ``reduced`` the answer has the coefficients of the field and not the field, which is a
+        few hundred times smaller; ``field_basis`` decodes them.
 
         Raises:
             LinkError: No field service runs.
-            RemoteError: It has no field for this frame, e.g. because the frame is not tared.
+            RemoteError: It has no field for this frame, e.g. because the frame is not tared, or its
+                bundle has no reduced form.
             StaleError: No frame is given and none is young enough.
         """
         return self.session.query(
             endpoints.ESTIMATE_FIELD,
-            FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
+            FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor), reduced),
             service="field",
             timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+            on_timings=on_timings,
         )
+
+    def field_basis(
+        self, basis_sha256: bytes = b"", *, timeout_s: float | None = None
+    ) -> FieldBasis:
+        """The basis of the coefficients of fields, some megabytes: ask once and keep it.
+
+        ``basis_sha256`` is that of an estimate; empty = that of the served bundle.
+
+        Raises:
+            LinkError: No field service runs.
+            RemoteError: It has no such basis.
+        """
+        wait_s = self._timeout_s if timeout_s is None else timeout_s
+        return ask_basis(self.session, basis_sha256, timeout_s=wait_s)
 
     def synthesise(
         self, field: FieldFrame | FieldEstimate, *, timeout_s: float | None = None
@@ -223,6 +279,36 @@ class Client(Closing):
             service="synthesis",
             timeout_s=self._timeout_s if timeout_s is None else timeout_s,
         )
+
+    def synthesise_from(
+        self,
+        source: ContactDescription | SimulationRequest | FieldFrame,
+        *,
+        simulator: str = "twin",
+        timeout_s: float = 60.0,
+        on_step: OnSynthesis | None = None,
+    ) -> SynthesisReply:
+        """Ask for the tared counts that a contact would give, without any finger.
+
+        The synthesis service has the contact simulated by the finite-element service and
+        synthesises its steps.
+
+        Args:
+            source: A contact, a simulation, or a field (see ``synthesise``).
+            simulator: Name under which the finite-element service answers.
+            timeout_s: How long it may take, time in the queue included [s].
+            on_step: Called, in this thread, with the electrodes of each step before the last.
+
+        Returns:
+            The electrodes of the last step, how the simulation ended and why.
+
+        Raises:
+            LinkError: No synthesis service runs.
+            RemoteError: It, or the finite-element service, refuses or cannot go on.
+        """
+        # The simulation ends in time for its last steps to be sent.
+        request = SynthesisRequest(source, simulator, timeout_s, on_step is not None)
+        return ask_synthesis(self.session, request, timeout_s=timeout_s + GRACE_S, on_step=on_step)
 
     def next_features(
         self, sensor: str, *, timeout_s: float = 1.0

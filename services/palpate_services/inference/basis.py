@@ -19,7 +19,10 @@ from palpate_services.inference.onnx_file import onnx_fields, varints
 
 _GRAPH, _INITIALIZER = 7, 5  # numbers of onnx.proto, which never change
 _DIMS, _TYPE, _NAME, _RAW = 1, 2, 8, 9
-_DTYPES = {1: np.dtype("<f4"), 10: np.dtype("<f2")}  # FLOAT, FLOAT16
+_DTYPES: dict[int, np.dtype[np.floating]] = {
+    1: np.dtype(np.float32),
+    10: np.dtype(np.float16),
+}
 _TOLERANCE = 1e-4
 _PART_BYTES = 2 << 20
 

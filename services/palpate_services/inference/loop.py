@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Generic, NoReturn, TypeVar
 
 import numpy as np
 
@@ -351,11 +351,17 @@ def reply(estimate: E | EstimateRefusal, health: Health) -> E:
     Raises:
         RemoteError: There is none; it says why and what to do.
     """
+    if isinstance(estimate, EstimateRefusal):
+        refuse(estimate, health)
     health.count("asked")
-    if not isinstance(estimate, EstimateRefusal):
-        return estimate
-    health.count(f"asked_{estimate.value}")
-    code, problem, remedy = _ERRORS[estimate]
+    return estimate
+
+
+def refuse(reason: EstimateRefusal, health: Health) -> NoReturn:
+    """Count a request that gets no estimate, and raise the ``RemoteError`` that says why."""
+    health.count("asked")
+    health.count(f"asked_{reason.value}")
+    code, problem, remedy = _ERRORS[reason]
     raise RemoteError(problem, remedy=remedy, code=code)
 
 

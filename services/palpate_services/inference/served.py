@@ -148,6 +148,15 @@ class ServedModels:
         """The bundle of a sensor; None = there is none."""
         return self._serving.of(sensor)
 
+    def all(self) -> list[Runtime]:
+        """The bundles that serve, that of all other sensors first."""
+        found = {
+            id(one): one
+            for sensor in (DEFAULT, *self._serving.assigned)
+            if (one := self._serving.of(sensor)) is not None
+        }
+        return list(found.values())
+
     def obey(self, command: ModelCommand, instance: str) -> ModelInventory:
         """Carry out a command that is permitted; what serves, and what could.
 

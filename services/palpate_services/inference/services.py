@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from palpate.bus import Session, endpoints
+import numpy as np
+
+from palpate.bus import QueryAnswer, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, FIELD_TRUTH, SYNTHESIS
 from palpate.config import LinkConfig
+from palpate.errors import ErrorCode, RemoteError
 from palpate.health import Health
-from palpate.messages import FieldEstimate, FieldRequest
+from palpate.messages import (
+    BasisRequest,
+    FeatureEstimate,
+    FeatureRequest,
+    FieldBasis,
+    FieldEstimate,
+    FieldRequest,
+)
 from palpate_services.config import (
     EstimatingConfig,
     FeaturesServiceConfig,
@@ -18,8 +29,10 @@ from palpate_services.config import (
     ModelsConfig,
     SynthesisServiceConfig,
 )
+from palpate_services.inference.asked_estimates import AskedEstimates
 from palpate_services.inference.estimates import (
     Estimation,
+    Sample,
     TaredSamples,
     features_of,
     field_of,
@@ -27,7 +40,9 @@ from palpate_services.inference.estimates import (
     synthesis_of,
 )
 from palpate_services.inference.loop import ServiceRoute, reply, serve
+from palpate_services.inference.model import Outputs, Runtime
 from palpate_services.inference.served import ServedModels
+from palpate_services.inference.synthesis_requests import SynthesisRequests
 
 _FEATURES = ServiceRoute("features", ELECTRODES, FEATURES, "frames_received")
 _FIELD = ServiceRoute("field", ELECTRODES, FIELD, "frames_received")
@@ -49,8 +64,10 @@ def run_estimating(
     """Serve the service whose table of the profile ``config`` is, until ``stop`` is set.
 
     Features are estimated from electrodes, as are fields, at a limited rate; synthesis goes from
-    fields to tared counts. The endpoint ``estimate`` of the field service replies with the field of
-    the frame in a request; ``synthesise`` with the tared counts of the field in a request.
+    fields to tared counts. The endpoint ``estimate`` of the first two replies with the estimate of
+    the frame in a request, ``basis`` of the field service with what decodes coefficients;
+    ``synthesise`` replies with the tared counts of the field in a request, and ``synthesise_from``
+    with those of a field, a described contact or a simulation.
     ``instance`` names this process among several of its kind; None = like the service. ``models``
     says where the user's bundles are and what is remembered; None = packaged bundles only, which
     nobody can change.
@@ -75,35 +92,90 @@ def run_estimating(
     elif isinstance(config, FieldServiceConfig):
         run(_FIELD, prepare=partial(_field, config), rate_hz=config.rate_hz)
     elif isinstance(config, SynthesisServiceConfig):
-        run(_SYNTHESIS[config.source], prepare=_synthesis)
+        run(_SYNTHESIS[config.source], prepare=partial(_synthesis, config))
 
 
 def _features(
     config: FeaturesServiceConfig, session: Session, models: ServedModels, health: Health
 ) -> Estimation[Any, Any]:
+    asked = AskedEstimates[FeatureRequest, FeatureEstimate](
+        session, config, models, health, lambda request, *made: features_of(request.frame, *made)
+    )
+    session.stream_queryable(
+        endpoints.ESTIMATE_FEATURES, asked.handle, service="features", instance=health.instance
+    )
     return Estimation(TaredSamples(session, config, health).take, features_of)
 
 
 def _field(
     config: FieldServiceConfig, session: Session, models: ServedModels, health: Health
 ) -> Estimation[Any, Any]:
-    # Requests come in a thread of their own, and samples are taken in one thread.
-    requested = Estimation(TaredSamples(session, config, health, any_age=True).take, field_of)
-
-    def handle(request: FieldRequest) -> FieldEstimate:
-        runtime = models.of(request.sensor)
-        return reply(requested.one(request.sensor, request.frame, runtime), health)
-
-    session.queryable(endpoints.ESTIMATE_FIELD, handle, service="field", instance=health.instance)
+    asked = AskedEstimates[FieldRequest, FieldEstimate](
+        session, config, models, health, _asked_field
+    )
+    name = health.instance
+    session.stream_queryable(endpoints.ESTIMATE_FIELD, asked.handle, service="field", instance=name)
+    session.stream_queryable(
+        endpoints.BASIS, partial(_send_basis, models), service="field", instance=name
+    )
     return Estimation(TaredSamples(session, config, health).take, field_of)
 
 
-def _synthesis(session: Session, models: ServedModels, health: Health) -> Estimation[Any, Any]:
+def _asked_field(
+    request: FieldRequest, sample: Sample, outputs: Outputs, runtime: Runtime
+) -> FieldEstimate:
+    field = field_of(request.frame, sample, outputs, runtime)
+    if not request.reduced:
+        return field
+    if field.coefficients is None:
+        raise _no_basis(runtime)
+    nothing = np.zeros((0, 3), np.float32)
+    return replace(field, displacement=nothing, displacement_sd=None, contact_force=None)
+
+
+def _send_basis(
+    models: ServedModels, request: BasisRequest, answer: QueryAnswer[FieldBasis]
+) -> None:
+    served = models.all()
+    wanted = request.basis_sha256
+    found = [one for one in served if one.basis is not None and wanted in (b"", one.basis.sha256)]
+    if not found:
+        if served and not wanted:
+            raise _no_basis(served[0])
+        raise RemoteError(
+            f"no served bundle has the basis {wanted.hex()[:12]}" if wanted else "no bundle serves",
+            remedy="take the coefficients anew: the bundle was changed (palpate model list)",
+            code=ErrorCode.NOT_FOUND,
+        )
+    assert found[0].basis is not None
+    for part in found[0].basis.parts(found[0].mesh_sha256):
+        answer.send(part)
+    answer.end()
+
+
+def _no_basis(runtime: Runtime) -> RemoteError:
+    return RemoteError(
+        f"the bundle {runtime.label} has no basis, so there is no reduced form of its fields",
+        remedy="ask for the whole field, or serve a bundle of palpate train field",
+        code=ErrorCode.INVALID_REQUEST,
+    )
+
+
+def _synthesis(
+    config: SynthesisServiceConfig, session: Session, models: ServedModels, health: Health
+) -> Estimation[Any, Any]:
     made = Estimation(lambda _, field, runtime: sample_of_field(field, runtime), synthesis_of)
     session.queryable(
         endpoints.SYNTHESISE,
         lambda field: reply(made.one("", field, models.of("")), health),
         service="synthesis",
         instance=health.instance,
+    )
+    session.stream_queryable(
+        endpoints.SYNTHESISE_FROM,
+        SynthesisRequests(session, config, models, health).handle,
+        service="synthesis",
+        instance=health.instance,
+        workers=config.simulations,
     )
     return made

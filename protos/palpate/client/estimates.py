@@ -1,0 +1,87 @@
+"""Answers that come in parts and are joined: the basis of coefficients, and electrodes to be."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from palpate.bus import Session, endpoints
+from palpate.errors import WireError
+from palpate.messages import BasisRequest, FieldBasis, SynthesisReply, SynthesisRequest
+
+OnSynthesis = Callable[[SynthesisReply], None]
+"""Called with the electrodes of each step of a simulation, as it converges."""
+
+
+def ask_basis(session: Session, basis_sha256: bytes, *, timeout_s: float) -> FieldBasis:
+    """The whole basis of a field service's coefficients; an empty digest = the served one.
+
+    Raises:
+        LinkError: No field service runs.
+        RemoteError: It has no such basis.
+        WireError: A part is missing, or breaks the contract.
+    """
+    parts = session.query_stream(
+        endpoints.BASIS, BasisRequest(basis_sha256), service="field", timeout_s=timeout_s
+    )
+    return join_basis(parts)
+
+
+def join_basis(parts: Iterator[FieldBasis]) -> FieldBasis:
+    """One basis of the parts of an answer.
+
+    Raises:
+        WireError: A part is missing (reason ``"incomplete"``).
+    """
+    first: FieldBasis | None = None
+    modes: list[object] = []
+    count = 0
+    for part in parts:
+        first = first or part
+        if part.first_mode != count or part.basis_sha256 != first.basis_sha256:
+            raise _incomplete(f"mode {count} is missing, {part.first_mode} came")
+        modes.append(part.modes)
+        count += len(part.modes)
+        if not part.more:
+            return dataclasses.replace(
+                first,
+                modes=np.concatenate(modes),  # type: ignore[arg-type]
+                more=False,
+            )
+    raise _incomplete(f"it ended after mode {count}")
+
+
+def ask_synthesis(
+    session: Session,
+    request: SynthesisRequest,
+    *,
+    timeout_s: float,
+    on_step: OnSynthesis | None = None,
+) -> SynthesisReply:
+    """The last reply to a request; ``on_step`` gets those before, if it asks for every step.
+
+    Raises:
+        LinkError: No synthesis service runs.
+        RemoteError: It, or the finite-element service that it asks, refuses or cannot go on.
+        StreamTimeout: No answer in time.
+        WireError: The request, or an answer, breaks the contract.
+    """
+    parts = session.query_stream(
+        endpoints.SYNTHESISE_FROM, request, service="synthesis", timeout_s=timeout_s
+    )
+    for part in parts:
+        if not part.more:
+            return part
+        if on_step is not None:
+            on_step(part)
+    raise _incomplete("it ended without a last message")
+
+
+def _incomplete(problem: str) -> WireError:
+    return WireError(
+        f"the answer is incomplete: {problem}",
+        remedy="ask again; if it happens again, look at the log of the service",
+        reason="incomplete",
+    )

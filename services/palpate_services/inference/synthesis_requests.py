@@ -1,0 +1,229 @@
+"""Electrodes of a field, a described contact or a simulation: the answers to ``SynthesisRequest``.
+
+Where a simulation is needed, the finite-element service is asked over the bus, with the time that
+the caller has left. Its steps are synthesised as they converge. A caller that stops waiting, and a
+contact that has reached its force, end the simulation: its token on the bus vanishes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+import uuid
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from palpate import clock
+from palpate.bus import QueryAnswer, Session, endpoints
+from palpate.client.simulations import GRACE_S
+from palpate.errors import ErrorCode, LinkError, RemoteError
+from palpate.health import Health
+from palpate.messages import (
+    ContactDescription,
+    FieldFrame,
+    Origin,
+    Pose,
+    SimulationOutcome,
+    SimulationParameters,
+    SimulationReply,
+    SimulationRequest,
+    SimulationStep,
+    Stamp,
+    SynthesisEstimate,
+    SynthesisReply,
+    SynthesisRequest,
+)
+from palpate_services.config import SynthesisServiceConfig
+from palpate_services.inference.contact_path import path_of
+from palpate_services.inference.estimates import EstimateRefusal, synthesise
+from palpate_services.inference.loop import refuse, reply
+from palpate_services.inference.model import Runtime
+from palpate_services.inference.served import ServedModels
+
+SERIAL = "fem"
+"""Serial number of the sensor that a simulation imitates."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Synthesised:
+    step: SimulationStep
+    number: int
+    estimate: SynthesisEstimate
+
+
+class SynthesisRequests:
+    """Answers questions, in the threads of a queryable with as many workers as simulations."""
+
+    def __init__(
+        self,
+        session: Session,
+        config: SynthesisServiceConfig,
+        models: ServedModels,
+        health: Health,
+    ) -> None:
+        self._session = session
+        self._config = config
+        self._models = models
+        self._health = health
+
+    def handle(self, request: SynthesisRequest, answer: QueryAnswer[SynthesisReply]) -> None:
+        """Answer a question, or raise the ``PalpateError`` that says why not."""
+        runtime = self._models.of("")
+        if runtime is None:
+            refuse(EstimateRefusal.NO_MODEL, self._health)
+        if isinstance(request.source, FieldFrame):
+            estimate = reply(synthesise(request.source, runtime), self._health)
+            answer.send(SynthesisReply(estimate))
+        else:
+            self._health.count("asked")
+            self._simulate(request, runtime, answer)
+        answer.end()
+
+    def _simulate(
+        self, request: SynthesisRequest, runtime: Runtime, answer: QueryAnswer[SynthesisReply]
+    ) -> None:
+        source = request.source
+        assert not isinstance(source, FieldFrame)
+        force_n = source.force_n if isinstance(source, ContactDescription) else None
+        asked = self._asked(request, runtime, answer)
+        last: _Synthesised | None = None
+        end = SimulationReply(asked.request_id, b"", ())
+        reached = False
+        with self._session.caller_token(asked.request_id):
+            parts = self._session.query_stream(
+                endpoints.SIMULATE,
+                asked,
+                sensor=request.simulator,
+                timeout_s=asked.deadline_s + GRACE_S,
+            )
+            # Closed early, the question is cancelled.
+            with contextlib.closing(self._parts(parts, request.simulator)) as replies:
+                for part in replies:
+                    end = part
+                    for number, step in enumerate(part.steps, start=part.first_step):
+                        if force_n is not None and np.linalg.norm(step.force) >= force_n:
+                            before = None if last is None else last.step
+                            step = _at_force(before, step, force_n)
+                            reached = True
+                        if last is not None and request.every_step:
+                            answer.send(_reply_of(last, more=True))
+                        estimate = self._estimate(step, number, part.mesh_sha256, runtime)
+                        last = _Synthesised(step, number, estimate)
+                        if reached:
+                            break
+                    if reached:
+                        break
+        outcome = SimulationOutcome.COMPLETE if reached else end.outcome
+        stopped = "" if reached else end.stopped_because
+        if force_n is not None and not reached and not stopped:
+            most_n = 0.0 if last is None else float(np.linalg.norm(last.step.force))
+            stopped = f"at the deepest the force is {most_n:.2f} N, {force_n:g} N was wanted"
+        if last is None:
+            answer.send(SynthesisReply(None, outcome=outcome, stopped_because=stopped))
+            return
+        answer.send(replace(_reply_of(last, more=False), outcome=outcome, stopped_because=stopped))
+
+    def _asked(
+        self, request: SynthesisRequest, runtime: Runtime, answer: QueryAnswer[SynthesisReply]
+    ) -> SimulationRequest:
+        """The simulation that a request needs, with the time that its caller has left."""
+        source = request.source
+        if isinstance(source, ContactDescription):
+            assert runtime.mesh is not None, "a bundle of this task has a mesh"
+            volume = SimulationParameters(fluid_volume_m3=self._config.fluid_volume_m3)
+            identity = f"synthesis-{uuid.uuid4().hex[:16]}"
+            asked = SimulationRequest(
+                identity, source.indenter, path_of(source, runtime.mesh), volume
+            )
+        else:
+            assert isinstance(source, SimulationRequest)
+            asked = source
+        left_s = answer.deadline_s - time.monotonic() - GRACE_S
+        limits = (asked.deadline_s, request.deadline_s, self._config.simulation_s)
+        deadline_s = min([one for one in limits if one > 0] + [max(left_s, 1.0)])
+        return replace(
+            asked,
+            deadline_s=deadline_s if math.isfinite(deadline_s) else self._config.simulation_s,
+            want_displacement=True,
+            want_contact_force=False,
+        )
+
+    def _parts(
+        self, parts: Iterator[SimulationReply], simulator: str
+    ) -> Generator[SimulationReply]:
+        """The parts of the answer of the finite-element service, whose errors become replies."""
+        try:
+            for part in parts:
+                yield part
+                if not part.more:
+                    return
+        except LinkError as error:
+            raise RemoteError(
+                f"no finite-element service answers as {simulator!r}: {error.problem}",
+                remedy="start one (extra fem, process fem), or name another in simulator",
+                code=ErrorCode.UNAVAILABLE,
+            ) from error
+
+    def _estimate(
+        self, step: SimulationStep, number: int, mesh_sha256: bytes, runtime: Runtime
+    ) -> SynthesisEstimate:
+        if mesh_sha256 != runtime.mesh_sha256:
+            raise RemoteError(
+                f"the simulation has the mesh {mesh_sha256.hex()[:12]}, the bundle "
+                f"{runtime.label} is made for {runtime.mesh_sha256.hex()[:12]}",
+                remedy="let both have the same mesh: the shipped bundle's is [fem] options = "
+                "{ edge_m = 0.0006 }",
+                code=ErrorCode.WRONG_CONTRACT,
+            )
+        if step.displacement is None:
+            raise RemoteError(
+                "the finite-element service sent a step without its displacement",
+                remedy="upgrade it: palpate status shows versions",
+                code=ErrorCode.WRONG_CONTRACT,
+            )
+        now_ns, wall_ns = clock.now()
+        stamp = Stamp(number + 1, number, now_ns, wall_ns, clock.CLOCK_ID, Origin.SIMULATED)
+        field = FieldFrame(stamp, SERIAL, mesh_sha256, step.displacement)
+        found = synthesise(field, runtime)
+        if isinstance(found, EstimateRefusal):
+            refuse(found, self._health)
+        return found
+
+
+def _reply_of(one: _Synthesised, *, more: bool) -> SynthesisReply:
+    bare = replace(one.step, displacement=None, contact_force=None)
+    return SynthesisReply(one.estimate, bare, one.number, more=more)
+
+
+def _at_force(
+    before: SimulationStep | None, after: SimulationStep, force_n: float
+) -> SimulationStep:
+    """The state between two steps at which the force has this magnitude, by straight lines.
+
+    Before the first step there is the untouched state.
+    """
+    assert after.displacement is not None
+    low = 0.0 if before is None else float(np.linalg.norm(before.force))
+    share = (force_n - low) / (float(np.linalg.norm(after.force)) - low)
+
+    if before is None:
+        displacement = (share * after.displacement).astype(np.float32)
+        force, torque = share * after.force, share * after.torque
+        return replace(after, displacement=displacement, force=force, torque=torque)
+    assert before.displacement is not None
+    a, b = before.pose_sensor_indenter, after.pose_sensor_indenter
+    x, y, z = (p + share * (q - p) for p, q in zip(a.position, b.position, strict=True))
+    return replace(
+        after,
+        pose_sensor_indenter=Pose((x, y, z), b.orientation),
+        force=before.force + share * (after.force - before.force),
+        torque=before.torque + share * (after.torque - before.torque),
+        fluid_pressure_pa=before.fluid_pressure_pa
+        + share * (after.fluid_pressure_pa - before.fluid_pressure_pa),
+        displacement=(
+            before.displacement + np.float32(share) * (after.displacement - before.displacement)
+        ).astype(np.float32),
+    )
