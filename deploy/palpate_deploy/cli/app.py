@@ -12,7 +12,8 @@ import typer
 
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.bench import bench_app
-from palpate_deploy.cli.files import bundle_app, model_app, register
+from palpate_deploy.cli.files import bundle_app, register
+from palpate_deploy.cli.models import model_app
 from palpate_deploy.cli.options import (
     DEFAULT_CONNECT,
     DEFAULT_PROFILE,

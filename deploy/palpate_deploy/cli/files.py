@@ -1,4 +1,4 @@
-"""``palpate model`` and ``palpate bundle``: bundles that are there, and making one."""
+"""``palpate record``, ``replay``, ``review``, ``info``, ``recover``; and making bundles."""
 
 from __future__ import annotations
 
@@ -139,26 +139,7 @@ def register(app: typer.Typer) -> None:
         app.command(epilog=example(*lines))(command)
 
 
-model_app = group("Bundles of networks: list and verify.")
 bundle_app = group("Make bundles.")
-
-
-@model_app.command("list", epilog=example("palpate model list"))
-def list_(json_: JsonOption = False) -> None:
-    """Bundles that ship with palpate."""
-    from palpate_deploy.demo.bundles import list_models
-
-    list_models(as_json=json_)
-
-
-@model_app.command(epilog=example("palpate model verify features-virtual"))
-def verify(
-    bundle: Annotated[str, typer.Argument(help="Name, name:version or folder.")],
-) -> None:
-    """Check digests, contract and golden vectors of a bundle."""
-    from palpate_deploy.demo.bundles import verify_model
-
-    verify_model(bundle)
 
 
 @bundle_app.command(epilog=example("palpate bundle virtual --out runs/bundle/1 --frames 20000"))

@@ -1,106 +1,22 @@
-"""Bundles: those that ship, a check of one, and the training of the one for the virtual finger."""
+"""The training of the bundle for the virtual finger."""
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from palpate.bus.topics import ELECTRODES, TOPICS, sensor_key
-from palpate.errors import BundleError, PalpateError
-from palpate.files.bundle import read_bundle
+from palpate.errors import BundleError
 from palpate.files.record import RecordWriter
-from palpate.printable import printable
 from palpate.process import require
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device
 from palpate_gateway.service.pipeline import Pipeline
-from palpate_services.inference.model import load
-from palpate_services.inference.repository import PACKAGED, available, resolve
-from palpate_services.inference.trial import proven
+from palpate_services.inference.repository import PACKAGED
 from palpate_training import EXTRA_MODULES
-
-_SHOWN_METRICS = (
-    "force_magnitude_n_median",
-    "force_angle_rad_median",
-    "location_distance_m_median",
-)
-"""Metrics that the table shows; --json and the manifest have all."""
-
-
-def list_models(*, as_json: bool) -> None:
-    """Print every bundle that ships with palpate; of a broken one the error."""
-    rows: list[dict[str, Any]] = []
-    for name in available():
-        try:
-            bundle = read_bundle(resolve(name))
-        except PalpateError as error:
-            rows.append({"bundle": name, "error": str(error)})
-            continue
-        manifest = bundle.manifest
-        rows.append(
-            {
-                "bundle": name,
-                "task": manifest.task,
-                "sha256": bundle.sha256.hex(),
-                "trained_on": manifest.trained_on,
-                "metrics": dict(manifest.metrics),
-            }
-        )
-    if as_json:
-        print(json.dumps({"repository": str(PACKAGED), "bundles": rows}, indent=2))
-        return
-    table = Table(title=str(PACKAGED), title_justify="left")
-    for column in ("bundle", "task", "sha256", "trained on", "metrics"):
-        table.add_column(column, overflow="fold")
-    for row in rows:
-        if "error" in row:
-            table.add_row(
-                escape(printable(str(row["bundle"]))),
-                "[red]broken[/]",
-                "",
-                escape(printable(str(row["error"]))),
-                "",
-            )
-            continue
-        table.add_row(
-            escape(printable(str(row["bundle"]))),
-            str(row["task"]),
-            str(row["sha256"])[:12],
-            escape(str(row["trained_on"])),
-            "\n".join(
-                f"{key} {value:.4g}"
-                for key, value in row["metrics"].items()
-                if key in _SHOWN_METRICS
-            ),
-        )
-    Console().print(table)
-
-
-def verify_model(name: str) -> None:
-    """Check a bundle as a service does before it serves it, and describe it.
-
-    Raises:
-        ConfigError: There is no such bundle.
-        BundleError: It breaks its contract.
-        MissingExtraError: ONNX Runtime is not installed.
-    """
-    bundle = read_bundle(resolve(name))
-    load(proven(bundle, bundle.manifest.task), bundle.manifest.task)
-    manifest = bundle.manifest
-    rows = next(iter(bundle.golden.values())).shape[0]
-    folder = printable(str(bundle.folder))
-    print(f"ok  {manifest.name}:{manifest.version}  task {manifest.task}  {folder}")
-    print(f"    digest {bundle.sha256.hex()}")
-    print(f"    {rows} golden rows reproduced; trained on {manifest.trained_on}")
-
 
 SENSOR = "virtual-finger"
 _STATION = "virtual"

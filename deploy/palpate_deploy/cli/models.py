@@ -1,0 +1,191 @@
+"""``palpate model``: the bundles that are there, and which of them a station serves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from palpate_deploy.cli.options import (
+    DEFAULT_CONNECT,
+    DEFAULT_PROFILE,
+    DEFAULT_STATION,
+    ConnectOption,
+    JsonOption,
+    ProfileOption,
+    StationOption,
+    example,
+    group,
+    station_link,
+)
+
+if TYPE_CHECKING:
+    from palpate.messages import ModelAction
+
+StationProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        metavar="NAME|FILE",
+        help="The station's profile, if its link, name or folders are not the usual ones.",
+    ),
+]
+TokenOption = Annotated[
+    Path | None,
+    typer.Option("--token", metavar="FILE", help="The station's admin token; default: its own."),
+]
+ServiceOption = Annotated[
+    str | None, typer.Option("--service", help="E.g. features; default: by the bundle's task.")
+]
+OneSensorOption = Annotated[
+    str, typer.Option("--sensor", help="Only for this sensor; default: all without one of its own.")
+]
+BundleArgument = Annotated[str, typer.Argument(metavar="NAME[:VERSION]", help="Default: newest.")]
+
+model_app = group("Bundles of networks: list, verify, import; load and roll back in a station.")
+
+
+@model_app.command("list", epilog=example("palpate model list"))
+def list_(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -> None:
+    """Bundles that ship with palpate, and those that were imported."""
+    from palpate_deploy.station.models import list_models
+    from palpate_deploy.station.profile import load_profile
+
+    list_models(load_profile(profile).models.folder, as_json=json_)
+
+
+@model_app.command(epilog=example("palpate model verify features-virtual"))
+def verify(
+    bundle: Annotated[str, typer.Argument(help="Name, name:version or folder.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+) -> None:
+    """Check digests, contract and golden vectors of a bundle."""
+    from palpate_deploy.station.models import verify_model
+    from palpate_deploy.station.profile import load_profile
+
+    verify_model(bundle, load_profile(profile).models.folder)
+
+
+@model_app.command("import", epilog=example("palpate model import runs/bundle/2"))
+def import_(
+    folder: Annotated[Path, typer.Argument(help="Folder of the bundle.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+) -> None:
+    """Check a bundle and copy it into the repository; nothing serves it until it is loaded."""
+    from palpate_deploy.station.models import import_model
+    from palpate_deploy.station.profile import load_profile
+
+    import_model(folder, load_profile(profile).models.folder)
+
+
+@model_app.command(epilog=example("palpate model served", "palpate model served --json"))
+def served(
+    service: ServiceOption = None,
+    token: TokenOption = None,
+    profile: StationProfileOption = None,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Which bundle serves which sensor, and what a roll back would serve."""
+    from palpate.messages import ModelAction
+
+    _change(ModelAction.LIST, service, token, profile, connect, station, as_json=json_)
+
+
+@model_app.command(
+    epilog=example("palpate model load features-twin:2", "palpate model load mine --sensor finger1")
+)
+def load(
+    bundle: BundleArgument,
+    sensor: OneSensorOption = "",
+    service: ServiceOption = None,
+    token: TokenOption = None,
+    profile: StationProfileOption = None,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Serve another bundle of the repository, without losing a frame."""
+    from palpate.messages import ModelAction
+
+    _change(
+        ModelAction.LOAD,
+        service,
+        token,
+        profile,
+        connect,
+        station,
+        bundle=bundle,
+        sensor=sensor,
+        as_json=json_,
+    )
+
+
+@model_app.command(epilog=example("palpate model unload --sensor finger1"))
+def unload(
+    sensor: OneSensorOption = "",
+    service: ServiceOption = None,
+    token: TokenOption = None,
+    profile: StationProfileOption = None,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Serve no bundle any more; a sensor then has the bundle of all others again."""
+    from palpate.messages import ModelAction
+
+    action = ModelAction.UNLOAD
+    _change(action, service, token, profile, connect, station, sensor=sensor, as_json=json_)
+
+
+@model_app.command(epilog=example("palpate model rollback"))
+def rollback(
+    sensor: OneSensorOption = "",
+    service: ServiceOption = None,
+    token: TokenOption = None,
+    profile: StationProfileOption = None,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Serve again what served before the last change; a second time undoes the first."""
+    from palpate.messages import ModelAction
+
+    action = ModelAction.ROLL_BACK
+    _change(action, service, token, profile, connect, station, sensor=sensor, as_json=json_)
+
+
+def _change(
+    action: ModelAction,
+    service: str | None,
+    token: Path | None,
+    profile: str | None,
+    connect: str,
+    station: str,
+    *,
+    bundle: str = "",
+    sensor: str = "",
+    as_json: bool,
+) -> None:
+    from palpate.config import check_name
+    from palpate_deploy.station.models import change_model
+    from palpate_deploy.station.profile import load_profile
+
+    for name, what in ((service, "service"), (sensor, "sensor")):
+        if name:
+            check_name(name, what)
+    link, station = station_link(profile, connect, station)
+    change_model(
+        link,
+        station,
+        action,
+        token=token,
+        profile=None if profile is None else load_profile(profile),
+        service=service,
+        bundle=bundle,
+        sensor=sensor,
+        as_json=as_json,
+    )
