@@ -83,3 +83,18 @@ def test_history_is_kept_in_the_working_tree_only(
     (tmp_path / "tests" / "benchmarks").mkdir(parents=True)
     line = json.loads(append_history("codec", {"a": 1}).read_text(encoding="utf-8"))
     assert (line["benchmark"], line["a"]) == ("codec", 1)
+
+
+@pytest.mark.slow
+def test_swap_mixes_no_bundles(palpate: Palpate, bundle: str) -> None:
+    """How many frames a loaded host loses is measured, not tested."""
+    done = palpate(
+        "bench", "swap", "--changes", "2", "--hold-seconds", "0.1", "--json", timeout=180
+    )
+    assert done.returncode == 0, done.stderr
+    values = json.loads(done.stdout)
+    assert values["swap.changes"] == 4
+    changing = values["swap.changing"]
+    assert changing["mixed"] == changing["repeated"] == 0
+    assert len(changing["bundles"]) > 1
+    assert "unknown" not in changing["bundles"]

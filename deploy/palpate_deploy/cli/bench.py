@@ -81,6 +81,28 @@ def alignment(
     )
 
 
+@bench_app.command(epilog=example("palpate bench swap", "palpate bench swap --sensors 5 --json"))
+def swap(
+    changes: Annotated[int, typer.Option(min=1, help="Loads; each is rolled back.")] = 20,
+    sensors: Annotated[int, typer.Option(min=1, max=40, help="Fingers.")] = 1,
+    rate_hz: Annotated[float, typer.Option(min=1, max=1000, help="Frames of each [Hz].")] = 100.0,
+    hold_seconds: Annotated[float, typer.Option(min=0, help="Time between two changes [s].")] = 0.3,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Load and roll back bundles while frames come: lost frames, mixed estimates, times."""
+    from palpate_deploy.bench.swap import run_swap
+
+    run_swap(
+        changes=changes,
+        sensors=sensors,
+        rate_hz=rate_hz,
+        hold_s=hold_seconds,
+        as_json=json_,
+        save=save,
+    )
+
+
 @bench_app.command(epilog=example("palpate bench codec --json"))
 def codec(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of all frames.")] = 20,

@@ -15,6 +15,7 @@ from palpate_deploy.cli.options import (
     JsonOption,
     ProfileOption,
     StationOption,
+    TlsOption,
     example,
     group,
     station_link,
@@ -86,13 +87,14 @@ def served(
     token: TokenOption = None,
     profile: StationProfileOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
     """Which bundle serves which sensor, and what a roll back would serve."""
     from palpate.messages import ModelAction
 
-    _change(ModelAction.LIST, service, token, profile, connect, station, as_json=json_)
+    _change(ModelAction.LIST, service, token, profile, connect, tls, station, as_json=json_)
 
 
 @model_app.command(
@@ -105,6 +107,7 @@ def load(
     token: TokenOption = None,
     profile: StationProfileOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
@@ -117,6 +120,7 @@ def load(
         token,
         profile,
         connect,
+        tls,
         station,
         bundle=bundle,
         sensor=sensor,
@@ -131,6 +135,7 @@ def unload(
     token: TokenOption = None,
     profile: StationProfileOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
@@ -138,7 +143,7 @@ def unload(
     from palpate.messages import ModelAction
 
     action = ModelAction.UNLOAD
-    _change(action, service, token, profile, connect, station, sensor=sensor, as_json=json_)
+    _change(action, service, token, profile, connect, tls, station, sensor=sensor, as_json=json_)
 
 
 @model_app.command(epilog=example("palpate model rollback"))
@@ -148,6 +153,7 @@ def rollback(
     token: TokenOption = None,
     profile: StationProfileOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
@@ -155,7 +161,7 @@ def rollback(
     from palpate.messages import ModelAction
 
     action = ModelAction.ROLL_BACK
-    _change(action, service, token, profile, connect, station, sensor=sensor, as_json=json_)
+    _change(action, service, token, profile, connect, tls, station, sensor=sensor, as_json=json_)
 
 
 def _change(
@@ -164,6 +170,7 @@ def _change(
     token: Path | None,
     profile: str | None,
     connect: str,
+    tls: Path | None,
     station: str,
     *,
     bundle: str = "",
@@ -177,7 +184,7 @@ def _change(
     for name, what in ((service, "service"), (sensor, "sensor")):
         if name:
             check_name(name, what)
-    link, station = station_link(profile, connect, station)
+    link, station = station_link(profile, connect, station, tls)
     change_model(
         link,
         station,

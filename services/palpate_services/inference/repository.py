@@ -16,6 +16,7 @@ from palpate.files.bundle import (
     MANIFEST,
     MESH,
     MODEL,
+    RANGE,
     Bundle,
     FieldMesh,
     read_bundle,
@@ -162,8 +163,8 @@ def _task_of(folder: Path) -> str | None:
 def _copied(source: Path, target: Path) -> Path:
     """Copy the files of a bundle, and nothing else that lies there."""
     target.mkdir()
-    for name in (MODEL, MANIFEST, GOLDEN, MESH):
-        if name == MESH and not (source / name).exists():
+    for name in (MODEL, MANIFEST, GOLDEN, MESH, RANGE):
+        if name in (MESH, RANGE) and not (source / name).exists():
             continue
         (target / name).write_bytes(read_file(source, name))
     return target

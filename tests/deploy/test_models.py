@@ -1,0 +1,121 @@
+"""``palpate model``: import a bundle, serve it, and find it served after a crash."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.bus import Session
+from palpate.config import LinkConfig
+from palpate.errors import LinkError
+from palpate.files.bundle import read_bundle, write_bundle
+from palpate_services.inference.repository import resolve
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture
+def imported(tmp_path: Path, bundle: str) -> Path:
+    """A bundle as its maker has it: the one that ships, as version 7 of another name."""
+    shipped = read_bundle(resolve(bundle))
+    folder = tmp_path / "made" / "bundle"
+    write_bundle(
+        folder,
+        model=shipped.model,
+        golden=shipped.golden,
+        manifest=dataclasses.replace(shipped.manifest, name="mine", version=7),
+        known_inputs=shipped.known_inputs,
+    )
+    return folder
+
+
+@pytest.fixture
+def run(station: tuple[Path, LinkConfig]) -> Iterator[Callable[[str], subprocess.Popen[bytes]]]:
+    """Start a process of the station, as its supervisor does."""
+    started = []
+
+    def start(service: str) -> subprocess.Popen[bytes]:
+        words = [sys.executable, "-m", "palpate_deploy", "run", service, "--profile"]
+        started.append(subprocess.Popen([*words, str(station[0])]))
+        return started[-1]
+
+    yield start
+    for process in reversed(started):
+        process.kill()
+        process.wait()
+
+
+def ready(link: LinkConfig, *, timeout_s: float = 60.0) -> None:
+    """Wait until the features service of the station is ready."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        try:
+            with Session.open(link.model_copy(update={"wait_for_router_s": 5.0})) as session:
+                while time.monotonic() < deadline:
+                    if any(one.ready for one in session.alive(station="*")):
+                        return
+                    time.sleep(0.05)
+        except LinkError:
+            time.sleep(0.1)
+    raise AssertionError("features is not ready")
+
+
+def test_import_load_and_roll_back(
+    palpate: Palpate,
+    run: Callable[[str], subprocess.Popen[bytes]],
+    station: tuple[Path, LinkConfig],
+    imported: Path,
+    bundle: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    profile, link = station
+    run("router")
+    features = run("features")
+    ready(link)
+
+    def told(*words: str | Path) -> Any:
+        done = palpate("model", *words, "--profile", profile, "--json")
+        assert done.returncode == 0, done.stderr
+        (inventory,) = json.loads(done.stdout)["features"]
+        return [(one["name"], one["version"], one["sensor"]) for one in inventory["served"]]
+
+    done = palpate("model", "load", "mine:7", "--profile", profile)
+    assert done.returncode != 0
+    assert "'mine:7' is not in the repository" in done.stderr
+    done = palpate("model", "import", imported)
+    assert done.returncode == 0, done.stderr
+    assert "mine:7" in palpate("model", "list").stdout
+    assert palpate("model", "verify", "mine").returncode == 0
+    assert told("served") == [(bundle, 1, "")], "an import changes nothing that serves"
+    assert told("load", "mine") == [("mine", 7, "")]
+    assert told("load", bundle, "--sensor", "thumb") == [("mine", 7, ""), (bundle, 1, "thumb")]
+    features.send_signal(signal.SIGKILL)
+    features.wait()
+    run("features")
+    ready(link)
+    assert told("served") == [("mine", 7, ""), (bundle, 1, "thumb")]
+    assert told("rollback") == [(bundle, 1, ""), (bundle, 1, "thumb")]
+    assert told("unload", "--sensor", "thumb")[0] == (bundle, 1, "")
+    # Another user has another state folder, and no token there.
+    monkeypatch.setenv("XDG_STATE_HOME", str(imported))
+    done = palpate("model", "unload", "--profile", profile)
+    assert done.returncode == 2
+    assert "admin token" in done.stderr
+
+
+def test_a_broken_bundle_is_not_imported(palpate: Palpate, imported: Path) -> None:
+    with open(imported / "model.onnx", "ab") as model:
+        model.write(b"\0")
+    done = palpate("model", "import", imported)
+    assert done.returncode != 0
+    assert "digest differs" in done.stderr
+    assert "mine" not in palpate("model", "list").stdout
