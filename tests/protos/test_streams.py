@@ -193,9 +193,9 @@ def test_duplicates_are_dropped_and_a_restarted_sender_is_followed(
     publisher = a.publisher(ELECTRODES, sensor="finger")
     wait_until(publisher.matched)
     first, fifth = frame_of(1), frame_of(5)
-    for frame in (first, fifth, fifth, first, frame_of(1)):
+    for frame in (first, fifth, frame_of(6), fifth, first, frame_of(1), frame_of(2)):
         publisher.put(frame)
-    assert [subscriber.next(1).message.stamp.sequence for _ in range(3)] == [1, 5, 1]
+    assert [subscriber.next(1).message.stamp.sequence for _ in range(5)] == [1, 5, 6, 1, 2]
     assert subscriber.counters["reordered"] == 2
     assert subscriber.counters["restarts"] == 1
     assert subscriber.counters["lost_on_bus"] == 3
@@ -256,7 +256,8 @@ def test_ten_thousand_random_payloads_on_the_bus_are_all_accounted_for(
             while True:
                 subscriber.next(timeout_s=0.2)
         counters = subscriber.counters
-        rejected = sum(v for k, v in counters.items() if k.startswith("rejected_"))
-        assert rejected + counters["delivered"] + counters.get("reordered", 0) == count
-        assert rejected > count / 20
+        names = ("delivered", "reordered", "other_session")
+        counted = sum(v for k, v in counters.items() if k in names or k.startswith("rejected_"))
+        assert count - 1 <= counted <= count, "one may be held until another follows"
+        assert counted - counters["delivered"] > count / 20
     assert key.endswith("/finger/electrodes")

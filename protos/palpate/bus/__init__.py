@@ -5,12 +5,14 @@ sensor streams drop rather than block; a query is always answered; plain TCP, ne
 """
 
 from palpate.bus.claims import SensorClaims
+from palpate.bus.delivery import Delivery
 from palpate.bus.link import Session
 from palpate.bus.presence import AliveService, CallerToken, Presence
-from palpate.bus.pubsub import Delivery, Publisher, ReceivedMessage, Subscriber, Tap, TapSample
+from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
 from palpate.bus.query import Cancellation
 from palpate.bus.queryable import QueryAnswer
 from palpate.bus.router import run_router
+from palpate.bus.tap import Tap, TapSample
 from palpate.bus.topics import MAX_PAYLOAD_BYTES
 
 __all__ = [

@@ -13,11 +13,14 @@ from typing import Any, Self, TypeVar
 import zenoh
 
 from palpate.bus.claims import SensorClaims
+from palpate.bus.delivery import Delivery
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
-from palpate.bus.pubsub import Delivery, Publisher, Subscriber, Tap
+from palpate.bus.pubsub import Publisher, Subscriber
 from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
 from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
+from palpate.bus.ring import Alarm
+from palpate.bus.tap import Tap
 from palpate.bus.timings import OnTimings
 from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
 from palpate.config import LinkConfig, check_name
@@ -163,6 +166,7 @@ class Session(Closing):
         self._link = link
         self.station = station
         self.wall_clock_error_s = link.wall_clock_error_s
+        self._alarm: Alarm | None = None
         self._observing: Session | None = None
         self._observing_lock = threading.Lock()
         self._closing: list[Callable[[], None]] = []
@@ -226,11 +230,17 @@ class Session(Closing):
                 topic,
                 key,
                 delivery=delivery,
+                alarm=self._get_alarm(),
                 capacity=capacity,
                 depth=depth,
                 wall_clock_error_s=self.wall_clock_error_s,
             )
         )
+
+    def _get_alarm(self) -> Alarm:
+        if self._alarm is None:
+            self._alarm = self._keep(Alarm())
+        return self._alarm
 
     def tap(
         self,

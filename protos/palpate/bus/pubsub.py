@@ -1,141 +1,46 @@
-"""Publishing and subscribing: typed messages of one topic, or undecoded ones of many (a tap).
-
-A slow consumer behind a plain queue works through ever older frames. So an estimator subscribes
-with ``NEWEST``, a recorder with ``QUEUE``, and an offline replay with ``EVERY``.
-"""
+"""Publishing and subscribing: typed messages of one topic."""
 
 from __future__ import annotations
 
-import queue
+import contextlib
+import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any, Generic, TypeVar
 
 import zenoh
 
 from palpate import clock
+from palpate.bus.continuity import Continuity
+from palpate.bus.delivery import Delivery, FifoQueue
+from palpate.bus.ring import Alarm, Ring, is_wake
 from palpate.bus.timings import timings_of
-from palpate.bus.topics import StreamAddress, Topic, check_schema, check_size, parse_key
+from palpate.bus.topics import (
+    Priority,
+    StreamAddress,
+    Topic,
+    check_schema,
+    check_size,
+    parse_key,
+)
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
-from palpate.messages import Origin, StageTimings
+from palpate.messages import StageTimings
 from palpate.process import Closing
 
-T = TypeVar("T")
+MOST_SOURCES = 256
+"""A subscriber follows so many sources at most: anybody may invent names."""
 
+FORGOTTEN_NS = 10_000_000_000
+"""A source that is silent for this long makes room for another [ns]."""
 
-class Delivery(Enum):
-    """What happens to messages that arrive faster than they are consumed.
+_RING = 4096
+"""Small messages that may wait in Zenoh's ring until a consumer looks: a second of 40 fingers."""
 
-    ``NEWEST``: per key only the newest few (one by default) wait; older ones are counted as
-    ``dropped``.
-    ``QUEUE``: first in, first out; beyond the capacity the newcomer is counted as ``overflow``.
-    ``EVERY``: first in, first out; beyond the capacity the *sender* waits. Offline replay only.
-    """
-
-    NEWEST = "newest"
-    QUEUE = "queue"
-    EVERY = "every"
-
-
-class NewestQueue(Generic[T]):
-    """Keeps the newest items of each key; serves keys in the order of their oldest waiting item.
-
-    ``depth`` items may wait per key. With more than one, a consumer that was delayed for a moment
-    catches up without loss; it has to check the age of items itself.
-    """
-
-    def __init__(self, counters: Counter[str], depth: int) -> None:
-        self._waiting: dict[str, deque[T]] = {}
-        self._lost: Counter[str] = Counter()
-        self._order: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._lock = threading.Lock()
-        self._counters = counters
-        self._depth = depth
-
-    def put(self, key: str, item: T) -> None:
-        """Add an item and drop the oldest of its key if too many wait; never blocks."""
-        with self._lock:
-            items = self._waiting.setdefault(key, deque())
-            # Every waiting item has one turn in `_order`. The turn of a dropped item stays for its
-            # successor, so `get` never finds a key without an item.
-            full = len(items) == self._depth
-            if full:
-                items.popleft()
-                self._lost[key] += 1
-                self._counters["dropped"] += 1
-            items.append(item)
-        if not full:
-            self._order.put(key)
-
-    def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """Next item, and how many of its key were dropped so far; None = none in time."""
-        try:
-            key = self._order.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-        with self._lock:
-            return self._waiting[key].popleft(), self._lost[key]
-
-    def close(self) -> None:
-        """Does nothing: this queue never blocks a sender."""
-
-
-class FifoQueue(Generic[T]):
-    """First in, first out, bounded; a full queue counts the newcomer or makes the sender wait."""
-
-    def __init__(self, counters: Counter[str], capacity: int, *, sender_waits: bool) -> None:
-        self._items: deque[tuple[T, int]] = deque()
-        self._lost: Counter[str] = Counter()
-        self._capacity = capacity
-        self._sender_waits = sender_waits
-        self._changed = threading.Condition()
-        self._closed = False
-        self._counters = counters
-
-    def put(self, key: str, item: T) -> None:
-        """Add an item; blocks while the queue is full only if the sender shall wait."""
-        with self._changed:
-            while self._sender_waits and len(self._items) >= self._capacity and not self._closed:
-                self._changed.wait(0.5)
-            if len(self._items) >= self._capacity:
-                self._lost[key] += 1
-                self._counters["overflow"] += 1
-                return
-            self._items.append((item, self._lost[key]))
-            self._changed.notify_all()
-
-    def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """Next item, and how many of its key were dropped before it; None = none in time."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: bool(self._items), timeout_s):
-                return None
-            item = self._items.popleft()
-            if self._sender_waits:
-                self._changed.notify_all()
-            return item
-
-    def close(self) -> None:
-        """Release a sender that waits."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-
-DeliveryQueue = NewestQueue[T] | FifoQueue[T]
-
-
-def queue_for(
-    delivery: Delivery, capacity: int, counters: Counter[str], *, depth: int = 1
-) -> DeliveryQueue[T]:
-    """The queue for a kind of delivery; ``depth`` is for ``NEWEST``."""
-    if delivery is Delivery.NEWEST:
-        return NewestQueue(counters, depth)
-    return FifoQueue(counters, capacity, sender_waits=delivery is Delivery.EVERY)
-
+_RING_LARGE = 512
+"""The same for fields, of up to 100 kB each."""
 
 M = TypeVar("M")
 
@@ -216,7 +121,8 @@ class ReceivedMessage(Generic[M]):
         payload: Its bytes as they arrived.
         station: Station that published it.
         sensor: Sensor, or ``service/instance`` for a service's topic.
-        received_monotonic_ns: Arrival in this process, host monotonic clock [ns].
+        received_monotonic_ns: When this process saw it first, host monotonic clock [ns]. With
+            ``NEWEST`` that is when it looked or was waiting; else when it arrived.
         attachment: What travelled beside the payload; of an estimate, its timings.
         decode_s: How long its decoding took [s].
     """
@@ -235,31 +141,83 @@ class ReceivedMessage(Generic[M]):
         return timings_of(self.attachment)
 
 
-@dataclass(frozen=True, slots=True)
-class TapSample:
-    """An undecoded message: what a recorder writes."""
+Arrival = tuple[zenoh.Sample, int, int]
+"""A sample, when it came [ns, monotonic], and how many of its key were dropped here before it."""
 
-    topic: str
-    station: str
-    sensor: str
-    key: str
-    encoding: str
-    payload: bytes
-    received_monotonic_ns: int
-    received_wall_ns: int
+HoldersOf = Callable[[str], frozenset[int]]
+"""Which runs of gateways hold a sensor of this name, by their claims."""
 
-    @property
-    def schema(self) -> str:
-        """Full name of the message, from the encoding."""
-        return self.encoding.partition(";")[2]
+
+class _Source(Generic[M]):
+    """What a subscriber keeps of one key."""
+
+    __slots__ = ("address", "continuity", "newest", "problem", "seen_ns", "waiting")
+
+    def __init__(
+        self, address: StreamAddress, continuity: Continuity[ReceivedMessage[M]] | None
+    ) -> None:
+        self.address = address
+        self.continuity = continuity
+        self.waiting: deque[ReceivedMessage[M]] = deque()
+        self.newest: ReceivedMessage[M] | None = None
+        self.problem: WireError | None = None
+        self.seen_ns = 0
+
+
+class _Queued:
+    """Samples that a callback of Zenoh puts into a queue."""
+
+    def __init__(
+        self, session: zenoh.Session, key: str, waiting: FifoQueue[Any], counters: Counter[str]
+    ) -> None:
+        self._waiting: FifoQueue[tuple[zenoh.Sample, int]] = waiting
+        self._counters = counters
+        self._subscriber = session.declare_subscriber(key, self._on_sample)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        # Zenoh's thread: enqueue and nothing else; an exception here would vanish.
+        if not is_wake(sample):
+            self._counters["received"] += 1
+            self._waiting.put(str(sample.key_expr), (sample, time.monotonic_ns()))
+
+    def take(self, timeout_s: float) -> Arrival | None:
+        item = self._waiting.get(timeout_s)
+        return None if item is None else (*item[0], item[1])
+
+    def close(self) -> None:
+        self._waiting.close()
+        self._subscriber.undeclare()
+
+
+class _Ringed:
+    """Samples from Zenoh's ring."""
+
+    def __init__(self, ring: Ring, counters: Counter[str]) -> None:
+        self._ring = ring
+        self._counters = counters
+
+    def take(self, timeout_s: float) -> Arrival | None:
+        sample = self._ring.take(timeout_s)
+        if sample is None:
+            return None
+        self._counters["received"] += 1
+        return sample, time.monotonic_ns(), 0
+
+    def close(self) -> None:
+        self._ring.close()
 
 
 class Subscriber(Generic[M], Closing):
-    """Receives one topic. Made by ``Session.subscriber``; use it from one thread.
+    """Receives one topic. Made by ``Session.subscriber``.
+
+    Messages of each source are checked in order of arrival (``Continuity``). Safe to use from
+    several threads; those that wait take turns.
 
     ``counters``: ``received``, ``delivered``, ``dropped`` (newest wins), ``overflow``,
     ``lost_on_bus`` (gaps in the sequence that were not dropped here), ``reordered``, ``restarts``
-    of the sender, and ``rejected_<reason>``.
+    of the sender, ``other_session`` (a second sender of a followed one's key), ``unannounced``
+    (of a sensor that no gateway claims), ``rejected_names`` (beyond ``MOST_SOURCES``), and
+    ``rejected_<reason>``.
     """
 
     def __init__(
@@ -269,219 +227,261 @@ class Subscriber(Generic[M], Closing):
         key: str,
         *,
         delivery: Delivery,
-        capacity: int,
+        alarm: Alarm,
+        capacity: int = 4096,
         depth: int = 1,
         wall_clock_error_s: float = clock.WALL_CLOCK_ERROR_S,
+        holders_of: HoldersOf | None = None,
     ) -> None:
         self.topic = topic
         self.key = key
+        self._delivery = delivery
         self._wall_clock_error_s = wall_clock_error_s
+        self._holders_of = holders_of
         self._counters: Counter[str] = Counter()
-        self._waiting: DeliveryQueue[tuple[zenoh.Sample, int]] = queue_for(
-            delivery, capacity, self._counters, depth=depth
-        )
-        self._newest: dict[str, tuple[zenoh.Sample, int]] = {}
-        self._addresses: dict[str, StreamAddress] = {}
-        # Of the last delivered message of each source: sequence, monotonic time, and how many of
-        # its key this process's queue had dropped before it.
-        self._last: dict[str, tuple[int, int, int]] = {}
-        self._subscriber = session.declare_subscriber(key, self._on_sample)
-
-    def _on_sample(self, sample: zenoh.Sample) -> None:
-        # Zenoh's thread: enqueue and nothing else; an exception here would vanish.
-        now_ns = time.monotonic_ns()
-        key = str(sample.key_expr)
-        item = (sample, now_ns)
-        self._counters["received"] += 1
-        self._newest[key] = item
-        self._waiting.put(key, item)
+        self._sources: dict[str, _Source[M]] = {}
+        self._forgot_ns = 0
+        # Every message that waits has one turn here. The turn of a dropped one stays for its
+        # successor, so that sensors come in order of their oldest message.
+        self._turns: deque[_Source[M]] = deque()
+        self._lock = threading.Lock()
+        self._reading = threading.Lock()
+        self._waits = False
+        self._arrivals: _Ringed | _Queued
+        if delivery is Delivery.NEWEST:
+            self._depth: float = depth
+            self._ring_capacity = _RING if topic.priority <= Priority.REAL_TIME else _RING_LARGE
+            self._arrivals = _Ringed(
+                Ring(session, key, capacity=self._ring_capacity, alarm=alarm), self._counters
+            )
+        else:
+            self._depth = math.inf
+            sender_waits = delivery is Delivery.EVERY
+            fifo: FifoQueue[Any] = FifoQueue(self._counters, capacity, sender_waits=sender_waits)
+            self._arrivals = _Queued(session, key, fifo, self._counters)
 
     @property
     def counters(self) -> dict[str, int]:
         """Events since it was declared."""
-        return dict(self._counters)
+        with self._lock:
+            with contextlib.suppress(LinkError):  # closed: nothing more comes
+                self._look()
+            return dict(self._counters)
 
     def next(self, timeout_s: float) -> ReceivedMessage[M]:
         """The next valid message that was not delivered yet; invalid ones are counted and skipped.
 
         Raises:
             StreamTimeout: None came within ``timeout_s``.
+            LinkError: The session was closed.
         """
-        deadline = time.monotonic() + timeout_s
-        while True:
-            item = self._waiting.get(max(0.0, deadline - time.monotonic()))
-            if item is None:
-                raise StreamTimeout(
-                    f"no {self.topic.name} on {self.key} within {timeout_s:g} s",
-                    remedy="check that its publisher runs: palpate status",
-                )
-            try:
-                received = self._decode(*item[0])
-            except WireError as error:
-                self._counters[f"rejected_{error.reason}"] += 1
-                continue
-            if self._in_order(received, item[1]):
-                self._counters["delivered"] += 1
-                return received
+        taken = self.next_batch(timeout_s, most=1)
+        if taken:
+            return taken[0]
+        raise StreamTimeout(
+            f"no {self.topic.name} on {self.key} within {timeout_s:g} s",
+            remedy="check that its publisher runs: palpate status",
+        )
 
-    def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
-        """The newest message (of a sensor), if it is not older than ``max_age_s``.
+    def next_batch(
+        self, timeout_s: float, *, most: int = 64, more_s: float = 0.0
+    ) -> list[ReceivedMessage[M]]:
+        """The next messages, ``most`` at most; empty = none came within ``timeout_s``.
 
-        Nothing is consumed. The age counts from the stamp (when the sensor was read); it is never
-        less than the time since arrival.
+        All that wait are taken. After the first, others are waited for during ``more_s``.
 
         Raises:
-            StaleError: It is older, invalid, or none ever came.
-            ClockSkewError: It was stamped in the future (a kind of ``StaleError``).
+            LinkError: The session was closed.
         """
-        candidates = [
-            item
-            for key, item in list(self._newest.items())
-            if sensor is None or self._address(key).sensor == sensor
-        ]
-        if not candidates:
-            raise StaleError(
-                f"no {self.topic.name} on {self.key} has arrived yet",
-                remedy="check that its publisher runs: palpate status",
-            )
-        sample, received_ns = max(candidates, key=lambda item: item[1])
-        try:
-            received = self._decode(sample, received_ns)
-        except WireError as error:
-            raise StaleError(
-                f"the newest {self.topic.name} is invalid: {error.problem}", remedy=error.remedy
-            ) from error
-        stamp = self.topic.stamp_of(received.message)
-        age_s = (time.monotonic_ns() - received_ns) * 1e-9
-        if stamp is not None:
-            stamped_s = clock.checked_age_s(stamp, wall_clock_error_s=self._wall_clock_error_s)
-            age_s = max(age_s, stamped_s)
+        taken: list[ReceivedMessage[M]] = []
+        arrival: Arrival | None = None
+        with self._reading:
+            until_s = time.monotonic() + timeout_s
+            while True:
+                with self._lock:
+                    self._waits = False
+                    if arrival is not None:
+                        self._check(arrival)
+                    had_some = bool(taken)
+                    self._collect(taken, most)
+                    now_s = time.monotonic()
+                    if taken and not had_some:
+                        until_s = now_s + more_s if more_s else now_s
+                    if len(taken) >= most or now_s >= until_s:
+                        return taken
+                    self._waits = True
+                arrival = self._arrivals.take(until_s - now_s)
+
+    def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
+        """The newest valid message (of a sensor), if it is not older than ``max_age_s``.
+
+        Nothing is consumed. The age counts from the stamp (when the sensor was read); it is never
+        less than the time since this process saw the message. For ``NEWEST`` only: others keep
+        their messages until they are taken.
+
+        Raises:
+            StaleError: It is older, or none ever came.
+            ClockSkewError: It was stamped in the future (a kind of ``StaleError``).
+            LinkError: The session was closed.
+        """
+        if self._delivery is not Delivery.NEWEST:
+            raise ValueError(f"latest() is for Delivery.NEWEST, not {self._delivery}")
+        with self._lock:
+            self._look()
+            wanted = [
+                source
+                for source in self._sources.values()
+                if sensor is None or source.address.sensor == sensor
+            ]
+            valid = [source.newest for source in wanted if source.newest is not None]
+        if not valid:
+            raise self._nothing(wanted)
+        newest = max(valid, key=lambda message: message.received_monotonic_ns)
+        age_s = self.age_s(newest)
         if age_s > max_age_s:
             raise StaleError(
                 f"the newest {self.topic.name} is {age_s:.3f} s old, {max_age_s:g} s is allowed",
                 remedy="do not act on it; check the sensor: palpate status",
             )
-        return received
+        return newest
 
-    def _address(self, key: str) -> StreamAddress:
-        address = self._addresses.get(key)
-        if address is None:
-            address = self._addresses[key] = parse_key(key)
-        return address
-
-    def _decode(self, sample: zenoh.Sample, received_ns: int) -> ReceivedMessage[M]:
-        check_schema(str(sample.encoding), self.topic.codec.schema)
-        address = self._address(str(sample.key_expr))
-        payload = sample.payload.to_bytes()
-        began_ns = time.monotonic_ns()
-        message = self.topic.codec.decode(payload)
-        decode_s = (time.monotonic_ns() - began_ns) * 1e-9
-        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        return ReceivedMessage(
-            message, payload, address.station, address.sensor, received_ns, attachment, decode_s
-        )
-
-    def _in_order(self, received: ReceivedMessage[M], lost_here: int) -> bool:
-        """Count gaps, restarts and duplicates in the sequence; False = do not deliver."""
-        stamp = self.topic.stamp_of(received.message)
-        if stamp is None:
-            return True
-        source = f"{received.station}/{received.sensor}"
-        last = self._last.get(source)
-        if last is not None:
-            sequence, monotonic_ns, lost_here_before = last
-            step = stamp.sequence - sequence
-            if step <= 0:
-                # A restarted gateway counts from 1 again, with a later clock. A replayed record
-                # starts over with its old clock. A message that was only overtaken is neither: it
-                # is a little older than the last by both measures.
-                restarted = (
-                    stamp.monotonic_ns > monotonic_ns
-                    or stamp.origin is Origin.REPLAYED
-                    or step < -1000
-                )
-                if not restarted or (step == 0 and stamp.monotonic_ns == monotonic_ns):
-                    self._counters["reordered"] += 1
-                    return False
-                self._counters["restarts"] += 1
-            elif self.topic.contiguous and step > 1:
-                # A hole in the sequence is what the bus lost and what this process's own queue
-                # dropped since the last delivered message; the queue has counted its part.
-                lost = step - 1 - (lost_here - lost_here_before)
-                if lost > 0:
-                    self._counters["lost_on_bus"] += lost
-        self._last[source] = (stamp.sequence, stamp.monotonic_ns, lost_here)
-        return True
-
-    def close(self) -> None:
-        """Undeclare; a blocked sender is released."""
-        self._waiting.close()
-        self._subscriber.undeclare()
-
-
-class Tap(Closing):
-    """Receives undecoded samples of several topics in order of arrival. Made by ``Session.tap``."""
-
-    def __init__(
-        self,
-        session: zenoh.Session,
-        keys: Sequence[str],
-        *,
-        delivery: Delivery,
-        capacity: int,
-    ) -> None:
-        self._counters: Counter[str] = Counter()
-        self._waiting: DeliveryQueue[tuple[zenoh.Sample, int, int]] = queue_for(
-            delivery, capacity, self._counters
-        )
-        # By default each subscriber calls back from a thread of its own, and a frame may overtake
-        # the tare that was sent before it. Called from the link's thread, arrival is the order.
-        in_order = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        self._subscribers = [session.declare_subscriber(key, in_order) for key in keys]
-
-    def _on_sample(self, sample: zenoh.Sample) -> None:
-        monotonic_ns, wall_ns = clock.now()
-        self._counters["received"] += 1
-        self._waiting.put(str(sample.key_expr), (sample, monotonic_ns, wall_ns))
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """``received``, ``dropped``, ``overflow``, ``rejected_key``."""
-        return dict(self._counters)
-
-    def next(self, timeout_s: float) -> TapSample:
-        """The next sample.
+    def age_s(self, received: ReceivedMessage[M]) -> float:
+        """Age of a message [s], from its stamp, and at least the time since it was seen here.
 
         Raises:
-            StreamTimeout: None came within ``timeout_s``.
+            ClockSkewError: It was stamped in the future.
         """
-        deadline = time.monotonic() + timeout_s
-        while True:
-            item = self._waiting.get(max(0.0, deadline - time.monotonic()))
-            if item is None:
-                raise StreamTimeout(
-                    f"no message within {timeout_s:g} s", remedy="check what runs: palpate status"
+        seen_s = (time.monotonic_ns() - received.received_monotonic_ns) * 1e-9
+        stamp = self.topic.stamp_of(received.message)
+        if stamp is None:
+            return seen_s
+        return max(seen_s, clock.checked_age_s(stamp, wall_clock_error_s=self._wall_clock_error_s))
+
+    def _nothing(self, sources: list[_Source[M]]) -> StaleError:
+        for source in sources:
+            if source.problem is not None:
+                return StaleError(
+                    f"every {self.topic.name} on {self.key} is invalid: {source.problem.problem}",
+                    remedy=source.problem.remedy,
                 )
-            sample, monotonic_ns, wall_ns = item[0]
-            key = str(sample.key_expr)
-            try:
-                address = parse_key(key)
-            except WireError as error:
-                self._counters[f"rejected_{error.reason}"] += 1
-                continue
-            return TapSample(
-                address.topic,
-                address.station,
-                address.sensor,
-                key,
-                str(sample.encoding),
-                sample.payload.to_bytes(),
-                monotonic_ns,
-                wall_ns,
+        return StaleError(
+            f"no {self.topic.name} on {self.key} has arrived yet",
+            remedy="check that its publisher runs: palpate status",
+        )
+
+    # All below are called with the lock.
+
+    def _look(self) -> None:
+        """Check what has arrived in the ring, unless a thread waits there: it checks it at once."""
+        if self._delivery is not Delivery.NEWEST or self._waits:
+            return
+        count = 0
+        while (arrival := self._arrivals.take(0.0)) is not None:
+            self._check(arrival)
+            count += 1
+        if count >= self._ring_capacity:
+            # A full ring has dropped what came before, nobody knows how much of which source.
+            for source in self._sources.values():
+                if source.continuity is not None:
+                    source.continuity.drops_unknown()
+
+    def _collect(self, taken: list[ReceivedMessage[M]], most: int) -> None:
+        """Take the messages whose turn it is."""
+        self._look()
+        while len(taken) < most:
+            if self._turns:
+                source = self._turns.popleft()
+                taken.append(source.waiting.popleft())
+                self._counters["delivered"] += 1
+            elif self._delivery is Delivery.NEWEST:
+                return
+            elif (arrival := self._arrivals.take(0.0)) is not None:
+                self._check(arrival)
+            else:
+                return
+
+    def _check(self, arrival: Arrival) -> None:
+        """Decode a sample, compare it with its source, and let wait what may be delivered."""
+        sample, arrived_ns, lost_here = arrival
+        key = str(sample.key_expr)
+        source = self._sources.get(key)
+        if source is None:
+            source = self._new_source(key, arrived_ns)
+            if source is None:
+                return
+        source.seen_ns = arrived_ns
+        try:
+            check_schema(str(sample.encoding), self.topic.codec.schema)
+            payload = sample.payload.to_bytes()
+            began_ns = time.monotonic_ns()
+            message = self.topic.codec.decode(payload)
+            decode_s = (time.monotonic_ns() - began_ns) * 1e-9
+        except WireError as error:
+            self._counters[f"rejected_{error.reason}"] += 1
+            source.problem = error
+            return
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        where = source.address
+        new = ReceivedMessage(
+            message, payload, where.station, where.sensor, arrived_ns, attachment, decode_s
+        )
+        stamp = None if source.continuity is None else self.topic.stamp_of(message)
+        if source.continuity is None or stamp is None:
+            self._let_wait(source, new)
+            return
+        serial = getattr(message, "sensor_serial", "")
+        for good in source.continuity.take(
+            new, stamp, serial=serial, arrived_ns=arrived_ns, lost_here=lost_here
+        ):
+            self._let_wait(source, good)
+
+    def _let_wait(self, source: _Source[M], message: ReceivedMessage[M]) -> None:
+        source.newest = message
+        if len(source.waiting) >= self._depth:
+            source.waiting.popleft()
+            self._counters["dropped"] += 1
+        else:
+            self._turns.append(source)
+        source.waiting.append(message)
+
+    def _new_source(self, key: str, now_ns: int) -> _Source[M] | None:
+        try:
+            address = parse_key(key)
+        except WireError as error:
+            self._counters[f"rejected_{error.reason}"] += 1
+            return None
+        holders_of = self._holders_of
+        if holders_of is not None and not holders_of(address.sensor):
+            self._counters["unannounced"] += 1
+            return None
+        if len(self._sources) >= MOST_SOURCES:
+            self._forget(now_ns)
+            if len(self._sources) >= MOST_SOURCES:
+                self._counters["rejected_names"] += 1
+                return None
+        continuity: Continuity[ReceivedMessage[M]] | None = None
+        if self.topic.rate_hz:  # each event is worth something by itself, in whatever order
+            sensor = address.sensor
+            continuity = Continuity(
+                self._counters,
+                contiguous=self.topic.contiguous,
+                trusting=self._delivery is Delivery.EVERY,
+                holders=(lambda: None) if holders_of is None else (lambda: holders_of(sensor)),
             )
+        source = self._sources[key] = _Source(address, continuity)
+        return source
+
+    def _forget(self, now_ns: int) -> None:
+        """Forget silent sources, once in a while: a flood of names must not cost a search each."""
+        if now_ns - self._forgot_ns < FORGOTTEN_NS // 10:
+            return
+        self._forgot_ns = now_ns
+        self._sources = {
+            key: source
+            for key, source in self._sources.items()
+            if source.waiting or now_ns - source.seen_ns < FORGOTTEN_NS
+        }
 
     def close(self) -> None:
-        """Undeclare; a blocked sender is released."""
-        self._waiting.close()
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
+        """Undeclare; a blocked sender is released, and one that waits gets a ``LinkError``."""
+        self._arrivals.close()

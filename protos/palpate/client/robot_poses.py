@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from palpate.bus import Publisher, Session
-from palpate.bus.pubsub import NewestQueue
+from palpate.bus.delivery import NewestQueue
 from palpate.bus.topics import ROBOT_POSE
 from palpate.errors import LinkError, WireError
 from palpate.messages import Pose, RobotPoseFrame

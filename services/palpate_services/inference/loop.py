@@ -94,6 +94,11 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
         "what comes is older than max_age_s",
         "look at the load of both hosts and at their clocks: palpate top, palpate status",
     ),
+    EstimateRefusal.CLOCK_SKEW: (
+        ErrorCode.INVALID_REQUEST,
+        "what comes is stamped in the future, so that its age is not known",
+        "synchronise the clocks of both hosts (docs/time.md); see link.wall_clock_error_s",
+    ),
     EstimateRefusal.REPLAYED: (
         ErrorCode.INVALID_REQUEST,
         "what comes was replayed, and this service takes live and simulated frames only",

@@ -1,0 +1,148 @@
+"""Samples of a subscription in Zenoh's own ring: no thread between the link and the consumer.
+
+A callback of Zenoh costs a second change of threads, and every change costs a wake-up of a core and
+a turn at the interpreter lock. Only, a ring has no wait with a time limit. So an alarm ends the
+waits: at the deadline it puts an empty sample into the ring, by a publication that does not leave
+this session.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from typing import Protocol
+
+import zenoh
+
+from palpate.errors import LinkError
+from palpate.process import Closing
+
+_WAKE = "palpate/wake"
+
+
+def is_wake(sample: zenoh.Sample) -> bool:
+    """Whether a sample only ends a wait; every subscriber of the session gets it."""
+    return len(sample.payload) == 0 and str(sample.encoding) == _WAKE
+
+
+class _Sleeper(Protocol):
+    """What an alarm wakes."""
+
+    def wake(self) -> None:
+        """End the wait."""
+
+
+class Alarm(Closing):
+    """Wakes those who wait, each at its deadline: one thread for a session. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._deadlines: dict[_Sleeper, float] = {}
+        self._next_s = math.inf
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def set(self, sleeper: _Sleeper, deadline_s: float) -> None:
+        """Wake a sleeper at an instant [s, monotonic]; inf = not any more."""
+        # Usually the thread sleeps until an earlier instant already, and nothing is locked.
+        self._deadlines[sleeper] = deadline_s
+        if deadline_s < self._next_s:
+            with self._changed:
+                if self._thread is None and not self._closed:
+                    self._thread = threading.Thread(target=self._run, name="alarm", daemon=True)
+                    self._thread.start()
+                self._changed.notify()
+
+    def forget(self, sleeper: _Sleeper) -> None:
+        """A sleeper is closed."""
+        self._deadlines.pop(sleeper, None)
+
+    def _run(self) -> None:
+        with self._changed:
+            while not self._closed:
+                now_s = time.monotonic()
+                for sleeper, deadline_s in list(self._deadlines.items()):
+                    if deadline_s <= now_s:
+                        self._deadlines[sleeper] = math.inf
+                        sleeper.wake()
+                self._next_s = self._earliest()
+                # One that was set meanwhile saw the old instant and did not notify.
+                if self._earliest() < self._next_s:
+                    continue
+                timeout_s = self._next_s - time.monotonic()
+                self._changed.wait(None if timeout_s == math.inf else max(0.0, timeout_s))
+                self._next_s = -math.inf
+
+    def _earliest(self) -> float:
+        return min(list(self._deadlines.values()), default=math.inf)
+
+    def close(self) -> None:
+        """End the thread; nobody is woken any more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(timeout=2)
+
+
+class Ring(Closing):
+    """The newest samples of a key, ``capacity`` at most; older ones are dropped uncounted.
+
+    Only one thread may wait at a time.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, *, capacity: int, alarm: Alarm) -> None:
+        self.capacity = capacity
+        self._session = session
+        self._key = key
+        self._wake_key = key.replace("*", "wake")
+        self._alarm = alarm
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
+        self._samples: zenoh.handlers.Handler[zenoh.Sample] = self._subscriber.handler
+
+    def take(self, timeout_s: float) -> zenoh.Sample | None:
+        """The oldest sample in the ring; None = none within ``timeout_s``.
+
+        Raises:
+            LinkError: The session or the subscriber was closed.
+        """
+        try:
+            while (sample := self._samples.try_recv()) is not None:
+                if not is_wake(sample):
+                    return sample
+            if timeout_s <= 0:
+                return None
+            deadline_s = time.monotonic() + timeout_s
+            while True:
+                self._alarm.set(self, deadline_s)
+                sample = self._samples.recv()
+                if not is_wake(sample):
+                    return sample
+                if time.monotonic() >= deadline_s:
+                    return None
+        except zenoh.ZError as error:
+            raise LinkError(
+                f"the subscription to {self._key} is closed: {error}",
+                remedy="open the session again",
+            ) from error
+        finally:
+            if timeout_s > 0:
+                self._alarm.set(self, math.inf)
+
+    def wake(self) -> None:
+        """End a wait."""
+        try:
+            self._session.put(
+                self._wake_key,
+                b"",
+                encoding=zenoh.Encoding(_WAKE),
+                allowed_destination=zenoh.Locality.SESSION_LOCAL,
+            )
+        except zenoh.ZError:  # the session is closed, and the wait has ended
+            pass
+
+    def close(self) -> None:
+        """Undeclare; one that waits gets a ``LinkError``."""
+        self._alarm.forget(self)
+        self._subscriber.undeclare()
