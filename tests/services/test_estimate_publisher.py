@@ -65,7 +65,7 @@ class Station:
         return [{} for _ in samples]
 
     def bundle(self) -> Any:
-        return type("Runtime", (), {"run_all": staticmethod(self.run_all)})()
+        return type("Runtime", (), {"label": "any:1", "run_all": staticmethod(self.run_all)})()
 
     def make(self, *, rate_hz: float | None = None, **config: Any) -> EstimatePublisher[Any, Any]:
         def publisher(topic: object, *, sensor: str, lossless: bool) -> object:

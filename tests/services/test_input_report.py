@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 
 from palpate import health as health_module
 from palpate.health import RECOVERY_S, Health
-from palpate.messages import ServiceState
+from palpate.messages import Origin, ServiceState, Stamp
 from palpate_services.inference import input_report as input_report_module
 from palpate_services.inference.estimates import EstimateRefusal
 from palpate_services.inference.input_report import REFUSED_S, InputReport
@@ -22,7 +24,10 @@ class Service:
         self.now_s = 50.0
         self.health = Health("features", "features")
         self.health.set_state(ServiceState.READY, "serving features-twin:1")
-        self.report = InputReport(self.health, _ERRORS, lambda: "serving features-twin:2")
+        self.report = InputReport(self.health, _ERRORS, self.recovered)
+
+    def recovered(self) -> None:
+        self.health.set_state(ServiceState.READY, "serving features-twin:2")
 
     def monotonic(self) -> float:
         return self.now_s
@@ -111,3 +116,31 @@ def test_invented_names_take_no_memory(service: Service) -> None:
     for number in range(5000):
         service.report.refused(f"s{number}", "untared")
     assert len(service.report._refused) <= input_report_module._SENSORS_MOST
+
+
+def test_the_log_names_the_first_frame_that_was_refused_and_not_every_frame(
+    service: Service, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    for sequence in range(41, 1041):
+        service.now_s += TICK_S
+        stamp = Stamp(sequence, 1000 + sequence, 0, 0, 1, Origin.LIVE)
+        service.report.refused("finger", "tare_unknown", stamp, tare_id=0xFEED, model="twin:2")
+        service.report.report()
+    service.report.answered("finger")
+    refused, again = caplog.records
+    fields = ("sensor", "sequence", "device_tick", "origin", "tare_id", "model", "reason")
+    assert [getattr(refused, name) for name in fields] == [
+        "finger", 41, 1041, "live", "000000000000feed", "twin:2", "tare_unknown",
+    ]  # fmt: skip
+    assert "finger" in refused.getMessage()
+    assert again.getMessage() == "sensor finger is answered again"
+
+
+def test_reasons_that_alternate_are_each_logged_once(
+    service: Service, caplog: pytest.LogCaptureFixture
+) -> None:
+    for _ in range(50):
+        service.run(0.1, finger="stale")
+        service.run(0.1, finger="untared")
+    assert len(caplog.records) == 2

@@ -18,18 +18,29 @@ USAGE = 2
 DEVICE = 3
 
 
-def configure(level: LogLevel = "warning", style: LogFormat = "text") -> None:
+def configure(
+    level: LogLevel = "warning",
+    style: LogFormat = "text",
+    *,
+    station: str = "",
+    service: str = "",
+) -> None:
     """Send the log lines of this process to stderr.
 
     Args:
         level: The lowest level that is written.
         style: ``text`` for people, ``12:34:56.789 warning palpate.bus.link: message`` in local
             time; ``json`` for machines, an object a line with ``time`` (UTC), ``level``,
-            ``logger``, ``message`` and, where there is one, ``exception``.
+            ``logger``, ``message``, ``pid``, ``station`` and ``service``, where there is one
+            ``exception``, and where the line concerns a frame the fields of ``palpate.log``.
+        station: Name of the station; ``""`` = this process belongs to none.
+        service: What this process serves; ``""`` = it is a command.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.addFilter(_add_level)
-    handler.setFormatter(_json_formatter() if style == "json" else _text_formatter())
+    where = {"station": station, "service": service}
+    formatter = _json_formatter(where) if style == "json" else _text_formatter()
+    handler.setFormatter(formatter)
     root = logging.getLogger()
     for old in list(root.handlers):
         root.removeHandler(old)
@@ -55,12 +66,18 @@ def _text_formatter() -> logging.Formatter:
     return formatter
 
 
-def _json_formatter() -> logging.Formatter:
+def _json_formatter(where: dict[str, str]) -> logging.Formatter:
     from pythonjsonlogger.json import JsonFormatter
 
     formatter = JsonFormatter(
-        ["asctime", "level", "name", "message"],
-        rename_fields={"asctime": "time", "name": "logger", "exc_info": "exception"},
+        ["asctime", "level", "name", "message", "process"],
+        rename_fields={
+            "asctime": "time",
+            "name": "logger",
+            "exc_info": "exception",
+            "process": "pid",
+        },
+        static_fields={name: value for name, value in where.items() if value},
         json_ensure_ascii=False,
     )
     formatter.converter = time.gmtime

@@ -52,7 +52,7 @@ def run_service(service: Service, profile: Profile) -> None:
     Raises:
         PalpateError: It cannot start or go on; the process ends and the supervisor restarts it.
     """
-    logs.configure(profile.log.level, profile.log.format)
+    logs.configure(profile.log.level, profile.log.format, station=profile.station, service=service)
     # Where a process hangs that is about to be killed, its log must show.
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     stop = stop_on_signals()

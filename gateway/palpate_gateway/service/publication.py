@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import Counter, deque
@@ -14,7 +15,11 @@ from palpate.bus import Publisher
 from palpate.errors import WireError
 from palpate.health import Health
 from palpate.heartbeat import Turns
+from palpate.log import about
+from palpate.messages import Tare
 from palpate_gateway.clock.stamps import DueMessage
+
+_log = logging.getLogger(__name__)
 
 _ENCODERS_DECIDE = "the frame was not published; this is a defect of the device driver"
 
@@ -38,6 +43,7 @@ class MessagePublisher:
         claim: Called with the name of its stream before each message; raises where another gateway
             or sensor publishes that stream.
         turns: Those of the thread: a recorded message may be due much later.
+        name: Name of the sensor, for the log.
     """
 
     def __init__(
@@ -48,6 +54,7 @@ class MessagePublisher:
         stop: threading.Event,
         claim: Callable[[str], None],
         turns: Turns | None = None,
+        name: str = "",
     ) -> None:
         self.counters: Counter[str] = Counter()
         self._publishers = publishers
@@ -55,6 +62,7 @@ class MessagePublisher:
         self._stop = stop
         self._claim = claim
         self._turns = turns or Turns()
+        self._name = name
         self._reasons: set[str] = set()
         self._latencies_ns: deque[int] = deque(maxlen=_KEPT)
 
@@ -101,13 +109,18 @@ class MessagePublisher:
                     publisher.put(item.message)
             except WireError as error:
                 self.counters["frames_rejected"] += 1
-                self._report_once(error)
+                self._report_once(error, item.message)
+            if isinstance(item.message, Tare):
+                tared = about(self._name, item.message.stamp, tare_id=item.message.tare_id)
+                _log.info("sensor %s is tared", self._name, extra=tared)
         return bool(items)
 
-    def _report_once(self, error: WireError) -> None:
+    def _report_once(self, error: WireError, message: object) -> None:
         """Report each reason once: a defect of a driver comes with every frame."""
         if error.reason not in self._reasons:
             self._reasons.add(error.reason)
+            frame = about(self._name, getattr(message, "stamp", None))
+            _log.error("sensor %s: not published: %s", self._name, error, extra=frame)
             self._health.fail(
                 WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
             )

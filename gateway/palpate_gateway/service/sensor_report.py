@@ -7,6 +7,7 @@ import time
 
 from palpate.errors import DeviceError, DeviceTimeout, PalpateError, SensorTaken
 from palpate.health import Health
+from palpate.log import about
 from palpate.messages import ChannelFault, FaultKind, SensorState
 from palpate_gateway.condition.channel_health import REMEDIES, describe
 from palpate_gateway.condition.condition import Condition
@@ -81,7 +82,13 @@ class SensorReport:
         now_s = time.monotonic()
         if error.problem != self._lost_by or now_s >= self._log_again_s:
             self._lost_by, self._log_again_s = error.problem, now_s + _LOG_AGAIN_S
-            _log.warning("sensor %s lost, open again in %.1f s: %s", self._name, backoff_s, error)
+            _log.warning(
+                "sensor %s lost, open again in %.1f s: %s",
+                self._name,
+                backoff_s,
+                error,
+                extra=about(self._name),
+            )
 
     def is_taken(self, error: SensorTaken) -> None:
         """Another gateway publishes under its key; told once for each such gateway."""
@@ -90,14 +97,14 @@ class SensorReport:
         self._taken_by = error.problem
         self._set_state(SensorState.STARTING, message=error.problem)
         self._health.fail(error)
-        _log.error("%s", error)
+        _log.error("%s", error, extra=about(self._name))
 
     def ended(self, error: PalpateError | None) -> None:
         """It will deliver no more."""
         self._set_state(SensorState.ENDED, message="" if error is None else error.problem)
         if error is not None:
             self._health.fail(error)
-            _log.error("sensor %s: %s", self._name, error)
+            _log.error("sensor %s: %s", self._name, error, extra=about(self._name))
 
     def tare_refused(self, error: DeviceError | None) -> None:
         """Why the last attempt to tare failed; None = there was none, or it succeeded."""
@@ -106,7 +113,7 @@ class SensorReport:
         elif not self._refused:
             self._refused = True
             self._health.fail(error, degraded=False)
-            _log.warning("sensor %s: %s", self._name, error)
+            _log.warning("sensor %s: %s", self._name, error, extra=about(self._name))
 
     def _set_state(
         self, state: SensorState, faults: tuple[ChannelFault, ...] = (), message: str = ""
@@ -125,7 +132,7 @@ class SensorReport:
                     f"sensor {self._name!r}: {describe([fault])}", remedy=REMEDIES[fault.kind]
                 )
                 self._health.fail(error, degraded=fault.kind is not FaultKind.ODD)
-                _log.warning("%s", error)
+                _log.warning("%s", error, extra=about(self._name))
 
     def _report_zero(self, *, zero_lost: bool) -> None:
         if zero_lost and not self._zero_lost:
@@ -134,5 +141,5 @@ class SensorReport:
                 remedy=_ZERO_REMEDY.format(name=self._name),
             )
             self._health.fail(error)
-            _log.warning("%s", error)
+            _log.warning("%s", error, extra=about(self._name))
         self._zero_lost = zero_lost

@@ -153,7 +153,7 @@ class SensorWorker:
         self._stop = stop
         self._key = key or SensorKey()
         self._publisher = MessagePublisher(
-            publishers, health, stop=stop, claim=self._key.check, turns=self._turns
+            publishers, health, stop=stop, claim=self._key.check, turns=self._turns, name=name
         )
         self._counters: Counter[str] = Counter()
         self._device_counters: Counter[str] = Counter()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from palpate.errors import ErrorCode, RemoteError
 from palpate.health import Health
-from palpate.messages import ServiceState
+from palpate.log import about
+from palpate.messages import NO_TARE, Stamp
 from palpate_services.inference.estimates import EstimateRefusal
+
+_log = logging.getLogger(__name__)
 
 REFUSED_S = 1.0
 """A sensor whose messages are all refused for longer than this is a trouble [s]: a finger needs the
@@ -28,6 +32,8 @@ class _Refusals:
     since_s: float
     last_s: float
     reason: str
+    frame: dict[str, object]
+    told: set[str] = field(default_factory=set)
 
 
 class InputReport:
@@ -38,33 +44,52 @@ class InputReport:
     Args:
         health: Of the service.
         errors: Code, problem and remedy of each refusal.
-        describe: One line for people when all is well.
+        recovered: Called when nothing is refused any more: says that the service is ready.
     """
 
     def __init__(
         self,
         health: Health,
         errors: Mapping[EstimateRefusal, tuple[ErrorCode, str, str]],
-        describe: Callable[[], str],
+        recovered: Callable[[], None],
     ) -> None:
-        self._health, self._errors, self._describe = health, errors, describe
+        self._health, self._errors, self._recovered = health, errors, recovered
         self._refused: dict[str, _Refusals] = {}
         self._in_trouble = False
 
     def answered(self, sensor: str) -> None:
         """An estimate of this sensor was published."""
-        self._refused.pop(sensor, None)
+        found = self._refused.pop(sensor, None)
+        if found is not None and found.told:
+            _log.info("sensor %s is answered again", sensor, extra=about(sensor))
 
-    def refused(self, sensor: str, reason: str) -> None:
-        """A message got no estimate; ``reason`` is the name of its counter."""
+    def refused(
+        self,
+        sensor: str,
+        reason: str,
+        stamp: Stamp | None = None,
+        *,
+        tare_id: int = NO_TARE,
+        model: str = "",
+    ) -> None:
+        """A message got no estimate; ``reason`` is the name of its counter.
+
+        ``stamp`` and ``tare_id`` are of the message, ``model`` is the bundle: for the log, which
+        tells the first message that was refused for a reason.
+        """
         if reason == EstimateRefusal.SKIPPED_RATE:
             return
         now_s = time.monotonic()
         found = self._refused.get(sensor)
-        if found is not None:
-            found.count, found.last_s, found.reason = found.count + 1, now_s, reason
-        elif len(self._refused) < _SENSORS_MOST:
-            self._refused[sensor] = _Refusals(1, now_s, now_s, reason)
+        if found is not None and found.reason == reason:
+            found.count, found.last_s = found.count + 1, now_s
+        elif found is not None or len(self._refused) < _SENSORS_MOST:
+            frame = {**about(sensor, stamp, tare_id=tare_id, model=model), "reason": reason}
+            if found is None:
+                self._refused[sensor] = _Refusals(1, now_s, now_s, reason, frame)
+            else:
+                found.count, found.last_s = found.count + 1, now_s
+                found.reason, found.frame = reason, frame
 
     def report(self) -> None:
         """Tell health; call it a few times a second."""
@@ -77,12 +102,21 @@ class InputReport:
             for sensor, found in self._refused.items()
             if found.count >= _REFUSED_LEAST and now_s > found.since_s + REFUSED_S
         }
+        for sensor, found in wrong.items():
+            if found.reason not in found.told:
+                found.told.add(found.reason)
+                _log.warning(
+                    "everything of sensor %s is refused: %s",
+                    sensor,
+                    found.reason,
+                    extra=found.frame,
+                )
         if wrong:
             self._in_trouble = True
             self._health.fail(self._error(wrong))
         elif self._in_trouble:
             self._in_trouble = False
-            self._health.set_state(ServiceState.READY, self._describe())
+            self._recovered()
 
     def _error(self, wrong: Mapping[str, _Refusals]) -> RemoteError:
         sensors = sorted(wrong)

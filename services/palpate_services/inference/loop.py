@@ -29,7 +29,7 @@ from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout, WireError
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import LIMIT_S, beat
-from palpate.messages import Origin, ServiceState, StageTimings, Stamp
+from palpate.messages import NO_TARE, Origin, ServiceState, StageTimings, Stamp
 from palpate.process import avoid_pauses
 from palpate_services.config import ElectrodesConfig, EstimatingConfig, ModelsConfig
 from palpate_services.inference.commands import show, take_commands
@@ -88,6 +88,11 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
         ErrorCode.UNAVAILABLE,
         "no bundle serves this sensor",
         "load one: palpate model load NAME",
+    ),
+    EstimateRefusal.CLOCK_SKEW: (
+        ErrorCode.INVALID_REQUEST,
+        "what comes was stamped in the future: the clocks of the hosts disagree",
+        "synchronise both hosts (chrony, PTP); see palpate status and palpate doctor",
     ),
     EstimateRefusal.STALE: (
         ErrorCode.INVALID_REQUEST,
@@ -198,7 +203,7 @@ class EstimatePublisher(Generic[M, E]):
         self._rate_limit = RateLimit(rate_hz)
         self._publishers: dict[str, Publisher[E]] = {}
         self._counts: Counter[str] = Counter()
-        self._input = InputReport(health, _ERRORS, models.describe)
+        self._input = InputReport(health, _ERRORS, partial(show, models, health))
         self._latencies_ns: list[int] = []
         self._busy_ns = 0
         self._batches = self._batched = 0
@@ -224,7 +229,7 @@ class EstimatePublisher(Generic[M, E]):
                 taken_ns = time.monotonic_ns()
                 sample = self._sample(received, runtime)
                 if isinstance(sample, EstimateRefusal):
-                    self._refuse(sensor, sample.value)
+                    self._refuse(received, sample.value, runtime)
                 elif runtime is not None:
                     sampled_ns = time.monotonic_ns()
                     samples.setdefault(runtime, []).append(
@@ -256,7 +261,7 @@ class EstimatePublisher(Generic[M, E]):
         infer_s = (time.monotonic_ns() - began_ns) * 1e-9
         for one, outputs in zip(taken, outputs_of, strict=True):
             if outputs is None:
-                self._refuse(one.received.sensor, EstimateRefusal.NON_FINITE.value)
+                self._refuse(one.received, EstimateRefusal.NON_FINITE.value, runtime)
                 continue
             received = one.received
             estimate = self._estimation.complete(received.message, one.sample, outputs, runtime)
@@ -265,7 +270,7 @@ class EstimatePublisher(Generic[M, E]):
             try:
                 payload = publisher.encode(estimate)
             except WireError as error:  # finite, and still not allowed by the message contract
-                self._refuse(received.sensor, f"unpublishable_{error.reason}")
+                self._refuse(received, f"unpublishable_{error.reason}", runtime)
                 continue
             encode_s = (time.monotonic_ns() - began_ns) * 1e-9
             stamp = self._stamp_of(received)
@@ -288,9 +293,16 @@ class EstimatePublisher(Generic[M, E]):
             since_ns = received.received_monotonic_ns if age_s is None else stamp.monotonic_ns
             self._latencies_ns.append(time.monotonic_ns() - since_ns)
 
-    def _refuse(self, sensor: str, reason: str) -> None:
+    def _refuse(self, received: ReceivedMessage[M], reason: str, runtime: Runtime | None) -> None:
+        """Count why there is no estimate, and remember the message for the log."""
         self._counts[reason] += 1
-        self._input.refused(sensor, reason)
+        self._input.refused(
+            received.sensor,
+            reason,
+            self._stamp_of(received),
+            tare_id=getattr(received.message, "tare_id", NO_TARE),
+            model="" if runtime is None else runtime.label,
+        )
 
     def _stamp_of(self, received: ReceivedMessage[M]) -> Stamp:
         stamp = self._route.source.stamp_of(received.message)
