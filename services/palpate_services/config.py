@@ -148,7 +148,7 @@ class RecorderConfig(StrictConfig):
     rrd_max_bytes: int = Field(default=2 * 1024**3, ge=1024**2)
     bundles: tuple[str, ...] = ()
     min_free_bytes: int = Field(default=256 * 1024**2, ge=0)
-    field_rate_hz: float = Field(default=1.0, ge=0, le=1000)
+    field_rate_hz: float = Field(default=0.5, ge=0, le=1000)
     rotate_bytes: int = Field(default=512 * 1024**2, ge=0)
     rotate_s: float = Field(default=3600.0, ge=0)
     keep_bytes: int = Field(default=20 * 1024**3, ge=0)

@@ -43,7 +43,7 @@ def test_fields_of_each_sensor_and_kind_at_their_rate(
     make_frame: Any, tmp_path: Path, rate_hz: float, kept: int
 ) -> None:
     health = Health("recorder", "recorder")
-    keys = {**EVERYTHING, "field_rate_hz": rate_hz}
+    keys: dict[str, Any] = {**EVERYTHING, "field_rate_hz": rate_hz}
     files = RecordFiles(
         RecorderConfig(out=tmp_path, rrd=False, min_free_bytes=0, **keys), "lab", health
     )

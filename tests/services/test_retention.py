@@ -156,7 +156,7 @@ def test_by_default_records_rotate_and_the_oldest_go() -> None:
     config = RecorderConfig()
     assert 0 < config.rotate_bytes < config.keep_bytes
     assert 0 < config.rotate_s < config.keep_s
-    assert config.field_rate_hz == 1.0
+    assert config.field_rate_hz == 0.5
 
 
 @pytest.mark.parametrize(

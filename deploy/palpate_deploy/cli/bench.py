@@ -156,3 +156,22 @@ def restart(
     from palpate_deploy.bench.restart import run_restart
 
     raise typer.Exit(run_restart(times=times, only=only, as_json=json_, save=save, out=out))
+
+
+@bench_app.command(epilog=example("palpate bench soak --minutes 30 --out docs/results/soak.json"))
+def soak(
+    minutes: Annotated[float, typer.Option(min=1, help="Duration [min].")] = 30.0,
+    fingers: Annotated[int, typer.Option(min=1, help="Virtual fingers.")] = 3,
+    fem: Annotated[bool, typer.Option(help="With the simulation service.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the result as JSON, and beside it a PNG.")
+    ] = None,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Run a whole station for long: memory, threads and descriptors must not grow."""
+    from palpate_deploy.bench.soak import run_soak
+
+    raise typer.Exit(
+        run_soak(minutes=minutes, fingers=fingers, fem=fem, out=out, as_json=json_, save=save)
+    )

@@ -43,6 +43,8 @@ METADATA = "palpate"
 
 _CHUNK_BYTES = 1 << 20
 
+_INDICES = "_Writer__chunk_indices"
+
 
 def descriptor_set(message_type: type[PbMessage]) -> bytes:
     """Serialised ``FileDescriptorSet`` of a message's file and its imports: MCAP's schema."""
@@ -130,7 +132,7 @@ class RecordWriter:
             self._indices = _ChunkIndices(path.parent)
             # It keeps an object of 1 kB for each chunk until the end: 50 MB an hour. No option
             # changes that; a test of the memory fails if a later version names it otherwise.
-            self._writer._Writer__chunk_indices = self._indices
+            setattr(self._writer, _INDICES, self._indices)
             self._writer.start(profile="", library=f"palpate contract v{CONTRACT_VERSION}")
             facts = {"contract_version": str(CONTRACT_VERSION), **(metadata or {})}
             self._writer.add_metadata(METADATA, facts)

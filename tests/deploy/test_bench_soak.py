@@ -1,0 +1,132 @@
+"""The soak finds what grows, and only that; how much a station needs is not a test."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate_deploy.bench.growth import (
+    BINS,
+    History,
+    Use,
+    Verdict,
+    processes_below,
+    slope_of,
+    use_of,
+    verdict_of,
+)
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+# Ends by itself: it must not outlive a test that is killed.
+_PROGRAM = """
+import os, sys, time
+kept = []
+for _ in range(600):
+    if sys.argv[1] == "leaks":
+        kept.append(bytearray(os.urandom(1 << 20)))
+    elif sys.argv[1] == "opens":
+        kept.append(open(os.devnull))
+    time.sleep(0.05)
+"""
+
+
+def watched(what: str, seconds: float = 4.0) -> History:
+    child = subprocess.Popen([sys.executable, "-c", _PROGRAM, what])
+    history = History()
+    try:
+        time.sleep(0.5)
+        begun = time.monotonic()
+        while (gone := time.monotonic() - begun) < seconds:
+            use = use_of(child.pid)
+            assert use is not None
+            history.add(gone, child.pid, use)
+            time.sleep(0.05)
+    finally:
+        child.kill()
+        child.wait()
+    return history
+
+
+def test_a_process_that_leaks_is_found() -> None:
+    growth = watched("leaks").growth(0.5)
+    assert growth.verdict is Verdict.GROWS
+    assert not growth.fine
+
+
+def test_a_process_that_opens_files_is_found() -> None:
+    growth = watched("opens").growth(0.5)
+    assert not growth.constant
+    assert not growth.fine
+
+
+def test_a_process_that_keeps_still_is_not() -> None:
+    growth = watched("sleeps").growth(0.5)
+    assert growth.constant
+    assert growth.slope_mb_per_h == pytest.approx(0.0, abs=1e-6)
+    assert growth.verdict is Verdict.STEADY
+
+
+def test_a_process_that_was_replaced_is_not_fine() -> None:
+    history = History()
+    for number in range(10 * BINS):
+        history.add(float(number), 1 if number < 50 else 2, Use(100 << 20, 3, 10))
+    growth = history.growth(0.0)
+    assert growth.restarts == 1
+    assert not growth.fine
+
+
+def test_what_is_given_back_is_no_growth() -> None:
+    """A sawtooth of 3 MB, as of a record that is written and closed, beside a real growth."""
+    hours = np.linspace(0, 1 / 3, 600)
+    noise = np.random.default_rng(1).uniform(0, 0.05, 600)
+    sawtooth = 100 + 3 * (hours * 60 % 1) + noise
+    slope, half = slope_of(hours, sawtooth)
+    assert verdict_of(slope, half) is Verdict.STEADY
+    slope, half = slope_of(hours, sawtooth + 6 * hours)
+    assert slope == pytest.approx(6, abs=1)
+    assert verdict_of(slope, half) is Verdict.GROWS
+
+
+def test_a_slope_that_is_not_known_is_no_verdict() -> None:
+    assert verdict_of(0.0, 0.9) is Verdict.STEADY
+    assert verdict_of(0.9, 0.2) is Verdict.UNDECIDED
+    assert verdict_of(50.0, 60.0) is Verdict.UNDECIDED
+    assert verdict_of(3.0, 1.5) is Verdict.GROWS
+
+
+def test_too_few_samples_are_no_answer() -> None:
+    history = History()
+    for number in range(2 * BINS):
+        history.add(float(number), 1, Use(1, 1, 1))
+    with pytest.raises(ValueError, match="samples after the warm-up"):
+        history.growth(1.0)
+
+
+def test_ended_processes_are_none() -> None:
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    assert use_of(child.pid) is None
+    assert processes_below(os.getpid())["up"] == os.getpid()
+
+
+@pytest.mark.slow
+def test_soak_watches_a_whole_station(palpate: Palpate, tmp_path: Path) -> None:
+    out = tmp_path / "soak.json"
+    words = ("--minutes", "2", "--fingers", "1", "--out", str(out), "--json")
+    result = palpate("bench", "soak", *words, timeout=400)
+    assert out.exists(), result.stderr
+    values = json.loads(out.read_text())["soak"]
+    names = {"up", "supervisord", "router", "gateway", "features", "field", "recorder", "synthesis"}
+    assert names <= set(values["processes"])
+    assert values["received"]["electrodes"] > 1000
+    assert 0 < values["disk_peak_mb"] <= values["disk_limit_mb"]
+    assert out.with_suffix(".png").stat().st_size > 10_000
