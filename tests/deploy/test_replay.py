@@ -5,13 +5,14 @@ from __future__ import annotations
 import gzip
 import json
 import subprocess
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from palpate.bus.topics import FEATURES
+from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.files.record import read_record
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -65,6 +66,52 @@ def test_real_capture(palpate: Palpate, shared_data: Path, bundle: str, tmp_path
     estimates = _estimates(first)
     assert len(estimates) == BTD_FRAMES
     assert estimates == _estimates(again)
+
+
+def _three_fingers(lines: Iterable[str], *, port: int) -> Iterator[str]:
+    """A log with the finger of ``port`` at the ports 1, 3 and 4; port 2 is empty."""
+    in_rows = False
+    for line in lines:
+        if not in_rows:
+            in_rows = line.startswith("Begin File")
+            yield line
+            continue
+        columns = line.split()
+        value, parity = columns[2 + 2 * port : 4 + 2 * port]
+        moved = str(min(4095, int(value) + 5))
+        yield " ".join([*columns[:4], value, parity, "0", "1", moved, parity, value, parity]) + "\n"
+
+
+def test_all_fingers_of_a_log_are_played(
+    palpate: Palpate, text_log: Path, bundle: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "three.btd"
+    with text_log.open(encoding="ascii") as lines:
+        file.write_text("".join(_three_fingers(lines, port=1)), encoding="ascii")
+    fingers = ("finger-1", "finger-3", "finger-4")
+    first = _replay(palpate, file, tmp_path / "first")
+    assert first["frames"] == first["estimates"] == 3 * 118
+    assert first["frames_by_sensor"] == dict.fromkeys(fingers, 118)
+    items = list(read_record(Path(first["records"][0])))
+    for topic in (ELECTRODES.name, FEATURES.name):
+        found = Counter(i.address.sensor for i in items if i.address.topic == topic)
+        assert found == dict.fromkeys(fingers, 118)
+    again = _replay(palpate, Path(first["records"][0]), tmp_path / "again")
+    assert sorted(_estimates(first)) == sorted(_estimates(again))
+
+
+def test_three_fingers_of_a_real_capture(
+    palpate: Palpate, shared_data: Path, bundle: str, tmp_path: Path
+) -> None:
+    capture = shared_data / "syntouch_btd_raw" / "data.btd.gz"
+    file = tmp_path / "three.btd"
+    with gzip.open(capture, "rt", encoding="latin-1") as lines:
+        file.write_text("".join(_three_fingers(lines, port=3)), encoding="latin-1")
+    account = _replay(palpate, file, tmp_path / "out")
+    assert account["frames_by_sensor"] == dict.fromkeys(
+        ("finger-1", "finger-3", "finger-4"), BTD_FRAMES
+    )
+    assert account["estimates"] == 3 * BTD_FRAMES
 
 
 @pytest.mark.parametrize("kind", ["plain", "gzip"])

@@ -63,7 +63,11 @@ def replay(
     rrd: Annotated[bool, typer.Option(help="Also write a Rerun view.")] = True,
     json_: JsonOption = False,
 ) -> None:
-    """Send a file through gateway, features and recorder, and check that nothing is lost."""
+    """Send a file through gateway, features and recorder, and check that nothing is lost.
+
+    A log of one finger is played as sensor finger, one of several as finger-1, finger-2 and so on,
+    by their ports.
+    """
     from palpate_deploy.diagnose.replay import run_replay
 
     raise typer.Exit(

@@ -55,6 +55,13 @@ class ReplayAccount:
         return total(self.gateway, "frames_published")
 
     @property
+    def by_sensor(self) -> dict[str, int]:
+        """The same for each of several sensors; with one there is nothing to tell."""
+        end = ".frames_published"
+        found = {k.removesuffix(end): n for k, n in self.gateway.items() if k.endswith(end)}
+        return dict(sorted(found.items()))
+
+    @property
     def estimated(self) -> int:
         """Estimates the features service published."""
         return self.features.get("estimates_published", 0)
@@ -111,6 +118,7 @@ def as_plain(account: ReplayAccount) -> dict[str, Any]:
         "seconds": round(account.seconds, 3),
         "samples": total(account.gateway, "samples"),
         "frames": account.published,
+        "frames_by_sensor": account.by_sensor,
         "missing_frames": total(account.gateway, "missing_frames"),
         "time_jumps": total(account.gateway, "time_jumps"),
         "estimates": account.estimated,
@@ -133,6 +141,8 @@ def print_account(account: ReplayAccount) -> None:
         table.add_row(name.replace("_", " "), f"{plain[name]:,}")
     for reason, count in sorted(account.unanswered.items()):
         table.add_row(f"  without estimate: {reason}", f"{count:,}")
+    for sensor, count in account.by_sensor.items():
+        table.add_row(f"  frames of {sensor}", f"{count:,}")
     for topic, count in sorted(account.recorded.items()):
         table.add_row(f"recorded {topic}", f"{count:,}")
     table.add_row("seconds", f"{account.seconds:.1f}")
@@ -198,12 +208,16 @@ def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) 
 
 
 def sensors_of(file: Path) -> list[dict[str, Any]]:
-    """The gateway's sensors for a file: a record (by its magic bytes), else a text log."""
+    """The gateway's sensors for a file: a record (by its magic bytes), else a text log.
+
+    A log of one finger is the sensor ``finger``; one of several is a sensor for each, named by its
+    port, e.g. ``finger-1`` and ``finger-3``.
+    """
     with open(file, "rb") as stream:
         head = stream.read(len(_MCAP_MAGIC))
     path = str(file.absolute())
     if not head.startswith(_MCAP_MAGIC):
-        return [{"name": "finger", "driver": "text_log", "options": {"path": path}}]
+        return _fingers_of_log(file, path)
     from palpate_gateway.recordings.record import recorded_sensors
 
     names = []
@@ -216,6 +230,20 @@ def sensors_of(file: Path) -> list[dict[str, Any]]:
     return [
         {"name": name, "driver": "record", "options": {"path": path, "sensor": name}}
         for name in names
+    ]
+
+
+def _fingers_of_log(file: Path, path: str) -> list[dict[str, Any]]:
+    from palpate_gateway.recordings.text_log import ports_of
+
+    ports: tuple[int, ...] = ()
+    with contextlib.suppress(RecordingError):  # the driver tells it
+        ports = ports_of(file)
+    if len(ports) < 2:
+        return [{"name": "finger", "driver": "text_log", "options": {"path": path}}]
+    return [
+        {"name": f"finger-{port}", "driver": "text_log", "options": {"path": path, "port": port}}
+        for port in ports
     ]
 
 

@@ -43,6 +43,19 @@ class TextLogOptions(StrictConfig):
     serial: str = ""
 
 
+_FIRST = -1
+"""Instead of a port: the first with data."""
+
+
+def ports_of(path: Path) -> tuple[int, ...]:
+    """Ports of the fingers in a log, from 1: those with data at its beginning.
+
+    Raises:
+        RecordingError: The file is no log, or nothing of it can be read.
+    """
+    return TextLogReader(path, port=_FIRST).ports
+
+
 class TextLogReader:
     """Slots of one finger of a log.
 
@@ -80,7 +93,7 @@ class TextLogReader:
                 f"{path}: the log has a header and no rows", remedy="record or copy it again"
             )
         self._columns = count_columns(str(path), rows.split(b"\n", 1)[0], self._line)
-        self._ports = (self._columns - 4) // 2
+        self._port_count = (self._columns - 4) // 2
         self._slots_before = 0
         self._frame_before: int | None = None
         self._pending = self._parse(rows) if rows.endswith(b"\n") else self._end()
@@ -90,6 +103,8 @@ class TextLogReader:
             )
         self.timed = len(self._pending) == 1 or bool(self._pending[:, 0].any())
         """Whether the log has times; else they are made from the number of slots."""
+        self.ports = self._ports_with_data()
+        """Ports of the fingers, those with data at the beginning."""
         self.port = self._choose_port(port)
         self.sensor_type = self._find_type()
         """Kind of sensor, from the sampled channels."""
@@ -161,30 +176,34 @@ class TextLogReader:
         self._frame_before = int(frame[-1])
         return np.asarray(index * self.slot_period_s, np.float64)
 
+    def _ports_with_data(self) -> tuple[int, ...]:
+        pending, ports = self._pending, range(1, self._port_count + 1)
+        return tuple(port for port in ports if (pending[:, 3 + 2 * port] == 0).any())
+
     def _choose_port(self, port: int) -> int:
-        good = [p + 1 for p in range(self._ports) if (self._pending[:, 5 + 2 * p] == 0).any()]
-        carrying = ", ".join(map(str, good)) or "none"
-        if port > self._ports:
+        carrying = ", ".join(map(str, self.ports)) or "none"
+        if port > self._port_count:
             raise RecordingError(
-                f"{self.path}: the log has no port {port}, it has {self._ports}",
+                f"{self.path}: the log has no port {port}, it has {self._port_count}",
                 remedy=f"ports with data: {carrying}",
             )
-        if port and port not in good:
+        if not self.ports:
+            raise RecordingError(
+                f"{self.path}: every slot of all {self._port_count} ports has wrong parity",
+                remedy="no sensor was connected when this log was recorded; record it again",
+            )
+        if port > 0 and port not in self.ports:
             raise RecordingError(
                 f"{self.path}: every slot of port {port} has wrong parity, so no sensor was there",
                 remedy=f"ports with data: {carrying}",
             )
-        if not good:
-            raise RecordingError(
-                f"{self.path}: every slot of all {self._ports} ports has wrong parity",
-                remedy="no sensor was connected when this log was recorded; record it again",
-            )
-        if not port and len(good) > 1:
+        if not port and len(self.ports) > 1:
             raise ConfigError(
-                f"{self.path}: {len(good)} fingers are in this log, at ports {carrying}",
-                remedy="choose one with the option port",
+                f"{self.path}: {len(self.ports)} fingers are in this log, at ports {carrying}",
+                remedy="make each a sensor of the profile, with its port in the option port; "
+                "`palpate replay` plays all of them",
             )
-        return port or good[0]
+        return port if port > 0 else self.ports[0]
 
     def _find_type(self) -> SensorType:
         """Kind of sensor by the electrodes in the rows; header and serial number do not tell it.

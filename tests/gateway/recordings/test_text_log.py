@@ -12,7 +12,7 @@ from palpate.errors import ConfigError, PalpateError, RecordingError
 from palpate.messages import SensorType
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading
-from palpate_gateway.recordings.text_log import TextLog, TextLogOptions, TextLogReader
+from palpate_gateway.recordings.text_log import TextLog, TextLogOptions, TextLogReader, ports_of
 
 
 def replay(
@@ -317,3 +317,10 @@ def test_real_capture(shared_data: Path) -> None:
 def test_real_capture_has_nothing_at_port_1(shared_data: Path) -> None:
     path = shared_data / "syntouch_btd_raw" / "data.btd.gz"
     check(replay(path, port=1)[2], RecordingError, "port 1", "ports with data: 3")
+
+
+def test_the_ports_of_a_log(log: Callable[..., Any], tmp_path: Path) -> None:
+    made = log(style="log")
+    made.lines = [line.replace("0 1 0 1 ", "7 0 0 1 ") for line in made.lines]
+    assert ports_of(made.write(tmp_path / "two")) == (1, 3)
+    assert ports_of(log().write(tmp_path / "one")) == (3,)
