@@ -68,6 +68,7 @@ mutants: $(VENV)/.dev  ## plant small faults in the central modules: which do th
 
 docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links | 20 s
 	$(BIN)/python docs/make_messages.py
+	$(BIN)/python docs/make_asyncapi.py
 	$(BIN)/python docs/make_electrode_map.py
 	$(BIN)/python docs/make_fingertip_mesh.py
 	$(BIN)/python docs/make_indenters.py
@@ -84,6 +85,7 @@ fmt: $(VENV)/.dev  ## format Python and .proto files, repair what lint can | 5 s
 proto: $(VENV)/.dev  ## regenerate the Python of the .proto files and their page | 5 s
 	$(BIN)/python -m grpc_tools.protoc -Iprotos --python_out=protos --pyi_out=protos protos/palpate/v1/*.proto
 	$(BIN)/python docs/make_messages.py
+	$(BIN)/python docs/make_asyncapi.py
 
 bundle: $(VENV)/.dev  ## train the shipped bundle again, on the virtual finger | 1-5 min
 	$(BIN)/palpate bundle virtual

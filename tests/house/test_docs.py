@@ -131,7 +131,9 @@ def test_palpate_commands_exist(
     assert not wrong
 
 
-@pytest.mark.parametrize("program", ["make_messages.py", "make_house.py", "make_numbers.py"])
+@pytest.mark.parametrize(
+    "program", ["make_messages.py", "make_asyncapi.py", "make_house.py", "make_numbers.py"]
+)
 def test_generated_documents_are_fresh(program: str) -> None:
     if program == "make_messages.py":
         pytest.importorskip("grpc_tools", reason="grpcio-tools not installed (extra dev)")
