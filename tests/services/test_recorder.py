@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -17,9 +18,9 @@ from typing import Any
 import pytest
 
 from palpate.bus import Delivery, Session, endpoints
-from palpate.bus.topics import ELECTRODES, FEATURES, POSE, TARE, WRENCH, sensor_key
+from palpate.bus.topics import ELECTRODES, FEATURES, POSE, STATUS, TARE, WRENCH, sensor_key
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, ErrorCode
+from palpate.errors import ConfigError, ErrorCode, StreamTimeout
 from palpate.files.record import RecordWriter, read_record
 from palpate.messages import (
     ElectrodeFrame,
@@ -32,7 +33,7 @@ from palpate.messages import (
 from palpate_services.config import FeaturesServiceConfig, RecorderConfig
 from palpate_services.inference.services import run_estimating
 from palpate_services.recorder.service import run_recorder
-from palpate_services.recorder.writer import leftovers, recover_all
+from palpate_services.recorder.writer import RecordFiles, leftovers, recover_all
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -295,3 +296,42 @@ def test_leftover_of_a_killed_recorder_is_recovered_by_the_next(
         until(lambda: status_of(session, "recorder").counters.get("recovered_records") == 1)
     items = list(read_record(tmp_path / "lab-killed.recovered.mcap"))
     assert [item.payload for item in items] == [payload]
+
+
+def test_a_recorder_that_must_stop_counts_what_it_had_no_time_to_write(
+    link: LinkConfig, until: Until, make_frame: Frames, tmp_path: Path
+) -> None:
+    """SIGTERM leaves it two seconds; a slow disk may need longer for what has arrived."""
+    stop, slow = threading.Event(), threading.Event()
+    write = RecordFiles.write
+
+    def write_slowly(files: RecordFiles, sample: Any) -> None:
+        if slow.is_set():
+            time.sleep(0.05)
+        write(files, sample)
+
+    config = RecorderConfig(out=tmp_path, topics=("electrodes",), rrd=False, drain_s=0.2)
+    with pytest.MonkeyPatch.context() as patch, Session.open(link) as session:
+        patch.setattr(RecordFiles, "write", write_slowly)
+        statuses = session.subscriber(STATUS, service="recorder", delivery=Delivery.QUEUE)
+        node = threading.Thread(target=run_recorder, args=(config, link, "lab", stop))
+        node.start()
+        until(lambda: any(a.service == "recorder" and a.ready for a in session.alive()))
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        until(frames.matched)
+        slow.set()
+        for sequence in range(1, 201):
+            frames.put(make_frame(sequence))
+        until(lambda: status_of(session, "recorder").counters.get("received", 0) >= 200)
+        stop.set()
+        node.join(timeout=30)
+        assert not node.is_alive()
+        last = statuses.next(10).message
+        with contextlib.suppress(StreamTimeout):
+            while True:
+                last = statuses.next(0.5).message
+    lost, recorded = last.counters["lost_at_stop"], last.counters["recorded_electrodes"]
+    assert lost > 0
+    assert lost + recorded == 200
+    (record,) = tmp_path.glob("*.mcap")
+    assert len(list(read_record(record))) >= recorded
