@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from palpate_deploy.station.host import free_endpoint
+from palpate_deploy.station.processes import command_line
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+PATIENCE_S = 60.0
 
 HIDES = """
 import importlib.abc, sys
@@ -107,6 +112,53 @@ def test_a_missing_package_is_named_before_anything_starts(
     assert f"'{module}' is not installed" in result.stderr
     assert f'pip install "palpate[{extra}]"' in result.stderr
     assert not list(Path(os.environ["XDG_STATE_HOME"]).rglob("supervisord.conf"))
+
+
+@pytest.mark.slow
+def test_systemd_hears_when_a_station_is_up_alive_and_stops(
+    profile: Callable[..., Path], tmp_path: Path
+) -> None:
+    """From `palpate up` itself: its processes are not the service manager's."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(PATIENCE_S)
+        where = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "2000000"}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "palpate_deploy", "up", "--profile", str(profile("router"))],
+            env={**os.environ, **where},
+            stdout=subprocess.DEVNULL,
+        )
+        try:
+            said: list[str] = []
+            while said.count("WATCHDOG=1") < 3 or "STATUS=1 of 1 processes run" not in said:
+                said += systemd.recv(4096).decode().splitlines()
+            assert said.count("READY=1") == 1
+            process.terminate()
+            while "STOPPING=1" not in said:
+                said += systemd.recv(4096).decode().splitlines()
+            assert process.wait(PATIENCE_S) == 0
+        finally:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_tells_systemd_too(
+    profile: Callable[..., Path], tmp_path: Path
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(PATIENCE_S)
+        process = subprocess.Popen(
+            command_line("router", profile("router")),
+            env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000"},
+        )
+        try:
+            assert systemd.recv(4096).startswith(b"READY=1\n")
+            assert systemd.recv(4096).endswith(b"WATCHDOG=1")
+        finally:
+            process.terminate()
+            assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.slow

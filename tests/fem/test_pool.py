@@ -164,3 +164,16 @@ def test_any_idle_worker_is_better_than_waiting(bench: Bench) -> None:
     assert bench.events[-1] == JobWaiting(0)
     bench.end(second)
     assert len(bench.workers[second].jobs) == 2, "what waited is started when a worker is free"
+
+
+def test_an_upkeep_that_hangs_is_noticed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service's own loop goes on all the while."""
+    monkeypatch.setattr(pool, "_TURN_S", 0.2)
+    deadline = time.monotonic() + PATIENCE_S
+    with bench.pool._lock:
+        while not bench.pool.turns.late:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    while bench.pool.turns.late:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

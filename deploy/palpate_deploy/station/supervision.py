@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 import xmlrpc.client
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -66,6 +66,14 @@ class ProcessState:
     served: bool
     exit_status: int
     why: str
+
+
+_RECENT_S = 300.0
+
+
+def recent(processes: Sequence[ProcessState]) -> list[ProcessState]:
+    """Processes that were started again in the last minutes, or are being."""
+    return [one for one in processes if one.why and one.uptime_s < _RECENT_S]
 
 
 class Supervisor:

@@ -15,7 +15,7 @@ from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState, SupervisedProcess
 from palpate.process import Closing
 from palpate.usage import ProcessUsage
-from palpate_deploy.station.supervision import ProcessState
+from palpate_deploy.station.supervision import ProcessState, recent
 
 SERVICE = "supervisor"
 
@@ -53,6 +53,7 @@ class SupervisorReport(Closing):
                 for one in processes
             ]
         )
+        self._health.set_counts({f"{one.service}.hung": one.hangs for one in processes})
         self._measure_router(processes)
         down = [one for one in processes if one.state not in _FINE]
         # A process is "starting" until its first heartbeat.
@@ -65,7 +66,9 @@ class SupervisorReport(Closing):
                 )
             )
         elif not down:
-            self._health.set_state(ServiceState.READY, f"{len(processes)} processes run")
+            said = [f"{len(processes)} processes run"]
+            said += [f"{one.service} was started again: {one.why}" for one in recent(processes)]
+            self._health.set_state(ServiceState.READY, "; ".join(said))
 
     def _measure_router(self, processes: Sequence[ProcessState]) -> None:
         """The router has no status of its own: its memory and processor time are told here."""

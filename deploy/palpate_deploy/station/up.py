@@ -24,15 +24,17 @@ from palpate_deploy.station.logs import print_error
 from palpate_deploy.station.processes import check_packages, ended_error
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import duration_text, shown_counters, state_text
-from palpate_deploy.station.supervision import ProcessState, Supervisor, SupervisorError
+from palpate_deploy.station.supervision import (
+    ProcessState,
+    Supervisor,
+    SupervisorError,
+    recent,
+)
 from palpate_deploy.station.supervisor_report import SupervisorReport
 from palpate_deploy.station.watch import cannot_serve
 
 _REFRESH_S = 0.25
 _SILENT_AFTER_S = 3.0
-_RECENT_S = 300.0
-"""How long the table says why a process was started again [s]."""
-
 _STARTED = ("RUNNING", "EXITED")
 
 _STATE_COLOURS = {"RUNNING": "green", "STARTING": "yellow", "STOPPING": "yellow"}
@@ -196,10 +198,8 @@ def _table(processes: list[ProcessState], known: dict[str, tuple[Status, float]]
     table = Table(expand=True)
     for column in ("process", "runs", "pid", "up", "restarts", "says", "counters"):
         table.add_column(column, overflow="fold")
-    problems: list[str] = []
+    problems = [f"{one.service}: {one.why}" for one in recent(processes)]
     for process in processes:
-        if process.why and (process.state != "RUNNING" or process.uptime_s < _RECENT_S):
-            problems.append(f"{process.service}: {process.why}")
         colour = _STATE_COLOURS.get(process.state, "red")
         status, heard_s = known.get(process.service, (None, 0.0))
         says = counters = ""
