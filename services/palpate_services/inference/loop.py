@@ -39,6 +39,7 @@ from palpate_services.inference.model import BATCH_MOST, Runtime
 from palpate_services.inference.remembered import RememberedFile
 from palpate_services.inference.repository import Repository
 from palpate_services.inference.served import ServedModels
+from palpate_services.inference.stage_gauges import StageGauges
 
 _log = logging.getLogger(__name__)
 
@@ -204,6 +205,7 @@ class EstimatePublisher(Generic[M, E]):
         self._publishers: dict[str, Publisher[E]] = {}
         self._counts: Counter[str] = Counter()
         self._input = InputReport(health, _ERRORS, partial(show, models, health))
+        self._stages = StageGauges()
         self._latencies_ns: list[int] = []
         self._busy_ns = 0
         self._batches = self._batched = 0
@@ -285,6 +287,7 @@ class EstimatePublisher(Generic[M, E]):
                 encode_s,
             )
             publisher.put_payload(payload, attachment=STAGE_TIMINGS.encode(timings))
+            self._stages.note(timings)
             self._rate_limit.note(received.sensor, stamp)
             self._counts["estimates_published"] += 1
             self._input.answered(received.sensor)
@@ -338,6 +341,8 @@ class EstimatePublisher(Generic[M, E]):
                 self._health.gauge("latency_p50_s", float(p50))
                 self._health.gauge("latency_p99_s", float(p99))
                 self._latencies_ns = []
+            for name, seconds in self._stages.take().items():
+                self._health.gauge(name, seconds)
             if self._batches:
                 self._health.gauge("batch_mean_samples", self._batched / self._batches)
                 self._batches = self._batched = 0
