@@ -46,6 +46,7 @@ class Station:
         self.sensors: tuple[str, ...] = ()
         self.refused: EstimateRefusal | None = None
         self.batches: list[int] = []
+        self.closed: list[str] = []
         # By sensor; each is a bundle of its own.
         self.runtimes: dict[str, Any] = {}
         self.runtime = self.bundle()
@@ -76,7 +77,10 @@ class Station:
                 self.put.append((sensor, estimate))
                 self.timings.append(STAGE_TIMINGS.decode(attachment))
 
-            return SimpleNamespace(encode=self.encode, put_payload=put_payload)
+            def close() -> None:
+                self.closed.append(sensor)
+
+            return SimpleNamespace(encode=self.encode, put_payload=put_payload, close=close)
 
         def count(name: str, by: int = 1) -> None:
             self.counts[name] += by
@@ -232,6 +236,25 @@ def test_a_sensor_without_a_bundle_is_counted(station: Station, came: Came) -> N
     publisher.report(last=True)
     assert station.put == [("finger", 2)]
     assert station.counts["no_model"] == 1
+
+
+def test_sensors_are_bounded_and_silent_ones_forgotten(
+    station: Station, came: Came, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "SENSORS_MOST", 2)
+    publisher = station.make(rate_hz=1.0)
+    publisher.take([came(n, START_NS, sensor=f"s{n}") for n in range(4)])
+    publisher.report(last=True)
+    assert [sensor for sensor, _ in station.put] == ["s0", "s1"]
+    assert station.counts["sensors_refused"] == 2
+    for minute in (1, 2):  # s1 goes on, s0 is silent
+        station.now_ns = START_NS + minute * 60_000 * MS
+        publisher.report()
+        publisher.take([came(5, station.now_ns, sensor="s1")])
+    assert station.sensors == ("s1",)
+    assert station.closed == ["s0"]
+    publisher.take([came(6, station.now_ns, sensor="s3")])
+    assert station.put[-1] == ("s3", 6)
 
 
 def test_what_has_come_is_answered_before_it_leaves(

@@ -49,8 +49,12 @@ E = TypeVar("E")
 Prepare = Callable[[Session, ServedModels, Health], Estimation[M, E]]
 """Declares the endpoints of a service, and returns how it makes estimates."""
 
+SENSORS_MOST = 256
+"""Sensors that one service answers; messages of more are counted as ``sensors_refused``."""
+
 _COUNT_PERIOD_NS = 200_000_000
 _GAUGE_PERIOD_NS = 1_000_000_000
+_FORGET_NS = 60_000_000_000  # a sensor that got no estimate for so long is forgotten
 _WAIT_S = 0.1  # how long a bus without messages delays the next look at the stop event
 _QUIET_S = 0.05  # a stopping service has drained when no message came for this long
 
@@ -153,6 +157,10 @@ class RateLimit:
         if self._period_ns is not None:
             self._last[sensor] = stamp.monotonic_ns // self._period_ns
 
+    def forget(self, sensor: str) -> None:
+        """A sensor is gone."""
+        self._last.pop(sensor, None)
+
 
 @dataclass(frozen=True, slots=True)
 class _Taken(Generic[M]):
@@ -203,13 +211,14 @@ class EstimatePublisher(Generic[M, E]):
         self._age_limit = AgeLimit(config, session.wall_clock_error_s)
         self._rate_limit = RateLimit(rate_hz)
         self._publishers: dict[str, Publisher[E]] = {}
+        self._used: set[str] = set()
         self._counts: Counter[str] = Counter()
         self._input = InputReport(health, _ERRORS, partial(show, models, health))
         self._stages = StageGauges()
         self._latencies_ns: list[int] = []
         self._busy_ns = 0
         self._batches = self._batched = 0
-        self._counted_ns = self._gauged_ns = time.monotonic_ns()
+        self._counted_ns = self._gauged_ns = self._forgot_ns = time.monotonic_ns()
 
     def take(self, messages: Sequence[ReceivedMessage[M]]) -> None:
         """Publish the estimates of messages, or count why there are none.
@@ -226,6 +235,9 @@ class EstimatePublisher(Generic[M, E]):
                 if self._sensors and sensor not in self._sensors:
                     continue
                 self._counts[self._route.received] += 1
+                if len(self._publishers) >= SENSORS_MOST and sensor not in self._publishers:
+                    self._counts["sensors_refused"] += 1
+                    continue
                 # One bundle makes all of an estimate, whichever is loaded meanwhile.
                 runtime = self._models.of(sensor)
                 taken_ns = time.monotonic_ns()
@@ -319,7 +331,16 @@ class EstimatePublisher(Generic[M, E]):
             publisher = self._session.publisher(target, sensor=sensor, lossless=self._lossless)
             self._publishers[sensor] = publisher
             self._health.set_sensors(tuple(sorted(self._publishers)))
+        self._used.add(sensor)
         return publisher
+
+    def _forget_silent(self) -> None:
+        """Forget the sensors that got no estimate since the last call."""
+        for sensor in [sensor for sensor in self._publishers if sensor not in self._used]:
+            self._publishers.pop(sensor).close()
+            self._rate_limit.forget(sensor)
+            self._health.set_sensors(tuple(sorted(self._publishers)))
+        self._used.clear()
 
     def report(self, *, last: bool = False) -> None:
         """Hand counters and gauges to health at their own periods; with ``last`` now."""
@@ -343,6 +364,9 @@ class EstimatePublisher(Generic[M, E]):
                 self._latencies_ns = []
             for name, seconds in self._stages.take().items():
                 self._health.gauge(name, seconds)
+            if now_ns - self._forgot_ns >= _FORGET_NS:
+                self._forgot_ns = now_ns
+                self._forget_silent()
             if self._batches:
                 self._health.gauge("batch_mean_samples", self._batched / self._batches)
                 self._batches = self._batched = 0
