@@ -243,7 +243,8 @@ def test_sensors_are_bounded_and_silent_ones_forgotten(
 ) -> None:
     monkeypatch.setattr(loop, "SENSORS_MOST", 2)
     publisher = station.make(rate_hz=1.0)
-    publisher.take([came(n, START_NS, sensor=f"s{n}") for n in range(4)])
+    for n in range(4):
+        publisher.take([came(n, START_NS, sensor=f"s{n}")])
     publisher.report(last=True)
     assert [sensor for sensor, _ in station.put] == ["s0", "s1"]
     assert station.counts["sensors_refused"] == 2
