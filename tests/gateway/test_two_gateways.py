@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Delivery, Subscriber
+from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES
+from palpate.codec import ELECTRODE_FRAME
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, StreamTimeout
 from palpate.messages import ElectrodeFrame, SensorState, ServiceState, Status
@@ -48,14 +49,24 @@ def process(link: LinkConfig, values: dict[str, Any]) -> Iterator[subprocess.Pop
         child.wait()
 
 
-def take(frames: Subscriber[ElectrodeFrame], count: int) -> list[ElectrodeFrame]:
-    return [frames.next(timeout_s=PATIENCE_S).message for _ in range(count)]
+class Published:
+    """What is published, from whichever gateway: a subscriber would follow only one of them."""
+
+    def __init__(self, session: Session, sensor: str = "*") -> None:
+        self._tap = session.tap([ELECTRODES], sensor=sensor)
+
+    def next(self, timeout_s: float) -> ElectrodeFrame:
+        return ELECTRODE_FRAME.decode(self._tap.next(timeout_s).payload)
 
 
-def next_of_another(frames: Subscriber[ElectrodeFrame], session_id: int) -> ElectrodeFrame:
+def take(frames: Published, count: int) -> list[ElectrodeFrame]:
+    return [frames.next(PATIENCE_S) for _ in range(count)]
+
+
+def next_of_another(frames: Published, session_id: int) -> ElectrodeFrame:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
-        frame = frames.next(timeout_s=PATIENCE_S).message
+        frame = frames.next(PATIENCE_S)
         if frame.stamp.session_id != session_id:
             return frame
     raise AssertionError("no frame of another gateway came")
@@ -74,7 +85,7 @@ def refused(bus: Any) -> Status:
 
 
 def test_the_second_is_refused_and_takes_over(bus: Any) -> None:
-    frames = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+    frames = Published(bus.session)
     with ExitStack() as stack:
         first = stack.enter_context(bus.gateway(finger(unit=1)))
         one = take(frames, 1)[0]
@@ -107,16 +118,16 @@ def test_a_gateway_with_other_sensors_serves_them(bus: Any) -> None:
     values = finger()
     more = {"sensors": [*values["sensors"], {**values["sensors"][0], "name": "thumb"}]}
     with bus.gateway(values):
-        take(bus.session.subscriber(ELECTRODES, sensor="finger", delivery=Delivery.QUEUE), 1)
+        take(Published(bus.session, "finger"), 1)
         with bus.gateway(more, instance="spare"):
-            take(bus.session.subscriber(ELECTRODES, sensor="thumb", delivery=Delivery.QUEUE), 10)
+            take(Published(bus.session, "thumb"), 10)
             status = refused(bus)
             assert status.counters["thumb.frames_published"] > 0
             assert status.counters["finger.frames_published"] == 0
 
 
 def test_of_gateways_that_start_at_one_instant_one_publishes(bus: Any) -> None:
-    frames = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+    frames = Published(bus.session)
     with ExitStack() as stack:
         for number in range(3):
             stack.enter_context(bus.gateway(finger(unit=number), instance=f"g{number}"))
@@ -133,7 +144,7 @@ def test_a_recording_waits_for_its_turn(bus: Any, log: Callable[..., Any], tmp_p
         "exit_at_end": True,
         "linger_s": 0.0,
     }
-    frames = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+    frames = Published(bus.session)
     with ExitStack() as stack:
         live = stack.enter_context(bus.gateway(finger()))
         name = take(frames, 1)[0].stamp.session_id
@@ -153,7 +164,7 @@ def test_a_recording_waits_for_its_turn(bus: Any, log: Callable[..., Any], tmp_p
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
 def test_one_that_dies_or_freezes_is_followed(bus: Any, end: signal.Signals) -> None:
-    frames = bus.session.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+    frames = Published(bus.session)
     with process(bus.link, finger(unit=1)) as child:
         one = take(frames, 1)[0]
         with bus.gateway(finger(unit=2), instance="spare"):
@@ -172,10 +183,10 @@ def test_one_that_dies_or_freezes_is_followed(bus: Any, end: signal.Signals) -> 
                 assert {frame.stamp.session_id for frame in late} == {other.stamp.session_id}
 
 
-def drain(frames: Subscriber[ElectrodeFrame]) -> None:
+def drain(frames: Published) -> None:
     while True:
         try:
-            frames.next(timeout_s=0)
+            frames.next(0.0)
         except StreamTimeout:
             return
 

@@ -56,6 +56,7 @@ class TareBook:
         self._wanted: dict[tuple[str, int], _Wanted] = {}
         self._asking = False
         self._changed = threading.Condition()
+        self._draining = threading.Lock()
         self._stream = session.subscriber(TARE, delivery=Delivery.QUEUE, capacity=_KEPT)
 
     def find(self, sensor: str, tare_id: int) -> Tare | None:
@@ -168,9 +169,10 @@ class TareBook:
                 self.remember(sensor, tare)
 
     def _drain(self) -> None:
-        while True:
-            try:
-                received = self._stream.next(timeout_s=0)
-            except StreamTimeout:
-                return
-            self.remember(received.sensor, received.message)
+        with self._draining:
+            while True:
+                try:
+                    received = self._stream.next(timeout_s=0)
+                except StreamTimeout:
+                    return
+                self.remember(received.sensor, received.message)
