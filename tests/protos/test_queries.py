@@ -213,3 +213,35 @@ def test_a_question_is_cancelled_from_another_thread(pair: Any, examples: dict[s
     go.set()
     with cancellation, pytest.raises(PalpateError):
         _tare(b, timeout_s=600.0)
+
+
+def test_a_flood_of_questions_is_refused_and_answered_in_the_end(
+    pair: Any, examples: dict[str, Any]
+) -> None:
+    """Far more callers than may wait: each is told when to come back, and none is lost."""
+    a, b = pair
+    tare: Tare = examples["Tare"]
+
+    def handler(_: TareRequest) -> Tare:
+        time.sleep(0.002)
+        return tare
+
+    queryable = a.queryable(endpoints.TARE, handler, sensor="finger", capacity=2)
+    time.sleep(0.3)
+    answers: list[object] = []
+
+    def ask() -> None:
+        for _ in range(3):
+            try:
+                answers.append(_tare(b).tare_id)
+            except PalpateError as error:
+                answers.append(error)
+
+    askers = [threading.Thread(target=ask, daemon=True) for _ in range(40)]
+    for asker in askers:
+        asker.start()
+    for asker in askers:
+        asker.join(3 * TIMEOUT_S)
+    assert answers == [tare.tare_id] * 120
+    assert queryable.counters["refused_full"] > 0
+    assert queryable.waiting == 0

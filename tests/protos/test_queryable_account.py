@@ -45,7 +45,9 @@ class Query:
         self.errors: list[Any] = []
         self.ended = threading.Event()
 
-    def reply(self, key: str, payload: bytes, *, encoding: object) -> None:
+    def reply(
+        self, key: str, payload: bytes, *, encoding: object, attachment: bytes | None = None
+    ) -> None:
         assert key == KEY
         self.replies.append(payload)
 
