@@ -119,10 +119,11 @@ class Heartbeat:
         self._words: memoryview | None = None
         if file is not None:
             with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as stream:
-                stream.truncate(mmap.PAGESIZE)
+                # Zeros: a process before this one may have used the file, and its beat must not
+                # count. Written, because a hole in a full memory would be found by a signal later.
+                stream.write(bytes(mmap.PAGESIZE))
+                stream.flush()
                 self._words = memoryview(mmap.mmap(stream.fileno(), mmap.PAGESIZE)).cast("q")
-            # A process before this one may have used the file: its beat must not count.
-            self._words[_BEATEN] = 0
             self._words[_PID] = os.getpid()
 
     def beat(self, within_s: float = LIMIT_S) -> None:

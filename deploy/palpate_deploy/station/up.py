@@ -138,7 +138,10 @@ class _Screen:
         # One that comes and goes must not keep the others from being up.
         if not self._up and all(p.state in _STARTED or p.restarts for p in processes):
             self._up = True
-            self._console.print(f"station {self._supervisor.profile.station!r} is up", markup=False)
+            absent = [f"{p.service} ({p.why})" for p in processes if p.state not in _STARTED]
+            without = f" without {', '.join(absent)}" if absent else ""
+            station = self._supervisor.profile.station
+            self._console.print(f"station {station!r} is up{without}", markup=False)
         if self._up:
             self._manager.alive(time.monotonic_ns())
         if running != self._running:

@@ -1,0 +1,39 @@
+"""What ``palpate up`` shows of processes that were started again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rich.console import Console
+
+from palpate_deploy.station.supervision import ProcessState, recent
+from palpate_deploy.station.up import _print_changes, _table
+
+FINE = ProcessState("gateway", "RUNNING", 10, 900.0, 0, 0, True, 0, "")
+HUNG = ProcessState("features", "RUNNING", 12, 30.0, 3, 1, True, -9, "hung: no heartbeat for 5.0 s")
+
+
+def test_the_table_counts_hangs_and_says_why() -> None:
+    console = Console(width=160, force_terminal=False)
+    with console.capture() as shown:
+        console.print(_table([FINE, HUNG], {}))
+    text = shown.get()
+    assert "3 (1 hung)" in text
+    assert "features: hung: no heartbeat for 5.0 s" in text
+    assert "gateway:" not in text
+
+
+def test_why_is_told_while_it_is_news() -> None:
+    assert recent([FINE, HUNG]) == [HUNG]
+    assert not recent([replace(HUNG, uptime_s=3600.0)])
+    assert recent([replace(HUNG, state="BACKOFF", pid=0, uptime_s=0.0)])
+
+
+def test_a_log_gets_one_line_a_change() -> None:
+    console = Console(width=160, force_terminal=False)
+    before: dict[str, tuple[str, int]] = {}
+    with console.capture() as shown:
+        for _ in range(3):
+            _print_changes(console, [HUNG], before)
+    (line,) = shown.get().splitlines()
+    assert line.endswith("features: running, pid 12, restart 3 (hung: no heartbeat for 5.0 s)")
