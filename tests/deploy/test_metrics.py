@@ -63,7 +63,8 @@ SUPERVISOR = Status(
     1,
     60.0,
     "1",
-    gauges={"router.process_rss_bytes": 7e7},
+    {"features.hung": 2},
+    {"router.process_rss_bytes": 7e7},
     processes=(SupervisedProcess("features", "left", "running", 4711, 3, 1.0),),
 )
 
@@ -140,6 +141,7 @@ def test_the_supervisor_speaks_for_the_router_and_counts_restarts() -> None:
     found = exported(SUPERVISOR, FEATURES)
     assert value(found["palpate_process_rss_bytes"], service="router") == 7e7
     assert value(found["palpate_process_restarts_total"], service="features") == 3
+    assert value(found["palpate_hung_total"], service="features", sensor="") == 2
 
 
 def test_a_process_that_says_nothing_is_down_and_has_no_old_values() -> None:

@@ -261,3 +261,20 @@ def test_ten_thousand_random_payloads_on_the_bus_are_all_accounted_for(
         assert count - 1 <= counted <= count, "one may be held until another follows"
         assert counted - counters["delivered"] > count / 20
     assert key.endswith("/finger/electrodes")
+
+
+@pytest.mark.parametrize("delivery", [Delivery.NEWEST, Delivery.QUEUE])
+def test_how_many_wait_is_known(
+    pair: Any, frame_of: FrameOf, wait_until: WaitUntil, delivery: Delivery
+) -> None:
+    a, b = pair
+    stream = b.subscriber(ELECTRODES, delivery=delivery, depth=3)
+    tap = b.tap([ELECTRODES])
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    for sequence in range(1, 4):
+        publisher.put(frame_of(sequence))
+    wait_until(lambda: (stream.waiting, tap.waiting) == (3, 3))
+    stream.next(1.0)
+    tap.next(1.0)
+    assert (stream.waiting, tap.waiting) == (2, 2)

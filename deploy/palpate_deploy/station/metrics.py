@@ -149,14 +149,19 @@ class StationCollector:
 
     def _figures(self, series: _Series, process: tuple[str, str, str], status: Status) -> None:
         """Every counter and gauge."""
+
+        def labels(sensor: str) -> tuple[str, ...]:
+            # A supervisor speaks for others: what stands in front is the name of a process.
+            if sensor and status.service == SUPERVISOR:
+                return (self._station, sensor, sensor, "")
+            return (*process, sensor)
+
         for name, count in sorted(status.counters.items()):
             sensor, own = sensor_part(name, status)
-            series.counter(own, _OF_SENSOR, (*process, sensor), count)
+            series.counter(own, _OF_SENSOR, labels(sensor), count)
         for name, value in sorted(status.gauges.items()):
             sensor, own = sensor_part(name, status)
-            of = (*process, sensor)
-            if (sensor, status.service) == (ROUTER[0], SUPERVISOR):  # it speaks for the router
-                of = (self._station, *ROUTER, "")
+            of = labels(sensor)
             if (part := quantile_part(own)) is not None:
                 stage, percentile = part
                 series.gauge(

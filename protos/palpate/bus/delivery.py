@@ -80,6 +80,11 @@ class NewestQueue(Generic[T]):
         self._waiting = {key: items for key, items in self._waiting.items() if items}
         self._lost = Counter({key: self._lost[key] for key in self._waiting})
 
+    def __len__(self) -> int:
+        """How many items wait."""
+        with self._lock:
+            return sum(map(len, self._waiting.values()))
+
     def close(self) -> None:
         """Does nothing: this queue never blocks a sender."""
 
@@ -118,6 +123,10 @@ class FifoQueue(Generic[T]):
             if self._sender_waits:
                 self._changed.notify_all()
             return item
+
+    def __len__(self) -> int:
+        """How many items wait."""
+        return len(self._items)
 
     def close(self) -> None:
         """Release a sender that waits."""

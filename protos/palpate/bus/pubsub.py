@@ -184,6 +184,10 @@ class _Queued:
         item = self._waiting.get(timeout_s)
         return None if item is None else (*item[0], item[1])
 
+    @property
+    def waiting(self) -> int:
+        return len(self._waiting)
+
     def close(self) -> None:
         self._waiting.close()
         self._subscriber.undeclare()
@@ -202,6 +206,10 @@ class _Ringed:
             return None
         self._counters["received"] += 1
         return sample, time.monotonic_ns(), 0
+
+    @property
+    def waiting(self) -> int:
+        return 0  # a ring cannot be counted; the subscriber empties it when it looks
 
     def close(self) -> None:
         self._ring.close()
@@ -267,6 +275,14 @@ class Subscriber(Generic[M], Closing):
             with contextlib.suppress(LinkError):  # closed: nothing more comes
                 self._look()
             return dict(self._counters)
+
+    @property
+    def waiting(self) -> int:
+        """How many messages wait to be taken."""
+        with self._lock:
+            with contextlib.suppress(LinkError):
+                self._look()
+            return len(self._turns) + self._arrivals.waiting
 
     def next(self, timeout_s: float) -> ReceivedMessage[M]:
         """The next valid message that was not delivered yet; invalid ones are counted and skipped.

@@ -68,6 +68,11 @@ class Tap(Closing):
         """``received``, ``dropped``, ``overflow``, ``rejected_key``."""
         return dict(self._counters)
 
+    @property
+    def waiting(self) -> int:
+        """How many samples wait."""
+        return len(self._waiting)
+
     def next(self, timeout_s: float) -> TapSample:
         """The next sample.
 

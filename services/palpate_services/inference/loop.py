@@ -507,6 +507,7 @@ def _waiting(
 def _refresh(messages: Subscriber[M], models: ServedModels, health: Health) -> None:
     """Copy what the subscriber counted (drops, losses on the bus), and what is served."""
     health.set_models(models.labels())
+    health.gauge("queue_messages", float(messages.waiting))
     if models.problem is not None:
         health.fail(models.problem)
     health.set_counts(

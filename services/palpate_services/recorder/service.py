@@ -12,7 +12,7 @@ from typing import Any
 from palpate.bus import Delivery, Session, Tap
 from palpate.bus.topics import TOPICS, Topic
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, StreamTimeout
+from palpate.errors import ConfigError, RecordingError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import ServiceState
@@ -60,7 +60,7 @@ def run_recorder(
             capacity=config.capacity,
         )
         files.start()
-        with HealthReporter(session, health, refresh=lambda: health.set_counts(tap.counters)):
+        with HealthReporter(session, health, refresh=QueueReport(tap, files, health).refresh):
             try:
                 avoid_pauses()
                 presence.ready()
@@ -76,6 +76,34 @@ def run_recorder(
                 tap.close()
                 _count_the_rest(tap, health)
                 files.close()
+
+
+class QueueReport:
+    """Tells health how many messages wait; the recorder is DEGRADED while some are lost there."""
+
+    def __init__(self, tap: Tap, files: RecordFiles, health: Health) -> None:
+        self._tap, self._files, self._health = tap, files, health
+        self._lost = 0
+        self._losing = False
+
+    def refresh(self) -> None:
+        """Take over the counters of the queue."""
+        counters = self._tap.counters
+        self._health.set_counts(counters)
+        self._health.gauge("queue_messages", float(self._tap.waiting))
+        lost = counters.get("overflow", 0)
+        if lost > self._lost:
+            self._losing = True
+            self._health.fail(
+                RecordingError(
+                    "messages come faster than they are written, and some are not recorded",
+                    remedy="record fewer topics, see [recorder] topics, or relieve disk and host",
+                )
+            )
+        elif self._losing:
+            self._losing = False
+            self._files.says_ready()
+        self._lost = lost
 
 
 def _drain(tap: Tap, files: RecordFiles, until_s: float = math.inf) -> int:

@@ -176,6 +176,7 @@ class RecordFiles:
         self._station = station
         self._health = health
         self._counts: Counter[str] = Counter()
+        self._path = config.out
         self._writer: RecordWriter | None = None
         self._view: LiveView | None = None
         self._views: list[LiveView] = []  # the present one, and earlier ones that are not finished
@@ -334,9 +335,15 @@ class RecordFiles:
             )
             self._view = LiveView(make)
             self._views.append(self._view)
-        self._health.set_state(ServiceState.READY, f"recording to {path}")
+        self._path = path
+        self.says_ready()
         self._counts["records_opened"] += 1
         _log.info("recording to %s", path)
+
+    def says_ready(self) -> None:
+        """Say that it records, if it does; after a trouble of another kind is over."""
+        if self._writer is not None:
+            self._health.set_state(ServiceState.READY, f"recording to {self._path}")
 
     def _new_path(self) -> Path:
         now = datetime.now(UTC)
