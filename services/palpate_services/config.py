@@ -22,7 +22,7 @@ class ModelsConfig(StrictConfig):
     """
 
     folder: Annotated[Path, AfterValidator(Path.expanduser)] = Field(
-        default_factory=lambda: data_folder() / "models"
+        default_factory=lambda: data_folder() / "models"  # as Repository.of_user
     )
     state: Annotated[Path, AfterValidator(Path.expanduser)] = Field(default_factory=state_folder)
 

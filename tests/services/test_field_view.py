@@ -19,7 +19,7 @@ from palpate.errors import ConfigError
 from palpate.files.record import read_record
 from palpate.messages import ElectrodeFrame, Stamp, SynthesisEstimate, Tare
 from palpate_services.config import RecorderConfig
-from palpate_services.inference.repository import MeshLibrary
+from palpate_services.inference.repository import MeshLibrary, Repository
 from palpate_services.recorder.service import run_recorder
 from palpate_services.viewer.timeline import FieldThinner, SensorTimeline
 
@@ -85,7 +85,7 @@ def test_library_knows_packaged_meshes_and_those_it_is_told_of(tmp_path: Path) -
     bundles.write(tmp_path / "mine", "synthesis", mesh=bundles.skin("mine"))
     bundles.write(models / "field-b" / "1", "field", mesh=bundles.skin("broken"))
     (models / "field-b" / "1" / "mesh.npz").write_bytes(b"broken")
-    library = MeshLibrary([str(tmp_path / "mine")], models)
+    library = MeshLibrary([str(tmp_path / "mine")], Repository(None, packaged=models))
     for name in ("skin", "mine"):
         found = library.find(bundles.skin(name).sha256)
         assert found is not None
@@ -93,7 +93,7 @@ def test_library_knows_packaged_meshes_and_those_it_is_told_of(tmp_path: Path) -
     assert library.find(bundles.skin("broken").sha256) is None
     assert library.find(bytes(32)) is None
     with pytest.raises(ConfigError, match="bundle 'no-such'"):
-        MeshLibrary(["no-such"], models)
+        MeshLibrary(["no-such"], Repository(None, packaged=models))
 
 
 def test_recorder_refuses_a_bundle_that_is_not_there(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from palpate.errors import BundleError, ConfigError, ErrorCode, PalpateError, RemoteError
-from palpate.files.bundle import read_bundle
+from palpate.files.bundle import Bundle, read_bundle
 from palpate.messages import ModelAction, ModelCommand, ModelInventory
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import served
@@ -182,6 +182,24 @@ def test_a_restart_serves_what_was_served(service: Service, models: Path) -> Non
     assert of(again) == "x:1", "what came before is remembered too"
     do(again, ROLL_BACK, "", "thumb")
     assert of(again, "thumb") == "y:1"
+
+
+def test_a_restart_does_not_try_again_what_has_served(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    do(service(), LOAD, "x:2")
+    tried: list[str] = []
+
+    def trial(bundle: Bundle, task: str) -> Bundle:
+        tried.append(f"{bundle.manifest.name}:{bundle.manifest.version}")
+        return bundle
+
+    monkeypatch.setattr(served, "proven", trial)
+    again = service()
+    do(again, ROLL_BACK)
+    assert (of(again), tried) == ("x:1", [])
+    do(again, LOAD, "x:3")
+    assert tried == ["x:3"]
 
 
 def test_a_new_version_waits_until_somebody_loads_it(

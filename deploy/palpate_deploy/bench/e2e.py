@@ -30,7 +30,7 @@ from palpate_deploy.station.host import free_endpoint, join, private_profile, wr
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import ask_status
-from palpate_services.inference.repository import resolve
+from palpate_services.inference.repository import Repository
 
 _STEP = 1.25
 _STEP_S = 3.0
@@ -188,7 +188,7 @@ def run_e2e(
     save: bool,
 ) -> None:
     """``palpate bench e2e``, whose help explains the options: measure, print, keep."""
-    folder = resolve(bundle)
+    folder = Repository.of_user().resolve(bundle)
     with progress_bar() as bar:
         palpate, floor = measure_latency(
             seconds=seconds, rounds=rounds, bundle=bundle, model=folder / "model.onnx", bar=bar

@@ -170,9 +170,9 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
     Raises:
         PalpateError: The replay could not be run at all.
     """
-    from palpate_services.inference.repository import resolve
+    from palpate_services.inference.repository import Repository
 
-    resolve(bundle)  # a missing bundle is an error before anything starts
+    Repository.of_user().resolve(bundle)  # a missing bundle is an error before anything starts
     profile = replay_profile(file, pace, out, bundle, rrd=rrd)
     account = replay(profile, file, show=not as_json)
     if as_json:

@@ -24,6 +24,7 @@ from palpate.files.bundle import (
     read_manifest,
     read_mesh,
 )
+from palpate.folders import data_folder
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +58,11 @@ class Repository:
     def __init__(self, folder: Path | None, *, packaged: Path = PACKAGED) -> None:
         self.folder = folder
         self._folders = [packaged] if folder is None else [packaged, folder]
+
+    @classmethod
+    def of_user(cls) -> Repository:
+        """The packaged bundles, and those in the folder that a profile has by default."""
+        return cls(data_folder() / "models")
 
     def available(self, task: str | None = None) -> list[str]:
         """Bundles (of a task) as ``name:version``, oldest version first."""
@@ -171,15 +177,17 @@ def _copied(source: Path, target: Path) -> Path:
 
 
 class MeshLibrary:
-    """The meshes of fields, by content hash: of packaged bundles, and of more by name or folder.
+    """The meshes of fields, by content hash: of a repository, and of more by name or folder.
+
+    ``repository`` None is that of the user.
 
     Raises:
         ConfigError: One of ``bundles`` does not exist.
     """
 
-    def __init__(self, bundles: Sequence[str] = (), models: Path = PACKAGED) -> None:
-        self._folders = [resolve(bundle, models) for bundle in bundles]
-        self._models = models
+    def __init__(self, bundles: Sequence[str] = (), repository: Repository | None = None) -> None:
+        self._repository = repository or Repository.of_user()
+        self._folders = [self._repository.resolve(bundle) for bundle in bundles]
         self._known: dict[bytes, FieldMesh] | None = None
 
     def find(self, sha256: bytes) -> FieldMesh | None:
@@ -189,8 +197,8 @@ class MeshLibrary:
         return self._known.get(sha256)
 
     def _read(self) -> Iterator[FieldMesh]:
-        packaged = (resolve(name, self._models) for name in available(self._models))
-        for folder in (*packaged, *self._folders):
+        known = (self._repository.resolve(name) for name in self._repository.available())
+        for folder in (*known, *self._folders):
             try:
                 mesh = read_mesh(folder)
             except BundleError as error:  # another bundle may hold the mesh that is needed

@@ -238,8 +238,11 @@ class ServedModels:
             code=ErrorCode.UNAVAILABLE,
         )
 
-    def _open(self, source: str) -> Choice:
-        """Load a bundle until it could serve; one that is loaded is taken as it is."""
+    def _open(self, source: str, *, tried: bytes = b"") -> Choice:
+        """Load a bundle until it could serve; one that is loaded is taken as it is.
+
+        The bundle of the digest ``tried`` has served on this host: it needs no trial again.
+        """
         folder = self._repository.resolve(source)
         bundle = read_bundle(folder)
         label = f"{bundle.manifest.name}:{bundle.manifest.version}"
@@ -254,14 +257,16 @@ class ServedModels:
         if runtime is None:
             if len(loaded) >= LOADED_MOST:
                 _refuse_more(f"{LOADED_MOST} bundles are loaded")
-            runtime = load(proven(bundle, self._task), self._task)
+            if bundle.sha256 != tried:
+                bundle = proven(bundle, self._task)
+            runtime = load(bundle, self._task)
         return Choice(str(folder.absolute()) if by_path else label, bundle.sha256, runtime)
 
     def _again(self, choice: Choice) -> Choice:
         """A bundle that served before, loaded, and still the same."""
         if choice.runtime is not None:
             return choice
-        found = self._open(choice.source)
+        found = self._open(choice.source, tried=choice.sha256)
         if found.sha256 != choice.sha256:
             raise BundleError(
                 f"bundle {choice.source} has changed since it served: its digest was "
