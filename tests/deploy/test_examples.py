@@ -5,6 +5,7 @@ Those that need the finite-element service are tested in tests/fem.
 
 from __future__ import annotations
 
+import functools
 import re
 import runpy
 import sys
@@ -18,12 +19,14 @@ from typing import Any
 import pytest
 
 from palpate import AsyncClient, Client
+from palpate.admin import token_file
 from palpate.config import LinkConfig, parse_config
 from palpate_gateway.config import GatewayConfig
 from palpate_gateway.service import node as gateway
 from palpate_services.config import (
     FeaturesServiceConfig,
     FieldServiceConfig,
+    ModelsConfig,
     RecorderConfig,
     SynthesisServiceConfig,
 )
@@ -43,8 +46,14 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> ModelsConfig:
+    folder = tmp_path_factory.mktemp("models")
+    return ModelsConfig(folder=folder / "models", state=folder / "state")
+
+
+@pytest.fixture(scope="module")
 def station(
-    router: Callable[[], AbstractContextManager[LinkConfig]], records: Path
+    router: Callable[[], AbstractContextManager[LinkConfig]], records: Path, models: ModelsConfig
 ) -> Iterator[Client]:
     """A finger that nobody touches, three services and a recorder, each in a thread."""
     finger = {
@@ -59,7 +68,10 @@ def station(
         patient = {"max_age_s": LIVE_S}  # a host on which other tests run, too
         parts: list[tuple[Callable[..., None], object]] = [
             (gateway.run, sensors),
-            (run_estimating, parse_config(FeaturesServiceConfig, patient, where="test")),
+            (
+                functools.partial(run_estimating, models=models),
+                parse_config(FeaturesServiceConfig, patient, where="test"),
+            ),
             (run_estimating, parse_config(FieldServiceConfig, patient, where="test")),
             (run_estimating, parse_config(SynthesisServiceConfig, patient, where="test")),
             (run_recorder, recorder),
@@ -126,6 +138,14 @@ def test_async_tasks(run_example: RunExample) -> None:
     lines = run_example("async_tasks.py", "50")
     assert any(line.startswith("served by features-") for line in lines)
     assert [line.split(":")[0].strip() for line in lines if line.endswith(" N")] == ["25", "50"]
+
+
+def test_swap_model(run_example: RunExample, models: ModelsConfig) -> None:
+    token = str(token_file(models.state, "lab"))
+    first, before, now, last = run_example("swap_model.py", "features-twin", token)
+    assert first.startswith("finger: features-twin after ")
+    assert before.split()[1] != now.split()[1], "another bundle made the second estimate"
+    assert last.startswith("rolled back in ")
 
 
 def test_grip_guard(run_example: RunExample) -> None:
