@@ -34,7 +34,9 @@ class EstimatingConfig(StrictConfig):
         bundle: Name of a bundle (newest version), ``name:version``, or the path of a bundle's
             folder.
         bundles: The same for sensors with a bundle of their own, by sensor.
-        sensors: Sensors to serve; empty = every sensor of the station.
+        sensors: Sensors to serve; empty = every sensor of the station that a gateway claims.
+        unannounced: With no ``sensors`` named, serve also those that no gateway claims, e.g. of a
+            gateway that is older than claims.
         delivery: ``newest`` takes the newest message and counts those it skipped (live);
             ``every`` takes each and slows the source down (lossless replay).
         keep_newest: Messages per sensor that may wait with ``newest``: a service that was delayed
@@ -50,6 +52,7 @@ class EstimatingConfig(StrictConfig):
     bundle: str
     bundles: dict[Name, str] = Field(default_factory=dict, max_length=256)
     sensors: tuple[Name, ...] = ()
+    unannounced: bool = False
     delivery: Literal["newest", "every"] = "newest"
     keep_newest: int = Field(default=3, ge=1, le=100)
     max_age_s: float | None = Field(default=0.03, gt=0)

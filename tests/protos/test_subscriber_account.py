@@ -22,6 +22,7 @@ from palpate.messages import ElectrodeFrame, Origin
 
 FrameOf = Callable[..., ElectrodeFrame]
 SECOND_NS = 1_000_000_000
+RING = 4096
 
 
 class Bus:
@@ -29,7 +30,7 @@ class Bus:
 
     def __init__(self, delivery: Delivery, *, capacity: int = 100, depth: int | None = None):
         self._callback: Callable[[Any], None] | None = None
-        self._ring: deque[Any] = deque()
+        self._ring: deque[Any] = deque(maxlen=RING)
         more = {} if depth is None else {"depth": depth}
         self.subscriber: Subscriber[ElectrodeFrame] = Subscriber(
             self,  # type: ignore[arg-type]
@@ -121,6 +122,20 @@ def test_holes_in_the_sequence_are_lost_on_the_bus(frame_of: FrameOf) -> None:
     bus.send(frame_of(14))
     assert bus.come(1) == [14]
     assert bus.count("lost_on_bus") == 4
+
+
+def test_what_a_full_ring_has_dropped_is_not_lost_on_the_bus(frame_of: FrameOf) -> None:
+    bus = Bus(Delivery.NEWEST, depth=5000)
+    bus.send(frame_of(1))
+    bus.come(1)
+    for sequence in range(2, 5002):
+        bus.send(frame_of(sequence))
+    assert bus.come(1) == [5002 - RING]
+    assert (bus.count("dropped"), bus.count("lost_on_bus")) == (5000 - RING, 0)
+    bus.come(RING - 1)
+    bus.send(frame_of(5003))
+    assert bus.come(1) == [5003]
+    assert bus.count("lost_on_bus") == 1
 
 
 def test_each_sender_has_an_account_of_its_own(frame_of: FrameOf) -> None:

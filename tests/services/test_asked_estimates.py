@@ -48,8 +48,8 @@ def station(
     stop = threading.Event()
     whole = bundles.write(tmp_path / "f", "field", more=bundles.WHOLE)
     configs = (
-        FeaturesServiceConfig(bundle=str(make_bundle()), max_age_s=0.5),
-        FieldServiceConfig(bundle=str(whole), max_age_s=0.5),
+        FeaturesServiceConfig(bundle=str(make_bundle()), max_age_s=0.5, unannounced=True),
+        FieldServiceConfig(bundle=str(whole), max_age_s=0.5, unannounced=True),
     )
     nodes = [
         threading.Thread(target=run_estimating, args=(config, link, "lab", stop))

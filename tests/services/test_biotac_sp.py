@@ -83,7 +83,7 @@ def test_features_service_names_the_sensor_and_serves_the_others(
     make_tare: Tares,
     until: Until,
 ) -> None:
-    config = FeaturesServiceConfig(bundle=str(make_bundle()), max_age_s=10.0)
+    config = FeaturesServiceConfig(bundle=str(make_bundle()), max_age_s=10.0, unannounced=True)
     with running(run_estimating, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         session = robot.session
@@ -114,7 +114,9 @@ def test_features_service_names_the_sensor_and_serves_the_others(
 def test_field_service_answers_by_an_error(
     link: LinkConfig, make_frame: Frames, make_tare: Tares, until: Until, tmp_path: Path
 ) -> None:
-    config = FieldServiceConfig(bundle=str(bundles.write(tmp_path / "f", "field")))
+    config = FieldServiceConfig(
+        bundle=str(bundles.write(tmp_path / "f", "field")), unannounced=True
+    )
     with running(run_estimating, config, link), Client(link.connect[0], timeout_s=5.0) as robot:
         until(lambda: any(one.ready for one in robot.alive()))
         announce(robot.session, "thumb", make_tare(sensor_type=SP))

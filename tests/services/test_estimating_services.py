@@ -111,7 +111,8 @@ def serve(case: Case, folder: Path, link: LinkConfig, until: Until) -> Serve:
     def running(**config: Any) -> Iterator[Session]:
         stop = threading.Event()
         source = {"source": case.source_name} if case.source_name else {}
-        settings = case.config(bundle=str(folder), **source, **case.options(), **config)
+        options = {"unannounced": True, **case.options(), **config}
+        settings = case.config(bundle=str(folder), **source, **options)
         node = threading.Thread(target=run_estimating, args=(settings, link, "lab", stop))
         node.start()
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from palpate.bus import Delivery, Session, endpoints
-from palpate.bus.topics import ELECTRODES, FEATURES, TARE
+from palpate.bus.topics import ELECTRODES, FEATURES, TARE, sensor_key
 from palpate.codec import (
     ELECTRODE_FRAME,
 )
@@ -48,7 +50,9 @@ def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> S
     @contextmanager
     def running(**config: Any) -> Iterator[Session]:
         stop = threading.Event()
-        settings = FeaturesServiceConfig(bundle=str(make_bundle()), **config)
+        settings = FeaturesServiceConfig(
+            bundle=str(make_bundle()), **{"unannounced": True, **config}
+        )
         node = threading.Thread(target=run_estimating, args=(settings, link, "lab", stop))
         node.start()
         try:
@@ -324,3 +328,32 @@ def test_a_model_that_hangs_stops_the_heartbeat(
         returns.set()
         estimates.next(20)
         assert beats.acquire(timeout=20)
+
+
+def test_invented_sensors_are_not_followed(
+    serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    """Only what a gateway claims is served; the service keeps nothing of other names."""
+    names = 300
+    with serve(max_age_s=20.0, unannounced=False) as session:
+        estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        payload = ELECTRODE_FRAME.encode(make_frame(1))
+        encoding = zenoh.Encoding(ELECTRODES.encoding)
+        for number in range(names):
+            key = sensor_key("lab", f"invented{number}", "electrodes")
+            session._raw.put(key, payload, encoding=encoding)
+        until(lambda: counters(session).get("unannounced") == names)
+        with session.claims(session_id=9, instance="gateway", lease_s=2.0) as claims:
+            claims.want("finger")
+            assert claims.wait("finger", 20.0)
+            announce(session, "finger", make_tare())
+            frames = session.publisher(ELECTRODES, sensor="finger")
+            frames.put(make_frame(1))
+            for sequence in range(2, 100):  # the claim may come after the first of them
+                frames.put(make_frame(sequence))
+                with contextlib.suppress(StreamTimeout):
+                    assert estimates.next(0.2).sensor == "finger"
+                    break
+            else:
+                raise AssertionError("the claimed finger got no estimate")
+        assert ask_status(session).sensors == ("finger",)

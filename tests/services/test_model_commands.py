@@ -60,7 +60,9 @@ def serve(kept: ModelsConfig, link: LinkConfig, until: Until) -> Serve:
     @contextmanager
     def running(models: ModelsConfig | None = kept, **config: Any) -> Iterator[Session]:
         stop = threading.Event()
-        settings = FeaturesServiceConfig(**{"bundle": "x:1", "max_age_s": 20.0, **config})
+        settings = FeaturesServiceConfig(
+            **{"bundle": "x:1", "max_age_s": 20.0, "unannounced": True, **config}
+        )
         node = threading.Thread(
             target=run_estimating, args=(settings, link, "lab", stop), kwargs={"models": models}
         )

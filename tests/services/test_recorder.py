@@ -53,6 +53,7 @@ def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) ->
             delivery="every" if lossless else "newest",
             accept_replayed=lossless,
             max_age_s=None,
+            unannounced=True,
         )
         keep = RecorderConfig(delivery="every" if lossless else "queue", **config)
         on = link.model_copy(update={"direct": not lossless})  # as the replay profile does it

@@ -7,7 +7,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Self, TypeVar
 
 import zenoh
@@ -15,6 +15,7 @@ import zenoh
 from palpate.bus.claims import SensorClaims
 from palpate.bus.delivery import Delivery
 from palpate.bus.endpoints import Endpoint
+from palpate.bus.holders import ClaimWatch
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Publisher, Subscriber
 from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
@@ -167,6 +168,7 @@ class Session(Closing):
         self.station = station
         self.wall_clock_error_s = link.wall_clock_error_s
         self._alarm: Alarm | None = None
+        self._claim_watches: dict[str, ClaimWatch] = {}
         self._observing: Session | None = None
         self._observing_lock = threading.Lock()
         self._closing: list[Callable[[], None]] = []
@@ -217,11 +219,15 @@ class Session(Closing):
         delivery: Delivery = Delivery.NEWEST,
         capacity: int = 4096,
         depth: int = 1,
+        sensors: Collection[str] = (),
+        announced: bool = False,
     ) -> Subscriber[M]:
         """Subscribe to a topic of a station; None = the session's own.
 
         ``delivery`` says what happens to messages that come faster than they are taken. With
         ``QUEUE`` and ``EVERY`` ``capacity`` of them may wait, with ``NEWEST`` ``depth`` per sensor.
+        Of ``sensor="*"`` those named in ``sensors`` are followed; with ``announced`` those that a
+        gateway has claimed, and when a claim passes, the new holder at once; else any.
         """
         key = self._key(topic, sensor, service, instance, station)
         return self._keep(
@@ -234,8 +240,16 @@ class Session(Closing):
                 capacity=capacity,
                 depth=depth,
                 wall_clock_error_s=self.wall_clock_error_s,
+                sensors=sensors,
+                holders_of=self._holders_of(station) if announced else None,
             )
         )
+
+    def _holders_of(self, station: str | None) -> Callable[[str], frozenset[int]]:
+        where = self.station if station is None else station
+        if where not in self._claim_watches:
+            self._claim_watches[where] = self._keep(ClaimWatch(self._raw, where))
+        return self._claim_watches[where].holders
 
     def _get_alarm(self) -> Alarm:
         if self._alarm is None:

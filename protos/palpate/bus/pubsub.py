@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -145,7 +145,7 @@ Arrival = tuple[zenoh.Sample, int, int]
 """A sample, when it came [ns, monotonic], and how many of its key were dropped here before it."""
 
 HoldersOf = Callable[[str], frozenset[int]]
-"""Which runs of gateways hold a sensor of this name, by their claims."""
+"""Which runs of gateways hold a sensor of this name, by their claims; empty = unannounced."""
 
 
 class _Source(Generic[M]):
@@ -224,8 +224,11 @@ class Subscriber(Generic[M], Closing):
     ``counters``: ``received``, ``delivered``, ``dropped`` (newest wins), ``overflow``,
     ``lost_on_bus`` (gaps in the sequence that were not dropped here), ``reordered``, ``restarts``
     of the sender, ``other_session`` (a second sender of a followed one's key), ``unannounced``
-    (of a sensor that no gateway claims), ``rejected_names`` (beyond ``MOST_SOURCES``), and
-    ``rejected_<reason>``.
+    (of a sensor that no gateway claims), ``of_others`` (of a sensor that is not wanted),
+    ``rejected_names`` (beyond ``MOST_SOURCES``), and ``rejected_<reason>``.
+
+    Of those that a wildcard key matches, only ``sensors`` are followed; if none are named, those
+    that have holders.
     """
 
     def __init__(
@@ -239,12 +242,14 @@ class Subscriber(Generic[M], Closing):
         capacity: int = 4096,
         depth: int = 1,
         wall_clock_error_s: float = clock.WALL_CLOCK_ERROR_S,
+        sensors: Collection[str] = (),
         holders_of: HoldersOf | None = None,
     ) -> None:
         self.topic = topic
         self.key = key
         self._delivery = delivery
         self._wall_clock_error_s = wall_clock_error_s
+        self._sensors = frozenset(sensors)
         self._holders_of = holders_of
         self._counters: Counter[str] = Counter()
         self._sources: dict[str, _Source[M]] = {}
@@ -391,15 +396,16 @@ class Subscriber(Generic[M], Closing):
         """Check what has arrived in the ring, unless a thread waits there: it checks it at once."""
         if self._delivery is not Delivery.NEWEST or self._waits:
             return
-        count = 0
+        arrivals: list[Arrival] = []
         while (arrival := self._arrivals.take(0.0)) is not None:
-            self._check(arrival)
-            count += 1
-        if count >= self._ring_capacity:
+            arrivals.append(arrival)
+        if len(arrivals) >= self._ring_capacity:
             # A full ring has dropped what came before, nobody knows how much of which source.
             for source in self._sources.values():
                 if source.continuity is not None:
                     source.continuity.drops_unknown()
+        for arrival in arrivals:
+            self._check(arrival)
 
     def _collect(self, taken: list[ReceivedMessage[M]], most: int) -> None:
         """Take the messages whose turn it is."""
@@ -466,8 +472,12 @@ class Subscriber(Generic[M], Closing):
         except WireError as error:
             self._counters[f"rejected_{error.reason}"] += 1
             return None
-        holders_of = self._holders_of
-        if holders_of is not None and not holders_of(address.sensor):
+        sensor, holders_of = address.sensor, self._holders_of
+        if self._sensors:
+            if sensor not in self._sensors:
+                self._counters["of_others"] += 1
+                return None
+        elif holders_of is not None and not holders_of(sensor):
             self._counters["unannounced"] += 1
             return None
         if len(self._sources) >= MOST_SOURCES:
@@ -477,7 +487,6 @@ class Subscriber(Generic[M], Closing):
                 return None
         continuity: Continuity[ReceivedMessage[M]] | None = None
         if self.topic.rate_hz:  # each event is worth something by itself, in whatever order
-            sensor = address.sensor
             continuity = Continuity(
                 self._counters,
                 contiguous=self.topic.contiguous,

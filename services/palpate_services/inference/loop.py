@@ -26,7 +26,7 @@ from palpate.bus.link import LOSSLESS_STALL_S
 from palpate.bus.topics import Topic
 from palpate.codec import STAGE_TIMINGS
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout, WireError
+from palpate.errors import ConfigError, ErrorCode, RemoteError, WireError
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import LIMIT_S, beat
 from palpate.messages import NO_TARE, Origin, ServiceState, StageTimings, Stamp
@@ -448,6 +448,9 @@ def serve(
             sensor=config.sensors[0] if len(config.sensors) == 1 else "*",
             delivery=Delivery(config.delivery),
             depth=config.keep_newest,
+            sensors=config.sensors if len(config.sensors) > 1 else (),
+            # A lossless replay takes all: its frames may come before the claim is known.
+            announced=not (config.sensors or config.unannounced or config.delivery == "every"),
         )
         refresh = partial(_refresh, messages, models, health)
         with HealthReporter(session, health, refresh=refresh):
@@ -456,13 +459,15 @@ def serve(
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
             while not stop.is_set():
-                publisher.take(_waiting(messages, _WAIT_S, config.batch_wait_s))
+                publisher.take(
+                    messages.next_batch(_WAIT_S, most=BATCH_MOST, more_s=config.batch_wait_s)
+                )
                 publisher.report()
             # Withdrawn first, so that no client relies on this service while it drains.
             presence.not_ready()
             health.set_state(ServiceState.STOPPING, "draining")
             deadline = time.monotonic() + config.drain_s
-            while time.monotonic() < deadline and (left := _waiting(messages, _QUIET_S)):
+            while time.monotonic() < deadline and (left := messages.next_batch(_QUIET_S)):
                 publisher.take(left)
             messages.close()
             publisher.report(last=True)
@@ -487,21 +492,6 @@ def _longest_wait_s(config: EstimatingConfig) -> float:
     """How long the loop may wait for others before it has answered one message [s]."""
     tare_s = config.tare_timeout_s if isinstance(config, ElectrodesConfig) else 0.0
     return tare_s + (LOSSLESS_STALL_S if config.delivery == "every" else 0.0)
-
-
-def _waiting(
-    messages: Subscriber[M], timeout_s: float, more_s: float = 0.0
-) -> list[ReceivedMessage[M]]:
-    """The next message and those that wait with it or come within ``more_s``; empty = none."""
-    taken: list[ReceivedMessage[M]] = []
-    try:
-        taken.append(messages.next(timeout_s))
-        deadline = time.monotonic() + more_s
-        while len(taken) < BATCH_MOST:
-            taken.append(messages.next(max(0.0, deadline - time.monotonic()) if more_s else 0.0))
-    except StreamTimeout:
-        pass
-    return taken
 
 
 def _refresh(messages: Subscriber[M], models: ServedModels, health: Health) -> None:
