@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -156,6 +157,36 @@ def test_what_serves_already_is_not_loaded_again(service: Service) -> None:
     do(started, LOAD, "x:1", "thumb")
     assert started.of("thumb") is serving, "two sensors share one bundle in memory"
     do(started, ModelAction.LIST)
+
+
+def test_a_roll_back_does_not_wait_for_a_load_and_counts(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = service()
+    do(started, LOAD, "x:2")
+    begun, go = threading.Event(), threading.Event()
+    refusals: list[PalpateError] = []
+
+    def slow(bundle: Bundle, task: str) -> Bundle:
+        begun.set()
+        assert go.wait(20)
+        return bundle
+
+    monkeypatch.setattr(served, "proven", slow)
+    loading = threading.Thread(target=lambda: refusals.append(refused(started, LOAD, "x:3")))
+    loading.start()
+    assert begun.wait(20)
+    second = refused(started, LOAD, "y", "thumb")
+    assert second.code is ErrorCode.RESOURCE_EXHAUSTED
+    assert second.retry_after_s > 0
+    do(started, ModelAction.LIST)
+    do(started, ROLL_BACK)
+    go.set()
+    loading.join(20)
+    assert of(started) == "x:1", "the roll back was the newer order"
+    assert "another command" in refusals[0].problem
+    do(started, LOAD, "x:3")
+    assert of(started) == "x:3"
 
 
 def test_caps(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def take_commands(
             show(models, health)
         return inventory
 
-    # Two at once: a list is not kept waiting by a bundle that loads.
+    # Two at once: a roll back does not wait for a bundle that loads.
     session.queryable(
         endpoints.MODELS,
         obey,

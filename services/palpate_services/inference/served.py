@@ -11,7 +11,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
@@ -71,6 +72,9 @@ class Assignment:
     changed: bool = False
 
 
+_NOTHING = Assignment(None, 0)
+
+
 class Serving:
     """What serves at one moment; never changed, only replaced as a whole."""
 
@@ -117,6 +121,7 @@ class ServedModels:
         self._task = task
         self._repository = repository
         self._file = file
+        self._loading = threading.Lock()
         self._changing = threading.Lock()
         self._problems: dict[str, PalpateError] = {}
         wanted = {DEFAULT: config.bundle, **config.bundles}
@@ -165,13 +170,15 @@ class ServedModels:
         Raises:
             ConfigError: There is no such bundle, or the change cannot be remembered.
             BundleError: It breaks its contract; what served still serves.
-            RemoteError: There is nothing to unload or to roll back, or too much is loaded.
+            RemoteError: There is nothing to unload or to roll back, too much is loaded, or another
+                command came between.
         """
         began_s = time.monotonic()
         changed_s = None
         if command.action is not ModelAction.LIST:
-            with self._changing:
-                changed_s = self._change(command)
+            before = self._serving.assigned.get(command.sensor, _NOTHING)
+            choice = self._chosen(command, before)
+            changed_s = self._assign(command.sensor, choice, before)
         return ModelInventory(
             instance,
             _listed(self._serving),
@@ -179,34 +186,65 @@ class ServedModels:
             0.0 if changed_s is None else changed_s - began_s,
         )
 
-    def _change(self, command: ModelCommand) -> float | None:
-        """Carry out a command; when it took effect [s, monotonic], None = it changed nothing."""
-        sensor, assigned = command.sensor, self._serving.assigned
-        one = assigned.get(sensor, Assignment(None, 0))
-        before = one.current
-        if command.action is ModelAction.LOAD:
-            if "/" in command.bundle or command.bundle.startswith("."):
-                _refuse("a bundle is loaded by name, not by path", "palpate model import FOLDER")
-            if sensor not in assigned and len(assigned) > SENSORS_MOST:
-                _refuse_more(f"{SENSORS_MOST} sensors have a bundle of their own")
-            choice: Choice | None = self._open(command.bundle)
-        elif command.action is ModelAction.UNLOAD:
-            if before is None:
+    def _chosen(self, command: ModelCommand, before: Assignment) -> Choice | None:
+        """What a command wants to serve, loaded; None = nothing."""
+        sensor = command.sensor
+        if command.action is ModelAction.UNLOAD:
+            if before.current is None:
                 _refuse(f"{_whose(sensor)} no bundle to unload", "palpate model served")
-            choice = None
-        else:
-            if not one.changed:
-                _refuse(f"{_whose(sensor)} no bundle from before", "palpate model load NAME")
-            choice = one.previous and self._again(one.previous)
-        if choice is not None and before is not None and before.runtime is choice.runtime:
             return None
-        changed = Assignment(choice, time.time_ns(), before, changed=True)
-        self._serving = Serving({**assigned, sensor: changed})
-        swapped_s = time.monotonic()
-        _log.info("%s: %s -> %s", sensor or "all sensors", _name(before), _name(choice))
-        self._problems.pop(sensor, None)
-        self._remember()
-        return swapped_s
+        if command.action is ModelAction.ROLL_BACK:
+            if not before.changed:
+                _refuse(f"{_whose(sensor)} no bundle from before", "palpate model load NAME")
+            if before.previous is None or before.previous.runtime is not None:
+                return before.previous
+            with self._one_load():
+                return self._again(before.previous)
+        if "/" in command.bundle or command.bundle.startswith("."):
+            _refuse("a bundle is loaded by name, not by path", "palpate model import FOLDER")
+        if before is _NOTHING and len(self._serving.assigned) > SENSORS_MOST:
+            _refuse_more(f"{SENSORS_MOST} sensors have a bundle of their own")
+        with self._one_load():
+            return self._open(command.bundle)
+
+    @contextmanager
+    def _one_load(self) -> Iterator[None]:
+        """Load one bundle at a time; whoever comes second is told so, and keeps nobody waiting."""
+        if not self._loading.acquire(blocking=False):
+            raise RemoteError(
+                "another bundle is being loaded",
+                remedy="ask again later",
+                code=ErrorCode.RESOURCE_EXHAUSTED,
+                retry_after_s=1.0,
+            )
+        try:
+            yield
+        finally:
+            self._loading.release()
+
+    def _assign(self, sensor: str, choice: Choice | None, before: Assignment) -> float | None:
+        """Let a bundle serve; since when it does [s, monotonic], None = it did already.
+
+        A roll back that came while it was loading is the newer order, and counts.
+        """
+        with self._changing:
+            assigned = self._serving.assigned
+            if assigned.get(sensor, _NOTHING) is not before:
+                raise RemoteError(
+                    "another command has changed meanwhile what serves",
+                    remedy="look with palpate model served, then give the command again",
+                    code=ErrorCode.UNAVAILABLE,
+                )
+            current = before.current
+            if choice is not None and current is not None and current.runtime is choice.runtime:
+                return None
+            changed = Assignment(choice, time.time_ns(), current, changed=True)
+            self._serving = Serving({**assigned, sensor: changed})
+            changed_s = time.monotonic()
+            _log.info("%s: %s -> %s", sensor or "all sensors", _name(current), _name(choice))
+            self._problems.pop(sensor, None)
+            self._remember()
+            return changed_s
 
     def describe(self) -> str:
         """One line for people."""
