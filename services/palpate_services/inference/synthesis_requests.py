@@ -105,7 +105,7 @@ class SynthesisRequests:
                     end = part
                     for number, step in enumerate(part.steps, start=part.first_step):
                         if force_n is not None and np.linalg.norm(step.force) >= force_n:
-                            before = None if last is None else last.step
+                            before = _untouched(asked, step) if last is None else last.step
                             step = _at_force(before, step, force_n)
                             reached = True
                         if last is not None and request.every_step:
@@ -198,24 +198,27 @@ def _reply_of(one: _Synthesised, *, more: bool) -> SynthesisReply:
     return SynthesisReply(one.estimate, bare, one.number, more=more)
 
 
-def _at_force(
-    before: SimulationStep | None, after: SimulationStep, force_n: float
-) -> SimulationStep:
-    """The state between two steps at which the force has this magnitude, by straight lines.
+def _untouched(asked: SimulationRequest, first: SimulationStep) -> SimulationStep:
+    """The state before the first step of a simulation."""
+    assert first.displacement is not None
+    return replace(
+        first,
+        pose_sensor_indenter=asked.path[0],
+        force=np.zeros(3),
+        torque=np.zeros(3),
+        displacement=np.zeros_like(first.displacement),
+    )
 
-    Before the first step there is the untouched state.
-    """
-    assert after.displacement is not None
-    low = 0.0 if before is None else float(np.linalg.norm(before.force))
-    share = (force_n - low) / (float(np.linalg.norm(after.force)) - low)
 
-    if before is None:
-        displacement = (share * after.displacement).astype(np.float32)
-        force, torque = share * after.force, share * after.torque
-        return replace(after, displacement=displacement, force=force, torque=torque)
+def _at_force(before: SimulationStep, after: SimulationStep, force_n: float) -> SimulationStep:
+    """The state between two steps at which the force has this magnitude, by straight lines."""
     assert before.displacement is not None
+    assert after.displacement is not None
+    low, high = (float(np.linalg.norm(step.force)) for step in (before, after))
+    share = (force_n - low) / (high - low)
     a, b = before.pose_sensor_indenter, after.pose_sensor_indenter
     x, y, z = (p + share * (q - p) for p, q in zip(a.position, b.position, strict=True))
+    moved = after.displacement - before.displacement
     return replace(
         after,
         pose_sensor_indenter=Pose((x, y, z), b.orientation),
@@ -223,7 +226,5 @@ def _at_force(
         torque=before.torque + share * (after.torque - before.torque),
         fluid_pressure_pa=before.fluid_pressure_pa
         + share * (after.fluid_pressure_pa - before.fluid_pressure_pa),
-        displacement=(
-            before.displacement + np.float32(share) * (after.displacement - before.displacement)
-        ).astype(np.float32),
+        displacement=before.displacement + np.float32(share) * moved,
     )
