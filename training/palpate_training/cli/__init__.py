@@ -14,6 +14,7 @@ train_app.command("features")(train.train_features_command)
 train_app.command("field")(train.train_field)
 train_app.command("synthesis")(train.train_synthesis)
 train_app.command("twin")(train.train_twin)
+train_app.command("upgrade")(train.train_upgrade)
 
 data_app = typer.Typer(
     no_args_is_help=True, help="Make data sets and look into them.", rich_markup_mode=None

@@ -172,6 +172,25 @@ def train_features_command(
     _show(report.metrics, f"{name} {version}: unseen presses", out)
 
 
+def train_upgrade(
+    bundle: Annotated[Path, typer.Argument(help="Folder of the older bundle.")],
+    data: Annotated[Path, typer.Argument(help="Data set (.h5) like the one it was trained on.")],
+    out: Bundle,
+    units: Annotated[
+        str, typer.Option(help="Specimens it was trained on, with commas between; empty = all.")
+    ] = "",
+) -> None:
+    """An older bundle with what newer ones say: what it was trained on; a field's coefficients.
+
+    palpate train upgrade models/features-twin/1 features.h5 models/features-twin/2
+    """
+    from palpate_training.tasks.upgrade import upgrade_bundle
+
+    chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
+    digest = upgrade_bundle(bundle, data, out, units=chosen)
+    console.print(f"wrote {out}, digest {digest.hex()}")
+
+
 def _bundle(
     train: Callable[..., dict[str, float]],
     task: str,

@@ -208,7 +208,7 @@ def _export(
         opset=OPSET,
         normalisation=dict(normalisation or {}),
         training_range=training_range,
-        basis=_basis_of(model, dict(zip(names, gives, strict=True))),
+        basis=basis_of(model, dict(zip(names, gives, strict=True))),
     )
     golden = {input_name: golden_inputs} | dict(zip(names, answers, strict=True))
     digest = write_bundle(
@@ -223,7 +223,7 @@ def _export(
     return digest
 
 
-def _basis_of(model: bytes, outputs: Mapping[str, TensorInfo]) -> dict[str, str]:
+def basis_of(model: bytes, outputs: Mapping[str, TensorInfo]) -> dict[str, str]:
     """Names of the constants of the graph that are the basis of its coefficients, if it has some.
 
     They are found by their shapes: the exporter folds the cast of small modes and renames them.

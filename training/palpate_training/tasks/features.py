@@ -178,17 +178,16 @@ def train_features(
             f" are estimated below it; at least {MIN_CONTACT_THRESHOLD_N} N",
         },
         seed=seed,
-        training_range=_training_range(data, split),
-        known_inputs=known_inputs(x[split.train]),
+        training_range=features_range(data, split.train),
+        known_inputs=known_inputs(x[split.train], data.group[split.train]),
     )
     return FeaturesReport(
         digest, metrics, (len(split.train), len(split.validation), len(split.test))
     )
 
 
-def _training_range(data: FeatureDataset, split: RowSplit) -> TrainingRange:
-    """What the networks have seen; contact locations of rows in contact only."""
-    rows = split.train
+def features_range(data: FeatureDataset, rows: Rows) -> TrainingRange:
+    """Range of networks that were trained on rows; contact locations of those in contact only."""
     outputs = [ends_of("force", "N", data.force[rows])]
     if data.contact_location is not None and data.in_contact is not None:
         where = data.contact_location[rows[data.in_contact[rows]]]

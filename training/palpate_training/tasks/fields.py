@@ -308,9 +308,7 @@ def field_bundle(
     untouched = code.decode(model.coefficients(np.zeros((1, counts.shape[1]), np.float32)))
     metrics["untouched_nodal_all_m"] = float(np.linalg.norm(untouched, axis=2).mean())
     metrics |= truncation_metrics(code)
-    seen = np.vstack(
-        [counts[split.train], (config or FieldFitConfig()).untouched_rows(split.train, seed)]
-    )
+    seen, presses = seen_rows(data, split.train, config or FieldFitConfig(), seed)
     export_fields(
         folder,
         FieldGraph(model.net, code, _node_sd(data, split.validation, estimate)),
@@ -326,18 +324,33 @@ def field_bundle(
             "displacement": f"{code.size} modes of the training rows, half precision in the graph",
             "displacement_sd": "constant per node: rms length of the error on validation rows",
         },
-        training_range=TrainingRange(
-            source=f"{len(seen)} training rows, untouched ones included, of"
-            f" {data.experiment.provenance.source}",
-            data_sha256=content_sha256(data),
-            rows=len(seen),
-            inputs=(ends_of("electrodes", "tared counts", seen),),
-            outputs=(longest_of("displacement", "m", fields_of(data, split.train)),),
-            combinations=True,
-        ),
-        known_inputs=known_inputs(seen),
+        training_range=field_range(data, split.train, seen),
+        known_inputs=known_inputs(seen, presses),
     )
     return metrics
+
+
+def seen_rows(
+    data: MixedDataset, rows: Rows, config: FieldFitConfig, seed: int
+) -> tuple[FloatArray, Rows]:
+    """All inputs (N, 19) of a training on rows, untouched ones included, and the press of each."""
+    untouched = config.untouched_rows(rows, seed)
+    none: Rows = np.full(len(untouched), -1)
+    presses = np.concatenate([data.experiment.row_trajectory[rows], none])
+    return np.vstack([tared_counts(data)[rows], untouched]), presses
+
+
+def field_range(data: MixedDataset, rows: Rows, seen: FloatArray) -> TrainingRange:
+    """Range of a field network that was trained on rows; ``seen`` are its inputs, all of them."""
+    return TrainingRange(
+        source=f"{len(seen)} training rows, untouched ones included, of"
+        f" {data.experiment.provenance.source}",
+        data_sha256=content_sha256(data),
+        rows=len(seen),
+        inputs=(ends_of("electrodes", "tared counts", seen),),
+        outputs=(longest_of("displacement", "m", fields_of(data, rows)),),
+        combinations=True,
+    )
 
 
 def fields_of(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:

@@ -25,7 +25,7 @@ from palpate_training.learning.fit import OnEpoch
 from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
 from palpate_training.learning.networks import FilmNet, Mlp, SynthesisGraph, predict
 from palpate_training.learning.ranges import ends_of, longest_of
-from palpate_training.learning.splits import RowSplit, by_trajectory, of_units, unit_sets
+from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.fields import (
     FieldFitConfig,
     fields_of,
@@ -227,12 +227,17 @@ def synthesis_bundle(
             " inside the graph",
             "tared_counts_sd": "constant per electrode: rms residual on validation rows",
         },
-        training_range=TrainingRange(
-            source=f"{len(split.train)} training rows of {data.experiment.provenance.source}",
-            data_sha256=content_sha256(data),
-            rows=len(split.train),
-            inputs=(longest_of("displacement", "m", fields_of(data, split.train)),),
-            outputs=(ends_of("tared_counts", "tared counts", counts[split.train]),),
-        ),
+        training_range=synthesis_range(data, split.train),
     )
     return metrics
+
+
+def synthesis_range(data: MixedDataset, rows: Rows) -> TrainingRange:
+    """Range of a synthesis network that was trained on rows."""
+    return TrainingRange(
+        source=f"{len(rows)} training rows of {data.experiment.provenance.source}",
+        data_sha256=content_sha256(data),
+        rows=len(rows),
+        inputs=(longest_of("displacement", "m", fields_of(data, rows)),),
+        outputs=(ends_of("tared_counts", "tared counts", tared_counts(data)[rows]),),
+    )
