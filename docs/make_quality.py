@@ -194,7 +194,7 @@ def main(data: Path | None) -> None:
         "# Flags of estimates: how often, and on what",
         "",
         f"Written by `{results['command']}`; numbers in [quality.json](quality.json). What",
-        "the flags mean: [ADR 0019](../adr/0019-what-an-estimate-is-worth.md).",
+        "the flags mean: [ADR 0021](../adr/0021-what-an-estimate-is-worth.md).",
         "",
         "## Presses of the finger that a bundle was trained for, never trained on",
         "",

@@ -1,4 +1,4 @@
-"""What a bundle was trained on, as it is kept in the bundle (docs/adr/0019).
+"""What a bundle was trained on, as it is kept in the bundle (docs/adr/0021).
 
 The ends of each value stand in the manifest, for people and programs. Which inputs occur *together*
 no ends can say, so the bundle has a file ``range.npz`` with representatives of the training inputs:

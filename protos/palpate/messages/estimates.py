@@ -16,7 +16,7 @@ from palpate.messages.frames import FieldFrame, FloatArray, Stamp
 class QualityFlag(IntEnum):
     """What a consumer has to know of an estimate beside its uncertainty.
 
-    docs/adr/0019-what-an-estimate-is-worth.md says how each is decided. An estimate without flags
+    docs/adr/0021-what-an-estimate-is-worth.md says how each is decided. An estimate without flags
     has none against it.
     """
 

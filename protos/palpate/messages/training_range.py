@@ -1,4 +1,4 @@
-"""What a bundle was trained on, as far as its estimates are compared with it (docs/adr/0019)."""
+"""What a bundle was trained on, as far as its estimates are compared with it (docs/adr/0021)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether an input, or an output, lies beyond what a bundle was trained on (docs/adr/0019)."""
+"""Whether an input, or an output, lies beyond what a bundle was trained on (docs/adr/0021)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a network was trained on, for the bundle it ships in (docs/adr/0019).
+"""What a network was trained on, for the bundle it ships in (docs/adr/0021).
 
 The ends of every value, and representatives of the inputs: rows of the training set, each the one
 that lies farthest from those chosen before. So the last distance is a radius within which *every*
