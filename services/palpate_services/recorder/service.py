@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from palpate.bus import Delivery, Session, Tap
@@ -65,12 +65,12 @@ def run_recorder(
                 avoid_pauses()
                 presence.ready()
                 while not stop.wait(_BATCH_S):
-                    _drain(tap, files)
+                    _drain(tap, files, lambda: not stop.is_set())
                 presence.not_ready()
                 if health.state is not ServiceState.DEGRADED:
                     health.set_state(ServiceState.STOPPING, "draining")
                 until_s = time.monotonic() + config.drain_s
-                while _drain(tap, files, until_s) and time.monotonic() < until_s:
+                while _drain(tap, files, lambda: time.monotonic() < until_s):
                     time.sleep(_BATCH_S)
             finally:
                 tap.close()
@@ -106,12 +106,12 @@ class QueueReport:
         self._lost = lost
 
 
-def _drain(tap: Tap, files: RecordFiles, until_s: float = math.inf) -> int:
-    """Record the waiting samples, at most until ``until_s`` [s, monotonic]; their number."""
+def _drain(tap: Tap, files: RecordFiles, may_go_on: Callable[[], bool]) -> int:
+    """Record the waiting samples while it ``may_go_on``; their number."""
     came = 0
     beat()
     try:
-        while time.monotonic() < until_s:
+        while may_go_on():
             files.write(tap.next(0.0))
             came += 1
             if came % _CHECK_AFTER == 0:
