@@ -154,7 +154,7 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
         "router routes",
         "thumb live 10:00 100 0.3 - 1:01",
         "ring lost",
-        "infer 0.4/0.9",
+        "p50/p99 ms infer features 0.4/0.9",
         "features lost: stale 10 (+2.0/s)",
         "thumb lost: silences 3",
         "field: lives and does not answer",

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
+import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -12,7 +15,7 @@ import pytest
 from palpate.bus import Delivery
 from palpate.bus.topics import STATUS
 from palpate.errors import StreamTimeout
-from palpate.health import Health, HealthReporter
+from palpate.health import _BURST, _CHANGES_HZ, Health, HealthReporter
 from palpate.messages import (
     ChannelFault,
     FaultKind,
@@ -167,6 +170,29 @@ def test_a_sensor_that_is_gone_is_lost_and_comes_back(
     now = bus.state(ServiceState.READY)
     assert now.counters.get("silences", 0) + now.counters.get("device_lost", 0) >= 1
     assert now.counters["tares"] == 1, "a tare outlives a restart of the line"
+
+
+def test_a_sensor_that_stutters_does_not_flap(
+    bus: Any, emulator: BiotacBridgeEmulator, served: Callable[..., SensorStatus]
+) -> None:
+    """Silences of 60 ms, many a second: it was lost and live again with each of them."""
+    states = bus.session.subscriber(STATUS, service="gateway", delivery=Delivery.QUEUE)
+    before = bus.status().counters.get("silences", 0)
+    began_s = time.monotonic()
+    while bus.status().counters.get("silences", 0) < before + 25:
+        assert time.monotonic() < began_s + 60.0
+        emulator.inject("silence", 0.06)
+        time.sleep(0.1)
+    lasted_s = time.monotonic() - began_s
+    served(lambda one, now: one.state is SensorState.LIVE)
+    told: list[SensorStatus] = []
+    with contextlib.suppress(StreamTimeout):
+        while True:
+            told += states.next(0.2).message.sensor_states
+    assert SensorState.LOST in {one.state for one in told}
+    # A host that is busy may let it rest for half a second between two silences.
+    assert sum(a.state is not b.state for a, b in pairwise(told)) < 25
+    assert len(told) <= _BURST + (_CHANGES_HZ + 1.0) * (lasted_s + 5.0)
 
 
 def test_age_and_drift_of_the_tare_are_gauged(

@@ -42,6 +42,12 @@ _RATES_S = 1.3  # two statuses of every process
 _WIDE = 110
 _QUIT = frozenset("qQ\x03\x1b")
 
+_STAGES = {
+    "arrival_age": "age", "waiting": "waiting", "decode": "decode", "tare": "tare",
+    "infer": "infer", "encode": "encode",
+}  # fmt: skip
+"""Stages of an estimate, in the order of its way."""
+
 _STATE_COLOURS = {
     "ready": "green", "live": "green", "routes": "green", "running": "green",
     "finished": "cyan", "ended": "cyan",
@@ -127,7 +133,9 @@ def screen(station: str, observed: Sequence[ObservedProcess], width: int) -> Gro
     parts: list[RenderableType] = [title, _process_table(processes, wide=width >= _WIDE)]
     if sensors:
         parts.append(_sensor_table(sensors))
-    parts += [*_stage_lines(processes), *_drop_lines(processes, sensors), *_trouble_lines(found)]
+    if (stages := _stage_table(processes)) is not None:
+        parts.append(stages)
+    parts += [*_drop_lines(processes, sensors), *_trouble_lines(found)]
     return Group(*parts)
 
 
@@ -193,17 +201,20 @@ def _sensor_table(sensors: Sequence[SensorActivity]) -> Table:
     return table
 
 
-def _stage_lines(processes: Sequence[ProcessActivity]) -> Iterator[Text]:
+def _stage_table(processes: Sequence[ProcessActivity]) -> Table | None:
     """Where the time goes: each stage of each process, median and 99th percentile."""
-    told = False
-    for one in processes:
-        stages = {name: of for name, of in one.latencies.items() if name != "latency"}
-        if stages:
-            if not told:
-                yield Text("stages, p50/p99 ms", style="bold")
-                told = True
-            words = [f"{name} {_ms(of.p50_s)}/{_ms(of.p99_s)}" for name, of in stages.items()]
-            yield Text(f"{process_name(one.service, one.instance)}: {'  '.join(words)}")
+    timed = [(one, {k: v for k, v in one.latencies.items() if k != "latency"}) for one in processes]
+    found = {stage for _, latencies in timed for stage in latencies}
+    stages = [*(stage for stage in _STAGES if stage in found), *sorted(found - {*_STAGES})]
+    if not stages:
+        return None
+    table = _table("p50/p99 ms", *(f"{_STAGES.get(stage, stage)}> " for stage in stages))
+    for one, latencies in timed:
+        if latencies:
+            cells = [latencies.get(stage) for stage in stages]
+            words = ["-" if of is None else f"{_ms(of.p50_s)}/{_ms(of.p99_s)}" for of in cells]
+            table.add_row(escape(process_name(one.service, one.instance)), *words)
+    return table
 
 
 def _drop_lines(
