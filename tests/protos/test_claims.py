@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from palpate.bus import SensorClaims, Session
+from palpate.bus import SensorClaims, Session, run_router
 from palpate.bus.claims import YIELD_S
 from palpate.bus.topics import SensorClaim, claim_key
 from palpate.config import LinkConfig
@@ -204,3 +204,37 @@ def test_without_a_link_nothing_is_taken(free_port: int) -> None:
     with claims_of(alone, 1) as claims:
         assert not claims.wait("finger", 1.0)
         assert claims.refusal("finger") is None
+
+
+@contextmanager
+def router_at(endpoint: str) -> Iterator[None]:
+    stop = threading.Event()
+    thread = threading.Thread(target=run_router, args=((endpoint,), stop), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("direct", [True, False])
+def test_a_router_that_is_started_again_moves_no_claim(free_port: int, direct: bool) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    link = LinkConfig(connect=(endpoint,), wait_for_router_s=PATIENCE_S, direct=direct)
+    with ExitStack() as stack:
+        router = stack.enter_context(ExitStack())
+        router.enter_context(router_at(endpoint))
+        first = stack.enter_context(claims_of(link, 2))
+        assert held_within_patience(first)
+        second = stack.enter_context(claims_of(link, 1))
+        refusal_of(second)
+        for _ in range(2):
+            router.close()
+            assert not second.wait("finger", 1.0)
+            router.enter_context(router_at(endpoint))
+            assert not second.wait("finger", 3.0)
+            assert first.wait("finger", 0.0)
+            first.check("finger")
+            refusal_of(second)

@@ -29,6 +29,10 @@ SETTLE_S = 0.2
 """For so long a sensor must have been free before it is taken [s]: by then each of two gateways
 that start at one instant sees the token of the other."""
 
+REJOIN_S = 2.0
+"""After the link was lost nothing is taken for this long [s]: who holds a sensor may need longer to
+come back, because attempts to connect are up to a second apart."""
+
 YIELD_S = 0.5
 """Of two that hold one sensor, the later one gives it up after this time [s]; one that stood still
 notices that itself, sooner."""
@@ -79,6 +83,7 @@ class SensorClaims(Closing):
         self._changed = threading.Condition(threading.RLock())
         self._closed = False
         self._alive_s = time.monotonic()
+        self._was_joined, self._blind_until_s = False, 0.0
         self._subscriber = self._liveliness.declare_subscriber(
             claims_key(station), self._on_sample, history=True
         )
@@ -177,6 +182,7 @@ class SensorClaims(Closing):
         now_s = time.monotonic()
         stood_still = now_s - self._alive_s >= self._lease_s
         self._alive_s = now_s
+        sees = all(own.claim.held for own in self._own.values()) or self._sees(now_s)
         for own in self._own.values():
             if stood_still and own.claim.held:
                 _log.warning("this process stood still: who publishes %s?", own.claim.sensor)
@@ -185,12 +191,21 @@ class SensorClaims(Closing):
             first = min(others, key=lambda one: one.order, default=own.claim)
             own.rival = first if first.order < own.claim.order else None
             may_change = (own.rival is None) != own.claim.held
-            if not may_change or not (own.claim.held or self._joined()):
+            if not may_change or not (own.claim.held or sees):
                 own.since_s = None
             elif own.since_s is None or stood_still:
                 own.since_s = now_s
             elif now_s - own.since_s >= (YIELD_S if own.claim.held else SETTLE_S):
                 self._become(own, held=not own.claim.held)
+
+    def _sees(self, now_s: float) -> bool:
+        """Whether the claims of others are known: the session is linked, and not just again."""
+        joined = self._joined()
+        # Not at the first time: nothing was missed before.
+        if joined != self._was_joined and (self._was_joined or self._blind_until_s):
+            self._blind_until_s = now_s + REJOIN_S
+        self._was_joined = joined
+        return joined and now_s >= self._blind_until_s
 
     def _become(self, own: _Own, *, held: bool) -> None:
         own.since_s = None
