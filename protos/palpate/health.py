@@ -232,7 +232,8 @@ class Health:
 class HealthReporter(Closing):
     """Publishes ``Status`` once a second and on each change of state, and answers when asked.
 
-    ``refresh`` is called before each report, e.g. to take over a subscriber's counters.
+    ``refresh`` is called before each report, e.g. to take over a subscriber's counters. What became
+    of the questions to this session is counted as ``questions_<event>``.
     """
 
     def __init__(
@@ -243,6 +244,7 @@ class HealthReporter(Closing):
         period_s: float = 1.0,
         refresh: Callable[[], None] | None = None,
     ) -> None:
+        self._session = session
         self._health = health
         self._period_s = period_s
         self._refresh = refresh
@@ -262,6 +264,10 @@ class HealthReporter(Closing):
     def _status(self) -> Status:
         if self._refresh is not None:
             self._refresh()
+        counters, waiting = self._session.questions()
+        if counters:
+            self._health.set_counts({f"questions_{name}": n for name, n in counters.items()})
+            self._health.gauge("waiting_questions", waiting)
         return self._health.status()
 
     def _run(self) -> None:

@@ -213,6 +213,8 @@ def test_a_cancelled_simulation_keeps_what_converged(service: Any) -> None:
 
 def occupied(service: Any, count: int) -> list[tuple[threading.Thread, list[Any]]]:
     """So many simulations that run or wait, named ``many <k>``."""
+    # The service is ready with its first worker; until the second is, one fewer is accepted.
+    service.until(lambda: service.robot.status()[0].gauges["ready_workers"] == 2)
     asked = [
         service.in_thread(fakes.request(f"many {k}", fakes.SLOW, steps=100)) for k in range(count)
     ]

@@ -25,7 +25,8 @@ from palpate.errors import (
     StreamTimeout,
     WireError,
 )
-from palpate.messages import FieldFrame, Tare, TareRequest
+from palpate.health import Health, HealthReporter
+from palpate.messages import FieldFrame, ServiceRequest, Tare, TareRequest
 
 WaitUntil = Callable[..., None]
 KEY = sensor_key("lab", "finger", "tare")
@@ -245,3 +246,22 @@ def test_a_flood_of_questions_is_refused_and_answered_in_the_end(
     assert answers == [tare.tare_id] * 120
     assert queryable.counters["refused_full"] > 0
     assert queryable.waiting == 0
+
+
+def test_the_status_counts_what_became_of_questions(
+    pair: Any, examples: dict[str, Any], wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    with HealthReporter(a, Health("gateway", "gateway"), period_s=0.05):
+        a.queryable(endpoints.TARE, lambda _: examples["Tare"], sensor="finger")
+        wait_until(lambda: not isinstance(_attempt(b), LinkError), timeout_s=TIMEOUT_S)
+        list(b._raw.get(KEY, payload=b"\xff", timeout=TIMEOUT_S))
+
+        def counters() -> dict[str, int]:
+            status = b.query(endpoints.STATUS, ServiceRequest(), timeout_s=TIMEOUT_S)
+            assert status.gauges.get("waiting_questions", 0.0) >= 0.0
+            return dict(status.counters)
+
+        wait_until(lambda: counters().get("questions_rejected_schema") == 1, timeout_s=TIMEOUT_S)
+        assert counters()["questions_answered"] == 1
+        assert counters()["questions_received"] == 2, "those about the status do not count"

@@ -7,6 +7,7 @@ import json
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Self, TypeVar
 
@@ -14,7 +15,7 @@ import zenoh
 
 from palpate.bus.claims import SensorClaims
 from palpate.bus.delivery import Delivery
-from palpate.bus.endpoints import Endpoint
+from palpate.bus.endpoints import STATUS, Endpoint
 from palpate.bus.holders import ClaimWatch
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Publisher, Subscriber
@@ -171,6 +172,7 @@ class Session(Closing):
         self._claim_watches: dict[str, ClaimWatch] = {}
         self._observing: Session | None = None
         self._observing_lock = threading.Lock()
+        self._answering: list[Queryable] = []
         self._closing: list[Callable[[], None]] = []
 
     @classmethod
@@ -284,11 +286,14 @@ class Session(Closing):
 
         ``capacity`` questions may wait, more are refused; ``workers`` are handled at once.
         """
-        key = self._key(endpoint, sensor, service, instance)
-        return self._keep(
-            Queryable(
-                self._raw, key, endpoint, single_reply(handler), capacity=capacity, workers=workers
-            )
+        return self.stream_queryable(
+            endpoint,
+            single_reply(handler),
+            sensor=sensor,
+            service=service,
+            instance=instance,
+            capacity=capacity,
+            workers=workers,
         )
 
     def stream_queryable(
@@ -304,9 +309,17 @@ class Session(Closing):
     ) -> Queryable:
         """Answer each question with several replies, or with their timings; from any thread."""
         key = self._key(endpoint, sensor, service, instance)
-        return self._keep(
-            Queryable(self._raw, key, endpoint, handler, capacity=capacity, workers=workers)
-        )
+        queryable = Queryable(self._raw, key, endpoint, handler, capacity=capacity, workers=workers)
+        if endpoint is not STATUS:
+            self._answering.append(queryable)
+        return self._keep(queryable)
+
+    def questions(self) -> tuple[dict[str, int], int]:
+        """Counters of all questions to this session but those about its status; how many wait."""
+        counters: Counter[str] = Counter()
+        for queryable in self._answering:
+            counters.update(queryable.counters)
+        return dict(counters), sum(one.waiting for one in self._answering)
 
     def query(
         self,
