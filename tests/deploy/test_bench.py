@@ -29,9 +29,9 @@ def test_codec(palpate: Palpate) -> None:
 @pytest.mark.slow
 def test_e2e_reports_both_sides_and_the_load(palpate: Palpate, bundle: str) -> None:
     result = palpate(
-        *("bench", "e2e", "--seconds", "1", "--rounds", "1", "--sensors", "3"),
+        *("bench", "e2e", "--seconds", "1", "--rounds", "1", "--sensors", "3", "--fields", "1"),
         *("--load-seconds", "2", "--no-ramp", "--json"),
-        timeout=120,
+        timeout=180,
     )
     assert result.returncode == 0, result.stderr
     values = json.loads(result.stdout)
@@ -40,9 +40,12 @@ def test_e2e_reports_both_sides_and_the_load(palpate: Palpate, bundle: str) -> N
         assert numbers["count"] > 20
         assert 0 < numbers["p50_s"] <= numbers["p99_s"] <= numbers["max_s"]
     assert values["e2e.p50_ratio"] > 0
-    load = values["load"]
-    assert load["published"] >= 600
-    assert load["lost"] == load["published"] - load["received"] >= 0
+    for service, fingers in (("features", 3), ("field", 1)):
+        load = values[f"load.{service}"]
+        assert load["published"] >= 200 * fingers
+        assert load["lost"] == load["published"] - load["received"] >= 0
+        assert set(load["cores"]) == {"gateway", "service", "client", "router"}
+        assert load["stages_s"]["infer"] > 0
 
 
 def test_rounds_are_cut_at_pauses_and_warmed_up() -> None:

@@ -3,6 +3,7 @@
 The shortest program for the same task: Zenoh, the generated protobuf classes, ONNX Runtime; no
 checks beyond the lengths, no health, no presence, no search for tares, one finger. It reads the
 same Zenoh settings as palpate from a file, and sends the same frames and estimates field by field.
+Its terms are equal (``harness.equal_terms``): garbage collection, change of threads, pinning.
 Only this module of the room imports these packages, because it must not use palpate's own code.
 
 ``python -m palpate_deploy.bench.floor router|source|service|client ...`` (see ``main``).
@@ -28,6 +29,7 @@ from palpate_deploy.bench.harness import (
     SERIAL,
     SourceGate,
     bench_counts,
+    equal_terms,
     stop_on_sigterm,
     write_rows,
 )
@@ -63,8 +65,8 @@ def router(settings: str) -> None:
         stop.wait()
 
 
-def source(settings: str, gate_file: str, rate_hz: str) -> None:
-    """Send prepared frames at absolute deadlines while the gate is open."""
+def source(settings: str, gate_file: str, rate_hz: str, core: str) -> None:
+    """Send prepared frames at absolute deadlines while the gate is open; stays on a core."""
     stop = stop_on_sigterm()
     gate = SourceGate(Path(gate_file), 1)
     period_ns = round(1e9 / float(rate_hz))
@@ -72,6 +74,7 @@ def source(settings: str, gate_file: str, rate_hz: str) -> None:
     sequence, due_ns, offset_ns = 0, 0, 1 << 62
     with session(settings) as opened:
         sink = publisher(opened, FRAMES, "ElectrodeFrame")
+        equal_terms(core)
         while not stop.is_set():
             if not gate.is_open:
                 time.sleep(0.02)
@@ -125,6 +128,7 @@ def service(settings: str, model: str) -> None:
     with session(settings) as opened:
         sink = publisher(opened, ESTIMATES, "FeatureEstimate")
         frames = opened.declare_subscriber(FRAMES, zenoh.handlers.RingChannel(1))
+        equal_terms()
         exit_on_sigterm()
         while True:
             sample = frames.recv()
@@ -153,6 +157,7 @@ def client(settings: str, out: str) -> None:
     rows: list[tuple[int, int, int]] = []
     with session(settings) as opened:
         estimates = opened.declare_subscriber(ESTIMATES, zenoh.handlers.RingChannel(1))
+        equal_terms()
         exit_on_sigterm()
         try:
             while True:

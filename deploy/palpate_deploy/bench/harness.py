@@ -14,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import StreamTimeout
+from palpate.process import avoid_pauses
 from palpate_deploy.station.lifetime import end_with_parent, stop_on_signals
+from palpate_gateway.one_core import stay_on_one_core
 
 if TYPE_CHECKING:  # the floor, which uses this module too, does without palpate's bus
     from palpate.bus import ReceivedMessage, Subscriber
@@ -26,6 +28,9 @@ REST_COUNTS = 3000
 SLOTS = 44
 KINDS = 256
 """Different frames, prepared before the first is due."""
+
+STAGES = ("age_at_arrival", "waiting", "decode", "tare", "infer", "encode")
+"""Stages of an estimate, whose times [ns] may follow its row; -1 = unknown."""
 
 _NOISE_COUNTS = 2
 _SEED = 1
@@ -76,6 +81,16 @@ def stop_on_sigterm() -> threading.Event:
     return stop
 
 
+def equal_terms(core: str = "") -> None:
+    """Before a process of a bench serves: what palpate's processes do, for the floor and clients.
+
+    Garbage collection and the switch of threads, and for the source its ``core``.
+    """
+    avoid_pauses()
+    if core:
+        stay_on_one_core(int(core))
+
+
 def received(stream: Subscriber[M], stop: threading.Event) -> Iterator[ReceivedMessage[M]]:
     """The messages of a stream until ``stop`` is set."""
     while not stop.is_set():
@@ -92,7 +107,10 @@ def dropped_by(*streams: Subscriber[Any]) -> int:
 
 
 def write_rows(out: Path, sensors: list[str], rows: Any, *, dropped: int, columns: int = 3) -> None:
-    """Write rows of a client: by default sequence, stamp and arrival [ns] of each estimate."""
+    """Write rows of a client: by default sequence, stamp and arrival [ns] of each estimate.
+
+    With more columns, ``STAGES`` follow.
+    """
     np.savez(
         out,
         sensors=np.array(sensors, dtype=str),

@@ -1,8 +1,8 @@
 """The services and the client of a benchmark, processes of their own.
 
 ``python -m palpate_deploy.bench.parts SERVICE PROFILE`` is a service as a station runs it, with the
-benchmark's device in the gateway's driver table. ``... client ENDPOINT STATION OUT DELIVERY`` is a
-robot's client, which notes the age of every estimate.
+benchmark's device in the gateway's driver table. ``... client ENDPOINT STATION OUT DELIVERY TOPIC``
+is a robot's client, which notes the age of every estimate of a topic.
 """
 
 from __future__ import annotations
@@ -13,7 +13,15 @@ import sys
 import time
 from pathlib import Path
 
-from palpate_deploy.bench.harness import dropped_by, received, stop_on_sigterm, write_rows
+from palpate.messages import StageTimings
+from palpate_deploy.bench.harness import (
+    STAGES,
+    dropped_by,
+    equal_terms,
+    received,
+    stop_on_sigterm,
+    write_rows,
+)
 
 DRIVER = "palpate_deploy.bench.device:BenchDevice"
 
@@ -34,33 +42,43 @@ def service(name: str, profile: str) -> None:
     run_service(service_named(name), load_profile(profile))
 
 
-def client(endpoint: str, station: str, out: Path, delivery: str) -> None:
+def client(endpoint: str, station: str, out: Path, delivery: str, topic: str) -> None:
     """Take estimates until ``SIGTERM``; then write sensor, sequence, stamp and arrival of each.
 
     ``delivery`` is ``newest``, as a robot's controller does, or ``queue`` to count what arrives.
     """
     from palpate.bus import Delivery, Session
-    from palpate.bus.topics import FEATURES
+    from palpate.bus.timings import timings_of
+    from palpate.bus.topics import TOPICS
     from palpate.config import LinkConfig
 
     stop = stop_on_sigterm()
     sensors: list[str] = []
-    rows: list[tuple[int, int, int]] = []
+    rows: list[tuple[int, ...]] = []
+    timings: list[bytes] = []
     with Session.open(LinkConfig(connect=(endpoint,)), station=station) as session:
-        stream = session.subscriber(FEATURES, delivery=Delivery(delivery))
+        stream = session.subscriber(TOPICS[topic], delivery=Delivery(delivery))
         with session.presence("client", instance="client") as presence:
+            equal_terms()
             presence.ready()
             for got in received(stream, stop):
                 now_ns = time.monotonic_ns()  # the client has the decoded estimate
                 source = got.message.source
                 rows.append((source.sequence, source.monotonic_ns, now_ns))
+                timings.append(got.attachment)
                 sensors.append(got.sensor)
         dropped = dropped_by(stream)
-    write_rows(out, sensors, rows, dropped=dropped)
+    full = [row + _stages_ns(timings_of(timing)) for row, timing in zip(rows, timings, strict=True)]
+    write_rows(out, sensors, full, dropped=dropped, columns=3 + len(STAGES))
+
+
+def _stages_ns(timings: StageTimings | None) -> tuple[int, ...]:
+    values = (getattr(timings, f"{stage}_s", None) for stage in STAGES)
+    return tuple(-1 if value is None else round(value * 1e9) for value in values)
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "client":
-        client(sys.argv[2], sys.argv[3], Path(sys.argv[4]), sys.argv[5])
+        client(sys.argv[2], sys.argv[3], Path(sys.argv[4]), sys.argv[5], sys.argv[6])
     else:
         service(sys.argv[1], sys.argv[2])

@@ -57,17 +57,26 @@ def progress_bar() -> Progress:
 
 
 def finish(
-    name: str, values: dict[str, Any], show: Callable[[], None], *, as_json: bool, save: bool
+    name: str,
+    values: dict[str, Any],
+    show: Callable[[], None],
+    *,
+    as_json: bool,
+    save: bool,
+    out: Path | None = None,
 ) -> None:
-    """Print a result, by ``show`` or as JSON, and append it to the history on request.
+    """Print a result, by ``show`` or as JSON; append it to the history, or write ``out``.
 
     Raises:
         ConfigError: The history is not there, see ``append_history``.
     """
+    text = json.dumps({**values, "machine": machine()}, indent=2)
     if as_json:
-        print(json.dumps({**values, "machine": machine()}, indent=2))
+        print(text)
     else:
         show()
+    if out is not None:
+        out.write_text(text + "\n", encoding="utf-8")
     if save:
         append_history(name, values)
 

@@ -17,17 +17,20 @@ SaveOption = Annotated[
 
 
 @bench_app.command(
-    epilog=example("palpate bench e2e", "palpate bench e2e --seconds 2 --rounds 3 --json")
+    epilog=example("palpate bench e2e --runs 5", "palpate bench e2e --seconds 2 --rounds 3 --json")
 )
 def e2e(
     seconds: Annotated[float, typer.Option(min=0.5, help="Duration of one round [s].")] = 4.0,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of palpate and of the floor.")] = 6,
-    sensors: Annotated[int, typer.Option(min=1, help="Fingers in the load test.")] = 20,
+    runs: Annotated[int, typer.Option(min=1, help="Runs, with new processes each.")] = 1,
+    sensors: Annotated[int, typer.Option(min=0, help="Fingers in the load test.")] = 40,
+    fields: Annotated[int, typer.Option(min=0, help="Fingers in the load test of fields.")] = 5,
     load_seconds: Annotated[
         float, typer.Option(min=1, help="Duration of the load test [s].")
     ] = 10.0,
     ramp: Annotated[bool, typer.Option(help="Raise the rate until a frame is lost.")] = True,
     bundle: Annotated[str, typer.Option(help="Bundle that is served.")] = "features-virtual",
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
@@ -37,12 +40,15 @@ def e2e(
     run_e2e(
         seconds=seconds,
         rounds=rounds,
+        runs=runs,
         sensors=sensors,
+        fields=fields,
         load_seconds=load_seconds,
         ramp=ramp,
         bundle=bundle,
         as_json=json_,
         save=save,
+        out=out,
     )
 
 
