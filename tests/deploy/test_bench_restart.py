@@ -11,7 +11,8 @@ from palpate_deploy.station.host import private_profile
 
 
 def _trials(*publishing_s: float, failed: int = 0, fault: str = "kill") -> Trials:
-    return Trials("features", fault, publishing_s, publishing_s, failed, 1.0)  # type: ignore[arg-type]
+    ended_s = tuple(0.1 * time_s for time_s in publishing_s)
+    return Trials("features", fault, publishing_s, ended_s, failed, 1.0)  # type: ignore[arg-type]
 
 
 def test_the_goal_is_for_every_trial() -> None:
@@ -20,6 +21,8 @@ def test_the_goal_is_for_every_trial() -> None:
     assert not _trials(1.0, failed=1).met
     assert _trials(7.0, 9.9, fault="hang").met
     assert not _trials(10.1, fault="hang").met
+    assert _trials(29.0, fault="end").met, "it has ended after 2.9 s"
+    assert not _trials(31.0, fault="end").met
 
 
 @pytest.mark.slow

@@ -226,6 +226,19 @@ def test_doctor_names_what_an_extra_lacks(monkeypatch: pytest.MonkeyPatch) -> No
         assert (line.grade, line.fix) == ("warn", 'pip install "palpate[fem]"')
 
 
+def test_doctor_fails_if_a_process_of_the_profile_lacks_its_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "onnxruntime" else found(name)
+    )
+    lines = {line.what: line for line in doctor._all("bench")}
+    assert lines["extras"].grade == "fail"
+    assert "'onnxruntime'" in lines["extras"].found
+    assert lines["extras"].fix == 'install it: pip install "palpate[services]"'
+
+
 def test_doctor_looks_for_all_that_simulations_need() -> None:
     looked_for = {module for module, _, _ in doctor._PACKAGES}
     assert set(EXTRA_MODULES) <= looked_for

@@ -1,4 +1,4 @@
-"""``palpate bench restart``: each process of a station is killed and is made to hang, many times.
+"""``palpate bench restart``: each process is killed, made to hang and told to end, many times.
 
 A station of its own runs under its supervisor. A trial ends when the process publishes again, as
 others see it: the gateway a frame, a service an estimate of a later frame, the recorder a record
@@ -37,9 +37,15 @@ from palpate_deploy.station.processes import service_named
 from palpate_deploy.station.profile import Profile, Service
 from palpate_deploy.station.supervision import ProcessState, Supervisor
 
-Fault = Literal["kill", "hang"]
-SIGNALS: dict[Fault, signal.Signals] = {"kill": signal.SIGKILL, "hang": signal.SIGSTOP}
-GOALS_S: dict[Fault, float] = {"kill": 3.0, "hang": 10.0}
+Fault = Literal["kill", "hang", "end"]
+SIGNALS: dict[Fault, signal.Signals] = {
+    "kill": signal.SIGKILL,
+    "hang": signal.SIGSTOP,
+    "end": signal.SIGTERM,
+}
+GOALS_S: dict[Fault, float] = {"kill": 3.0, "hang": 10.0, "end": 3.0}
+"""Until it publishes again; after SIGTERM until it has ended with status 0: it may work off what
+has arrived for two seconds, and then closes its files and its session."""
 
 _PATIENCE_S = 60.0
 _START_S = 180.0
@@ -60,12 +66,12 @@ class Trials:
 
     Attributes:
         service: The process.
-        fault: ``kill`` (SIGKILL) or ``hang`` (SIGSTOP).
+        fault: ``kill`` (SIGKILL), ``hang`` (SIGSTOP) or ``end`` (SIGTERM).
         publishing_s: When it published again, of each trial in which it did.
         process_s: When the new process was there.
-        failed: Trials in which it did not publish again in time.
-        floor_s: A bare restart under a bare supervisord plus bare imports; for ``hang`` also the
-            time without a heartbeat that is allowed.
+        failed: Trials in which it did not publish again in time, or did not end with status 0.
+        floor_s: A bare restart under a bare supervisord, and unless it is to ``end``, bare imports;
+            for ``hang`` also the time without a heartbeat that is allowed.
     """
 
     service: str
@@ -76,9 +82,14 @@ class Trials:
     floor_s: float
 
     @property
+    def judged_s(self) -> tuple[float, ...]:
+        """The times that the goal is for."""
+        return self.process_s if self.fault == "end" else self.publishing_s
+
+    @property
     def met(self) -> bool:
         """Whether it came back each time, and soon enough."""
-        return not self.failed and max(self.publishing_s, default=0.0) <= GOALS_S[self.fault]
+        return not self.failed and max(self.judged_s, default=0.0) <= GOALS_S[self.fault]
 
 
 class RestartStation:
@@ -217,7 +228,9 @@ def measure_restarts(
             tuple(publishing for publishing, _ in rows if publishing < _PATIENCE_S),
             tuple(process for _, process in rows if process < _PATIENCE_S),
             sum(publishing >= _PATIENCE_S for publishing, _ in rows),
-            bare_s + imports_s[service] + (LIMIT_S if fault == "hang" else 0.0),
+            bare_s
+            + (imports_s[service] if fault != "end" else 0.0)
+            + (LIMIT_S if fault == "hang" else 0.0),
         )
         for (service, fault), rows in ((pair, taken[pair]) for pair in pairs)
     ], unprovoked
@@ -235,16 +248,19 @@ def _try(station: RestartStation, service: Service, fault: Fault) -> tuple[float
         return passed_s if passed_s >= _PATIENCE_S else (time.monotonic_ns() - since_ns) * 1e-9
 
     process_s = until(lambda: station.process(service).pid not in (0, pid))
+    if fault == "end" and station.process(service).exit_status != 0:
+        return _PATIENCE_S, process_s
     return until(lambda: station.publishes(service, since_ns, pid)), process_s
 
 
 def _show(results: Sequence[Trials], unprovoked: dict[str, int]) -> None:
-    table = Table(title="from the signal until the process publishes again", title_justify="left")
+    title = "from the signal until the process publishes again (SIGTERM: until it has ended)"
+    table = Table(title=title, title_justify="left")
     for column in ("process", "fault", "back", "p50", "max", "goal", "floor"):
         table.add_column(column, justify="left" if column in ("process", "fault") else "right")
     for result in results:
         back = len(result.publishing_s)
-        times = result.publishing_s or (float("nan"),)
+        times = result.judged_s or (float("nan"),)
         colour = "green" if result.met else "red"
         table.add_row(
             result.service,

@@ -22,6 +22,7 @@ from palpate.errors import LinkError, PalpateError
 from palpate.folders import state_folder
 from palpate_deploy.station.host import check_free, join
 from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.processes import check_packages
 from palpate_deploy.station.profile import Profile, load_profile
 
 Grade = Literal["ok", "warn", "fail"]
@@ -119,6 +120,11 @@ def _packages() -> Iterator[Finding]:
             yield Finding("package", grade, f"{distribution} is not installed{why}", fix)
             continue
         yield Finding("package", "ok", found)
+
+
+def _extras(profile: Profile) -> Found:
+    check_packages(profile)
+    return "ok", "every process of the profile finds its packages", ""
 
 
 def _sensors(profile: Profile) -> Found:
@@ -250,6 +256,7 @@ def _cpu(_: Profile) -> Found:
 
 
 _CHECKS: dict[str, Callable[[Profile], Found]] = {
+    "extras": _extras,
     "sensors": _sensors,
     "router": _router,
     "bundle": _bundle,
