@@ -17,6 +17,7 @@ from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
+from palpate_deploy.station.host import state_folder
 from palpate_deploy.station.processes import command_line
 
 _log = logging.getLogger(__name__)
@@ -184,6 +185,10 @@ def test_nothing_outlives_a_killed_parent(
         subprocess.run(["kill", "-9", str(process_ids(tmp_path)["supervisord"])], check=True)
     wait_until(lambda: not process_ids(tmp_path), PATIENCE_S, "every process has ended")
     assert up.wait(timeout=60) != 0
+    config = next(state_folder().rglob("supervisord.conf")).read_text(encoding="utf-8")
+    (line,) = (line for line in config.splitlines() if line.endswith("supervisor.sock"))
+    folder = Path(line.partition("=")[2].strip()).parent
+    wait_until(lambda: not folder.exists(), PATIENCE_S, "its shared memory is given back")
 
 
 def test_interrupt_stops_cleanly(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +25,7 @@ from palpate_deploy.station.lifetime import PARENT_PID, end_with_parent
 from palpate_deploy.station.watch import Watch
 
 WATCH_FOLDER = "_PALPATE_WATCH"
-"""Environment variable with the folder of the processes' heartbeats."""
+"""Environment variable with the folder of the processes' heartbeats; removed at the end."""
 
 _WAIT_S = 0.1
 
@@ -61,8 +62,9 @@ def main() -> None:
     options.first = True
     options.test = False
     supervisord = Supervisor(options)
+    folder = Path(os.environ.pop(WATCH_FOLDER))
     options.watch = Watch(
-        Path(os.environ.pop(WATCH_FOLDER)),
+        folder,
         lambda: _processes(supervisord),
         lambda line: options.logger.warn(line),
     )
@@ -70,6 +72,8 @@ def main() -> None:
         supervisord.main()
     options.close_httpservers()
     options.close_logger()
+    # Here too, because a `palpate up` that was killed cannot do it.
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":
