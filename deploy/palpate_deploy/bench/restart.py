@@ -250,11 +250,13 @@ def _try(station: RestartStation, service: Service, fault: Fault) -> tuple[float
     process_s = until(lambda: station.process(service).pid not in (0, pid))
     if fault == "end" and station.process(service).exit_status != 0:
         return _PATIENCE_S, process_s
-    return until(lambda: station.publishes(service, since_ns, pid)), process_s
+    # A process that was told to end has published after that, too.
+    after_ns = time.monotonic_ns() if fault == "end" else since_ns
+    return until(lambda: station.publishes(service, after_ns, pid)), process_s
 
 
 def _show(results: Sequence[Trials], unprovoked: dict[str, int]) -> None:
-    title = "from the signal until the process publishes again (SIGTERM: until it has ended)"
+    title = "from the signal until it publishes again (SIGTERM: until it has ended)"
     table = Table(title=title, title_justify="left")
     for column in ("process", "fault", "back", "p50", "max", "goal", "floor"):
         table.add_column(column, justify="left" if column in ("process", "fault") else "right")
