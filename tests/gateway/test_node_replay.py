@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace as changed
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from palpate.bus.topics import TOPICS
 from palpate.codec import TARE
 from palpate.errors import RecordingError, RemoteError
-from palpate.files.record import read_record
+from palpate.files.record import RecordWriter, read_record
 from palpate.messages import ElectrodeFrame, Origin, ServiceState
 
 PATIENCE_S = 10.0
@@ -66,6 +69,28 @@ def test_two_fast_replays_give_the_same_bytes(
             runs.append(electrodes)
     assert runs[0] == runs[1]
     assert len(runs[0]) == 80
+
+
+def test_a_record_keeps_the_session_of_its_run(
+    bus: Any, record: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The gateway that plays it has another."""
+    named = tmp_path / "named.mcap"
+    with RecordWriter(named) as writer:
+        for item in read_record(record(50)):
+            codec = TOPICS[item.address.topic].codec
+            message = codec.decode(item.payload)
+            stamp = changed(message.stamp, session_id=0xFEED)
+            payload = codec.encode(changed(message, stamp=stamp))
+            writer.write(item.key, codec.schema, payload, log_time_ns=item.log_time_ns)
+    values = replay(named)
+    values["sensors"] = [{"driver": "record", "options": {"path": named}}]
+    wanted = Counter((item.address.topic, item.payload) for item in read_record(named))
+    with bus.consumer() as tap, bus.gateway(values):
+        samples = [tap.next(timeout_s=PATIENCE_S) for _ in range(wanted.total())]
+    assert Counter((sample.topic, sample.payload) for sample in samples) == wanted
+    decoded = [TOPICS[sample.topic].codec.decode(sample.payload) for sample in samples]
+    assert {message.stamp.session_id for message in decoded} == {0xFEED}
 
 
 def test_record_is_republished_byte_for_byte(bus: Any, record: Callable[..., Path]) -> None:
