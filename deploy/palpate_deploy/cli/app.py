@@ -125,13 +125,14 @@ def top(
     once: Annotated[bool, typer.Option("--once", help="Print one picture and end.")] = False,
     profile: WantedOption = None,
     connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
     json_: JsonOption = False,
 ) -> None:
     """Rates, latencies, losses, memory of every process and sensor, live; q quits."""
     from palpate_deploy.station.top import run_top
 
-    link, station = station_link(profile, connect, station)
+    link, station = station_link(profile, connect, station, tls)
     raise typer.Exit(
         run_top(link, station, profile=profile, period_s=period_s, once=once, as_json=json_)
     )

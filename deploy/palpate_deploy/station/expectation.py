@@ -1,4 +1,4 @@
-"""What should run at a station, by its profile or by the folder of its run on this host."""
+"""What should run at a station: by its profile, or by the folder of its run on this host."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from palpate.census import ProcessName
-from palpate.config import endpoint_host_port, is_loopback
+from palpate.bus import Session
+from palpate.census import ROUTER, ProcessName
+from palpate.config import LinkConfig, endpoint_host_port, is_loopback
+from palpate.errors import LinkError
 from palpate_deploy.station.host import running_folders
 from palpate_deploy.station.profile import load_profile
 from palpate_deploy.station.supervisor_report import SERVICE as SUPERVISOR
@@ -52,6 +54,23 @@ def expectation_here(connect: Iterable[str], station: str) -> Expectation | None
             names.add((SUPERVISOR, SUPERVISOR))
         return Expectation(f"run {folder.name} on this host", frozenset(names))
     return None
+
+
+def ask_through_router(link: LinkConfig, station: str, said: Expectation | None) -> Session:
+    """Join a station through its router alone, which knows every process at once.
+
+    Raises:
+        LinkError: There is no router, or it does not answer although ``said`` knows a run.
+    """
+    try:
+        return Session.open(link.model_copy(update={"direct": False}), station=station)
+    except LinkError as error:
+        if said is None or ROUTER not in said.processes:
+            raise
+        raise LinkError(
+            f"the router at {', '.join(link.connect)} does not answer, but should: {said.source}",
+            remedy="it starts, or hangs and is started again by itself: ask again in ten seconds",
+        ) from error
 
 
 def _profile(folder: Path) -> dict[str, Any]:

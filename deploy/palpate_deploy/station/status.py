@@ -22,7 +22,11 @@ from palpate.messages import (
     ServiceState,
     Status,
 )
-from palpate_deploy.station.expectation import expectation_here, expectation_of
+from palpate_deploy.station.expectation import (
+    ask_through_router,
+    expectation_here,
+    expectation_of,
+)
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.troubles import Trouble, process_name, troubles
 from palpate_gateway.clock.stamps import ClockQuality
@@ -151,8 +155,7 @@ def show_status(
     said = expectation_here(link.connect, station)
     if profile is not None:
         said = expectation_of(profile)
-    # Through the router, which knows every process at once.
-    with Session.open(link.model_copy(update={"direct": False}), station=station) as session:
+    with ask_through_router(link, station, said) as session:
         expected = frozenset() if said is None else said.processes
         census = take_census(session, expected=expected, timeout_s=timeout_s)
         router = session.has_router()

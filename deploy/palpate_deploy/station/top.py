@@ -20,7 +20,6 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from palpate.bus import Session
 from palpate.census import ROUTER
 from palpate.config import LinkConfig
 from palpate_deploy.station.activity import (
@@ -31,7 +30,11 @@ from palpate_deploy.station.activity import (
     process_activities,
     sensor_activities,
 )
-from palpate_deploy.station.expectation import expectation_here, expectation_of
+from palpate_deploy.station.expectation import (
+    ask_through_router,
+    expectation_here,
+    expectation_of,
+)
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
 from palpate_deploy.station.status import duration_text
@@ -77,7 +80,7 @@ def run_top(
     expected = frozenset() if said is None else said.processes
     console = Console()
     with (
-        Session.open(link.model_copy(update={"direct": False}), station=station) as session,
+        ask_through_router(link, station, said) as session,
         StationObserver(session, expected=expected) as observer,
     ):
         observer.ask(_ASK_S)

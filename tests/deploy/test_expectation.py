@@ -1,0 +1,86 @@
+"""What should run: by a profile, and by the runs of this host."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, LinkError
+from palpate_deploy.station.expectation import (
+    ask_through_router,
+    expectation_here,
+    expectation_of,
+)
+from palpate_deploy.station.host import free_endpoint, new_run_folder, write_profile
+from palpate_deploy.station.profile import parse_profile
+
+PROCESSES = ["router", "gateway", "features"]
+
+
+def a_run(listen: str, *, station: str = "lab", supervised: bool = True) -> Path:
+    profile = parse_profile(
+        {"station": station, "processes": PROCESSES, "router": {"listen": [listen]}}, where="test"
+    )
+    folder = new_run_folder("mine")
+    write_profile(profile, folder)
+    if supervised:
+        (folder / "supervisord.conf").touch()
+    return folder
+
+
+def names(*more: str) -> set[tuple[str, str]]:
+    return {(name, name) for name in (*PROCESSES, *more)}
+
+
+def test_a_profile_says_what_it_starts() -> None:
+    said = expectation_of("virtual")
+    assert {name for name, _ in said.processes} >= {"router", "gateway", "features", "recorder"}
+    assert said.source == "profile virtual"
+    with pytest.raises(ConfigError, match="does not exist"):
+        expectation_of("virtaul")
+
+
+def test_a_run_of_this_host_is_found_by_router_and_station() -> None:
+    here = free_endpoint()
+    folder = a_run(here)
+    said = expectation_here([here], "lab")
+    assert said is not None
+    assert said.processes == names("supervisor")
+    assert folder.name in said.source
+    assert expectation_here([here.replace("127.0.0.1", "localhost")], "lab") is not None
+    assert expectation_here([here], "elsewhere") is None
+    assert expectation_here([free_endpoint()], "lab") is None
+    assert expectation_here(["tcp/10.1.2.3:7447"], "lab") is None
+
+
+def test_the_newest_run_counts_and_one_that_has_ended_does_not() -> None:
+    here = free_endpoint()
+    ended = a_run(here)
+    ended.rename(ended.with_name(f"99999999-999999-mine-{2**22 + 5}"))
+    assert expectation_here([here], "lab") is None
+    finite = a_run(here, supervised=False)
+    finite.rename(finite.with_name(f"20990101-000000-replay-{os.getpid()}"))
+    said = expectation_here([here], "lab")
+    assert said is not None
+    assert said.processes == names()
+
+
+def test_a_damaged_folder_is_passed_over() -> None:
+    here = free_endpoint()
+    (a_run(here) / "profile.toml").write_text("not = [toml", encoding="utf-8")
+    assert expectation_here([here], "lab") is None
+
+
+def test_a_router_that_should_answer_is_not_said_to_be_absent() -> None:
+    here = free_endpoint()
+    link = LinkConfig(connect=(here,), wait_for_router_s=0.3)
+    with pytest.raises(LinkError, match="no router") as absent:
+        ask_through_router(link, "lab", None)
+    assert "palpate up" in absent.value.remedy
+    a_run(here)
+    with pytest.raises(LinkError, match="does not answer, but should") as hangs:
+        ask_through_router(link, "lab", expectation_here([here], "lab"))
+    assert "by itself" in hangs.value.remedy
