@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import field_bundles as bundles
 import pytest
 
 from palpate.bus import TapSample
@@ -18,6 +18,8 @@ from palpate.health import Health
 from palpate.messages import Stamp
 from palpate_services.config import EVERYTHING, RecorderConfig
 from palpate_services.recorder.writer import RecordFiles
+
+bundles: Any = importlib.import_module("field_bundles")
 
 PERIOD_NS = 50_000_000
 SECONDS = 3

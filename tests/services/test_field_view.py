@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import importlib
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -203,3 +205,34 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
         view.add("finger", dataclasses.replace(field, displacement=field.displacement[:-1]))
         view.flush()
         assert dict(view.counters) == {"view_wrong_mesh": 1}
+
+
+def test_a_closed_view_is_freed_without_a_garbage_collection(
+    make_frame: Frames, tmp_path: Path
+) -> None:
+    """A service makes no full collection; a view in a circle stayed for each record it wrote."""
+    pytest.importorskip("rerun")
+    from palpate_services.viewer.record_view import LiveView, RerunView
+
+    meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
+    frame = make_frame()
+    gone = []
+
+    def make() -> RerunView:
+        view = RerunView(tmp_path / "view.rrd", title="view", meshes=meshes, live=True)
+        gone.append(weakref.ref(view))
+        return view
+
+    gc.collect()
+    gc.disable()
+    try:
+        live = LiveView(make)
+        live.offer("finger", frame)
+        live.offer("finger", bundles.truth(frame.stamp))
+        live.finish()
+        assert live.join(20.0)
+        gone.append(weakref.ref(live))
+        del live
+        assert [one() for one in gone] == [None, None]
+    finally:
+        gc.enable()

@@ -8,6 +8,7 @@ asks the kernel how well the clock is kept.
 from __future__ import annotations
 
 import ctypes
+import functools
 import logging
 import math
 import sys
@@ -225,6 +226,16 @@ class WallDiscipline(NamedTuple):
     error_s: float
 
 
+@functools.cache
+def _adjtimex() -> Callable[[object], int] | None:
+    """The call of the kernel, looked up once: each ``CDLL`` makes a class, a circle of garbage."""
+    try:
+        found: Callable[[object], int] = ctypes.CDLL(None, use_errno=True).adjtimex
+    except (OSError, AttributeError):
+        return None
+    return found
+
+
 def wall_discipline() -> WallDiscipline | None:
     """How well the wall clock of this host is kept; None = unknown.
 
@@ -235,10 +246,7 @@ def wall_discipline() -> WallDiscipline | None:
         return None
     memory = ctypes.create_string_buffer(_STRUCT_BYTES)
     state = _Timex.from_buffer(memory)
-    try:
-        ask = ctypes.CDLL(None, use_errno=True).adjtimex
-    except (OSError, AttributeError):
-        return None
-    if ask(memory) < 0:
+    ask = _adjtimex()
+    if ask is None or ask(memory) < 0:
         return None
     return WallDiscipline(state.maxerror < _UNKNOWN_US, 1e-6 * state.maxerror)

@@ -73,23 +73,26 @@ class _Skin:
 
 
 class FieldDrawer:
-    """Draws fields on the skins of their meshes, with the ``send`` of a view.
+    """Draws fields on the skins of their meshes.
 
     ``counters``: ``view_no_mesh`` (fields of a mesh that no bundle holds), ``view_wrong_mesh``
     (fields with another number of nodes than their mesh).
     """
 
-    def __init__(self, rr: Any, stream: Any, send: Send, meshes: MeshLibrary) -> None:
+    def __init__(self, rr: Any, stream: Any, meshes: MeshLibrary) -> None:
         self.counters: Counter[str] = Counter()
         self._rr = rr
         self._stream = stream
-        self._send = send
         self._meshes = meshes
         self._skins: dict[bytes, _Skin] = {}
         self._begun: set[str] = set()
 
-    def draw(self, entity: str, rows: list[FieldRow]) -> None:
-        """Draw fields in order of time; each mesh gets an entity below ``entity``."""
+    def draw(self, entity: str, rows: list[FieldRow], send: Send) -> None:
+        """Draw fields in order of time with ``send``; each mesh gets an entity below ``entity``.
+
+        ``send`` is a method of the view that owns this. Kept here, it would make a circle that only
+        a full garbage collection frees, which a service never makes: each view 10 MB a finger.
+        """
         for sha256, group in groupby(rows, key=lambda row: row.mesh_sha256):
             same = list(group)
             mesh = self._meshes.find(sha256)
@@ -100,9 +103,9 @@ class FieldDrawer:
             if len(fitting) < len(same):
                 self.counters["view_wrong_mesh"] += len(same) - len(fitting)
             if fitting:
-                self._draw(f"{entity}/{sha256.hex()[:8]}", mesh, fitting)
+                self._draw(f"{entity}/{sha256.hex()[:8]}", mesh, fitting, send)
 
-    def _draw(self, entity: str, mesh: FieldMesh, rows: list[FieldRow]) -> None:
+    def _draw(self, entity: str, mesh: FieldMesh, rows: list[FieldRow], send: Send) -> None:
         skin = self._skins.get(mesh.sha256)
         if skin is None:
             skin = self._skins[mesh.sha256] = _Skin(mesh)
@@ -120,7 +123,7 @@ class FieldDrawer:
         columns = rr.Mesh3D.columns(
             vertex_positions=(skin.rest + moved).reshape(-1, 3), vertex_colors=colours.reshape(-1)
         )
-        self._send(entity, rows, columns.partition([len(skin.used)] * len(rows)))
+        send(entity, rows, columns.partition([len(skin.used)] * len(rows)))
 
 
 class RerunView:
@@ -151,7 +154,7 @@ class RerunView:
         self._with_fields: set[str] = set()
         self._stream = self._rr.RecordingStream(APPLICATION)
         library = MeshLibrary() if meshes is None else meshes
-        self._fields = FieldDrawer(self._rr, self._stream, self._send, library)
+        self._fields = FieldDrawer(self._rr, self._stream, library)
         self._open = False
         self._title = title
 
@@ -277,7 +280,7 @@ class RerunView:
             there = [row.values is not None for row in places]
             columns = rr.Points3D.columns(positions=points)
             self._send_some(f"{sensor}/finger/contact/{name}", places, there, columns)
-            self._fields.draw(f"{sensor}/field/{name}", rows[f"field/{name}"])
+            self._fields.draw(f"{sensor}/field/{name}", rows[f"field/{name}"], self._send)
 
     def _send_some(
         self, entity: str, rows: list[TimelineRow], there: list[bool], columns: Any

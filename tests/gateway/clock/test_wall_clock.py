@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 
@@ -157,3 +158,16 @@ def test_the_kernel_tells_how_the_wall_clock_is_kept(monkeypatch: pytest.MonkeyP
         assert 0.0 <= kept.error_s < 1e4
     monkeypatch.setattr(sys, "platform", "darwin")
     assert wall_discipline() is None
+
+
+def test_to_ask_for_the_discipline_leaves_no_garbage() -> None:
+    """It is asked for each second, and a service makes no full garbage collection."""
+    wall_discipline()
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(100):
+            wall_discipline()
+        assert gc.collect() < 100
+    finally:
+        gc.enable()
