@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -32,6 +33,7 @@ from palpate_deploy.cli.app import app
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station.host import check_free, free_endpoint
 from palpate_deploy.station.logs import exit_code
+from palpate_deploy.station.profile import changed, load_profile
 from palpate_fem.cli.app import EXTRA_MODULES
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -237,6 +239,18 @@ def test_doctor_fails_if_a_process_of_the_profile_lacks_its_package(
     assert lines["extras"].grade == "fail"
     assert "'onnxruntime'" in lines["extras"].found
     assert lines["extras"].fix == 'install it: pip install "palpate[services]"'
+
+
+def test_doctor_warns_where_the_disk_cannot_hold_what_is_kept(tmp_path: Path) -> None:
+    base = load_profile("virtual")
+    limit = shutil.disk_usage(tmp_path).free * 2
+    keys = {"out": str(tmp_path), "min_free_bytes": 0}
+    grade, found, fix = doctor._disk(changed(base, recorder={**keys, "keep_bytes": limit}))
+    assert grade == "warn"
+    assert "pause" in found
+    assert "keep_bytes" in fix
+    grade, _, _ = doctor._disk(changed(base, recorder={**keys, "keep_bytes": 0}))
+    assert grade == "ok"
 
 
 def test_doctor_looks_for_all_that_simulations_need() -> None:

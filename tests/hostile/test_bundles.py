@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import tracemalloc
 from pathlib import Path
 
@@ -13,11 +14,14 @@ pytest.importorskip("onnxruntime")
 from tests.hostile import trial
 from tests.hostile.bundles import CASES, write_good
 
+from palpate.config import LinkConfig
 from palpate.errors import BundleError, ConfigError, PalpateError
 from palpate.files.bundle import read_bundle
 from palpate.printable import printable
+from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import trial as trial_module
 from palpate_services.inference.repository import PACKAGED, resolve
+from palpate_services.inference.services import run_estimating
 from palpate_services.inference.trial import proven, ships
 
 # These have to be run before they show what they are.
@@ -98,6 +102,16 @@ def test_a_bundle_that_is_exchanged_for_another_good_one_is_noticed(tmp_path: Pa
     manifest.write_bytes(manifest.read_bytes().replace(b'"nothing"', b'"something"'))
     with pytest.raises(BundleError, match="exchanged while it was tried"):
         proven(bundle, "features")
+
+
+@pytest.mark.slow
+def test_a_service_does_not_start_with_a_model_that_never_ends(
+    tmp_path: Path,
+) -> None:
+    CASES["Loop that never ends"](tmp_path / "b")
+    config = FeaturesServiceConfig(bundle=str(tmp_path / "b"))
+    with pytest.raises(BundleError, match="did not finish its golden vectors"):
+        run_estimating(config, LinkConfig(), "lab", threading.Event())
 
 
 def test_what_ships_is_trusted_like_the_code(

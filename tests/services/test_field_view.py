@@ -216,7 +216,7 @@ def test_a_closed_view_is_freed_without_a_garbage_collection(
 
     meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
     frame = make_frame()
-    gone = []
+    gone: list[weakref.ref[Any]] = []
 
     def make() -> RerunView:
         view = RerunView(tmp_path / "view.rrd", title="view", meshes=meshes, live=True)

@@ -204,6 +204,15 @@ def _disk(profile: Profile) -> Found:
         return "fail", found, "free space: the recorder pauses below its limit"
     if free < 10 * profile.recorder.min_free_bytes:
         return "warn", found, "free space soon"
+    keeps = profile.recorder.keep_bytes
+    there = sum(path.stat().st_size for path in folder.glob(f"{profile.station}-*"))
+    if keeps > free + there - profile.recorder.min_free_bytes:
+        return (
+            "warn",
+            f"{found}; the recorder keeps up to {keeps / 1e9:.1f} GB, so it will pause for want of "
+            "room before it removes old records",
+            "free space, or set [recorder] keep_bytes to what the disk can hold",
+        )
     return "ok", found, ""
 
 
