@@ -177,6 +177,8 @@ def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes, int]]:
             raise ValueError(f"there is no record at byte {at:,}")
         most = _BYTES_MAX.get(opcode)
         if most is None:
+            if size > os.fstat(file.fileno()).st_size:
+                raise ValueError(f"the record at byte {at:,} says that it has {size:,} bytes")
             # Attachments and indices; to read them would take as long as they say they are.
             file.seek(size, os.SEEK_CUR)
             continue
