@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import importlib
+import os
 import threading
 import weakref
 from collections.abc import Callable
@@ -208,7 +209,7 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
 
 
 def test_a_closed_view_is_freed_without_a_garbage_collection(
-    make_frame: Frames, tmp_path: Path
+    make_frame: Frames, tmp_path: Path, until: Until
 ) -> None:
     """A service makes no full collection; a view in a circle stayed for each record it wrote."""
     pytest.importorskip("rerun")
@@ -219,20 +220,26 @@ def test_a_closed_view_is_freed_without_a_garbage_collection(
     gone: list[weakref.ref[Any]] = []
 
     def make() -> RerunView:
-        view = RerunView(tmp_path / "view.rrd", title="view", meshes=meshes, live=True)
+        path = tmp_path / f"view{len(gone)}.rrd"
+        view = RerunView(path, title="view", meshes=meshes, live=True)
         gone.append(weakref.ref(view))
         return view
 
-    gc.collect()
-    gc.disable()
-    try:
+    def draw() -> weakref.ref[Any]:
         live = LiveView(make)
         live.offer("finger", frame)
         live.offer("finger", bundles.truth(frame.stamp))
         live.finish()
         assert live.join(20.0)
-        gone.append(weakref.ref(live))
-        del live
-        assert [one() for one in gone] == [None, None]
+        return weakref.ref(live)
+
+    gc.collect()
+    gc.disable()
+    try:
+        gone.append(draw())
+        threads = len(os.listdir("/proc/self/task"))
+        gone += [draw() for _ in range(3)]
+        assert [one() for one in gone] == [None] * 8
+        until(lambda: len(os.listdir("/proc/self/task")) <= threads)
     finally:
         gc.enable()

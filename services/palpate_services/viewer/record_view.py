@@ -333,6 +333,11 @@ def _of_one_width(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
     return [[row for row in rows if len(row.values) == width] for width in widths]
 
 
+def release_closed_views() -> None:
+    """End the threads of views that nobody holds any more: two each, which Rerun would keep."""
+    require("rerun", extra="services").bindings.flush_and_cleanup_orphaned_recordings()
+
+
 class LiveView:
     """The view beside a running record, drawn in a thread of its own: it may fail, the record not.
 
@@ -386,6 +391,8 @@ class LiveView:
                 while not self._stop.wait(PERIOD_S):
                     self._draw(view)
                 self._draw(view)
+            del view
+            release_closed_views()
         except Exception as error:
             # A defect of the picture must be visible in the log, and must not stop the record.
             if isinstance(error, PalpateError):
