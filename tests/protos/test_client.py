@@ -7,6 +7,8 @@ import dataclasses
 import inspect
 import logging
 import math
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -294,6 +296,33 @@ def shared_robot(
 def _request() -> SimulationRequest:
     path = straight_path((-0.004, 0.0, -0.011), (-0.004, 0.0, -0.007), 2)
     return SimulationRequest("r-1", "sphere_7mm", path)
+
+
+_LEFT_OPEN = """
+import sys, threading
+from palpate import Client
+
+seen = threading.Semaphore(0)
+robot = Client(sys.argv[1], timeout_s=20)
+robot.stream_features("finger", max_age_s=20.0).call(lambda estimate: seen.release())
+for _ in range(5):
+    assert seen.acquire(timeout=20)
+robot.features("finger", max_age_s=20.0)
+print("ends")
+"""
+
+
+def test_a_program_that_leaves_its_client_open_ends_well(link: LinkConfig, finger: Finger) -> None:
+    """Zenoh's threads would call into an interpreter that is gone: it was aborted, exit 134."""
+    for _ in range(3):
+        result = subprocess.run(
+            [sys.executable, "-c", _LEFT_OPEN, link.connect[0]],
+            capture_output=True,
+            text=True,
+            timeout=6 * LIVE_S,
+            check=False,
+        )
+        assert (result.returncode, result.stdout, result.stderr) == (0, "ends\n", "")
 
 
 @pytest.mark.parametrize(

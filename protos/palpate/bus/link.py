@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import json
 import re
 import threading
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Self, TypeVar
@@ -153,11 +155,21 @@ R = TypeVar("R")
 K = TypeVar("K", bound=Closing)
 
 
-class Session(Closing):
-    """A process's connection to the bus. Always used as a context manager.
+_open: weakref.WeakSet[Session] = weakref.WeakSet()
 
-    A process that ends with an open Zenoh session may hang in its thread shutdown; ``with`` closes
-    it on every path.
+
+@atexit.register
+def _close_all() -> None:
+    """Close what is still open: Zenoh's threads would call into an interpreter that is gone."""
+    for session in list(_open):
+        session.close()
+
+
+class Session(Closing):
+    """A process's connection to the bus. Best used as a context manager.
+
+    A process that ends with an open Zenoh session is aborted or hangs, so those that are still open
+    at its end are closed then.
 
     Methods take the name of a ``sensor`` for its topics and endpoints; for those of a process, the
     names of its ``service`` and ``instance``. Where many can be meant, ``"*"`` stands for any.
@@ -173,6 +185,7 @@ class Session(Closing):
         self._observing: Session | None = None
         self._observing_lock = threading.Lock()
         self._answering: list[Queryable] = []
+        _open.add(self)
         self._closing: list[Callable[[], None]] = []
 
     @classmethod
@@ -464,6 +477,7 @@ class Session(Closing):
 
     def close(self) -> None:
         """Leave the bus."""
+        _open.discard(self)
         for close in reversed(self._closing):
             with contextlib.suppress(zenoh.ZError):  # already undeclared, or the session is gone
                 close()

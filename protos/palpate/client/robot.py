@@ -14,11 +14,13 @@ Links, subscriptions and streams come back by themselves when a router or a serv
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import math
 import os
 import threading
 import time
+import weakref
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -74,6 +76,16 @@ STREAM_TIMEOUT_S = 10.0
 """Longest silence of a stream by default [s]: a restarted service is back earlier."""
 
 
+_open: weakref.WeakSet[Client] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Close what a program has left open, before the session under it."""
+    for client in list(_open):
+        client.close()
+
+
 class Client(Closing):
     """A robot's view of a station.
 
@@ -111,6 +123,7 @@ class Client(Closing):
         self.session = Session.open(
             joining_link(connect, wait_s=timeout_s, tls=tls), station=check_name(name, "station")
         )
+        _open.add(self)
 
     def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
         """Contact location and force of one finger now.
@@ -430,13 +443,16 @@ class Client(Closing):
         return take_census(self.session, timeout_s=self._timeout_s)
 
     def close(self) -> None:
-        """Leave the bus; streams end."""
+        """Leave the bus; streams end. Done at the end of a program that has left it open, too."""
+        _open.discard(self)
         for publisher in self._publishers:
             publisher.close()
         with self._lock:
             streams, self._streams = self._streams, []
         for stream in streams:
             stream.close()
+        for stream in streams:
+            stream.wait_for_calls()
         self.session.close()
 
     def _stream(

@@ -70,6 +70,7 @@ class Stream(Closing, Generic[M]):
         self._subscriber = subscriber
         self._closed = threading.Event()
         self._stale = 0
+        self._watch: Watch[M] | None = None
 
     @property
     def counters(self) -> dict[str, int]:
@@ -132,7 +133,8 @@ class Stream(Closing, Generic[M]):
 
     def call(self, callback: Callable[[M], None], *, on_error: OnError | None = None) -> Watch[M]:
         """Call a function with each message, in a thread of palpate's; see ``Watch``."""
-        return Watch(self, callback, on_error)
+        self._watch = Watch(self, callback, on_error)
+        return self._watch
 
     @property
     def closed(self) -> bool:
@@ -144,6 +146,11 @@ class Stream(Closing, Generic[M]):
         if not self._closed.is_set():
             self._closed.set()
             self._subscriber.close()
+
+    def wait_for_calls(self) -> None:
+        """After ``close``: wait until no callback runs any more."""
+        if self._watch is not None:
+            self._watch.close()
 
 
 class Watch(Closing, Generic[M]):
