@@ -31,7 +31,7 @@ class Bus:
     def __init__(self, delivery: Delivery, *, capacity: int = 100, depth: int | None = None):
         self._callback: Callable[[Any], None] | None = None
         self._ring: deque[Any] = deque(maxlen=RING)
-        more = {} if depth is None else {"depth": depth}
+        more: dict[str, Any] = {} if depth is None else {"depth": depth}
         self.subscriber: Subscriber[ElectrodeFrame] = Subscriber(
             self,  # type: ignore[arg-type]
             ELECTRODES,

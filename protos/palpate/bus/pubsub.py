@@ -180,13 +180,16 @@ class _Queued:
             self._counters["received"] += 1
             self._waiting.put(str(sample.key_expr), (sample, time.monotonic_ns()))
 
-    def take(self, timeout_s: float) -> Arrival | None:
-        item = self._waiting.get(timeout_s)
-        return None if item is None else (*item[0], item[1])
-
     @property
     def waiting(self) -> int:
         return len(self._waiting)
+
+    def poll(self) -> Arrival | None:
+        return self.wait(0.0)
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        item = self._waiting.get(timeout_s)
+        return None if item is None else (*item[0], item[1])
 
     def close(self) -> None:
         self._waiting.close()
@@ -199,20 +202,22 @@ class _Ringed:
     def __init__(self, ring: Ring, counters: Counter[str]) -> None:
         self._ring = ring
         self._counters = counters
+        self.close = ring.close
 
-    def take(self, timeout_s: float) -> Arrival | None:
-        sample = self._ring.take(timeout_s)
+    waiting = 0  # whoever asks has looked, and taken all
+
+    def poll(self) -> Arrival | None:
+        return self._arrival(self._ring.poll())
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        return self._arrival(self._ring.wait(timeout_s))
+
+    def _arrival(self, sample: zenoh.Sample | None) -> Arrival | None:
         if sample is None:
             return None
+        arrived_ns = time.monotonic_ns()
         self._counters["received"] += 1
-        return sample, time.monotonic_ns(), 0
-
-    @property
-    def waiting(self) -> int:
-        return 0  # a ring cannot be counted; the subscriber empties it when it looks
-
-    def close(self) -> None:
-        self._ring.close()
+        return sample, arrived_ns, 0
 
 
 class Subscriber(Generic[M], Closing):
@@ -247,7 +252,9 @@ class Subscriber(Generic[M], Closing):
     ) -> None:
         self.topic = topic
         self.key = key
-        self._delivery = delivery
+        self._schema, self._decode = topic.codec.schema, topic.codec.decode
+        self._newest_wins = delivery is Delivery.NEWEST
+        self._trusting = delivery is Delivery.EVERY
         self._wall_clock_error_s = wall_clock_error_s
         self._sensors = frozenset(sensors)
         self._holders_of = holders_of
@@ -331,7 +338,7 @@ class Subscriber(Generic[M], Closing):
                     if len(taken) >= most or now_s >= until_s:
                         return taken
                     self._waits = True
-                arrival = self._arrivals.take(until_s - now_s)
+                arrival = self._arrivals.wait(until_s - now_s)
 
     def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
         """The newest valid message (of a sensor), if it is not older than ``max_age_s``.
@@ -345,8 +352,8 @@ class Subscriber(Generic[M], Closing):
             ClockSkewError: It was stamped in the future (a kind of ``StaleError``).
             LinkError: The session was closed.
         """
-        if self._delivery is not Delivery.NEWEST:
-            raise ValueError(f"latest() is for Delivery.NEWEST, not {self._delivery}")
+        if not self._newest_wins:
+            raise ValueError("latest() is for subscribers with Delivery.NEWEST")
         with self._lock:
             self._look()
             wanted = [
@@ -394,10 +401,10 @@ class Subscriber(Generic[M], Closing):
 
     def _look(self) -> None:
         """Check what has arrived in the ring, unless a thread waits there: it checks it at once."""
-        if self._delivery is not Delivery.NEWEST or self._waits:
+        if not self._newest_wins or self._waits:
             return
         arrivals: list[Arrival] = []
-        while (arrival := self._arrivals.take(0.0)) is not None:
+        while (arrival := self._arrivals.poll()) is not None:
             arrivals.append(arrival)
         if len(arrivals) >= self._ring_capacity:
             # A full ring has dropped what came before, nobody knows how much of which source.
@@ -415,9 +422,9 @@ class Subscriber(Generic[M], Closing):
                 source = self._turns.popleft()
                 taken.append(source.waiting.popleft())
                 self._counters["delivered"] += 1
-            elif self._delivery is Delivery.NEWEST:
+            elif self._newest_wins:
                 return
-            elif (arrival := self._arrivals.take(0.0)) is not None:
+            elif (arrival := self._arrivals.poll()) is not None:
                 self._check(arrival)
             else:
                 return
@@ -433,16 +440,17 @@ class Subscriber(Generic[M], Closing):
                 return
         source.seen_ns = arrived_ns
         try:
-            check_schema(str(sample.encoding), self.topic.codec.schema)
+            check_schema(str(sample.encoding), self._schema)
             payload = sample.payload.to_bytes()
             began_ns = time.monotonic_ns()
-            message = self.topic.codec.decode(payload)
+            message = self._decode(payload)
             decode_s = (time.monotonic_ns() - began_ns) * 1e-9
         except WireError as error:
             self._counters[f"rejected_{error.reason}"] += 1
             source.problem = error
             return
-        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        attached = sample.attachment
+        attachment = b"" if attached is None else attached.to_bytes()
         where = source.address
         new = ReceivedMessage(
             message, payload, where.station, where.sensor, arrived_ns, attachment, decode_s
@@ -490,7 +498,7 @@ class Subscriber(Generic[M], Closing):
             continuity = Continuity(
                 self._counters,
                 contiguous=self.topic.contiguous,
-                trusting=self._delivery is Delivery.EVERY,
+                trusting=self._trusting,
                 holders=(lambda: None) if holders_of is None else (lambda: holders_of(sensor)),
             )
         source = self._sources[key] = _Source(address, continuity)

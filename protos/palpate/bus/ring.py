@@ -101,8 +101,8 @@ class Ring(Closing):
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
         self._samples: zenoh.handlers.Handler[zenoh.Sample] = self._subscriber.handler
 
-    def take(self, timeout_s: float) -> zenoh.Sample | None:
-        """The oldest sample in the ring; None = none within ``timeout_s``.
+    def poll(self) -> zenoh.Sample | None:
+        """The oldest sample in the ring; None = there is none.
 
         Raises:
             LinkError: The session or the subscriber was closed.
@@ -111,24 +111,33 @@ class Ring(Closing):
             while (sample := self._samples.try_recv()) is not None:
                 if not is_wake(sample):
                     return sample
-            if timeout_s <= 0:
-                return None
-            deadline_s = time.monotonic() + timeout_s
-            while True:
-                self._alarm.set(self, deadline_s)
-                sample = self._samples.recv()
-                if not is_wake(sample):
-                    return sample
+        except zenoh.ZError as error:
+            raise self._closed(error) from error
+        return None
+
+    def wait(self, timeout_s: float) -> zenoh.Sample | None:
+        """The next sample; None = none within ``timeout_s``.
+
+        Raises:
+            LinkError: The session or the subscriber was closed.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        self._alarm.set(self, deadline_s)
+        try:
+            while is_wake(sample := self._samples.recv()):
                 if time.monotonic() >= deadline_s:
                     return None
+                self._alarm.set(self, deadline_s)
+            return sample
         except zenoh.ZError as error:
-            raise LinkError(
-                f"the subscription to {self._key} is closed: {error}",
-                remedy="open the session again",
-            ) from error
+            raise self._closed(error) from error
         finally:
-            if timeout_s > 0:
-                self._alarm.set(self, math.inf)
+            self._alarm.set(self, math.inf)
+
+    def _closed(self, error: zenoh.ZError) -> LinkError:
+        return LinkError(
+            f"the subscription to {self._key} is closed: {error}", remedy="open the session again"
+        )
 
     def wake(self) -> None:
         """End a wait."""
