@@ -92,6 +92,7 @@ def test_a_view_goes_with_its_record_and_counts(tmp_path: Path) -> None:
 
 def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
     record(tmp_path, name_of(1, "other"), age_s=99 * DAY_S)  # of another station
+    record(tmp_path, name_of(1, "lab-2"), age_s=99 * DAY_S)  # of another one, named alike
     record(tmp_path, name_of(2), age_s=99 * DAY_S, mine=False)  # of `palpate record`, or older
     record(tmp_path, "lab-20261122T100003.000Z-good-one.mcap", age_s=99 * DAY_S)  # renamed
     (tmp_path / name_of(4)).write_bytes(b"not a record")

@@ -38,6 +38,7 @@ from palpate_deploy.bench.growth import (
 )
 from palpate_deploy.bench.results import finish, machine, progress_bar
 from palpate_deploy.station.host import join, private_profile
+from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile, plain_values
@@ -177,6 +178,7 @@ def measure_soak(
         LinkError: It has no router.
     """
     with ExitStack() as stack:
+        stop = stop_on_signals()
         run = stack.enter_context(FiniteRun("bench-soak"))
         profile = soak_profile(run.folder, fingers, fem=fem)
         path = run.folder / "station.toml"
@@ -193,7 +195,8 @@ def measure_soak(
         while (gone_s := watched.look()) < 60.0 * minutes:
             bar.update(task, completed=gone_s / 60.0)
             run.check(["up"])
-            time.sleep(SAMPLE_S)
+            if stop.wait(SAMPLE_S):
+                raise KeyboardInterrupt  # the station is stopped on the way out
         return watched.result(fingers), watched.histories, watched.disk
 
 

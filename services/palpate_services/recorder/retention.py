@@ -35,7 +35,8 @@ STEADY_S = 600.0
 that has just started may be years off."""
 
 _JUMP_S = 60.0
-_NAME = re.compile(r"(?P<stem>.+-\d{8}T\d{6}\.\d{3}Z)(?:\.recovered)?\.mcap(?:\.part)?")
+_STAMP = r"-\d{8}T\d{6}\.\d{3}Z"
+_ENDING = r"(?:\.recovered)?\.mcap(?:\.part)?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,7 @@ class Retention:
     def __init__(self, config: RecorderConfig, station: str, health: Health) -> None:
         self._config = config
         self._station = station
+        self._name = re.compile(f"(?P<stem>{re.escape(station)}{_STAMP}){_ENDING}")
         self._health = health
         self._mine: dict[tuple[str, int], bool] = {}  # by name and inode: files never change
         self._clocks = self._read_clocks()
@@ -108,7 +110,7 @@ class Retention:
     def _found(self) -> Iterator[OldRecord]:
         seen: set[tuple[str, int]] = set()
         for path in self._config.out.glob(f"{self._station}-*.mcap*"):
-            match = _NAME.fullmatch(path.name)
+            match = self._name.fullmatch(path.name)
             # A file can be renamed, recovered or removed by others at any time.
             with contextlib.suppress(OSError, RecordingError):
                 if match is None or path.is_symlink() or not path.is_file():
