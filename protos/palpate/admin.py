@@ -81,7 +81,8 @@ def read_token(path: Path) -> bytes:
             f"admin token {path} cannot be read: {error.strerror or error}",
             remedy="a station makes it when it starts; give commands as the user of the station",
         ) from error
-    if status.st_mode & 0o077 or status.st_uid != os.geteuid():
+    # Root may read every file, and is the operator of a station that has a user of its own.
+    if status.st_mode & 0o077 or os.geteuid() not in (status.st_uid, 0):
         raise ConfigError(
             f"admin token {path} belongs to another user, or others may read or write it",
             remedy=f"as its owner: chmod 600 {path}, or remove it: the station makes a new one",

@@ -12,19 +12,31 @@ from palpate.folders import data_folder, state_folder
 
 DEFAULT_BUNDLE = "features-virtual"
 
+_UserPath = Annotated[Path, AfterValidator(Path.expanduser)]
+
 
 class ModelsConfig(StrictConfig):
     """Where bundles are, beside the packaged ones, and what is remembered of them.
 
     Attributes:
-        folder: The user's bundles: ``<name>/<version>/``.
-        state: Where a station remembers what it serves, and keeps its admin token.
+        folder: The user's bundles: ``<name>/<version>/``; None = ``models`` in palpate's data
+            folder of whoever runs the process.
+        state: Where a station remembers what it serves, and keeps its admin token; None = palpate's
+            state folder of whoever runs the process.
     """
 
-    folder: Annotated[Path, AfterValidator(Path.expanduser)] = Field(
-        default_factory=lambda: data_folder() / "models"  # as Repository.of_user
-    )
-    state: Annotated[Path, AfterValidator(Path.expanduser)] = Field(default_factory=state_folder)
+    folder: _UserPath | None = None
+    state: _UserPath | None = None
+
+    @property
+    def repository_folder(self) -> Path:
+        """The user's bundles."""
+        return data_folder() / "models" if self.folder is None else self.folder
+
+    @property
+    def memory_folder(self) -> Path:
+        """What is remembered, and the token."""
+        return state_folder() if self.state is None else self.state
 
 
 class EstimatingConfig(StrictConfig):

@@ -141,7 +141,7 @@ def test_async_tasks(run_example: RunExample) -> None:
 
 
 def test_swap_model(run_example: RunExample, models: ModelsConfig) -> None:
-    token = str(token_file(models.state, "lab"))
+    token = str(token_file(models.memory_folder, "lab"))
     first, before, now, last = run_example("swap_model.py", "features-twin", token)
     assert first.startswith("finger: features-twin after ")
     assert before.split()[1] != now.split()[1], "another bundle made the second estimate"

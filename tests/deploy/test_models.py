@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -119,3 +120,12 @@ def test_a_broken_bundle_is_not_imported(palpate: Palpate, imported: Path) -> No
     assert done.returncode != 0
     assert "digest differs" in done.stderr
     assert "mine" not in palpate("model", "list").stdout
+
+
+def test_a_printed_profile_names_no_folder_of_who_printed_it(palpate: Palpate) -> None:
+    """It is printed by root, and run by the user of the unit (deploy/README.md)."""
+    printed = palpate("up", "--print-config")
+    assert printed.returncode == 0
+    assert "share/palpate" not in printed.stdout
+    assert "XDG" not in printed.stdout
+    assert os.environ["XDG_STATE_HOME"] not in printed.stdout

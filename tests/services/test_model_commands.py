@@ -81,7 +81,7 @@ def serve(kept: ModelsConfig, link: LinkConfig, until: Until) -> Serve:
 
 @pytest.fixture
 def admin(kept: ModelsConfig) -> Callable[[Session], ModelAdmin]:
-    return lambda session: ModelAdmin(session, read_token(token_file(kept.state, "lab")))
+    return lambda session: ModelAdmin(session, read_token(token_file(kept.memory_folder, "lab")))
 
 
 Admin = Callable[[Session], ModelAdmin]
@@ -151,7 +151,7 @@ def test_an_overheard_command_is_not_obeyed_again(
     serve: Serve, kept: ModelsConfig, admin: Admin
 ) -> None:
     with serve() as session:
-        token = read_token(token_file(kept.state, "lab"))
+        token = read_token(token_file(kept.memory_folder, "lab"))
         command = ModelCommand(
             ModelAction.LOAD, "lab", "features", bytes(16), time.time_ns(), bundle="x:2"
         )
@@ -190,7 +190,7 @@ def test_no_frame_is_lost_and_no_estimate_mixed_while_bundles_change(
     tare, frames = make_tare(), [make_frame(n) for n in range(1, 401)]
     runtimes = {
         found.sha256: load(found, "features")
-        for found in (read_bundle(kept.folder / "x" / version) for version in "12")
+        for found in (read_bundle(kept.repository_folder / "x" / version) for version in "12")
     }
     with serve(delivery="every") as session:
         session.queryable(endpoints.TARE, lambda _: tare, sensor="finger")

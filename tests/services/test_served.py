@@ -110,8 +110,9 @@ def test_one_sensor_changes_and_the_others_do_not(service: Service) -> None:
     assert (of(started), of(started, "thumb")) == ("x:1", "y:1")
     do(started, LOAD, "x:2")
     assert (of(started), of(started, "thumb")) == ("x:2", "y:1")
-    do(started, UNLOAD, "", "thumb")
+    inventory = do(started, UNLOAD, "", "thumb")
     assert of(started, "thumb") == "x:2"
+    assert [(one.version, one.previous) for one in inventory.served] == [(2, "x:1"), (2, "y:1")]
     do(started, ROLL_BACK, "", "thumb")
     assert of(started, "thumb") == "y:1"
     do(started, ROLL_BACK, "", "thumb")

@@ -224,7 +224,7 @@ def _change(admin: ModelAdmin, changes: int, hold_s: float) -> tuple[list[float]
 
 def _runtimes(profile: Profile) -> dict[bytes, Runtime]:
     """Every bundle that serves during the run, by its digest."""
-    repository = Repository(profile.models.folder)
+    repository = Repository(profile.models.repository_folder)
     names = [FIRST, *(f"{_NAME}:{version}" for version in range(1, COPIES + 1))]
     bundles = [read_bundle(repository.resolve(name)) for name in names]
     return {bundle.sha256: load(bundle, "features") for bundle in bundles}

@@ -54,7 +54,7 @@ def list_(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -
     from palpate_deploy.station.models import list_models
     from palpate_deploy.station.profile import load_profile
 
-    list_models(load_profile(profile).models.folder, as_json=json_)
+    list_models(load_profile(profile).models.repository_folder, as_json=json_)
 
 
 @model_app.command(epilog=example("palpate model verify features-virtual"))
@@ -66,7 +66,7 @@ def verify(
     from palpate_deploy.station.models import verify_model
     from palpate_deploy.station.profile import load_profile
 
-    verify_model(bundle, load_profile(profile).models.folder)
+    verify_model(bundle, load_profile(profile).models.repository_folder)
 
 
 @model_app.command("import", epilog=example("palpate model import runs/bundle/2"))
@@ -78,7 +78,7 @@ def import_(
     from palpate_deploy.station.models import import_model
     from palpate_deploy.station.profile import load_profile
 
-    import_model(folder, load_profile(profile).models.folder)
+    import_model(folder, load_profile(profile).models.repository_folder)
 
 
 @model_app.command(epilog=example("palpate model served", "palpate model served --json"))

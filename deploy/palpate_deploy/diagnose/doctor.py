@@ -182,7 +182,7 @@ def _bundle(profile: Profile) -> Found:
     from palpate_services.inference.repository import Repository
     from palpate_services.inference.trial import proven
 
-    repository = Repository(profile.models.folder)
+    repository = Repository(profile.models.repository_folder)
     names = []
     for task, name in served:
         manifest = load(proven(read_bundle(repository.resolve(name)), task), task).manifest

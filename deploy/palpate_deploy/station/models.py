@@ -142,7 +142,7 @@ def change_model(
         RemoteError: The service refuses.
     """
     kept = ModelsConfig() if profile is None else profile.models
-    secret = read_token(token_file(kept.state, station) if token is None else token)
+    secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
     with Session.open(link, station=station) as session:
         admin = ModelAdmin(session, secret)
         if action is ModelAction.LIST:
@@ -160,7 +160,7 @@ def change_model(
 
 def _service_of(bundle: str, kept: ModelsConfig) -> str:
     """The service for a bundle's task, by the repository of this host."""
-    return read_manifest(Repository(kept.folder).resolve(bundle)).task
+    return read_manifest(Repository(kept.repository_folder).resolve(bundle)).task
 
 
 def _served(admin: ModelAdmin, services: tuple[str, ...]) -> dict[str, tuple[ModelInventory, ...]]:

@@ -56,7 +56,7 @@ class ServedModel:
 
     Attributes:
         sensor: Name of the sensor; empty = every one without a bundle of its own.
-        name: Name of the bundle; empty = none, it was unloaded.
+        name: Name of the bundle; empty = none: unloaded, or not to be had since a restart.
         version: Its version; 0 = none.
         bundle_sha256: Digest of its manifest, 32 bytes; empty = none.
         since_wall_ns: Since when it serves [ns since the Unix epoch].

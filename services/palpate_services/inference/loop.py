@@ -479,10 +479,10 @@ def _models(
     """The bundles of a service, and the token of those who may change them."""
     if kept is None:
         return ServedModels(task, config, Repository(None)), None
-    file = RememberedFile(kept.state / "stations" / station / f"{task}.{instance}.json")
-    models = ServedModels(task, config, Repository(kept.folder), file)
+    file = RememberedFile(kept.memory_folder / "stations" / station / f"{task}.{instance}.json")
+    models = ServedModels(task, config, Repository(kept.repository_folder), file)
     try:
-        return models, make_token(token_file(kept.state, station))
+        return models, make_token(token_file(kept.memory_folder, station))
     except ConfigError as error:
         _log.warning("no commands are taken: %s", error)
         return models, None

@@ -350,10 +350,11 @@ class ServedModels:
 
 
 def _listed(serving: Serving) -> tuple[ServedModel, ...]:
+    others = serving.assigned.get(DEFAULT, _NOTHING).current
     return tuple(
         ServedModel(
             sensor,
-            *_identity(one.current),
+            *_identity(one.current or others),
             one.since_wall_ns,
             _name(one.previous) if one.previous else "",
         )
