@@ -175,7 +175,10 @@ def run_restart(*, times: int, only: str, as_json: bool, save: bool, out: Path |
         PalpateError: The station does not start, or there is no history to append to.
     """
     with tempfile.TemporaryDirectory(prefix="palpate-restart-") as folder:
-        profile = private_profile("virtual", recorder={"out": folder})
+        # What the user's own stations have served must not matter here.
+        profile = private_profile(
+            "virtual", recorder={"out": folder}, models={"state": folder, "folder": folder}
+        )
         wanted = [service_named(only)] if only else list(profile.processes)
         if extra := [service for service in wanted if service not in profile.processes]:
             processes = (*profile.processes, *extra)
