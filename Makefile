@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench fuzz docs fmt proto bundle build clean
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs fmt proto bundle build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -56,6 +56,24 @@ check: $(VENV)/.dev  ## format, lint, types, borders, wire contract, house tests
 bench: $(VENV)/.dev  ## latency and throughput beside their bare floor | 2-5 min
 	$(BIN)/palpate bench e2e
 	@for bench in $(wildcard tests/benchmarks/bench_*.py); do echo "$$bench"; $(BIN)/python "$$bench"; done
+
+# Each writes its result; the page says which goal is missed, and so does the exit status.
+serving_bench = mkdir -p docs/results/serving && $(BIN)/palpate bench
+
+faults: $(VENV)/.dev  ## break what a station stands on, one after another: what do others notice? | 15 min, Linux only
+	@failed=0; \
+	$(serving_bench) faults --out docs/results/serving/faults.json || failed=1; \
+	$(serving_bench) restart --times $(or $(TIMES),3) --out docs/results/serving/restart.json || failed=1; \
+	$(serving_bench) swap --out docs/results/serving/swap.json || failed=1; \
+	$(BIN)/python docs/make_serving.py; exit $$failed
+
+serving: $(VENV)/.dev  ## all figures of docs/results/serving.md, on an idle machine | 2 h, Linux only
+	@failed=0; \
+	$(serving_bench) e2e --runs 5 --out docs/results/serving/e2e.json || failed=1; \
+	$(serving_bench) status --count 200 --out docs/results/serving/status.json || failed=1; \
+	$(MAKE) faults TIMES=20 || failed=1; \
+	$(serving_bench) soak --minutes 30 --out docs/results/serving/soak.json || failed=1; \
+	$(BIN)/python docs/make_serving.py; exit $$failed
 
 fuzz: $(VENV)/.dev  ## fuzz the gateway's decoders: make fuzz DECODER=kms40 SECONDS=600 | 10 min each, Linux only
 	@$(pip_install) -e '.[fuzz]' | $(show)

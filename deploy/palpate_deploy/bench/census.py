@@ -24,7 +24,7 @@ from rich.table import Table
 
 from palpate.census import ROUTER
 from palpate.errors import ErrorCode, RemoteError
-from palpate_deploy.bench.results import finish, machine, progress_bar
+from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.station.host import private_profile
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import FiniteRun
@@ -151,10 +151,7 @@ def run_status_bench(*, count: int, as_json: bool, save: bool, out: Path | None)
     """
     result = measure_status(count, os.cpu_count() or 1)
     values = {"status": asdict(result), "status.goal_met": result.complete == result.calls}
-    if out is not None:
-        text = json.dumps({**values, "machine": machine()}, indent=2)
-        out.write_text(text + "\n", encoding="utf-8")
-    finish("status", values, lambda: _show(result), as_json=as_json, save=save)
+    finish("status", values, lambda: _show(result), as_json=as_json, save=save, out=out)
     return 0 if result.complete == result.calls else FAILED
 
 

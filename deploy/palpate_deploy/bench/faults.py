@@ -618,8 +618,6 @@ def run_faults(*, seconds: float, only: str, as_json: bool, save: bool, out: Pat
     Raises:
         ConfigError: No row's name contains ``only``.
     """
-    import json
-
     chosen = [trial for trial in TRIALS if only in trial.name]
     if not chosen:
         raise ConfigError(
@@ -634,12 +632,7 @@ def run_faults(*, seconds: float, only: str, as_json: bool, save: bool, out: Pat
             results.append(_tried(trial, seconds))
             bar.advance(task)
     values = {"faults": [asdict(result) for result in results]}
-    finish("faults", values, lambda: _print(results), as_json=as_json, save=save)
-    if out is not None:
-        from palpate_deploy.bench.results import machine
-
-        text = json.dumps({**values, "machine": machine()}, indent=1)
-        out.write_text(text + "\n", encoding="utf-8")
+    finish("faults", values, lambda: _print(results), as_json=as_json, save=save, out=out)
     return int(any(result.met is False for result in results))
 
 

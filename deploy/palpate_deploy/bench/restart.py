@@ -8,7 +8,6 @@ have restarted exactly what was broken here.
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
@@ -30,7 +29,7 @@ from palpate.errors import LinkError, PalpateError
 from palpate.heartbeat import LIMIT_S
 from palpate.messages import ServiceRequest
 from palpate_deploy.bench.restart_floor import import_s, restarts_s
-from palpate_deploy.bench.results import finish, machine, progress_bar
+from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.station.host import join, private_profile
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import service_named
@@ -190,10 +189,9 @@ def run_restart(*, times: int, only: str, as_json: bool, save: bool, out: Path |
         "restart.unprovoked": unprovoked,
         "restart.goal_met": met,
     }
-    if out is not None:
-        text = json.dumps({**values, "machine": machine()}, indent=2)
-        out.write_text(text + "\n", encoding="utf-8")
-    finish("restart", values, lambda: _show(results, unprovoked), as_json=as_json, save=save)
+    finish(
+        "restart", values, lambda: _show(results, unprovoked), as_json=as_json, save=save, out=out
+    )
     return 0 if met else FAILED
 
 

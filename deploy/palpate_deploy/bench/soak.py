@@ -8,7 +8,6 @@ every estimate. Its processes are looked at from outside, every two seconds.
 from __future__ import annotations
 
 import contextlib
-import json
 import threading
 import time
 from collections import Counter
@@ -36,7 +35,7 @@ from palpate_deploy.bench.growth import (
     processes_below,
     use_of,
 )
-from palpate_deploy.bench.results import finish, machine, progress_bar
+from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.station.host import join, private_profile
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
@@ -314,10 +313,8 @@ def run_soak(
         "soak.long_enough": result.decided,
     }
     if out is not None:
-        text = json.dumps({**values, "machine": machine()}, indent=2)
-        out.write_text(text + "\n", encoding="utf-8")
         draw(histories, disk, result, out.with_suffix(".png"))
-    finish("soak", values, lambda: show(result), as_json=as_json, save=save)
+    finish("soak", values, lambda: show(result), as_json=as_json, save=save, out=out)
     return 0 if result.fine else FAILED
 
 

@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from palpate.messages import NO_TARE, ElectrodeFrame, FeatureEstimate, ServiceRe
 from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.bench.station import SETTLE_S, wait_ready
 from palpate_deploy.station.host import join, private_profile
+from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile
 from palpate_services.inference.estimates import EstimateRefusal, estimate
@@ -106,9 +108,16 @@ class Witness:
 
 
 def run_swap(
-    *, changes: int, sensors: int, rate_hz: float, hold_s: float, as_json: bool, save: bool
-) -> None:
-    """``palpate bench swap``, whose help explains the options: measure, print, keep."""
+    *,
+    changes: int,
+    sensors: int,
+    rate_hz: float,
+    hold_s: float,
+    as_json: bool,
+    save: bool,
+    out: Path | None = None,
+) -> int:
+    """``palpate bench swap``, whose help explains the options; 1 if the goal is missed."""
     with FiniteRun("bench-swap") as children:
         profile = _start(children, sensors, rate_hz)
         runtimes = _runtimes(profile)
@@ -142,7 +151,8 @@ def run_swap(
         "swap.goal_met": not (busy.lost or busy.repeated or busy.mixed)
         and max(rolls_s) <= ROLL_BACK_GOAL_S,
     }
-    finish("swap", values, lambda: _print(values, still, busy), as_json=as_json, save=save)
+    finish("swap", values, lambda: _print(values, still, busy), as_json=as_json, save=save, out=out)
+    return 0 if values["swap.goal_met"] else FAILED
 
 
 def _start(children: FiniteRun, sensors: int, rate_hz: float) -> Profile:

@@ -14,6 +14,7 @@ bench_app = group("Latency and load, compared with a bare implementation (the fl
 SaveOption = Annotated[
     bool, typer.Option("--save", help="Append the result to tests/benchmarks/history.jsonl.")
 ]
+OutOption = Annotated[Path | None, typer.Option(help="Write the result as JSON.")]
 
 
 @bench_app.command(
@@ -30,7 +31,7 @@ def e2e(
     ] = 10.0,
     ramp: Annotated[bool, typer.Option(help="Raise the rate until a frame is lost.")] = True,
     bundle: Annotated[str, typer.Option(help="Bundle that is served.")] = "features-virtual",
-    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
@@ -93,20 +94,23 @@ def swap(
     sensors: Annotated[int, typer.Option(min=1, max=40, help="Fingers.")] = 1,
     rate_hz: Annotated[float, typer.Option(min=1, max=1000, help="Frames of each [Hz].")] = 100.0,
     hold_seconds: Annotated[float, typer.Option(min=0, help="Time between two changes [s].")] = 0.3,
+    out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
     """Load and roll back bundles while frames come: lost frames, mixed estimates, times."""
     from palpate_deploy.bench.swap import run_swap
 
-    run_swap(
+    code = run_swap(
         changes=changes,
         sensors=sensors,
         rate_hz=rate_hz,
         hold_s=hold_seconds,
         as_json=json_,
         save=save,
+        out=out,
     )
+    raise typer.Exit(code)
 
 
 @bench_app.command(epilog=example("palpate bench codec --json"))
@@ -125,7 +129,7 @@ def codec(
 def faults(
     seconds: Annotated[float, typer.Option(min=0.5, help="Duration of a quiet part [s].")] = 5.0,
     only: Annotated[str, typer.Option(help="Only the rows whose name contains this.")] = "",
-    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
@@ -135,10 +139,10 @@ def faults(
     raise typer.Exit(run_faults(seconds=seconds, only=only, as_json=json_, save=save, out=out))
 
 
-@bench_app.command(epilog=example("palpate bench status --out docs/results/status.json"))
+@bench_app.command(epilog=example("palpate bench status --out docs/results/serving/status.json"))
 def status(
     count: Annotated[int, typer.Option(min=1, help="How often to ask.")] = 200,
-    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
@@ -154,7 +158,7 @@ def restart(
         int, typer.Option(min=1, help="How often each process, with each fault.")
     ] = 20,
     only: Annotated[str, typer.Option(help="Only this process, e.g. features or fem.")] = "",
-    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
@@ -164,7 +168,9 @@ def restart(
     raise typer.Exit(run_restart(times=times, only=only, as_json=json_, save=save, out=out))
 
 
-@bench_app.command(epilog=example("palpate bench soak --minutes 30 --out docs/results/soak.json"))
+@bench_app.command(
+    epilog=example("palpate bench soak --minutes 30 --out docs/results/serving/soak.json")
+)
 def soak(
     minutes: Annotated[float, typer.Option(min=1, help="Duration [min].")] = 30.0,
     fingers: Annotated[int, typer.Option(min=1, help="Virtual fingers.")] = 3,

@@ -1,0 +1,232 @@
+"""Write docs/results/serving.md from the files of ``palpate bench`` in docs/results/serving/.
+
+``python docs/make_serving.py``          writes the page
+``python docs/make_serving.py --check``  exits 1 if the page is not what the files say
+
+``make serving`` measures everything anew, which takes two hours on an idle machine.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+FOLDER = Path(__file__).parent / "results" / "serving"
+PAGE = FOLDER.with_suffix(".md")
+
+HEAD = """# Serving: latency, load, faults, exchange of models, a long run
+
+Each table is made from the file of one command, which stands above it; `make serving` runs all of
+them, and `python docs/make_serving.py` writes this page. The goals are those of the serving
+reference. Hostile files have [a page of their own](hostile-files.md), as have
+[faults of devices](faults.md).
+"""
+
+
+def _read(name: str) -> Any:
+    return json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
+    heads = [column.strip() for column in columns.split("|")]
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _section(title: str, command: str, values: Any, text: str) -> str:
+    machine = values["machine"]
+    where = f"{machine['cpus']} cores, {machine['cpu']}"
+    return f"\n## {title}\n\n`{command}`; {where}.\n\n{text}"
+
+
+def _yes(met: bool | None) -> str:
+    return {True: "yes", False: "**no**", None: "not tried"}[met]
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.2f} ms"
+
+
+def _latency() -> str:
+    values = _read("e2e")
+    rows = [
+        (
+            name,
+            *(_ms(values[f"e2e.{name}"][key]) for key in ("p50_s", "p99_s", "max_s")),
+            f"{values[f'e2e.{name}']['lost']:.0f}",
+        )
+        for name in ("palpate", "floor")
+    ]
+    for key, goal in (("p50", 1.15), ("p99", 1.3)):
+        ratios = [run[f"{key}_ratio"] for run in values["e2e.runs"]]
+        rows.append(
+            (
+                f"ratio of {key}, median of {len(ratios)} runs ({min(ratios):.2f} to "
+                f"{max(ratios):.2f}); goal {goal:g}",
+                *(f"{median(ratios):.2f}" if name == key else "" for name in ("p50", "p99", "max")),
+                "",
+            )
+        )
+    text = _table("frame stamp to estimate in the client | p50 | p99 | max | lost", rows)
+    text += "\n" + _table(
+        "load | frames | lost | p50 | p99",
+        (
+            (
+                f"{load['sensors']} fingers at {load['rate_hz']:g} Hz, {name}",
+                f"{load['published']:,}",
+                str(load["lost"]),
+                _ms(load["p50_s"]),
+                _ms(load["p99_s"]),
+            )
+            for name in ("features", "field")
+            if (load := values.get(f"load.{name}"))
+        ),
+    )
+    return _section("Latency beside a bare floor", "palpate bench e2e --runs 5", values, text)
+
+
+def _restarts() -> str:
+    values = _read("restart")
+    goals = {"kill": 3.0, "hang": 10.0}
+    rows = []
+    for trials in values["restart"]:
+        times = trials["publishing_s"]
+        tried = len(times) + trials["failed"]
+        rows.append(
+            (
+                trials["service"],
+                trials["fault"],
+                f"{len(times)}/{tried}",
+                f"{median(times):.2f} s" if times else "",
+                f"{max(times):.2f} s" if times else "",
+                f"{goals[trials['fault']]:g} s" if trials["fault"] in goals else "",
+                f"{trials['floor_s']:.2f} s",
+                _yes(trials["met"]),
+            )
+        )
+    text = _table("process | fault | back | p50 | max | goal | floor | met", rows)
+    return _section(
+        "Killed and hung processes until they publish again",
+        "palpate bench restart --times 20",
+        values,
+        text,
+    )
+
+
+def _status() -> str:
+    values = _read("status")
+    result = values["status"]
+    text = (
+        f"{result['complete']} of {result['calls']} answers of `palpate status` were complete "
+        f"({result['processes']} processes; {result['burners']} loops loaded the cores). A call "
+        f"took {result['p50_s']:.2f} s in the median, {result['max_s']:.2f} s at most.\n"
+    )
+    return _section("Status under load", "palpate bench status --count 200", values, text)
+
+
+def _swaps() -> str:
+    values = _read("swap")
+    rows = [
+        (
+            name.replace("_", " "),
+            f"{account['frames']:,}",
+            str(account["lost"]),
+            str(account["repeated"]),
+            str(account["mixed"]),
+            _ms(account["gap_max_s"]),
+        )
+        for name in ("undisturbed", "changing")
+        for account in [values[f"swap.{name}"]]
+    ]
+    text = _table("part | frames | lost | repeated | mixed | longest gap", rows)
+    loads, backs = values["swap.load_s"], values["swap.roll_back_s"]
+    text += (
+        f"\n{values['swap.changes']} changes: a load took {_ms(loads['p50_s'])} in the median and "
+        f"{_ms(loads['max_s'])} at most, a roll back {_ms(backs['p50_s'])} and "
+        f"{_ms(backs['max_s'])} (goal 100 ms).\n"
+    )
+    return _section("Exchange of models at 100 Hz", "palpate bench swap", values, text)
+
+
+def _faults() -> str:
+    values = _read("faults")
+    rows = (
+        (
+            result["fault"],
+            result["goal"],
+            _yes(result["met"]),
+            ", ".join(f"{name} {_figure(value)}" for name, value in result["figures"].items())
+            or result["why"],
+        )
+        for result in values["faults"]
+    )
+    return _section(
+        "Faults around a station",
+        "palpate bench faults",
+        values,
+        _table("fault | goal | met | measured", rows),
+    )
+
+
+def _figure(value: float | int | str) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _soak() -> str:
+    values = _read("soak")
+    result = values["soak"]
+    rows = (
+        (
+            name,
+            f"{one['rss_mb']:.0f} MB",
+            f"{one['slope_mb_per_h']:+.2f} +- {one['slope_ci95_mb_per_h']:.2f} MB/h",
+            " to ".join(map(str, one["threads"])),
+            " to ".join(map(str, one["descriptors"])),
+            str(one["restarts"]),
+        )
+        for name, one in result["processes"].items()
+    )
+    text = _table("process | memory | its slope (95 %) | threads | descriptors | restarts", rows)
+    lost = sum(result["lost"].values())
+    text += (
+        f"\n{result['minutes']:.0f} minutes, {result['fingers']} fingers, "
+        f"{sum(result['received'].values()):,} messages received, {lost} lost. Records and views: "
+        f"{result['disk_mb_per_h']:.0f} MB an hour, {result['disk_peak_mb']:.0f} MB at most of "
+        f"{result['disk_limit_mb']:.0f} MB allowed, {result['removed_records']} records removed.\n"
+        "\n![Memory of each process](serving/soak.png)\n"
+    )
+    return _section("A long run of the whole station", "palpate bench soak", values, text)
+
+
+SECTIONS = {
+    "e2e": _latency,
+    "restart": _restarts,
+    "status": _status,
+    "swap": _swaps,
+    "faults": _faults,
+    "soak": _soak,
+}
+"""By the name of the file: what was not measured yet is left out."""
+
+
+def page() -> str:
+    """The page as the files say it."""
+    there = [make for name, make in SECTIONS.items() if (FOLDER / f"{name}.json").is_file()]
+    return HEAD + "".join(make() for make in there)
+
+
+def main() -> None:
+    """Write the page, or check it."""
+    if "--check" in sys.argv[1:]:
+        if PAGE.read_text(encoding="utf-8") != page():
+            raise SystemExit(f"{PAGE} is out of date: python docs/make_serving.py")
+        return
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
