@@ -118,7 +118,7 @@ def test_every_example_is_tested_and_listed() -> None:
     listed = (EXAMPLES / "README.md").read_text(encoding="utf-8")
     for path in EXAMPLES.glob("*.py"):
         assert f"[{path.name}]({path.name})" in listed
-        assert f'"{path.name}"' in tests
+        assert path.name in NEED_SIMULATIONS or f'example("{path.name}"' in tests
 
 
 def test_features_stream(run_example: RunExample) -> None:
@@ -219,9 +219,13 @@ def test_without_a_station_an_example_says_what_to_do(
     for kind in (Client, AsyncClient):
         defaults: Any = kind.__init__.__kwdefaults__
         monkeypatch.setitem(defaults, "timeout_s", 0.2)
-    for name in sorted(path.name for path in EXAMPLES.glob("*.py")):
-        if name in ("read_record.py", "grip_guard.py") or name in NEED_SIMULATIONS:
-            continue
+    for name in (
+        "features_stream.py",
+        "callbacks.py",
+        "async_tasks.py",
+        "tare.py",
+        "synthesise.py",
+    ):
         monkeypatch.setattr(sys, "argv", [name])
         with pytest.raises(SystemExit, match="palpate up"):
             runpy.run_path(str(EXAMPLES / name), run_name="__main__")
