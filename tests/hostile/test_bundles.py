@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import threading
 import tracemalloc
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -15,9 +17,10 @@ from tests.hostile import trial
 from tests.hostile.bundles import CASES, write_good
 
 from palpate.config import LinkConfig
-from palpate.errors import BundleError, ConfigError, PalpateError
+from palpate.errors import BundleError, ConfigError
 from palpate.files.bundle import read_bundle
 from palpate.printable import printable
+from palpate_deploy.station.cell import cell
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import trial as trial_module
 from palpate_services.inference.repository import PACKAGED, resolve
@@ -141,4 +144,10 @@ def test_printable_shows_what_would_act() -> None:
     assert printable("plain, ü and 指") == "plain, ü and 指"
     assert printable("\x1b[2J\x07\x9b1m\u202e\ud800\n") == r"\x1b[2J\x07\x9b1m\u202e\ud800\n"
     assert printable("two\nlines", keep="\n") == "two\nlines"
-    assert isinstance(BundleError("x", remedy="y"), PalpateError)
+
+
+def test_a_cell_of_a_table_has_neither_controls_nor_markup() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=80)
+    console.print(cell("[red]no\x1b]0;owned\x07[/] and [link=x]"), highlight=False)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert shown == "[red]no\\x1b]0;owned\\x07[/] and [link=x]\n"

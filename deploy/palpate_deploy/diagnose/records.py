@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from palpate.bus import Session
@@ -21,6 +20,7 @@ from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
 from palpate.printable import printable
+from palpate_deploy.station.cell import cell
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.status import duration_text
 
@@ -99,13 +99,13 @@ def print_contents(path: Path) -> RecordSummary:
         check_readable(path)
     seconds = max(0, summary.end_wall_ns - summary.start_wall_ns) * 1e-9
     began = datetime.fromtimestamp(summary.start_wall_ns * 1e-9, UTC)
-    table = Table(title=escape(printable(str(path))), title_justify="left")
+    table = Table(title=cell(str(path)), title_justify="left")
     table.add_column("stream", overflow="fold")
     table.add_column("messages", justify="right")
     table.add_column("Hz", justify="right")
     for key, count in sorted(summary.counts.items()):
         rate = f"{(count - 1) / seconds:.2f}" if seconds and count > 1 else "-"
-        table.add_row(escape(printable(key)), f"{count:,}", rate)
+        table.add_row(cell(key), f"{count:,}", rate)
     table.caption = (
         f"{path.stat().st_size / 1e6:.2f} MB, from {began:%Y-%m-%d %H:%M:%S} UTC, "
         f"{duration_text(seconds)}" + ("" if summary.complete else ", cut off: palpate recover")

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from palpate import clock
@@ -26,6 +25,7 @@ from palpate.config import LinkConfig
 from palpate.errors import ConfigError, StreamTimeout, WireError
 from palpate.messages import Stamp
 from palpate.printable import printable
+from palpate_deploy.station.cell import cell
 from palpate_deploy.station.logs import FAILED
 
 
@@ -82,7 +82,7 @@ def list_topics(link: LinkConfig, station: str, seconds: float, *, as_json: bool
         table.add_row(
             name,
             topic.codec.schema.rpartition(".")[2],
-            escape(printable(" ".join(sorted(sources[name])))) or "[dim]-[/]",
+            cell(" ".join(sorted(sources[name]))) or "[dim]-[/]",
             f"{rates_hz[name]:.1f}" if messages[name] else "[dim]-[/]",
             f"{topic.rate_hz:g}" if topic.rate_hz else "events",
             topic.doc,

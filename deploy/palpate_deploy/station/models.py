@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from palpate.admin import read_token, token_file
@@ -19,6 +18,7 @@ from palpate.errors import LinkError, PalpateError
 from palpate.files.bundle import Bundle, read_bundle, read_manifest
 from palpate.messages import ModelAction, ModelInventory, ServedModel
 from palpate.printable import printable
+from palpate_deploy.station.cell import cell
 from palpate_deploy.station.profile import Profile
 from palpate_services.config import ModelsConfig
 from palpate_services.inference.model import load
@@ -66,15 +66,15 @@ def list_models(folder: Path, *, as_json: bool) -> None:
     for column in ("bundle", "task", "sha256", "trained on", "metrics"):
         table.add_column(column, overflow="fold")
     for row in rows:
-        name = escape(printable(str(row["bundle"])))
+        name = cell(str(row["bundle"]))
         if "error" in row:
-            table.add_row(name, "[red]broken[/]", "", escape(printable(str(row["error"]))), "")
+            table.add_row(name, "[red]broken[/]", "", cell(str(row["error"])), "")
             continue
         table.add_row(
             name,
             str(row["task"]),
             str(row["sha256"])[:12],
-            escape(str(row["trained_on"])),
+            cell(str(row["trained_on"])),
             "\n".join(
                 f"{key} {value:.4g}"
                 for key, value in row["metrics"].items()

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -22,6 +21,7 @@ from palpate.messages import (
     ServiceState,
     Status,
 )
+from palpate_deploy.station.cell import cell
 from palpate_deploy.station.expectation import (
     ask_through_router,
     expectation_here,
@@ -236,7 +236,7 @@ def _table(station: str, census: Iterable[ProcessReport]) -> Table:
             state_text(status.state),
             duration_text(status.uptime_s),
             _sensors(status),
-            escape(status.message),
+            cell(status.message),
             shown_counters(status),
         )
     if not table.row_count:
@@ -250,8 +250,8 @@ def _sensors(status: Status) -> str:
     for sensor in status.sensor_states:
         state = sensor.state.name.lower().replace("_", " ")
         colour = _SENSOR_COLOURS.get(sensor.state, "yellow")
-        said = f" [dim]({escape(sensor.message)})[/]" if sensor.message else ""
-        lines.append(f"{escape(sensor.name)} [{colour}]{state}[/]{said}")
+        said = f" [dim]({cell(sensor.message)})[/]" if sensor.message else ""
+        lines.append(f"{cell(sensor.name)} [{colour}]{state}[/]{said}")
     return "\n".join(lines) or " ".join(status.sensors)
 
 

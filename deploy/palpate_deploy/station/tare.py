@@ -9,6 +9,7 @@ from palpate.client.tares import ask_tare, ask_zero
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.messages import FloatArray, Tare, WrenchZero
+from palpate.printable import printable
 
 
 def take_tare(
@@ -37,14 +38,14 @@ def take_tare(
 
 def _print_tare(sensor: str, tare: Tare) -> None:
     numbers = " ".join(f"{value:.0f}" for value in tare.electrodes)
-    print(f"tared {sensor} ({tare.sensor_serial}) over {tare.frames_averaged} frames")
+    print(f"tared {sensor} ({printable(tare.sensor_serial)}) over {tare.frames_averaged} frames")
     print(f"tare id   {tare.tare_id}")
     print(f"baseline  {numbers} counts")
     print(f"noise     {float(np.median(tare.electrodes_sd)):.2f} counts (median of electrodes)")
 
 
 def _print_zero(sensor: str, zero: WrenchZero) -> None:
-    print(f"zeroed {sensor} ({zero.sensor_serial}, {zero.device})")
+    print(f"zeroed {sensor} ({printable(zero.sensor_serial)}, {printable(zero.device)})")
     print(f"before  {_wrench(zero.force_before, zero.torque_before)}")
     print(f"after   {_wrench(zero.force_after, zero.torque_after)}")
     print(f"means of {zero.readings_averaged} readings each")

@@ -16,7 +16,6 @@ from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -30,6 +29,7 @@ from palpate_deploy.station.activity import (
     process_activities,
     sensor_activities,
 )
+from palpate_deploy.station.cell import cell
 from palpate_deploy.station.expectation import (
     ask_through_router,
     expectation_here,
@@ -160,7 +160,7 @@ def _process_table(processes: Sequence[ProcessActivity], *, wide: bool) -> Table
     for one in processes:
         whole = one.latencies.get("latency", StageLatency())
         row = [
-            escape(process_name(one.service, one.instance)),
+            cell(process_name(one.service, one.instance)),
             _state(one.state if one.ready or one.state != "ready" else "not ready"),
             _number(one.in_hz),
             _number(one.out_hz),
@@ -178,8 +178,8 @@ def _process_table(processes: Sequence[ProcessActivity], *, wide: bool) -> Table
                 _number(one.uses.open_files),
                 "-" if one.status_age_s is None else f"{one.status_age_s:.1f}",
                 _number(one.pid or None),
-                escape(" ".join(one.models)),
-                escape(one.message),
+                cell(" ".join(one.models)),
+                cell(one.message),
             ]
         table.add_row(*row)
     return table
@@ -191,7 +191,7 @@ def _sensor_table(sensors: Sequence[SensorActivity]) -> Table:
     )
     for one in sensors:
         table.add_row(
-            escape(one.name),
+            cell(one.name),
             _state(one.state),
             duration_text(one.state_age_s),
             _number(one.rate_hz),
@@ -199,7 +199,7 @@ def _sensor_table(sensors: Sequence[SensorActivity]) -> Table:
             _ms(one.publish.p99_s),
             "-" if one.tare_age_s is None else duration_text(one.tare_age_s),
             _number(one.tare_drift_counts),
-            escape(one.message),
+            cell(one.message),
         )
     return table
 
@@ -216,7 +216,7 @@ def _stage_table(processes: Sequence[ProcessActivity]) -> Table | None:
         if latencies:
             cells = [latencies.get(stage) for stage in stages]
             words = ["-" if of is None else f"{_ms(of.p50_s)}/{_ms(of.p99_s)}" for of in cells]
-            table.add_row(escape(process_name(one.service, one.instance)), *words)
+            table.add_row(cell(process_name(one.service, one.instance)), *words)
     return table
 
 
@@ -243,7 +243,7 @@ def _trouble_lines(found: Sequence[Trouble]) -> Iterator[Text]:
 
 
 def _state(state: str) -> str:
-    return f"[{_STATE_COLOURS.get(state, 'yellow')}]{escape(state.replace('_', ' '))}[/]"
+    return f"[{_STATE_COLOURS.get(state, 'yellow')}]{cell(state.replace('_', ' '))}[/]"
 
 
 def _number(value: float | None, scale: float = 1.0) -> str:

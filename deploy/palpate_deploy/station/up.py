@@ -9,7 +9,6 @@ import time
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -18,6 +17,7 @@ from palpate.bus.topics import STATUS
 from palpate.errors import ConfigError, StreamTimeout
 from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status
+from palpate_deploy.station.cell import cell
 from palpate_deploy.station.host import join
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import print_error
@@ -207,7 +207,7 @@ def _table(processes: list[ProcessState], known: dict[str, tuple[Status, float]]
         status, heard_s = known.get(process.service, (None, 0.0))
         says = counters = ""
         if status is not None and time.monotonic() - heard_s < _SILENT_AFTER_S:
-            says = f"{state_text(status.state)} {escape(status.message)}"
+            says = f"{state_text(status.state)} {cell(status.message)}"
             counters = shown_counters(status)
             if status.last_error is not None and status.state is ServiceState.DEGRADED:
                 problems.append(

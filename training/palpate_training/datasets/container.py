@@ -6,6 +6,7 @@ import csv
 import hashlib
 import logging
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -125,7 +126,7 @@ def read_archive(
             return {name: archive[name] for name in names(archive.files)}
     except KeyError as error:
         raise DatasetError(f"{path}: {error.args[0]}", remedy=remedy) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
         raise DatasetError(
             f"{path}: not a readable NumPy archive: {error}", remedy=remedy
         ) from error
