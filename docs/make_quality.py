@@ -42,6 +42,8 @@ EVERY = 10
 WRONG_N, WRONG_SHARE = 0.5, 0.5
 """An estimate is wrong if its force is off by more than both [N] and share of the truth."""
 
+DRIFTS_COUNTS = (10.0, 20.0, 40.0)
+DRIFTED_ROWS = 200
 TIMED_RUNS = 2000
 
 
@@ -130,6 +132,22 @@ def loud_where_wrong(name: str, archive: Any, finger: int) -> dict[str, Any]:
     }
 
 
+def force_of_drift(name: str, drift_counts: float) -> dict[str, Any]:
+    """Force that a bundle estimates of an untouched finger whose electrodes have all drifted."""
+    runtime = runtime_of(name)
+    noise = np.random.default_rng(0).normal(0.0, NOISE_COUNTS, (DRIFTED_ROWS, 19))
+    medians = []
+    for drifted in (noise + drift_counts, noise - drift_counts):
+        _, _, force = looked_at(runtime, drifted.astype(np.float32))
+        medians.append(float(np.median(force)))
+    return {
+        "bundle": name,
+        "drift_counts": drift_counts,
+        "rising_force_n": medians[0],
+        "falling_force_n": medians[1],
+    }
+
+
 def check_us(name: str) -> float:
     """Median time of one comparison with the training range [us], in a hot loop."""
     bundle = read_bundle(resolve(name))
@@ -160,7 +178,7 @@ def table(rows: Sequence[dict[str, Any]], columns: dict[str, str]) -> list[str]:
             is_share = key.endswith("_share")
             cells.append(
                 percent(value) if is_share and value != "" else
-                f"{value:.1f}" if isinstance(value, float) else f"{value}"
+                f"{value:.2f}" if isinstance(value, float) else f"{value}"
             )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return lines
@@ -177,6 +195,11 @@ def main(data: Path | None) -> None:
             silent_where_trained("field-twin", tape, "tape, three specimens"),
         ],
         "real_fingers": [],
+        "drift": [
+            force_of_drift(name, drift)
+            for name in ("features-virtual", "features-twin")
+            for drift in DRIFTS_COUNTS
+        ],
         "check_median_us": {
             name: check_us(name)
             for name in ("features-virtual", "features-twin", "field-twin", "synthesis-twin")
@@ -224,6 +247,19 @@ def main(data: Path | None) -> None:
                 "wrong_share": "wrong", "flagged_of_wrong_share": "of these flagged",
                 "flagged_of_right_share": "flagged of the others",
                 "flagged_share": "flagged", "flagged_untouched_share": "flagged untouched",
+            },
+        ),
+        "",
+        "## Why a tare is doubtful after a kelvin",
+        "",
+        "Force that is estimated of an untouched finger when all electrodes have drifted alike;",
+        "a kelvin moves them by about 20 counts.",
+        "",
+        *table(
+            results["drift"],
+            {
+                "bundle": "bundle", "drift_counts": "drift [counts]",
+                "rising_force_n": "rising [N]", "falling_force_n": "falling [N]",
             },
         ),
         "",

@@ -18,7 +18,7 @@ of what the model can do."""
 class RangeCheck:
     """Compares inputs and outputs of a bundle with its training range. Keeps no state.
 
-    A few microseconds for 19 electrodes (tests/benchmarks/bench_quality.py).
+    Some 10 microseconds for 19 electrodes (docs/results/quality.md).
     """
 
     def __init__(self, known: TrainingRange | None, inputs: KnownInputs | None) -> None:
