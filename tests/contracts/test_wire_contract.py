@@ -148,7 +148,10 @@ class Listening:
 
     def send(self, payload: bytes, *, encoding: str = "", key: str = "") -> None:
         self._stranger.put(
-            key or self.key(), payload, encoding=zenoh.Encoding(encoding or self.topic.encoding)
+            key or self.key(),
+            payload,
+            encoding=zenoh.Encoding(encoding or self.topic.encoding),
+            congestion_control=zenoh.CongestionControl.BLOCK,  # a busy host may not lose it
         )
 
     def _arrives(self, payload: bytes, timeout_s: float) -> bool:
