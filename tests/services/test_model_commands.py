@@ -26,6 +26,7 @@ from palpate.messages import (
     ModelAction,
     ModelCommand,
     ServiceRequest,
+    ServiceState,
     Status,
     Tare,
 )
@@ -177,6 +178,24 @@ def test_a_restarted_service_serves_what_was_loaded(serve: Serve, admin: Admin) 
         admin(session).load("features", "x:2")
     with serve() as session:
         assert admin(session).served("features")[0].served[0].version == 2
+
+
+def test_a_bundle_that_is_gone_degrades_the_service_until_another_is_loaded(
+    serve: Serve, kept: ModelsConfig, admin: Admin, until: Until
+) -> None:
+    with serve() as session:
+        admin(session).load("features", "x:2")
+    shutil.rmtree(kept.repository_folder / "x" / "2")
+    with serve() as session:
+        until(lambda: status_of(session).state is ServiceState.DEGRADED)
+        status = status_of(session)
+        assert status.last_error is not None
+        assert "'x:2' is not in the repository" in status.last_error.message
+        with pytest.raises(RemoteError, match="no bundle serves"):
+            session.query(endpoints.MODEL, ServiceRequest(), service="features")
+        admin(session).load("features", "x:1")
+        until(lambda: status_of(session).state is ServiceState.READY)
+        assert status_of(session).models == ("x:1",)
 
 
 def test_no_frame_is_lost_and_no_estimate_mixed_while_bundles_change(

@@ -172,7 +172,10 @@ def _copied(source: Path, target: Path) -> Path:
     for name in (MODEL, MANIFEST, GOLDEN, MESH, RANGE):
         if name in (MESH, RANGE) and not (source / name).exists():
             continue
-        (target / name).write_bytes(read_file(source, name))
+        with open(target / name, "xb") as file:
+            file.write(read_file(source, name))
+            file.flush()
+            os.fsync(file.fileno())  # what is renamed afterwards must outlast a power failure
     return target
 
 
