@@ -16,6 +16,9 @@ ProcessName = tuple[str, str]
 ROUTER: ProcessName = ("router", "router")
 """The router: it has no token and no status, and lives if this process is connected to it."""
 
+SUPERVISOR: ProcessName = ("supervisor", "supervisor")
+"""The process that keeps the others running and says which should run: ``palpate up``."""
+
 PATIENCE_S = 5.0
 """How long a census waits for a process that does not answer [s]; without one it takes 20 ms."""
 

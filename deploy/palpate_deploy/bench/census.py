@@ -22,14 +22,13 @@ import tomli_w
 from rich.console import Console
 from rich.table import Table
 
-from palpate.census import ROUTER
+from palpate.census import ROUTER, SUPERVISOR
 from palpate.errors import ErrorCode, RemoteError
 from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.station.host import private_profile
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import plain_values
-from palpate_deploy.station.supervisor_report import SERVICE as SUPERVISOR
 
 _START_S = 120.0
 _CALL_S = 60.0
@@ -96,7 +95,7 @@ def measure_status(count: int, burners: int) -> StatusResult:
         path = run.folder / "station.toml"
         path.write_text(tomli_w.dumps(plain_values(profile)), encoding="utf-8")
         run.start_module("up", "__main__", "up", "--profile", path)
-        wanted = frozenset({*profile.processes, SUPERVISOR})
+        wanted = frozenset({*profile.processes, SUPERVISOR[0]})
         where = ("--connect", profile.link.connect[0], "--station", profile.station)
         deadline = time.monotonic() + _START_S
         while not _call(where, wanted).ready:

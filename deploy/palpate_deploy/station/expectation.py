@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from palpate.bus import Session
-from palpate.census import ROUTER, ProcessName
+from palpate.census import ROUTER, SUPERVISOR, ProcessName
 from palpate.config import LinkConfig, endpoint_host_port, is_loopback
 from palpate.errors import LinkError
 from palpate_deploy.station.host import running_folders
 from palpate_deploy.station.profile import load_profile
-from palpate_deploy.station.supervisor_report import SERVICE as SUPERVISOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ def expectation_here(connect: Iterable[str], station: str) -> Expectation | None
             continue
         names = {(name, name) for name in values.get("processes", ())}
         if (folder / "supervisord.conf").exists():
-            names.add((SUPERVISOR, SUPERVISOR))
+            names.add(SUPERVISOR)
         return Expectation(f"run {folder.name} on this host", frozenset(names))
     return None
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from palpate.bus import Session
-from palpate.census import ROUTER
+from palpate.census import ROUTER, SUPERVISOR
 from palpate.config import LinkConfig, endpoint_host_port
 from palpate.errors import LinkError
 from palpate.health import Health, HealthReporter
@@ -23,7 +23,6 @@ from palpate.process import require
 from palpate_deploy.station.activity import quantile_part, sensor_part
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
 from palpate_deploy.station.profile import MetricsConfig
-from palpate_deploy.station.supervisor_report import SERVICE as SUPERVISOR
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -152,7 +151,7 @@ class StationCollector:
 
         def labels(sensor: str) -> tuple[str, ...]:
             # A supervisor speaks for others: what stands in front is the name of a process.
-            if sensor and status.service == SUPERVISOR:
+            if sensor and (status.service, status.instance) == SUPERVISOR:
                 return (self._station, sensor, sensor, "")
             return (*process, sensor)
 

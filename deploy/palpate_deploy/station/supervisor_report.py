@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.bus import Session
-from palpate.census import ROUTER
+from palpate.census import ROUTER, SUPERVISOR
 from palpate.errors import PalpateError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState, SupervisedProcess
 from palpate.process import Closing
 from palpate.usage import ProcessUsage
 from palpate_deploy.station.supervision import ProcessState, recent
-
-SERVICE = "supervisor"
 
 _FINE = frozenset({"RUNNING", "EXITED"})
 """EXITED is the state of a finite source at its end; any other process is started again."""
@@ -32,9 +30,9 @@ class SupervisorReport(Closing):
 
     def __init__(self, session: Session, logs: Path) -> None:
         self._logs = logs
-        self._health = Health(SERVICE, SERVICE)
+        self._health = Health(*SUPERVISOR)
         self._router: tuple[int, ProcessUsage] | None = None
-        self._presence = session.presence(SERVICE, instance=SERVICE)
+        self._presence = session.presence(SUPERVISOR[0], instance=SUPERVISOR[1])
         self._reporter = HealthReporter(session, self._health)
         self._presence.ready()
 
