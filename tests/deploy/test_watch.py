@@ -17,7 +17,7 @@ from supervisor.states import ProcessStates
 
 from palpate.heartbeat import FILE_VARIABLE, START_S, Pulse, read_pulse
 from palpate_deploy.station.logs import FAILED, USAGE
-from palpate_deploy.station.watch import Silence, Watch, cannot_serve
+from palpate_deploy.station.watch import HangWatch, Silence, cannot_serve
 
 PATIENCE_S = 30.0
 PID = 4711
@@ -116,7 +116,7 @@ class _Station:
             pid=self.child.pid, state=ProcessStates.RUNNING, config=config, backoff=0
         )
         self.lines: list[str] = []
-        self.watch = Watch(folder, lambda: [self.process], self.lines.append)
+        self.watch = HangWatch(folder, lambda: [self.process], self.lines.append)
 
     def look_until(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + PATIENCE_S

@@ -22,7 +22,7 @@ from supervisor.poller import Poller
 from supervisor.supervisord import Supervisor
 
 from palpate_deploy.station.lifetime import PARENT_PID, end_with_parent
-from palpate_deploy.station.watch import Watch
+from palpate_deploy.station.watch import HangWatch
 
 WATCH_FOLDER = "_PALPATE_WATCH"
 """Environment variable with the folder of the processes' heartbeats; removed at the end."""
@@ -37,7 +37,7 @@ class _WatchfulPoller(Poller):  # type: ignore[misc]  # supervisor has no types
 
 
 class _Options(ServerOptions):  # type: ignore[misc]
-    watch: Watch
+    watch: HangWatch
 
     def waitpid(self) -> tuple[int | None, int | None]:
         pid, status = super().waitpid()
@@ -63,7 +63,7 @@ def main() -> None:
     options.test = False
     supervisord = Supervisor(options)
     folder = Path(os.environ.pop(WATCH_FOLDER))
-    options.watch = Watch(
+    options.watch = HangWatch(
         folder,
         lambda: _processes(supervisord),
         lambda line: options.logger.warn(line),

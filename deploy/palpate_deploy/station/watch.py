@@ -87,7 +87,7 @@ class Watched:
     continued: bool = False
 
 
-class Watch:
+class HangWatch:
     """Watches the processes of supervisord, which are its children.
 
     Args:
@@ -212,11 +212,11 @@ def _send(send: Callable[[int, int], None], pid: int, number: int) -> None:
 class WatchInterface:
     """What the watch answers over supervisord's RPC."""
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, watch: HangWatch) -> None:
         self._watch = watch
 
     def processes(self) -> list[dict[str, Any]]:
-        """See ``Watch.report``."""
+        """See ``HangWatch.report``."""
         return self._watch.report()
 
 
