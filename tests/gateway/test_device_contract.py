@@ -199,7 +199,7 @@ class TestDeviceContract:
         device = bench.device()
         for _ in range(2):  # the first opening imports, which opens what stays open
             gc.collect()
-            before = Held.now()
+            before = Held.settled()
             device.open()
             bench.take(device, 1)
             device.close()
@@ -212,7 +212,7 @@ class TestDeviceContract:
         with bench.device():  # the first opening imports, which opens what stays open
             pass
         gc.collect()
-        before = Held.now()
+        before = Held.settled()
         # A virtual finger has no address but its tape, whose name is configuration.
         with pytest.raises((DeviceError, ConfigError), match=bench.case.names) as caught:
             make_device(bench.case.driver, bench.case.nowhere).open()
@@ -320,6 +320,20 @@ class Held:
     def now(cls) -> Held:
         """Of this process."""
         return cls(len(os.listdir("/proc/self/fd")), threading.active_count())
+
+    @classmethod
+    def settled(cls) -> Held:
+        """Of this process when it has not changed for a while.
+
+        An emulator's own router opens a link to itself a moment after it serves.
+        """
+        since_s, held = time.monotonic(), cls.now()
+        deadline_s = since_s + PATIENCE_S
+        while time.monotonic() - since_s < 0.3 and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+            if (now := cls.now()) != held:
+                since_s, held = time.monotonic(), now
+        return held
 
     def __le__(self, other: Held) -> bool:
         return self.files <= other.files and self.threads <= other.threads
