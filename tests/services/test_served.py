@@ -273,6 +273,25 @@ def test_nobody_else_serves_for_a_bundle_that_cannot_be_had_again(
     assert of(again, "thumb") == "x:2"
 
 
+@pytest.mark.parametrize("how", ["gone", "changed"])
+def test_after_an_upgrade_the_profile_counts_again(
+    service: Service, models: Path, make_bundle: Make, how: str
+) -> None:
+    """Unlike a bundle that somebody has loaded, the profile's is replaced by its newest version."""
+    assert of(service(bundle="x")) == "x:3"
+    shutil.rmtree(models / "x" / "3")
+    if how == "changed":
+        shutil.copytree(
+            make_bundle(name="x", version=3, trained_on="more data"), models / "x" / "3"
+        )
+    again = service(bundle="x")
+    assert again.problem is None
+    assert of(again) == ("x:2" if how == "gone" else "x:3")
+    shutil.rmtree(models / "x")
+    with pytest.raises(ConfigError, match="'x' is not in the repository"):
+        service(bundle="x")
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 2}', '{"format": 1, "profile": {}}'])
 def test_a_damaged_memory_is_a_problem_and_no_other_bundle(
     service: Service, tmp_path: Path, text: str

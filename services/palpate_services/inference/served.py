@@ -137,7 +137,7 @@ class ServedModels:
                 assigned[sensor] = Assignment(self._open(bundle), time.time_ns())
         else:
             for sensor, one in remembered.items():
-                assigned[sensor] = self._restored(sensor, one)
+                assigned[sensor] = self._restored(sensor, one, wanted.get(sensor))
         self._serving = Serving(assigned)
         try:
             self._remember()
@@ -321,14 +321,21 @@ class ServedModels:
             if choice is not None and choice.runtime is not None
         }
 
-    def _restored(self, sensor: str, remembered: Remembered) -> Assignment:
-        """What served a sensor before this process began, loaded again."""
+    def _restored(self, sensor: str, remembered: Remembered, wanted: str | None) -> Assignment:
+        """What served a sensor before this process began, loaded again.
+
+        If that is not to be had, e.g. after an upgrade of palpate, and no command had chosen it,
+        the bundle that the profile wants is chosen anew.
+        """
         current = None
         if remembered.bundle:
             current = Choice(remembered.bundle, remembered.sha256, None)
             try:
                 current = self._again(current)
             except PalpateError as error:
+                if wanted is not None and not remembered.changed:
+                    _log.warning("%s; the profile counts again", error)
+                    return Assignment(self._open(wanted), time.time_ns())
                 _log.error("%s: not served again: %s", sensor or "all sensors", error)
                 self._problems[sensor] = error
         previous = (
