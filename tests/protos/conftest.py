@@ -21,11 +21,11 @@ from palpate.messages import (
     ErrorReply,
     FeatureEstimate,
     FeatureRequest,
-    FieldBasis,
     FieldEstimate,
     FieldFrame,
     FieldRequest,
     IndenterPoseFrame,
+    ModeBasis,
     ModelAction,
     ModelCommand,
     ModelInventory,
@@ -277,7 +277,7 @@ def examples() -> dict[str, Any]:
             True,
         ),
         "BasisRequest": BasisRequest(digest),
-        "FieldBasis": FieldBasis(digest, mesh, nodes, np.stack([nodes, -nodes]), 3, 0, True),
+        "FieldBasis": ModeBasis(digest, mesh, nodes, np.stack([nodes, -nodes]), 3, 0, True),
     }
 
 

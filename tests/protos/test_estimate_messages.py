@@ -12,8 +12,8 @@ from palpate import codec
 from palpate.errors import WireError
 from palpate.messages import (
     ContactDescription,
-    FieldBasis,
     FieldEstimate,
+    ModeBasis,
     QualityFlag,
     SimulationParameters,
     SimulationRequest,
@@ -123,9 +123,9 @@ def test_a_reduced_field_that_says_too_little(
 
 
 def test_a_basis_in_parts_and_what_it_decodes(examples: dict[str, Any]) -> None:
-    part: FieldBasis = examples["FieldBasis"]
+    part: ModeBasis = examples["FieldBasis"]
     assert part.mean is not None
-    later = FieldBasis(part.basis_sha256, part.mesh_sha256, None, part.modes[:1] * 2, 3, 2)
+    later = ModeBasis(part.basis_sha256, part.mesh_sha256, None, part.modes[:1] * 2, 3, 2)
     came = [codec.FIELD_BASIS.decode(codec.FIELD_BASIS.encode(one)) for one in (part, later)]
     assert [len(one.modes) for one in came] == [2, 1]
     modes = np.concatenate([one.modes for one in came])

@@ -9,13 +9,13 @@ import numpy as np
 
 from palpate.bus import Session, endpoints
 from palpate.errors import WireError
-from palpate.messages import BasisRequest, FieldBasis, SynthesisReply, SynthesisRequest
+from palpate.messages import BasisRequest, ModeBasis, SynthesisReply, SynthesisRequest
 
 OnSynthesis = Callable[[SynthesisReply], None]
 """Called with the electrodes of each step of a simulation, as it converges."""
 
 
-def ask_basis(session: Session, basis_sha256: bytes, *, timeout_s: float) -> FieldBasis:
+def ask_basis(session: Session, basis_sha256: bytes, *, timeout_s: float) -> ModeBasis:
     """The whole basis of a field service's coefficients; an empty digest = the served one.
 
     Raises:
@@ -29,13 +29,13 @@ def ask_basis(session: Session, basis_sha256: bytes, *, timeout_s: float) -> Fie
     return join_basis(parts)
 
 
-def join_basis(parts: Iterator[FieldBasis]) -> FieldBasis:
+def join_basis(parts: Iterator[ModeBasis]) -> ModeBasis:
     """One basis of the parts of an answer.
 
     Raises:
         WireError: A part is missing (reason ``"incomplete"``).
     """
-    first: FieldBasis | None = None
+    first: ModeBasis | None = None
     modes: list[object] = []
     count = 0
     for part in parts:

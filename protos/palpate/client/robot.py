@@ -47,10 +47,10 @@ from palpate.messages import (
     ElectrodeFrame,
     FeatureEstimate,
     FeatureRequest,
-    FieldBasis,
     FieldEstimate,
     FieldFrame,
     FieldRequest,
+    ModeBasis,
     ModelMetadata,
     ServiceRequest,
     SimulationCancelRequest,
@@ -265,7 +265,7 @@ class Client(Closing):
 
     def field_basis(
         self, basis_sha256: bytes = b"", *, timeout_s: float | None = None
-    ) -> FieldBasis:
+    ) -> ModeBasis:
         """The basis of the coefficients of fields, some megabytes: ask once and keep it.
 
         ``basis_sha256`` is that of an estimate; empty = that of the served bundle.

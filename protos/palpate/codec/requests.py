@@ -39,9 +39,9 @@ from palpate.messages import (
     BasisRequest,
     ContactDescription,
     FeatureRequest,
-    FieldBasis,
     FieldFrame,
     FieldRequest,
+    ModeBasis,
     SynthesisReply,
     SynthesisRequest,
 )
@@ -184,7 +184,7 @@ def _basis_request_from_wire(msg: requests_pb2.BasisRequest) -> BasisRequest:
     return BasisRequest(check_digest(digest, "basis_sha256") if digest else b"")
 
 
-def _check_parts(basis: FieldBasis) -> None:
+def _check_parts(basis: ModeBasis) -> None:
     end = basis.first_mode + len(basis.modes)
     if end > basis.modes_total or (end == basis.modes_total) == basis.more:
         reject("basis", f"modes {basis.first_mode}..{end} of {basis.modes_total} are no part")
@@ -192,13 +192,13 @@ def _check_parts(basis: FieldBasis) -> None:
         reject("basis", "the mean belongs to the first part, and to no other")
 
 
-def _basis_from_wire(msg: requests_pb2.FieldBasis) -> FieldBasis:
+def _basis_from_wire(msg: requests_pb2.FieldBasis) -> ModeBasis:
     nodes = msg.nodes
     mean = field_from_wire(msg.mean, 3, "mean", rows=nodes) if msg.mean else None
     flat = field_from_wire(msg.modes, 3, "modes")
     if not nodes or len(flat) % nodes:
         reject("shape", f"modes have {len(flat)} vectors, not a multiple of {nodes} nodes")
-    basis = FieldBasis(
+    basis = ModeBasis(
         check_digest(msg.basis_sha256, "basis_sha256"),
         check_digest(msg.mesh_sha256, "mesh_sha256"),
         mean,
@@ -211,7 +211,7 @@ def _basis_from_wire(msg: requests_pb2.FieldBasis) -> FieldBasis:
     return basis
 
 
-def _basis_encode(basis: FieldBasis) -> bytes:
+def _basis_encode(basis: ModeBasis) -> bytes:
     _check_parts(basis)
     head = requests_pb2.FieldBasis(
         basis_sha256=check_digest(basis.basis_sha256, "basis_sha256"),

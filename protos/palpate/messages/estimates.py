@@ -82,7 +82,7 @@ class FieldEstimate:
         displacement_sd: One standard deviation of its magnitude [m], shape ``(V,)``, or None.
         contact_force: Nodal contact force on the skin [N], shape ``(V, 3)``, or None.
         coefficients: The same displacement in the bundle's basis [m], shape ``(K,)``, or None:
-            see ``FieldBasis``.
+            see ``ModeBasis``.
         basis_sha256: Content hash of that basis, 32 bytes; empty without coefficients.
     """
 

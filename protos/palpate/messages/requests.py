@@ -103,7 +103,7 @@ class BasisRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class FieldBasis:
+class ModeBasis:
     """The basis of a bundle's coefficients, or a part of it: ``mean + coefficients @ modes``.
 
     Attributes:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from palpate.errors import BundleError
 from palpate.files.bundle import Bundle
-from palpate.messages import FieldBasis, FloatArray
+from palpate.messages import FloatArray, ModeBasis
 from palpate_services.inference.onnx_file import onnx_fields, varints
 
 _GRAPH, _INITIALIZER = 7, 5  # numbers of onnx.proto, which never change
@@ -43,13 +43,13 @@ class Basis:
     modes: npt.NDArray[np.floating]
     sha256: bytes
 
-    def parts(self, mesh_sha256: bytes) -> Iterator[FieldBasis]:
+    def parts(self, mesh_sha256: bytes) -> Iterator[ModeBasis]:
         """The basis in messages of moderate size."""
         count, width = self.modes.shape
         each = max(1, _PART_BYTES // (4 * width))
         for first in range(0, count, each):
             modes = self.modes[first : first + each].astype(np.float32)
-            yield FieldBasis(
+            yield ModeBasis(
                 self.sha256,
                 mesh_sha256,
                 self.mean.reshape(-1, 3) if first == 0 else None,

@@ -18,9 +18,9 @@ from palpate.messages import (
     BasisRequest,
     FeatureEstimate,
     FeatureRequest,
-    FieldBasis,
     FieldEstimate,
     FieldRequest,
+    ModeBasis,
 )
 from palpate_services.config import (
     EstimatingConfig,
@@ -134,7 +134,7 @@ def _asked_field(
 
 
 def _send_basis(
-    models: ServedModels, request: BasisRequest, answer: QueryAnswer[FieldBasis]
+    models: ServedModels, request: BasisRequest, answer: QueryAnswer[ModeBasis]
 ) -> None:
     served = models.all()
     wanted = request.basis_sha256
