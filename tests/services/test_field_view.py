@@ -228,7 +228,8 @@ def test_a_closed_view_is_freed_without_a_garbage_collection(
     def draw() -> weakref.ref[Any]:
         live = LiveView(make)
         live.offer("finger", frame)
-        live.offer("finger", bundles.truth(frame.stamp))
+        until(lambda: bool(list(tmp_path.glob("view*.rrd"))))
+        live.offer("finger", bundles.truth(frame.stamp))  # changes the layout
         live.finish()
         assert live.join(20.0)
         return weakref.ref(live)

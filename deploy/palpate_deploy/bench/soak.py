@@ -227,6 +227,7 @@ class _Watch:
         self._warm_up_s = warm_up_s
         self._begun_s = time.monotonic()
         self._before: Counter[str] | None = None
+        self._totals()  # the first question takes a megabyte of each process, which is no growth
 
     def look(self) -> float:
         """Take a sample; returns how long it has been going on [s]."""

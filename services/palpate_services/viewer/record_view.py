@@ -7,10 +7,11 @@ module that uses Rerun, whose names change with each release.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -235,10 +236,18 @@ class RerunView:
         self._with_fields |= with_fields
         drawn = dict(sorted(self._drawn.items()))
         layout = record_layout(drawn, with_fields=self._with_fields)
-        if self._open:
-            self._stream.send_blueprint(layout)
-        else:
-            self._stream.save(self.path, default_blueprint=layout, write_footer=not self._live)
+        native = self._stream.to_native()
+        with _stored(self._rr, layout) as blueprint:
+            if self._open:
+                self._rr.bindings.send_blueprint(blueprint, True, True, recording=native)
+            else:
+                self._rr.bindings.save(
+                    path=str(self.path),
+                    default_blueprint=blueprint,
+                    recording=native,
+                    write_footer=not self._live,
+                )
+        if not self._open:
             self._stream.send_recording_name(self._title)
             self._open = True
         for sensor in new:
@@ -331,6 +340,28 @@ def _of_one_width(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
     """Rows by their number of values: two kinds where a finger was exchanged for an SP."""
     widths = dict.fromkeys(len(row.values) for row in rows)
     return [[row for row in rows if len(row.values) == width] for width in widths]
+
+
+@contextlib.contextmanager
+def _stored(rr: Any, layout: Any) -> Iterator[Any]:
+    """A layout in the form that Rerun sends; freed at the end of the block.
+
+    As its ``save`` and ``send_blueprint`` make it, which keep two threads and the layout for ever:
+    the stream of a layout holds a memory that holds the stream, until it is disconnected.
+    """
+    native = rr.bindings.new_blueprint(
+        application_id=APPLICATION,
+        make_default=False,
+        make_thread_default=False,
+        default_enabled=True,
+    )
+    stream = rr.RecordingStream._from_native(native)
+    stream.set_time("blueprint", sequence=0)
+    layout.to_blueprint()._log_to_stream(stream)
+    try:
+        yield stream.memory_recording().storage
+    finally:
+        stream.disconnect()
 
 
 def release_closed_views() -> None:
