@@ -11,8 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -424,6 +424,19 @@ def test_an_async_stream_says_that_it_is_silent_and_goes_on(
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 
+async def _begun(
+    ask: Callable[[], Coroutine[Any, Any, object]], begun: threading.Event
+) -> asyncio.Task[object]:
+    """A question that has reached its service, which may not be known here at first."""
+    while True:
+        asking = asyncio.create_task(ask())
+        while not asking.done():
+            if begun.is_set():
+                return asking
+            await asyncio.sleep(0.01)
+        assert isinstance(asking.exception(), LinkError)
+
+
 def test_cancelling_a_task_ends_its_question_and_its_stream(
     link: LinkConfig, finger: Finger, examples: dict[str, Any], wait_until: WaitUntil
 ) -> None:
@@ -437,8 +450,7 @@ def test_cancelling_a_task_ends_its_question_and_its_stream(
 
     async def scene(session: Session) -> None:
         async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
-            asking = asyncio.create_task(robot.tare("slow", timeout_s=600.0))
-            assert await asyncio.to_thread(begun.wait, LIVE_S)
+            asking = await _begun(lambda: robot.tare("slow", timeout_s=600.0), begun)
             asking.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await asking
@@ -455,7 +467,6 @@ def test_cancelling_a_task_ends_its_question_and_its_stream(
 
     with Session.open(link) as session:
         session.queryable(endpoints.TARE, handler, sensor="slow")
-        time.sleep(0.3)
         asyncio.run(asyncio.wait_for(scene(session), 3 * LIVE_S))
         go.set()
     wait_until(
@@ -492,11 +503,12 @@ def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
 
         async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
             request = _request()
-            await robot.simulate(request, on_progress=on_progress)
+            while not steps:
+                with suppress(LinkError):  # the service is not known here yet
+                    await robot.simulate(request, on_progress=on_progress)
             assert steps == [0, 1, 2]
             endless = dataclasses.replace(request, request_id="endless")
-            asking = asyncio.create_task(robot.simulate(endless, timeout_s=600.0))
-            assert await asyncio.to_thread(begun.wait, LIVE_S)
+            asking = await _begun(lambda: robot.simulate(endless, timeout_s=600.0), begun)
             asking.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await asking
@@ -505,7 +517,6 @@ def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
     with Session.open(link) as session:
         session.watch_callers(lambda *_: gone.set() if begun.is_set() else None)
         session.stream_queryable(endpoints.SIMULATE, simulate, sensor="twin")
-        time.sleep(0.3)
         asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 

@@ -198,12 +198,13 @@ def test_a_question_is_cancelled_from_another_thread(pair: Any, examples: dict[s
         return tare
 
     a.queryable(endpoints.TARE, handler, sensor="finger")
-    time.sleep(0.3)
     cancellation, ended = Cancellation(), threading.Event()
 
     def ask() -> None:
-        with cancellation, pytest.raises(LinkError):
-            _tare(b, timeout_s=600.0)
+        with cancellation:
+            while not begun.is_set():  # the service may not be known here at first
+                with pytest.raises(LinkError):
+                    _tare(b, timeout_s=600.0)
         ended.set()
 
     asker = threading.Thread(target=ask, daemon=True)
@@ -217,7 +218,7 @@ def test_a_question_is_cancelled_from_another_thread(pair: Any, examples: dict[s
 
 
 def test_a_flood_of_questions_is_refused_and_answered_in_the_end(
-    pair: Any, examples: dict[str, Any]
+    pair: Any, examples: dict[str, Any], wait_until: WaitUntil
 ) -> None:
     """Far more callers than may wait: each is told when to come back, and none is lost."""
     a, b = pair
@@ -228,7 +229,7 @@ def test_a_flood_of_questions_is_refused_and_answered_in_the_end(
         return tare
 
     queryable = a.queryable(endpoints.TARE, handler, sensor="finger", capacity=2)
-    time.sleep(0.3)
+    wait_until(lambda: not isinstance(_attempt(b), LinkError), timeout_s=TIMEOUT_S)
     answers: list[object] = []
 
     def ask() -> None:
