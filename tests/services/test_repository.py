@@ -74,6 +74,15 @@ def test_an_imported_bundle_is_found_by_its_own_name(
     assert repository.add(made, read_bundle) == (label, folder), "the same once more is no error"
 
 
+@pytest.mark.parametrize("name", available())
+def test_every_kind_of_bundle_is_copied_whole(repository: Repository, name: str) -> None:
+    shipped = read_bundle(resolve(name))
+    label, folder = repository.add(shipped.folder, read_bundle)
+    assert label == name
+    assert names(folder) == names(shipped.folder)
+    assert read_bundle(folder).sha256 == shipped.sha256
+
+
 def test_what_the_check_refuses_leaves_nothing_behind(
     repository: Repository, make_bundle: Callable[..., Path]
 ) -> None:
