@@ -57,11 +57,14 @@ def free_endpoint() -> str:
 def private_profile(name: str, **tables: Mapping[str, Any]) -> Profile:
     """A shipped profile, its router at a free port: independent of any station of this host.
 
+    What its namesake among the user's stations was told to serve does not matter, either.
+
     Raises:
         ConfigError: A value of ``tables``, which replace keys as in ``changed``, is wrong.
     """
     here = (free_endpoint(),)
-    return changed(load_profile(name), router={"listen": here}, link={"connect": here}, **tables)
+    own = {"models": {"state": str(state_folder() / "private")}, **tables}
+    return changed(load_profile(name), router={"listen": here}, link={"connect": here}, **own)
 
 
 def join(profile: Profile, *, wait_s: float) -> Session:
