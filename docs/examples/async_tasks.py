@@ -1,4 +1,4 @@
-"""Two tasks of one event loop: one follows a finger, the other asks about the station.
+"""Tasks of one event loop: one follows a finger, one asks about the station, one is cancelled.
 
 With a station without hardware:
 
@@ -27,22 +27,25 @@ async def follow(robot: AsyncClient, count: int) -> None:
                 return
 
 
-async def look(robot: AsyncClient) -> None:
-    """Say what serves, then wait for a sensor that does not exist until this task is cancelled."""
+async def describe(robot: AsyncClient) -> None:
+    """Say what serves."""
     model = await robot.model()
     print(f"served by {model.name} version {model.version}")
+
+
+async def wait_for_another(robot: AsyncClient) -> None:
+    """Wait for a sensor that does not exist, until this task is cancelled."""
     async for _ in robot.stream_features("no-such-finger", timeout_s=None):
         print("there it is")
 
 
 async def main(count: int) -> None:
-    """The stream ends the program; leaving ``async with`` ends what still waits."""
+    """Three tasks at once; leaving ``async with`` ends what still waits."""
     try:
         async with AsyncClient() as robot:
-            looking = asyncio.create_task(look(robot))
-            await follow(robot, count)
-            looking.cancel()
-            await asyncio.gather(looking, return_exceptions=True)
+            waiting = asyncio.create_task(wait_for_another(robot))
+            await asyncio.gather(follow(robot, count), describe(robot))
+            waiting.cancel()
     except PalpateError as error:
         sys.exit(str(error))
 
