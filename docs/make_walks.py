@@ -61,9 +61,7 @@ class Lane:
 FRAME = (
     Lane("gateway: thread of the CAN bus", "run gateway", r"line .*"),
     Lane("gateway: thread of the sensor", "run gateway", r"sensor .*"),
-    Lane("features: Zenoh's thread", "run features", r".*pyo3.*", "bus/"),
     Lane("features: its loop", "run features", r"MainThread", "inference/loop"),
-    Lane("robot: Zenoh's thread", "robot", r".*pyo3.*", "bus/"),
     Lane("robot: the caller", "robot", r"MainThread", "client/"),
 )
 SIMULATION = (
