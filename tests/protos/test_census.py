@@ -8,12 +8,12 @@ from contextlib import AbstractContextManager, ExitStack
 
 import pytest
 
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.census import ROUTER, take_census
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.health import Health, HealthReporter
-from palpate.messages import ServiceState, SupervisedProcess
+from palpate.messages import ServiceRequest, ServiceState, Status, SupervisedProcess
 
 NAMES = ("features", "field", "gateway", "recorder", "synthesis")
 LOOKS = 12
@@ -45,6 +45,17 @@ def test_a_session_that_has_just_joined_sees_every_process(
         with Session.open(link) as fresh:
             found = fresh.alive()
         assert [(one.service, one.ready) for one in found] == [(name, True) for name in NAMES]
+
+
+def test_a_question_of_a_session_that_has_just_joined_reaches_everyone(
+    station: dict[str, tuple[Session, Health]], link: LinkConfig
+) -> None:
+    for look in range(LOOKS):
+        with Session.open(link) as fresh:
+            answers = fresh.query_all(endpoints.STATUS, ServiceRequest(), timeout_s=20.0)
+            one = fresh.query(endpoints.STATUS, ServiceRequest(), service=NAMES[look % len(NAMES)])
+        assert one.service == NAMES[look % len(NAMES)]
+        assert {answer.service for answer in answers if isinstance(answer, Status)} == set(NAMES)
 
 
 def test_a_robot_that_has_just_joined_gets_every_status(

@@ -37,6 +37,9 @@ INDIRECT_WAIT_S = 60.0
 _OBSERVER_WAIT_S = 1.0
 """How long a session that has joined looks for its router once more [s]."""
 
+_YOUNG_S = 2.0
+"""Within this time the links of a session to all processes of its station have come up [s]."""
+
 LOSSLESS_STALL_S = 60.0
 """How long a lossless (replay) publisher may be blocked before its link is closed."""
 
@@ -178,6 +181,7 @@ class Session(Closing):
     def __init__(self, raw: zenoh.Session, station: str, link: LinkConfig) -> None:
         self._raw = raw
         self._link = link
+        self._opened_s = time.monotonic()
         self.station = station
         self.wall_clock_error_s = link.wall_clock_error_s
         self._alarm: Alarm | None = None
@@ -360,10 +364,11 @@ class Session(Closing):
         if sensor is not None:
             check_name(sensor, "sensor")
         key = self._key(endpoint, sensor, service, instance)
+        asking = self._asking()
 
         def once(left_s: float) -> R:
             replies = ask(
-                self._raw,
+                asking,
                 key,
                 endpoint,
                 request,
@@ -371,7 +376,7 @@ class Session(Closing):
                 everyone=True,
                 on_timings=on_timings,
             )
-            return first_reply(list(replies), lambda: no_reply(self._raw, key))
+            return first_reply(list(replies), lambda: no_reply(asking, key))
 
         return ask_again(once, timeout_s)
 
@@ -387,8 +392,8 @@ class Session(Closing):
     ) -> list[R | PalpateError]:
         """Every answer; errors are returned, not raised."""
         key = self._key(endpoint, sensor, service, instance)
-        replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=True)
-        return list(replies)
+        asking = self._asking()
+        return list(ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=True))
 
     def query_stream(
         self,
@@ -407,8 +412,9 @@ class Session(Closing):
         if sensor is not None:
             check_name(sensor, "sensor")
         key = self._key(endpoint, sensor, service, instance)
-        replies = ask(self._raw, key, endpoint, request, timeout_s=timeout_s, everyone=False)
-        return raise_errors(replies, lambda: no_reply(self._raw, key))
+        asking = self._asking()
+        replies = ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=False)
+        return raise_errors(replies, lambda: no_reply(asking, key))
 
     def caller_token(self, request_id: str) -> CallerToken:
         """Show that this process waits for an answer, until it is closed or this process dies."""
@@ -470,6 +476,19 @@ class Session(Closing):
                 link = self._link.model_copy(update=update)
                 self._observing = self._keep(Session.open(link, station=self.station))
             return self._observing
+
+    def _asking(self) -> zenoh.Session:
+        """The Zenoh session through which a question reaches whoever serves it.
+
+        A young session does not know all of them yet, and would say that nobody does. To ask once
+        more after silence could tare a finger twice, so the way is chosen before.
+        """
+        if time.monotonic() - self._opened_s > _YOUNG_S:
+            return self._raw
+        try:
+            return self.observer()._raw
+        except LinkError:  # there are only peers
+            return self._raw
 
     def has_router(self) -> bool:
         """Whether a router is connected at present."""
