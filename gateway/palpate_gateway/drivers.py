@@ -42,11 +42,24 @@ def driver_names() -> list[str]:
 
 
 def load_driver(name: str) -> type[Device]:
-    """The device class of a driver.
+    """The device class of a driver that can be used here.
 
     Raises:
         ConfigError: There is no such driver, or its table entry names no device class.
         MissingExtraError: It needs a package that is not installed.
+    """
+    device = find_driver(name)
+    for module_name in device.needs:
+        check_installed(module_name, extra="gateway")
+    return device
+
+
+def find_driver(name: str) -> type[Device]:
+    """The device class of a driver, also without the packages that it ``needs``.
+
+    Raises:
+        ConfigError: There is no such driver, or its table entry names no device class.
+        MissingExtraError: A package without which it cannot even be imported is not installed.
     """
     target = DRIVERS.get(name)
     if target is None:
@@ -75,8 +88,6 @@ def load_driver(name: str) -> type[Device]:
             f"driver {name!r} names {target!r}, which is no device class",
             remedy="name a subclass of palpate_gateway.device.Device as 'module:Class'",
         )
-    for module_name in device.needs:
-        check_installed(module_name, extra="gateway")
     return device
 
 

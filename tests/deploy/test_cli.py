@@ -271,7 +271,9 @@ def test_json_logs(tmp_path: Path) -> None:
     )
     assert process.stderr is not None
     first = json.loads(process.stderr.readline())
-    assert list(first) == ["time", "level", "logger", "message"]
+    assert list(first)[:4] == ["time", "level", "logger", "message"]
+    assert first["service"] == "router"
+    assert first["pid"] == process.pid
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", first["time"])
     assert first["level"] == "info"
     assert first["logger"] == "palpate_deploy.station.processes"

@@ -79,6 +79,7 @@ def test_import_load_and_roll_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     profile, link = station
+    shipped = read_bundle(resolve(bundle)).manifest.version
     run("router")
     features = run("features")
     ready(link)
@@ -96,16 +97,17 @@ def test_import_load_and_roll_back(
     assert done.returncode == 0, done.stderr
     assert "mine:7" in palpate("model", "list").stdout
     assert palpate("model", "verify", "mine").returncode == 0
-    assert told("served") == [(bundle, 1, "")], "an import changes nothing that serves"
+    assert told("served") == [(bundle, shipped, "")], "an import changes nothing that serves"
     assert told("load", "mine") == [("mine", 7, "")]
-    assert told("load", bundle, "--sensor", "thumb") == [("mine", 7, ""), (bundle, 1, "thumb")]
+    served = [("mine", 7, ""), (bundle, shipped, "thumb")]
+    assert told("load", bundle, "--sensor", "thumb") == served
     features.send_signal(signal.SIGKILL)
     features.wait()
     run("features")
     ready(link)
-    assert told("served") == [("mine", 7, ""), (bundle, 1, "thumb")]
-    assert told("rollback") == [(bundle, 1, ""), (bundle, 1, "thumb")]
-    assert told("unload", "--sensor", "thumb")[0] == (bundle, 1, "")
+    assert told("served") == served
+    assert told("rollback") == [(bundle, shipped, ""), (bundle, shipped, "thumb")]
+    assert told("unload", "--sensor", "thumb")[0] == (bundle, shipped, "")
     # Another user has another state folder, and no token there.
     monkeypatch.setenv("XDG_STATE_HOME", str(imported))
     done = palpate("model", "unload", "--profile", profile)

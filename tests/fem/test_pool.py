@@ -171,9 +171,9 @@ def test_an_upkeep_that_hangs_is_noticed(bench: Bench, monkeypatch: pytest.Monke
     monkeypatch.setattr(pool, "_TURN_S", 0.2)
     deadline = time.monotonic() + PATIENCE_S
     with bench.pool._lock:
-        while not bench.pool.turns.late:
+        while not bench.pool.turns.are_late():
             assert time.monotonic() < deadline
             time.sleep(0.01)
-    while bench.pool.turns.late:
+    while bench.pool.turns.are_late():
         assert time.monotonic() < deadline
         time.sleep(0.01)

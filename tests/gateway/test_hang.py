@@ -77,9 +77,9 @@ def test_a_recording_with_a_long_pause_does_not_hang() -> None:
     waits = threading.Thread(target=publisher.put, args=([item],))
     waits.start()
     deadline = time.monotonic() + PATIENCE_S
-    while turns.late and time.monotonic() < deadline:
+    while turns.are_late() and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert not turns.late
+    assert not turns.are_late()
     stop.set()
     waits.join(PATIENCE_S)
     assert not waits.is_alive()

@@ -122,13 +122,28 @@ def test_the_watchdog_of_the_parent_is_not_ours(tmp_path: Path, systemd: socket.
 
 def test_turns_are_late_only_between_two_of_them() -> None:
     turns = Turns()
-    assert not turns.late, "a thread that was not started does not hang"
+    assert not turns.are_late(), "a thread that was not started does not hang"
     turns.next(60.0)
-    assert not turns.late
+    assert not turns.are_late()
     turns.next(-1.0)
-    assert turns.late
+    assert turns.are_late()
     turns.next(float("inf"))
-    assert not turns.late, "nor does one that has ended"
+    assert not turns.are_late(), "nor does one that has ended"
+
+
+def test_a_process_that_stood_still_gives_its_threads_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr("palpate.heartbeat.time.monotonic", lambda: now_s)
+    turns = Turns()
+    turns.next(2.0)
+    now_s += 30.0  # SIGSTOP, and SIGCONT
+    assert not turns.are_late()
+    now_s += 0.9
+    assert not turns.are_late()
+    now_s += 0.2
+    assert turns.are_late()
 
 
 def test_the_router_beats_only_while_it_answers(

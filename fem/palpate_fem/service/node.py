@@ -354,7 +354,7 @@ def _serve(pool: WorkerPool, health: Health, presence: Presence, stop: threading
         RemoteError: No worker will ever be ready.
     """
     while not stop.wait(_POLL_S):
-        if not pool.turns.late:
+        if not pool.turns.are_late():
             beat()
         if pool.broken is not None:
             raise pool.broken

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import json
 import logging
 import re
-from collections.abc import Iterator
+import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import typer
 
 from palpate.errors import MissingExtraError, PalpateError
 from palpate.process import require
-from palpate_gateway.drivers import driver_names, load_driver
+from palpate_gateway.drivers import driver_names, find_driver
 
 BY_ID = Path("/dev/serial/by-id")
 """Names of serial ports that do not depend on the USB socket."""
 
-_PACKAGE_OF = {
-    "palpate_gateway.ports.can_bus": "can",
-    "palpate_gateway.ports.serial_port": "serial",
-}
 _DISTRIBUTION = {"can": "python-can", "serial": "pyserial"}
 
 _NOT_HARDWARE = frozenset({"virtual", "udp_multicast", "serial", "socketcand"})
@@ -65,35 +59,18 @@ def _show(found: list[dict[str, str]] | str, keys: tuple[str, ...]) -> None:
 def _about(name: str) -> dict[str, str]:
     """Name of a driver, its description, and its missing packages."""
     try:
-        module = importlib.import_module(load_driver(name).__module__)
+        device = find_driver(name)
     except PalpateError as error:
         return {"name": name, "about": error.problem, "missing": error.remedy}
-    line = (module.__doc__ or "").strip().partition("\n")[0]
-    needs = sorted({_PACKAGE_OF[part] for part in _parts(module) if part in _PACKAGE_OF})
-    missing = [one for one in needs if importlib.util.find_spec(one) is None]
-    names = ", ".join(_DISTRIBUTION[one] for one in missing)
+    line = (sys.modules[device.__module__].__doc__ or "").strip().partition("\n")[0]
+    missing = [one for one in device.needs if importlib.util.find_spec(one) is None]
+    names = ", ".join(_DISTRIBUTION[one] for one in sorted(missing))
     return {
         "name": name,
         # The reference of the protocol is of no use in a list of drivers.
         "about": re.sub(r" \([^()]*hardware reference[^()]*\)", "", line).rstrip("."),
         "missing": f'{names}; pip install "palpate[gateway]"' if missing else "",
     }
-
-
-def _parts(module: ModuleType, seen: set[str] | None = None) -> Iterator[str]:
-    """Names of the gateway's modules that a module uses, and its own name."""
-    seen = {module.__name__} if seen is None else seen
-    yield module.__name__
-    for value in list(vars(module).values()):
-        name = value.__name__ if isinstance(value, ModuleType) else _home(value)
-        if name.startswith("palpate_gateway.") and name not in seen:
-            seen.add(name)
-            yield from _parts(importlib.import_module(name), seen)
-
-
-def _home(value: Any) -> str:
-    home = getattr(value, "__module__", "")
-    return home if isinstance(home, str) else ""
 
 
 def _serial_ports() -> list[dict[str, str]] | str:

@@ -205,7 +205,7 @@ class SensorWorker:
 
     def hangs(self) -> bool:
         """Whether the thread does not come back, e.g. from its driver."""
-        late = self._turns.late
+        late = self._turns.are_late()
         if late and not self._hangs:
             self._health.fail(
                 DeviceError(
