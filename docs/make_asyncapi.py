@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from palpate.bus.deadline import attachment_of
+from palpate.bus.attachments import attachment_of
 from palpate.bus.endpoints import ENDPOINTS, Endpoint
 from palpate.bus.topics import (
     ASKING_ROOT,

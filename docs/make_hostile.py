@@ -17,7 +17,7 @@ from pathlib import Path
 
 from tests.hostile import bundles, records, trial
 
-from palpate.printable import printable
+from palpate.errors import printable
 from palpate_deploy.bench.results import machine
 
 PAGE = Path(__file__).parent / "results" / "hostile-files.md"

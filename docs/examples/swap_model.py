@@ -17,7 +17,7 @@ from palpate import Client
 from palpate.admin import read_token, token_file
 from palpate.client.models import ModelAdmin
 from palpate.errors import PalpateError
-from palpate.folders import state_folder
+from palpate.process import state_folder
 
 
 def main(bundle: str, token: Path | None) -> None:

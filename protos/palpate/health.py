@@ -27,8 +27,7 @@ from palpate.messages import (
     Status,
     SupervisedProcess,
 )
-from palpate.process import Closing
-from palpate.usage import ProcessUsage
+from palpate.process import Closing, ProcessUsage
 
 _log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from palpate.config import Name, StrictConfig
-from palpate.folders import data_folder, state_folder
+from palpate.process import data_folder, state_folder
 
 DEFAULT_BUNDLE = "features-virtual"
 

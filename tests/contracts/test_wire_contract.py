@@ -19,7 +19,7 @@ import zenoh
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from palpate.bus import MAX_PAYLOAD_BYTES, Delivery, Session
-from palpate.bus.deadline import attachment_of
+from palpate.bus.attachments import attachment_of
 from palpate.bus.endpoints import ENDPOINTS, Endpoint
 from palpate.bus.queryable import Queryable, single_reply
 from palpate.bus.topics import (

@@ -9,13 +9,13 @@ import pytest
 
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, LinkError
-from palpate_deploy.station.expectation import (
+from palpate_deploy.station.host import free_endpoint, new_run_folder, write_profile
+from palpate_deploy.station.profile import parse_profile
+from palpate_deploy.station.troubles import (
     ask_through_router,
     expectation_here,
     expectation_of,
 )
-from palpate_deploy.station.host import free_endpoint, new_run_folder, write_profile
-from palpate_deploy.station.profile import parse_profile
 
 PROCESSES = ["router", "gateway", "features"]
 

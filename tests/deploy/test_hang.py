@@ -15,7 +15,7 @@ from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES
 from palpate.client import Client
 from palpate.config import LinkConfig
-from palpate.folders import state_folder
+from palpate.process import state_folder
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import load_profile
 

@@ -17,7 +17,7 @@ from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
-from palpate.folders import state_folder
+from palpate.process import state_folder
 from palpate_deploy.station.processes import command_line
 from palpate_deploy.station.status import show_status
 

@@ -15,7 +15,7 @@ import pytest
 
 from palpate.bus import Session, endpoints
 from palpate.bus.topics import ELECTRODES
-from palpate.client.tares import ask_tare
+from palpate.client.estimates import ask_tare
 from palpate.errors import ErrorCode, RemoteError
 from palpate.messages import ServiceState, TareRequest
 from palpate_gateway.service.requests import MOST
@@ -26,7 +26,7 @@ RATE_HZ = 200
 ASKER = """
 import sys
 from palpate.bus import Session
-from palpate.client.tares import ask_tare
+from palpate.client.estimates import ask_tare
 from palpate.config import LinkConfig
 with Session.open(LinkConfig(connect=(sys.argv[1],), wait_for_router_s=20)) as session:
     print("asks", flush=True)

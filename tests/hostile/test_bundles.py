@@ -17,10 +17,9 @@ from tests.hostile import trial
 from tests.hostile.bundles import CASES, write_good
 
 from palpate.config import LinkConfig
-from palpate.errors import BundleError, ConfigError
+from palpate.errors import BundleError, ConfigError, printable
 from palpate.files.bundle import read_bundle
-from palpate.printable import printable
-from palpate_deploy.station.cell import cell
+from palpate_deploy.station.logs import cell
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import trial as trial_module
 from palpate_services.inference.repository import PACKAGED, resolve

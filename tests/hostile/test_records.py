@@ -10,10 +10,9 @@ import pytest
 from tests.hostile import trial
 from tests.hostile.records import CASES, KEY, NOW_NS, SCHEMA, write_good
 
-from palpate.errors import RecordingError, WireError
+from palpate.errors import RecordingError, WireError, printable
 from palpate.files import record as record_module
 from palpate.files.record import RecordWriter, check_readable, recover, summarise
-from palpate.printable import printable
 
 MEMORY_BYTES = 150 << 20
 """Twice the largest chunk that is allowed, packed and expanded, and some."""

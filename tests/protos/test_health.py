@@ -17,7 +17,7 @@ from palpate.config import LinkConfig
 from palpate.errors import DeviceTimeout, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.messages import SensorState, ServiceState, SupervisedProcess
-from palpate.usage import ProcessUsage
+from palpate.process import ProcessUsage
 
 PATIENCE_S = 20.0
 SILENT = DeviceTimeout("sensor 'finger' is lost: silent for 40 ms", remedy="check its cable")

@@ -12,7 +12,7 @@ import pytest
 
 from palpate.bus import endpoints
 from palpate.bus import queryable as queryable_module
-from palpate.bus.deadline import attachment_of, deadline_of
+from palpate.bus.attachments import attachment_of, deadline_of
 from palpate.bus.queryable import Queryable, QueryAnswer, error_reply, single_reply
 from palpate.bus.topics import ENCODING_PREFIX, MAX_PAYLOAD_BYTES
 from palpate.codec import ERROR

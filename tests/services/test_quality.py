@@ -24,9 +24,8 @@ from palpate.messages import (
     ValueRange,
 )
 from palpate_services.inference.estimates import TARE_TDC_COUNTS, EstimateRefusal, estimate
-from palpate_services.inference.model import Runtime, load
+from palpate_services.inference.model import MARGIN, RangeCheck, Runtime, load
 from palpate_services.inference.repository import resolve
-from palpate_services.inference.training_range import MARGIN, RangeCheck
 
 Frames = Callable[..., ElectrodeFrame]
 Tares = Callable[..., Tare]

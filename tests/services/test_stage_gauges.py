@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from palpate.messages import StageTimings
-from palpate_services.inference.stage_gauges import StageGauges
+from palpate_services.inference.input_report import StageGauges
 
 
 def test_percentiles_of_each_stage_since_the_last_look() -> None:

@@ -30,10 +30,10 @@ from palpate.messages import (
 )
 from palpate.rigid import rotation_matrices
 from palpate_services.config import SynthesisServiceConfig
-from palpate_services.inference.contact_path import CLEARANCE_M, DEEPEST_M, STEP_M, path_of
 from palpate_services.inference.estimates import synthesise
 from palpate_services.inference.model import load
 from palpate_services.inference.services import run_estimating
+from palpate_services.inference.synthesis_requests import CLEARANCE_M, DEEPEST_M, STEP_M, path_of
 
 bundles: Any = importlib.import_module("field_bundles")
 

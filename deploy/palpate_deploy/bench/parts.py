@@ -48,7 +48,7 @@ def client(endpoint: str, station: str, out: Path, delivery: str, topic: str) ->
     ``delivery`` is ``newest``, as a robot's controller does, or ``queue`` to count what arrives.
     """
     from palpate.bus import Delivery, Session
-    from palpate.bus.timings import timings_of
+    from palpate.bus.attachments import timings_of
     from palpate.bus.topics import TOPICS
     from palpate.config import LinkConfig
 

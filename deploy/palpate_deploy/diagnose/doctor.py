@@ -19,7 +19,7 @@ from rich.console import Console
 
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import LinkError, PalpateError
-from palpate.folders import state_folder
+from palpate.process import state_folder
 from palpate_deploy.station.host import check_free, join
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import check_packages

@@ -22,11 +22,9 @@ from palpate import clock
 from palpate.bus import Delivery, ReceivedMessage, Session, TapSample
 from palpate.bus.topics import TOPICS, Topic
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, StreamTimeout, WireError
+from palpate.errors import ConfigError, StreamTimeout, WireError, printable
 from palpate.messages import Stamp
-from palpate.printable import printable
-from palpate_deploy.station.cell import cell
-from palpate_deploy.station.logs import FAILED
+from palpate_deploy.station.logs import FAILED, cell
 
 
 def topic_named(name: str) -> Topic[Any]:

@@ -16,7 +16,7 @@ import tomli_w
 from palpate.bus import Session
 from palpate.config import endpoint_host_port
 from palpate.errors import ConfigError, LinkError
-from palpate.folders import state_folder
+from palpate.process import state_folder
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
 
 

@@ -7,8 +7,9 @@ import sys
 import time
 from typing import Literal
 
-from palpate.errors import ConfigError, DeviceError, MissingExtraError, PalpateError
-from palpate.printable import printable
+from rich.markup import escape
+
+from palpate.errors import ConfigError, DeviceError, MissingExtraError, PalpateError, printable
 
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
@@ -98,3 +99,8 @@ def print_error(error: PalpateError) -> None:
     """Print to stderr what was wrong and what to do about it."""
     print(f"error: {printable(error.problem)}", file=sys.stderr)
     print(f"  fix: {printable(error.remedy)}", file=sys.stderr, flush=True)
+
+
+def cell(text: str) -> str:
+    """The text without control characters, and without a meaning as Rich's markup."""
+    return escape(printable(text))

@@ -14,11 +14,10 @@ from palpate.admin import read_token, token_file
 from palpate.bus import Session
 from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
-from palpate.errors import LinkError, PalpateError
+from palpate.errors import LinkError, PalpateError, printable
 from palpate.files.bundle import Bundle, read_bundle, read_manifest
 from palpate.messages import ModelAction, ModelInventory, ServedModel
-from palpate.printable import printable
-from palpate_deploy.station.cell import cell
+from palpate_deploy.station.logs import cell
 from palpate_deploy.station.profile import Profile
 from palpate_services.config import ModelsConfig
 from palpate_services.inference.model import load

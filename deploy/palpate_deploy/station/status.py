@@ -21,14 +21,15 @@ from palpate.messages import (
     ServiceState,
     Status,
 )
-from palpate_deploy.station.cell import cell
-from palpate_deploy.station.expectation import (
+from palpate_deploy.station.logs import FAILED, cell
+from palpate_deploy.station.troubles import (
+    Trouble,
     ask_through_router,
     expectation_here,
     expectation_of,
+    process_name,
+    troubles,
 )
-from palpate_deploy.station.logs import FAILED
-from palpate_deploy.station.troubles import Trouble, process_name, troubles
 from palpate_gateway.clock.stamps import ClockQuality
 from palpate_gateway.clock.wall_clock import WallDiscipline
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from palpate.bus import Session
-from palpate.client.tares import ask_tare, ask_zero
+from palpate.client.estimates import ask_tare, ask_zero
 from palpate.config import LinkConfig
-from palpate.errors import LinkError
+from palpate.errors import LinkError, printable
 from palpate.messages import FloatArray, Tare, WrenchZero
-from palpate.printable import printable
 
 
 def take_tare(

@@ -29,16 +29,17 @@ from palpate_deploy.station.activity import (
     process_activities,
     sensor_activities,
 )
-from palpate_deploy.station.cell import cell
-from palpate_deploy.station.expectation import (
+from palpate_deploy.station.logs import FAILED, cell
+from palpate_deploy.station.observation import ObservedProcess, StationObserver
+from palpate_deploy.station.status import duration_text
+from palpate_deploy.station.troubles import (
+    Trouble,
     ask_through_router,
     expectation_here,
     expectation_of,
+    process_name,
+    troubles,
 )
-from palpate_deploy.station.logs import FAILED
-from palpate_deploy.station.observation import ObservedProcess, StationObserver
-from palpate_deploy.station.status import duration_text
-from palpate_deploy.station.troubles import Trouble, process_name, troubles
 
 _ASK_S = 2.0
 _RATES_S = 1.3  # two statuses of every process

@@ -15,17 +15,16 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
-from palpate.bus.claims import SensorClaims
+from palpate.bus.attachments import OnTimings
+from palpate.bus.claims import ClaimWatch, SensorClaims
 from palpate.bus.delivery import Delivery
 from palpate.bus.endpoints import STATUS, Endpoint
-from palpate.bus.holders import ClaimWatch
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Publisher, Subscriber
 from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
 from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
 from palpate.bus.ring import Alarm
 from palpate.bus.tap import Tap
-from palpate.bus.timings import OnTimings
 from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
 from palpate.config import LinkConfig, check_name
 from palpate.errors import LinkError, PalpateError

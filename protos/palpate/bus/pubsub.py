@@ -14,10 +14,10 @@ from typing import Any, Generic, TypeVar
 import zenoh
 
 from palpate import clock
+from palpate.bus.attachments import timings_of
 from palpate.bus.continuity import Continuity
 from palpate.bus.delivery import Delivery, FifoQueue
 from palpate.bus.ring import Alarm, Ring, is_wake
-from palpate.bus.timings import timings_of
 from palpate.bus.topics import (
     Priority,
     StreamAddress,

@@ -16,9 +16,8 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
-from palpate.bus.deadline import attachment_of
+from palpate.bus.attachments import OnTimings, attachment_of, timings_of
 from palpate.bus.endpoints import Endpoint
-from palpate.bus.timings import OnTimings, timings_of
 from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
 from palpate.codec import ERROR
 from palpate.config import check_duration

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 
 import zenoh
 
-from palpate.bus.deadline import deadline_of
+from palpate.bus.attachments import deadline_of
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.topics import ENCODING_PREFIX, check_schema, check_size
 from palpate.codec import ERROR, STAGE_TIMINGS, Codec

@@ -1,15 +1,58 @@
-"""Answers that come in parts and are joined: the basis of coefficients, and electrodes to be."""
+"""Questions that need more than one call: tares, bases of coefficients, electrodes to be."""
 
 from __future__ import annotations
 
 import dataclasses
+import uuid
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from palpate.bus import Session, endpoints
 from palpate.errors import WireError
-from palpate.messages import BasisRequest, ModeBasis, SynthesisReply, SynthesisRequest
+from palpate.messages import (
+    BasisRequest,
+    ModeBasis,
+    SynthesisReply,
+    SynthesisRequest,
+    Tare,
+    TareRequest,
+    WrenchZero,
+    WrenchZeroRequest,
+)
+
+
+def ask_tare(session: Session, sensor: str, *, frames: int, timeout_s: float) -> Tare:
+    """The tare that a BioTac's gateway takes now, over so many ``frames``; 0 = its own number.
+
+    If this process ends or is interrupted, the token vanishes and the gateway drops the request.
+
+    Raises:
+        LinkError: No gateway serves a BioTac of this name.
+        RemoteError: The gateway refuses, e.g. because the finger is touched.
+        StreamTimeout: No answer in time.
+    """
+    request_id = uuid.uuid4().hex
+    with session.caller_token(request_id):
+        return session.query(
+            endpoints.TARE,
+            TareRequest(frames=frames, request_id=request_id),
+            sensor=sensor,
+            timeout_s=timeout_s,
+        )
+
+
+def ask_zero(session: Session, sensor: str, *, readings: int, timeout_s: float) -> WrenchZero:
+    """The zero that a force/torque sensor's gateway takes now; as ``ask_tare`` otherwise."""
+    request_id = uuid.uuid4().hex
+    with session.caller_token(request_id):
+        return session.query(
+            endpoints.ZERO,
+            WrenchZeroRequest(readings=readings, request_id=request_id),
+            sensor=sensor,
+            timeout_s=timeout_s,
+        )
+
 
 OnSynthesis = Callable[[SynthesisReply], None]
 """Called with the electrodes of each step of a simulation, as it converges."""

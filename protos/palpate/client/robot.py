@@ -25,15 +25,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from palpate.bus import AliveService, Delivery, ReceivedMessage, Session, Subscriber, endpoints
+from palpate.bus.attachments import OnTimings
 from palpate.bus.query import LONGEST_S
-from palpate.bus.timings import OnTimings
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, WRENCH, Topic
 from palpate.census import ProcessReport, take_census
-from palpate.client.estimates import OnSynthesis, ask_basis, ask_synthesis
+from palpate.client.estimates import OnSynthesis, ask_basis, ask_synthesis, ask_tare, ask_zero
 from palpate.client.robot_poses import RobotPosePublisher
 from palpate.client.simulations import GRACE_S, OnProgress, OnStep, ask_simulation
 from palpate.client.streams import Stream
-from palpate.client.tares import ask_tare, ask_zero
 from palpate.config import (
     STATION_VARIABLE,
     TlsConfig,

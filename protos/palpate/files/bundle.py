@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.config import check_name
-from palpate.errors import BundleError, ConfigError
+from palpate.errors import BundleError, ConfigError, printable
 from palpate.files.bounded import arrays_of_npz, parse_json, read_regular
 from palpate.files.tasks import SENSOR_TYPE, TaskContract, check_tensors
 from palpate.files.training_range import (
@@ -35,7 +35,6 @@ from palpate.files.training_range import (
     parse_training_range,
 )
 from palpate.messages import FloatArray, SensorType, TensorInfo, TrainingRange
-from palpate.printable import printable
 
 BUNDLE_CONTRACT_VERSION = 1
 

@@ -30,10 +30,9 @@ from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
-from palpate.errors import ConfigError, RecordingError, WireError
+from palpate.errors import ConfigError, RecordingError, WireError, printable
 from palpate.files.bounded import open_regular
 from palpate.files.mcap_stream import CHANNELS_MAX, McapMessage, check_summary, parts_of
-from palpate.printable import printable
 
 FLUSH_S = 0.1
 """Messages reach the operating system after this time [s]; kill -9 costs no more than this."""

@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import BundleError
+from palpate.errors import BundleError, printable
 from palpate.files.bounded import arrays_of_npz
 from palpate.messages import FloatArray, TensorInfo, TrainingRange, ValueRange
-from palpate.printable import printable
 
 RANGE_BYTES_MAX = 1 << 20
 """Size of ``range.npz``, and of what its arrays expand to [bytes]."""

@@ -10,6 +10,8 @@ from palpate.messages.estimates import (
     QualityFlag,
     StageTimings,
     SynthesisEstimate,
+    TrainingRange,
+    ValueRange,
     as_field_frame,
 )
 from palpate.messages.frames import (
@@ -77,7 +79,6 @@ from palpate.messages.simulation import (
     SimulationRequest,
     SimulationStep,
 )
-from palpate.messages.training_range import TrainingRange, ValueRange
 
 __all__ = [
     "BIOTAC_LAYOUT",

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from palpate.errors import ErrorCode
+from palpate.messages.estimates import TrainingRange
 from palpate.messages.frames import NO_TARE, FloatArray, Stamp
 from palpate.messages.models import ServedModel
-from palpate.messages.training_range import TrainingRange
 
 
 class SensorState(IntEnum):

@@ -32,14 +32,12 @@ from palpate.heartbeat import LIMIT_S, beat
 from palpate.messages import NO_TARE, Origin, ServiceState, StageTimings, Stamp
 from palpate.process import avoid_pauses
 from palpate_services.config import ElectrodesConfig, EstimatingConfig, ModelsConfig
-from palpate_services.inference.commands import show, take_commands
 from palpate_services.inference.estimates import AgeLimit, EstimateRefusal, Estimation, Sample
-from palpate_services.inference.input_report import InputReport
+from palpate_services.inference.input_report import InputReport, StageGauges
 from palpate_services.inference.model import BATCH_MOST, Runtime
 from palpate_services.inference.remembered import RememberedFile
 from palpate_services.inference.repository import Repository
-from palpate_services.inference.served import ServedModels
-from palpate_services.inference.stage_gauges import StageGauges
+from palpate_services.inference.served import ServedModels, show, take_commands
 
 _log = logging.getLogger(__name__)
 

@@ -24,7 +24,7 @@ from palpate.files.bundle import (
     read_manifest,
     read_mesh,
 )
-from palpate.folders import data_folder
+from palpate.process import data_folder
 
 _log = logging.getLogger(__name__)
 

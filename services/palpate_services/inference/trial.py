@@ -15,9 +15,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from palpate.errors import BundleError, PalpateError
+from palpate.errors import BundleError, PalpateError, printable
 from palpate.files.bundle import Bundle, read_bundle
-from palpate.printable import printable
 from palpate.process import require
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import PACKAGED

@@ -1,4 +1,6 @@
-"""How long a caller waits: carried by every question, so that nobody works for one who has left.
+"""What travels beside a payload: how long the caller of a question waits, timings of an estimate.
+
+Nobody works for a caller who has left.
 
 The time that is left, not the instant when it ends, is in the attachment of the query, because
 clocks of two hosts differ. It is text that any language can write: ``palpate.v1;timeout_ms=1500``.
@@ -9,9 +11,29 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 from palpate.bus.topics import CONTRACT_VERSION
+from palpate.codec import STAGE_TIMINGS
 from palpate.errors import WireError
+from palpate.messages import StageTimings
+
+OnTimings = Callable[[StageTimings], None]
+"""Called with the timings of an estimate."""
+
+
+def timings_of(attachment: bytes) -> StageTimings | None:
+    """The timings in the attachment of an estimate; None if there are none, or of another kind.
+
+    What cannot be read costs no message.
+    """
+    if not attachment:
+        return None
+    try:
+        return STAGE_TIMINGS.decode(attachment)
+    except WireError:
+        return None
+
 
 _HEAD = f"palpate.v{CONTRACT_VERSION};"
 _KEY = "timeout_ms="
