@@ -392,7 +392,8 @@ class Session(Closing):
         """Every answer; errors are returned, not raised."""
         key = self._key(endpoint, sensor, service, instance)
         asking = self._asking()
-        return list(ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=True))
+        replies = ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=True)
+        return list(replies)
 
     def query_stream(
         self,
