@@ -86,7 +86,8 @@ def _latency() -> str:
             if (load := values.get(f"load.{name}"))
         ),
     )
-    return _section("Latency beside a bare floor", "palpate bench e2e --runs 5", values, text)
+    command = f"palpate bench e2e --runs {len(values['e2e.runs'])}"
+    return _section("Latency beside a bare floor", command, values, text)
 
 
 def _restarts() -> str:

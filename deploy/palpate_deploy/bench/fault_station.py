@@ -190,12 +190,11 @@ class FaultStation:
         command = [sys.executable, "-m", "palpate_deploy.bench.parts", name, str(self._path)]
         self._run.start(name, [*self._prefix.get(name, ()), *command])
 
-    def start_client(self, name: str) -> int:
-        """Start a robot's client that queues every estimate, a process of its own; its id."""
+    def start_client(self, name: str) -> None:
+        """Start a robot's client that queues every estimate, a process of its own."""
         where = self.profile.link.connect[0], self.profile.station
         out = self.folder / f"{name}.npz"
         self._run.start_module(name, "bench.parts", "client", *where, out, "queue")
-        return self.pid(name)
 
     def pid(self, name: str) -> int:
         """Process id of a process."""

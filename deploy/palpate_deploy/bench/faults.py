@@ -12,6 +12,7 @@ import random
 import resource
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections import Counter
@@ -38,8 +39,7 @@ from palpate.bus.topics import (
 from palpate.codec import ELECTRODE_FRAME, ERROR, TARE_REQUEST
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, PalpateError, StaleError, StreamTimeout
-from palpate.files.record import read_record
-from palpate.messages import SensorState, ServiceState, TareRequest
+from palpate.messages import SensorState, ServiceRequest, ServiceState, TareRequest
 from palpate_deploy.bench.fault_station import (
     FORGED_TICK,
     SENSOR,
@@ -147,7 +147,7 @@ def subscriber_frozen(seconds: float) -> tuple[bool, Figures]:
             mark = station.observer.mark()
             time.sleep(seconds)
             quiet.append(station.observer.account(mark))
-            client = station.start_client(f"client{index}")
+            station.start_client(f"client{index}")
             time.sleep(2.0)
             resident = {name: resident_bytes(pid) for name, pid in pids.items()}
             mark = station.observer.mark()
@@ -157,7 +157,6 @@ def subscriber_frozen(seconds: float) -> tuple[bool, Figures]:
             for name, pid in pids.items():
                 grew[name] = max(grew[name], resident_bytes(pid) - resident[name])
             station.kill(f"client{index}", signal.SIGKILL)
-            assert client > 0
         medians = [
             sorted(account.p99_s for account in side)[rounds // 2] for side in (quiet, frozen)
         ]
@@ -193,8 +192,6 @@ def _small_disk(folder: Path, size_mib: int) -> tuple[str, ...]:
 def _disk_trial(
     seconds: float, break_it: Callable[[Path, int], None], mend: Callable[[Path, int], None]
 ) -> tuple[bool, Figures]:
-    import tempfile
-
     with tempfile.TemporaryDirectory(prefix="palpate-disk-") as name:
         folder = Path(name)
         with FaultStation(
@@ -219,10 +216,6 @@ def _disk_trial(
             time.sleep(1.0)
             station.check("recorder", "features", "gateway")
             status = station.stop_one("recorder")
-            readable = 0
-            records = sorted(inside.glob("*.mcap")) if inside.exists() else []
-            for record in records:
-                readable += sum(1 for _ in read_record(record))
     ratio = broken.p99_s / quiet.p99_s
     figures: Figures = {
         "told_s": told_s,
@@ -273,8 +266,6 @@ def wall_clock_jumps(seconds: float) -> tuple[bool, Figures]:
     library = next((path for path in FAKETIME if Path(path).is_file()), None)
     if library is None:
         raise _Untried("libfaketime is not installed (Debian: apt install libfaketime)")
-    import tempfile
-
     with tempfile.TemporaryDirectory(prefix="palpate-clock-") as name:
         told = Path(name) / "time"
         told.write_text("+0\n", encoding="ascii")
@@ -317,8 +308,6 @@ def wall_clock_jumps(seconds: float) -> tuple[bool, Figures]:
 
 
 def _counters(station: FaultStation, service: str) -> dict[str, int]:
-    from palpate.messages import ServiceRequest
-
     status = station.observer.session.query(
         endpoints.STATUS, ServiceRequest(), service=service, timeout_s=5.0
     )
@@ -348,8 +337,6 @@ def _stranger(station: FaultStation) -> Iterator[zenoh.Session]:
 
 def sensor_silent(seconds: float) -> tuple[bool, Figures]:
     """A BioTac on a serial line stops sending, and goes on after three seconds."""
-    import tempfile
-
     with tempfile.TemporaryDirectory(prefix="palpate-line-") as name:
         line = f"{name}/bridge"
         sensor = {"driver": "biotac_bridge", "options": {"line": line, "source": 1, "port": 1}}
