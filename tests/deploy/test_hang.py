@@ -81,32 +81,19 @@ def test_processes_that_hang_are_replaced_and_do_not_delay_the_end(
     assert not list((tmp_path / "runs").glob("*.part")), "the stopped recorder closed its record"
 
 
-def test_a_supervisor_that_hangs_ends_the_station(
+@pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL])
+def test_nobody_is_left_by_a_supervisor_that_hangs_or_is_killed(
     up: subprocess.Popen[bytes],
     station: tuple[Path, LinkConfig],
     tmp_path: Path,
     process_ids: ProcessIds,
+    end: signal.Signals,
 ) -> None:
-    """It is the service manager's to start the whole station again."""
-    _estimate_arrives(station[1])
-    pids = process_ids(tmp_path)
-    os.kill(pids["supervisord"], signal.SIGSTOP)
-    os.kill(pids["features"], signal.SIGSTOP)
-    assert up.wait(timeout=2 * PATIENCE_S) == 1
-    assert process_ids(tmp_path) == {}
-
-
-def test_nobody_is_left_by_a_killed_supervisor(
-    up: subprocess.Popen[bytes],
-    station: tuple[Path, LinkConfig],
-    tmp_path: Path,
-    process_ids: ProcessIds,
-) -> None:
-    """Not even a process that could not hear that it should end."""
+    """Not even a process that could not be told to end; a new start is the service manager's."""
     _estimate_arrives(station[1])
     pids = process_ids(tmp_path)
     os.kill(pids["features"], signal.SIGSTOP)
-    os.kill(pids["supervisord"], signal.SIGKILL)
+    os.kill(pids["supervisord"], end)
     assert up.wait(timeout=2 * PATIENCE_S) == 1
     assert process_ids(tmp_path) == {}
 

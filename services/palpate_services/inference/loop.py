@@ -223,8 +223,10 @@ class EstimatePublisher(Generic[M, E]):
 
         The model runs once for messages of different sensors that have the same bundle.
         """
+        if not messages:
+            beat(self._turn_s)
+            return
         began_ns = time.monotonic_ns()
-        beat(self._turn_s)
         for tick in _without_repetition(messages):
             samples: dict[Runtime, list[_Taken[M]]] = {}
             for received in tick:
