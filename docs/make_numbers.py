@@ -159,9 +159,34 @@ def _twin() -> Iterator[Claim]:
     )
 
 
+def _serving() -> Iterator[Claim]:
+    """Latency of an estimate beside the bare floor, and the load on one host."""
+    bench = _read("serving/e2e.json")
+    ours, load = bench["e2e.palpate"], bench["load.features"]
+    fields = bench["load.field"]
+    figures = {
+        "p50": f"{1e3 * ours['p50_s']:.2f}",
+        "p99": f"{1e3 * ours['p99_s']:.2f}",
+        "p50_ratio": f"{bench['e2e.p50_ratio']:.2f}",
+        "p99_ratio": f"{bench['e2e.p99_ratio']:.2f}",
+        "lost": f"{load['lost']:,}",
+        "frames": f"{load['published']:,}",
+        "load_p99": f"{1e3 * load['p99_s']:.1f}",
+        "fields_lost": f"{fields['lost']:,}",
+        "fields": f"{fields['published']:,}",
+    }
+    yield Claim(
+        "README.md",
+        "| p50 {p50} ms, p99 {p99} ms: {p50_ratio} and {p99_ratio} times a bare floor",
+        figures,
+    )
+    yield Claim("README.md", "| {lost} of {frames} frames lost, p99 {load_p99} ms; fields", figures)
+    yield Claim("README.md", "mesh at 100 Hz: {fields_lost} of {fields} lost", figures)
+
+
 def claims() -> list[Claim]:
     """Every figure of the documents that a result file holds."""
-    return [*_fem(), *_real_force(), *_twin()]
+    return [*_fem(), *_real_force(), *_twin(), *_serving()]
 
 
 def main() -> None:

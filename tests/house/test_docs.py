@@ -132,7 +132,14 @@ def test_palpate_commands_exist(
 
 
 @pytest.mark.parametrize(
-    "program", ["make_messages.py", "make_asyncapi.py", "make_house.py", "make_numbers.py"]
+    "program",
+    [
+        "make_messages.py",
+        "make_asyncapi.py",
+        "make_house.py",
+        "make_numbers.py",
+        "make_serving.py",
+    ],
 )
 def test_generated_documents_are_fresh(program: str) -> None:
     if program == "make_messages.py":
