@@ -92,7 +92,7 @@ def capture(folder: Path) -> list[ElectrodeFrame]:
         pipeline.begin(device.identity, FileClock(device.identity.serial, None))
         out: list[DueMessage] = []
         while readings := device.read(1.0):
-            out += pipeline.push(readings, 0)
+            pipeline.push(readings, 0, out.append)
     return [one.message for one in out if isinstance(one.message, ElectrodeFrame)]
 
 

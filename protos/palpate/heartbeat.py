@@ -142,24 +142,25 @@ class Turns:
     """The turns of one of several threads: the loop that beats for all of them looks at each."""
 
     def __init__(self) -> None:
-        self._due_s = math.inf
+        self._due_s = self._within_s = math.inf
         self._looked_s = time.monotonic()
 
     def next(self, within_s: float) -> None:
         """The thread has made a turn; the next takes ``within_s`` at most [s]."""
+        self._within_s = within_s
         self._due_s = time.monotonic() + within_s
 
     def are_late(self) -> bool:
         """Whether the thread hangs; one that has not begun, or has ended, does not.
 
-        To be asked at every turn of the loop. If that stood still itself, so did the thread, which
-        has a second more.
+        To be asked at every turn of the loop. If that stood still itself, so did the thread, whose
+        turn then begins again.
         """
         now_s = time.monotonic()
         paused = now_s - self._looked_s > _STOOD_STILL_S
         self._looked_s = now_s
         if paused:
-            self._due_s = max(self._due_s, now_s + _STOOD_STILL_S)
+            self._due_s = now_s + self._within_s
         return now_s > self._due_s
 
 

@@ -70,7 +70,7 @@ class EstimatingConfig(StrictConfig):
     max_age_s: float | None = Field(default=0.03, gt=0)
     accept_replayed: bool = False
     batch_wait_s: float = Field(default=0.0, ge=0, le=0.002)
-    drain_s: float = Field(default=2.0, ge=0, le=30)
+    drain_s: float = Field(default=1.5, ge=0, le=30)
 
 
 class ElectrodesConfig(EstimatingConfig):
@@ -168,7 +168,7 @@ class RecorderConfig(StrictConfig):
     rotate_s: float = Field(default=3600.0, ge=0)
     keep_bytes: int = Field(default=20 * 1024**3, ge=0)
     keep_s: float = Field(default=14 * 86400.0, ge=0)
-    drain_s: float = Field(default=2.0, ge=0, le=60)
+    drain_s: float = Field(default=1.5, ge=0, le=60)
 
     @field_validator("rotate_bytes", "rotate_s")
     @classmethod

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.gateway.pipelines import finished, pushed
 
 from palpate.codec import FIELD_ESTIMATE, SYNTHESIS_ESTIMATE
 from palpate.files.bundle import read_bundle
@@ -40,8 +41,8 @@ def played() -> list[object]:
         pipeline = Pipeline(device.info)
         pipeline.begin(device.identity, FileClock(device.identity.serial, None))
         while readings := device.read(timeout_s=1.0):
-            messages += [item.message for item in pipeline.push(readings, arrival_ns=0)]
-        messages += [item.message for item in pipeline.finish()]
+            messages += [item.message for item in pushed(pipeline, readings, 0)]
+        messages += [item.message for item in finished(pipeline)]
     return messages
 
 

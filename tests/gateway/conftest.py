@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.gateway.pipelines import pushed
 
 from palpate.bus import Delivery, Session, Tap, endpoints
 from palpate.bus.topics import TOPICS, sensor_key
@@ -127,7 +128,7 @@ def record(tmp_path: Path) -> Callable[..., Path]:
                 with device:
                     pipeline.begin(device.identity, FileClock(device.identity.serial, 10**18))
                     while readings := device.read(1.0):
-                        for item in pipeline.push(readings, 0):
+                        for item in pushed(pipeline, readings, 0):
                             topic = TOPICS[item.topic]
                             assert not isinstance(item.message, bytes)
                             writer.write(

@@ -74,7 +74,7 @@ def test_a_recording_with_a_long_pause_does_not_hang() -> None:
     publisher = MessagePublisher({}, health, stop=stop, claim=lambda stream: None, turns=turns)
     due_ns = time.monotonic_ns() + 600 * 1_000_000_000
     item = DueMessage("electrodes", b"", due_ns)
-    waits = threading.Thread(target=publisher.put, args=([item],))
+    waits = threading.Thread(target=publisher.put, args=(item,))
     waits.start()
     deadline = time.monotonic() + PATIENCE_S
     while turns.are_late() and time.monotonic() < deadline:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.pipelines import finished, pushed
 
 from palpate.bus.topics import TOPICS
 from palpate.codec import ELECTRODE_FRAME
@@ -58,7 +59,7 @@ def tares(out: list[DueMessage]) -> list[Tare]:
 
 def test_live_frames_go_out_at_once_and_carry_the_tare_later() -> None:
     made = pipeline(live=True)
-    out = made.push(readings(25), arrival_ns=10**9)
+    out = pushed(made, readings(25), arrival_ns=10**9)
     ids = [frame.tare_id for frame in frames(out)]
     assert ids[:10] == [NO_TARE] * 10
     (tare,) = tares(out)
@@ -71,53 +72,53 @@ def test_live_frames_go_out_at_once_and_carry_the_tare_later() -> None:
 
 def test_recording_is_held_until_its_tare() -> None:
     made = pipeline(live=False)
-    assert made.push(readings(9), 0) == []
-    out = made.push(readings(5, first=9), 0)
+    assert pushed(made, readings(9), 0) == []
+    out = pushed(made, readings(5, first=9), 0)
     (tare,) = tares(out)
     assert out[0].message is tare
     assert [frame.tare_id for frame in frames(out)] == [tare.tare_id] * 14
     assert [frame.stamp.sequence for frame in frames(out)] == list(range(1, 15))
     assert made.counters["frames_untared"] == 0
     assert made.counters["frames_published"] == 14
-    assert made.finish() == []
+    assert finished(made) == []
     assert made.tare_error is None, "nothing is held any more"
 
 
 def test_short_recording_goes_out_untared_and_says_so() -> None:
     made = pipeline(live=False)
-    made.push(readings(9), 0)
-    out = made.finish()
+    pushed(made, readings(9), 0)
+    out = finished(made)
     assert [frame.tare_id for frame in frames(out)] == [NO_TARE] * 9
     assert "BT1 delivered 9 frames, a tare needs 10" in str(made.tare_error)
-    assert made.finish() == []
+    assert finished(made) == []
 
 
 def test_recording_that_starts_touched_is_held_for_ten_attempts_only() -> None:
     made = pipeline(live=False)
     moving = [readings(1, first=k, value=2000 + 300 * (k % 2))[0] for k in range(105)]
-    assert made.push(moving[:99], 0) == []
-    out = made.push(moving[99:], 0)
+    assert pushed(made, moving[:99], 0) == []
+    out = pushed(made, moving[99:], 0)
     assert [frame.tare_id for frame in frames(out)] == [NO_TARE] * 105
     assert made.counters["tares_refused"] == 10
     assert "E1 varies by 150 counts" in str(made.tare_error)
     # A quiet stretch later still gives a tare.
-    assert len(tares(made.push(readings(20, first=105), 0))) == 1
+    assert len(tares(pushed(made, readings(20, first=105), 0))) == 1
     assert made.tare_error is None
 
 
 def test_sequences_go_on_when_the_device_is_opened_again() -> None:
     made = pipeline(live=True)
-    made.push(readings(5), 10**9)
+    pushed(made, readings(5), 10**9)
     made.begin(IDENTITY, LiveClock())
-    out = frames(made.push(readings(5), 2 * 10**9))
+    out = frames(pushed(made, readings(5), 2 * 10**9))
     assert [frame.stamp.sequence for frame in out] == [6, 7, 8, 9, 10]
 
 
 def test_a_tare_outlives_the_same_finger_opened_again() -> None:
     made = pipeline(live=True)
-    (tare,) = tares(made.push(readings(12), 10**9))
+    (tare,) = tares(pushed(made, readings(12), 10**9))
     made.begin(IDENTITY, LiveClock())
-    out = made.push(readings(30, first=12), 2 * 10**9)
+    out = pushed(made, readings(30, first=12), 2 * 10**9)
     assert not tares(out)
     assert {frame.tare_id for frame in frames(out)} == {tare.tare_id}
 
@@ -127,7 +128,7 @@ def test_a_finger_of_another_kind_has_no_tare_yet(tare: Any) -> None:
     made = Pipeline(info(live=True), tare=tare, tare_frames=10)
     made.begin(IDENTITY, LiveClock())
     made.ask_tare(10)
-    assert tares(made.push(readings(12), 10**9))
+    assert tares(pushed(made, readings(12), 10**9))
     made.begin(replace(IDENTITY, sensor_type=SensorType.BIOTAC_SP), LiveClock())
     assert made.ledger.current_id == NO_TARE
     assert made._tares.attempting == (tare == "still"), "of itself, unless tares are asked for"
@@ -135,18 +136,18 @@ def test_a_finger_of_another_kind_has_no_tare_yet(tare: Any) -> None:
 
 def test_gaps_are_stamped_and_counted() -> None:
     made = pipeline(live=True)
-    out = frames(made.push(readings(3, missed=2), 10**9))
+    out = frames(pushed(made, readings(3, missed=2), 10**9))
     assert [frame.stamp.missed_before for frame in out] == [2, 2, 2]
     assert made.counters["missing_frames"] == 6
 
 
 def test_tare_on_demand_uses_the_next_frames() -> None:
     made = pipeline(live=True)
-    made.push(readings(10), 10**9)
+    pushed(made, readings(10), 10**9)
     future = made.ask_tare(5)
-    made.push(readings(4, first=10, value=1500), 10**9)
+    pushed(made, readings(4, first=10, value=1500), 10**9)
     assert not future.done()
-    out = made.push(readings(3, first=14, value=1500), 10**9)
+    out = pushed(made, readings(3, first=14, value=1500), 10**9)
     tare = future.result(timeout=0)
     assert tare.electrodes.tolist() == [1500.0] * 19
     assert tares(out) == [tare]
@@ -156,7 +157,7 @@ def test_tare_on_demand_uses_the_next_frames() -> None:
 def test_tare_on_demand_of_a_touched_finger_is_refused() -> None:
     made = pipeline(live=True)
     future = made.ask_tare(4)
-    made.push([readings(1, first=k, value=2000 + 300 * (k % 2))[0] for k in range(4)], 10**9)
+    pushed(made, [readings(1, first=k, value=2000 + 300 * (k % 2))[0] for k in range(4)], 10**9)
     with pytest.raises(DeviceError, match="E1 varies by 150 counts"):
         future.result(timeout=0)
 
@@ -164,7 +165,7 @@ def test_tare_on_demand_of_a_touched_finger_is_refused() -> None:
 def test_no_tare_after_the_end() -> None:
     made = pipeline(live=False)
     future = made.ask_tare(5)
-    made.finish()
+    finished(made)
     with pytest.raises(DeviceError, match="not tared: the recording has ended"):
         future.result(timeout=0)
     with pytest.raises(DeviceError, match="BT1 cannot be tared: the recording has ended"):
@@ -174,7 +175,7 @@ def test_no_tare_after_the_end() -> None:
 def test_rate_of_the_condition_is_that_of_the_slots() -> None:
     """44 slots at 4400 Hz are 100 frames a second."""
     made = pipeline(live=True)
-    others = frames(pipeline(live=True).push(readings(200), 10**9))
+    others = frames(pushed(pipeline(live=True), readings(200), 10**9))
     assert made.condition is not None
     ends = [k for k, frame in enumerate(others, start=1) if made.condition.add(frame)]
     assert ends == list(range(20, 201, 20)), "blocks of 0.2 s"
@@ -183,7 +184,7 @@ def test_rate_of_the_condition_is_that_of_the_slots() -> None:
 def test_paced_items_are_due_at_their_stamp() -> None:
     made = Pipeline(info(live=False), tare_frames=10)
     made.begin(IDENTITY, PacedClock())
-    out = made.push(readings(20), 0)
+    out = pushed(made, readings(20), 0)
     assert all(i.due_ns == f.stamp.monotonic_ns for i, f in zip(out[1:], frames(out), strict=True))
     assert out[0].due_ns == out[1].due_ns
 
@@ -197,7 +198,7 @@ def test_replaying_twice_gives_the_same_bytes() -> None:
             made.begin(device.identity, FileClock(device.identity.serial, None))
             out: list[DueMessage] = []
             while got := device.read(1.0):
-                out += made.push(got, 0)
+                out += pushed(made, got, 0)
             runs.append([TOPICS[item.topic].codec.encode(item.message) for item in out])
     assert runs[0] == runs[1]
     assert len(runs[0]) == 301
@@ -205,9 +206,9 @@ def test_replaying_twice_gives_the_same_bytes() -> None:
 
 def test_a_true_field_goes_out_with_the_serial_and_a_sequence_of_its_own() -> None:
     made = pipeline(live=True)
-    made.push(readings(7), 10**9)
+    pushed(made, readings(7), 10**9)
     still = np.arange(6, dtype=np.float32).reshape(2, 3)
-    out = made.push([FieldReading(k, k * 0.01, b"m" * 32, still) for k in (7, 12)], 10**9)
+    out = pushed(made, [FieldReading(k, k * 0.01, b"m" * 32, still) for k in (7, 12)], 10**9)
     assert [item.topic for item in out] == ["field_truth"] * 2
     for number, item in enumerate(out, start=1):
         decoded = TOPICS["field_truth"].codec.decode(
@@ -224,7 +225,7 @@ def test_record_passes_unchanged_and_its_tares_are_known(record: Callable[..., P
         made.begin(device.identity, FileClock("x", None))
         out: list[Any] = []
         while got := device.read(1.0):
-            out += made.push(got, 0)
+            out += pushed(made, got, 0)
     assert made.counters["frames_published"] == 60
     assert made.counters["tares"] == 1
     first = next(item for item in out if item.topic == "electrodes")
@@ -244,8 +245,8 @@ def test_real_capture_is_tared_from_its_first_frames(shared_data: Path) -> None:
         made.begin(identity, FileClock(identity.serial, identity.start_wall_ns))
         out: list[DueMessage] = []
         while got := device.read(1.0):
-            out += made.push(got, 0)
-        out += made.finish()
+            out += pushed(made, got, 0)
+        out += finished(made)
     assert made.counters["frames_published"] == 2124
     assert made.counters["missing_frames"] == 530
     assert made.counters["frames_untared"] == 0
@@ -257,10 +258,10 @@ def test_what_a_record_lost_when_it_was_taken_is_told_again_by_its_replay() -> N
     source = pipeline(live=True)
     recorded = [
         RecordedMessage("electrodes", ELECTRODE_FRAME.encode(frame), 0.01 * i)
-        for i, frame in enumerate(frames(source.push(readings(4, missed=3), 0)))
+        for i, frame in enumerate(frames(pushed(source, readings(4, missed=3), 0)))
     ]
     replay = pipeline(live=False)
-    replay.push([*recorded, RecordedMessage("electrodes", b"not a frame", 0.05)], 0)
+    pushed(replay, [*recorded, RecordedMessage("electrodes", b"not a frame", 0.05)], 0)
     assert replay.counters["missing_frames"] == 12
     assert replay.counters["frames_published"] == 5
 
@@ -268,6 +269,6 @@ def test_what_a_record_lost_when_it_was_taken_is_told_again_by_its_replay() -> N
 @pytest.mark.parametrize(("topic", "refused"), [("tare", 1), ("electrodes", 0)])
 def test_a_recorded_message_that_does_not_decode_goes_out(topic: str, refused: int) -> None:
     replay = pipeline(live=False)
-    (item,) = replay.push([RecordedMessage(topic, b"damaged", 0.01)], 0)
+    (item,) = pushed(replay, [RecordedMessage(topic, b"damaged", 0.01)], 0)
     assert (item.topic, item.message) == (topic, b"damaged")
     assert replay.counters["tares_refused"] == refused

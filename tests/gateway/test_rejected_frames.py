@@ -15,10 +15,9 @@ from palpate.config import StrictConfig
 from palpate.errors import PalpateError
 from palpate.health import Health
 from palpate.messages import Origin, ServiceState
-from palpate_gateway.clock.stamps import DueMessage
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import Reading, WrenchReading
-from palpate_gateway.service.pipeline import Pipeline
+from palpate_gateway.service.pipeline import Pipeline, Put
 from palpate_gateway.service.worker import SensorWorker
 
 
@@ -97,11 +96,11 @@ def test_a_name_too_long_for_a_frame_keeps_its_end() -> None:
 
 
 class SlowPipeline(Pipeline):
-    """Takes 50 ms to stamp and tare."""
+    """Takes 50 ms to stamp."""
 
-    def push(self, readings: Iterable[Reading], arrival_ns: int) -> list[DueMessage]:
+    def push(self, readings: Iterable[Reading], arrival_ns: int, put: Put) -> None:
         time.sleep(0.05)
-        return super().push(readings, arrival_ns)
+        super().push(readings, arrival_ns, put)
 
 
 class Waiter(Babbler):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from tests.gateway.pipelines import pushed
 
 from palpate.codec import ELECTRODE_FRAME, TARE
 from palpate.config import StrictConfig
@@ -55,7 +56,7 @@ def sent(items: list[DueMessage]) -> tuple[list[ElectrodeFrame], list[Tare]]:
 def test_an_sp_is_published_and_tared() -> None:
     pipeline = Pipeline(INFO, tare_frames=FRAMES)
     pipeline.begin(identity(SensorType.BIOTAC_SP), FileClock("s", 10**18))
-    frames, tares = sent(pipeline.push(readings(SensorType.BIOTAC_SP), 10**9))
+    frames, tares = sent(pushed(pipeline, readings(SensorType.BIOTAC_SP), 10**9))
     assert {frame.sensor_type for frame in frames} == {SensorType.BIOTAC_SP}
     (tare,) = tares
     np.testing.assert_allclose(tare.electrodes, np.arange(24) + 2000.5)
@@ -65,15 +66,15 @@ def test_an_sp_is_published_and_tared() -> None:
 def test_the_tare_of_a_finger_is_not_that_of_the_next() -> None:
     pipeline = Pipeline(INFO, tare_frames=FRAMES)
     pipeline.begin(identity(SensorType.BIOTAC), FileClock("s", 10**18))
-    _, tares = sent(pipeline.push(readings(SensorType.BIOTAC), 10**9))
+    _, tares = sent(pushed(pipeline, readings(SensorType.BIOTAC), 10**9))
     assert pipeline.ledger.current_id == tares[0].tare_id
     asked = pipeline.ask_tare(10)
-    pipeline.push(readings(SensorType.BIOTAC, FRAMES, 5), 2 * 10**9)
+    pushed(pipeline, readings(SensorType.BIOTAC, FRAMES, 5), 2 * 10**9)
 
     pipeline.begin(identity(SensorType.BIOTAC_SP), FileClock("s", 2 * 10**18))
     assert pipeline.ledger.current_id == NO_TARE
     assert pipeline.ledger.find(tares[0].tare_id) is tares[0]
-    frames, tares = sent(pipeline.push(readings(SensorType.BIOTAC_SP, 35), 3 * 10**9))
+    frames, tares = sent(pushed(pipeline, readings(SensorType.BIOTAC_SP, 35), 3 * 10**9))
     assert frames[0].tare_id == NO_TARE
     assert asked.result(0.0).electrodes.shape == (24,)
     assert [tare.electrodes.shape for tare in tares] == [(24,)] * len(tares)

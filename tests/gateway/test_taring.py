@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
+from tests.gateway.pipelines import finished, pushed
 
 from palpate.errors import DeviceError
 from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
@@ -43,7 +44,7 @@ def push(made: Pipeline, frames: Iterable[ElectrodeFrame]) -> list[DueMessage]:
             tdc=frame.tdc,
             validity=frame.validity,
         )
-        out += made.push([reading], frame.stamp.monotonic_ns)
+        out += pushed(made, [reading], frame.stamp.monotonic_ns)
     return out
 
 
@@ -163,6 +164,6 @@ def test_the_end_of_a_recording_leaves_a_cancelled_request_alone() -> None:
     made = pipeline(live=False, tare="query")
     given_up, waiting = made.ask_tare(50), made.ask_tare(50)
     given_up.cancel()
-    made.finish()
+    finished(made)
     with pytest.raises(DeviceError, match="the recording has ended"):
         waiting.result(0)

@@ -118,7 +118,8 @@ def came(make_frame: Frames) -> Callable[..., ReceivedMessage[ElectrodeFrame]]:
         sequence: int, at_ns: int, *, sensor: str = "finger", arrived_ns: int = 0, **frame: Any
     ) -> ReceivedMessage[ElectrodeFrame]:
         message = make_frame(sequence, monotonic_ns=at_ns, **frame)
-        return ReceivedMessage(message, b"", "lab", sensor, arrived_ns or at_ns)
+        arrived_ns = arrived_ns or at_ns
+        return ReceivedMessage(message, b"", "lab", sensor, arrived_ns, stamp=message.stamp)
 
     return make
 
@@ -151,6 +152,19 @@ def test_a_message_without_an_estimate_leaves_its_period_to_the_next(
     publisher.report(last=True)
     assert station.put == [("finger", 2)]
     assert station.counts["untared"] == 1
+
+
+def test_a_rehearsal_has_no_effect(station: Station, came: Came) -> None:
+    """And there is none for a message that got no estimate: it might have to wait for a tare."""
+    publisher = station.make()
+    answered, refused = came(1, START_NS), came(2, START_NS + 10 * MS)
+    publisher.take([answered])
+    publisher.rehearse(answered)
+    publisher.rehearse(refused)
+    assert station.batches == [1, 1]
+    assert station.put == [("finger", 1)]
+    publisher.report(last=True)
+    assert station.counts == {"frames_received": 1, "estimates_published": 1}
 
 
 def test_sensors_of_others_are_not_even_counted(station: Station, came: Came) -> None:
@@ -326,6 +340,6 @@ def test_an_age_by_a_clock_that_says_nothing_of_it_is_none(
     if origin is Origin.SIMULATED:
         stamp = dataclasses.replace(message.message.stamp, clock_id=clock.CLOCK_ID ^ 1)
         frame = dataclasses.replace(message.message, stamp=stamp)
-        message = dataclasses.replace(message, message=frame)
+        message = dataclasses.replace(message, message=frame, stamp=stamp)
     publisher.take([message])
     assert station.timings[0].age_at_arrival_s is None

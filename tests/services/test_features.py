@@ -102,6 +102,30 @@ def test_answers_frames_and_says_what_it_is(
         assert metadata.bundle_sha256 == got.message.bundle_sha256
 
 
+def test_a_stop_does_not_wait_for_the_end_of_a_live_stream(
+    serve: Serve, link: LinkConfig, make_frame: Frames, make_tare: Tares
+) -> None:
+    """It answers what has come; after ``drain_s`` it would be too late for ``serve``."""
+    ended = threading.Event()
+
+    def send(robot: Session) -> None:
+        frames = robot.publisher(ELECTRODES, sensor="finger")
+        sequence = 0
+        while not ended.wait(0.01):
+            sequence += 1
+            frames.put(make_frame(sequence))
+
+    with Session.open(link) as robot:
+        sender = threading.Thread(target=send, args=(robot,))
+        with serve(max_age_s=10.0, drain_s=30.0) as session:
+            estimates = session.subscriber(FEATURES)
+            announce(robot, "finger", make_tare())
+            sender.start()
+            estimates.next(5.0)
+        ended.set()
+        sender.join()
+
+
 def test_one_sensor_of_the_station_is_served(
     serve: Serve, make_frame: Frames, make_tare: Tares, until: Until
 ) -> None:

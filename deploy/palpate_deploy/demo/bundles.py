@@ -56,31 +56,26 @@ def write_virtual_record(
         clock = FileClock(device.identity.serial, None)
         pipeline.begin(device.identity, clock)
 
-        def write(items: list[DueMessage]) -> None:
+        def write(item: DueMessage) -> None:
             nonlocal written
-            for item in items:
-                topic = TOPICS[item.topic]
-                stamp = topic.stamp_of(item.message)
-                payload = (
-                    item.message
-                    if isinstance(item.message, bytes)
-                    else topic.codec.encode(item.message)
-                )
-                writer.write(
-                    keys[item.topic],
-                    topic.codec.schema,
-                    payload,
-                    # A record is ordered by log time; here it is the time of the reading.
-                    log_time_ns=0 if stamp is None else stamp.wall_ns,
-                    sequence=0 if stamp is None else stamp.sequence,
-                )
-                written += item.topic == ELECTRODES.name
-            if on_frames is not None:
-                on_frames(written)
+            topic = TOPICS[item.topic]
+            stamp = topic.stamp_of(item.message)
+            message = item.message
+            writer.write(
+                keys[item.topic],
+                topic.codec.schema,
+                message if isinstance(message, bytes) else topic.codec.encode(message),
+                # A record is ordered by log time; here it is the time of the reading.
+                log_time_ns=0 if stamp is None else stamp.wall_ns,
+                sequence=0 if stamp is None else stamp.sequence,
+            )
+            written += item.topic == ELECTRODES.name
 
         while readings := device.read(timeout_s=1.0):
-            write(pipeline.push(readings, arrival_ns=0))
-        write(pipeline.finish())
+            pipeline.push(readings, 0, write)
+            if on_frames is not None:
+                on_frames(written)
+        pipeline.finish(write)
     return written
 
 

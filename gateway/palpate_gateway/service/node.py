@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 SERVICE = "gateway"
 
-_POLL_S = 0.05
+_POLL_S = 0.2
 _JOIN_S = 2.0
 _SETTLE_S = 0.3
 """Wait between a consumer's presence and the first frame of a lossless replay [s]: its subscription

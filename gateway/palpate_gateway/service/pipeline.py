@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import replace
 from math import inf
@@ -18,6 +18,9 @@ from palpate_gateway.condition.stillness import StillLimits
 from palpate_gateway.device import DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import Reading, RecordedMessage
 from palpate_gateway.tare import TARE_FRAMES, TareAttempts, TareLedger, TareMode
+
+Put = Callable[[DueMessage], None]
+"""Takes the next message that is to be published."""
 
 _HELD_WINDOWS = 10
 """A recording is held back for this many attempts to tare before it goes out untared."""
@@ -129,33 +132,30 @@ class Pipeline:
         """The sensor is away: nobody waits for its frames to tare."""
         self._tares.give_up(why)
 
-    def push(self, readings: Iterable[Reading], arrival_ns: int) -> list[DueMessage]:
+    def push(self, readings: Iterable[Reading], arrival_ns: int, put: Put) -> None:
         """Stamp and tare readings.
 
         Args:
             readings: In order of time.
             arrival_ns: Host monotonic clock when they arrived [ns].
-
-        Returns:
-            What is to be published, in order.
+            put: Gets what is to be published, in order.
         """
-        out: list[DueMessage] = []
         ledger = self.ledger
         for reading in readings:
             item = self._stamper.message(reading, arrival_ns, ledger.current_id)
             if isinstance(item.message, ElectrodeFrame):
+                # First of all, so that no consumer waits for the condition to be judged.
+                self._pass(item, put)
                 self._counts["missing_frames"] += item.message.stamp.missed_before
-                self._pass(item, out)
                 self._watch(item.message)
-                self._tare(item.message, item.due_ns, out)
+                self._tare(item.message, item.due_ns, put)
             elif isinstance(reading, RecordedMessage):
                 self._count_recorded(reading)
-                out.append(item)
+                put(item)
             else:
-                self._pass(item, out)
-        return out
+                self._pass(item, put)
 
-    def finish(self) -> list[DueMessage]:
+    def finish(self, put: Put) -> None:
         """The source has ended: what is still held goes out untared."""
         self._tares.finish()
         if self._held_frames and self.tare_error is None:
@@ -164,7 +164,7 @@ class Pipeline:
                 f"{self.tare_frames}",
                 remedy="replay a longer recording, or lower tare_frames",
             )
-        return self._release(NO_TARE)
+        self._release(NO_TARE, put)
 
     def _watch(self, frame: ElectrodeFrame) -> None:
         """Update the condition of the sensor, and tare again where its rules say so."""
@@ -174,19 +174,19 @@ class Pipeline:
             self._counts["retares"] += 1
             self._tares.attempt()
 
-    def _tare(self, frame: ElectrodeFrame, due_ns: int, out: list[DueMessage]) -> None:
+    def _tare(self, frame: ElectrodeFrame, due_ns: int, put: Put) -> None:
         """Offer the frame to the tares that are under way, and publish those it completes."""
         for tare in self._tares.offer(frame):
             if self.condition is not None:
                 self.condition.tared(tare)
             # Published before the frames that were held back for it, and due with the first.
-            out.append(DueMessage(TARE.name, tare, self._held[0].due_ns if self._held else due_ns))
+            put(DueMessage(TARE.name, tare, self._held[0].due_ns if self._held else due_ns))
             if self._holding:
-                out.extend(self._release(tare.tare_id))
+                self._release(tare.tare_id, put)
         if self._held_frames >= _HELD_WINDOWS * self.tare_frames:
-            out.extend(self._release(NO_TARE))
+            self._release(NO_TARE, put)
 
-    def _pass(self, item: DueMessage, out: list[DueMessage]) -> None:
+    def _pass(self, item: DueMessage, put: Put) -> None:
         """Publish a message, or hold it back until the first tare exists."""
         frame = item.message if isinstance(item.message, ElectrodeFrame) else None
         if self._holding:
@@ -196,19 +196,17 @@ class Pipeline:
         if frame is not None:
             self._counts["frames_published"] += 1
             self._counts["frames_untared"] += frame.tare_id == NO_TARE
-        out.append(item)
+        put(item)
 
-    def _release(self, tare_id: int) -> list[DueMessage]:
+    def _release(self, tare_id: int, put: Put) -> None:
         """Stop holding back: all that was held, its frames with this tare."""
         held, self._held = self._held, []
         self._holding = False
         self._held_frames = 0
-        out: list[DueMessage] = []
         for item in held:
             if isinstance(item.message, ElectrodeFrame):
                 item = replace(item, message=replace(item.message, tare_id=tare_id))
-            self._pass(item, out)
-        return out
+            self._pass(item, put)
 
     def _count_recorded(self, reading: RecordedMessage) -> None:
         """A recorded message goes out as it is; its tare is kept for later requests.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections import Counter, deque
@@ -27,8 +28,12 @@ LATE_S = 75.0
 """A device that opens or takes its zero, and the put of a lossless replay, end within this time
 [s]; a thread that takes longer hangs."""
 
+_YIELD: Callable[[], object] = getattr(os, "sched_yield", lambda: None)
+"""The gateway's threads share one core (``one_core``): Zenoh's thread shall send a frame before
+this one goes on, which then judges the sensor's condition for a while."""
+
 _KEPT = 512
-"""Number of reads whose latencies are kept."""
+"""Number of messages whose latencies are kept."""
 
 
 class MessagePublisher:
@@ -74,7 +79,7 @@ class MessagePublisher:
     def gauges(self) -> dict[str, float]:
         """Median and 99 % of the latency from a reading's arrival in this process to the bus [s].
 
-        Stamping, condition, tare and encoding are inside, transport to this process is not.
+        Stamping and encoding are inside, transport to this process is not.
         """
         latencies_ns = list(self._latencies_ns)
         if not latencies_ns:
@@ -82,38 +87,36 @@ class MessagePublisher:
         p50, p99 = np.percentile(latencies_ns, (50, 99)) * 1e-9
         return {"publish_p50_s": float(p50), "publish_p99_s": float(p99)}
 
-    def put_read(self, items: list[DueMessage], read_ns: int) -> None:
-        """Publish the messages of one read, and note their latency since ``read_ns``.
+    def put(self, item: DueMessage, *, read_ns: int = 0) -> None:
+        """Publish a message when it is due; it is left out if ``stop`` is set before.
 
-        That is when the device's ``read`` had returned, by the host's monotonic clock [ns].
+        ``read_ns`` is when the device's ``read`` with its reading had returned, by the host's
+        monotonic clock [ns]; 0 = it came of no reading.
         """
+        if item.due_ns:
+            wait_s = (item.due_ns - time.monotonic_ns()) * 1e-9
+            if wait_s > 0:
+                self._turns.next(wait_s + LATE_S)
+                if self._stop.wait(wait_s):
+                    return
+        self._claim(item.topic)
+        publisher = self._publishers[item.topic]
+        message = item.message
+        try:
+            if isinstance(message, bytes):
+                publisher.put_payload(message)
+            else:
+                publisher.put(message)
+            _YIELD()
+        except WireError as error:
+            self.counters["frames_rejected"] += 1
+            self._report_once(error, message)
         # A recorded message waits until it is due: its latency would be that of the recording.
-        if self.put(items) and not items[0].due_ns:
+        if read_ns and not item.due_ns:
             self._latencies_ns.append(time.monotonic_ns() - read_ns)
-
-    def put(self, items: list[DueMessage]) -> bool:
-        """Publish messages, each when it is due; whether there were any, and all are out."""
-        for item in items:
-            if item.due_ns:
-                wait_s = (item.due_ns - time.monotonic_ns()) * 1e-9
-                if wait_s > 0:
-                    self._turns.next(wait_s + LATE_S)
-                    if self._stop.wait(wait_s):
-                        return False
-            self._claim(item.topic)
-            publisher = self._publishers[item.topic]
-            try:
-                if isinstance(item.message, bytes):
-                    publisher.put_payload(item.message)
-                else:
-                    publisher.put(item.message)
-            except WireError as error:
-                self.counters["frames_rejected"] += 1
-                self._report_once(error, item.message)
-            if isinstance(item.message, Tare):
-                tared = about(self._name, item.message.stamp, tare_id=item.message.tare_id)
-                _log.info("sensor %s is tared", self._name, extra=tared)
-        return bool(items)
+        if isinstance(message, Tare):
+            tared = about(self._name, message.stamp, tare_id=message.tare_id)
+            _log.info("sensor %s is tared", self._name, extra=tared)
 
     def _report_once(self, error: WireError, message: object) -> None:
         """Report each reason once: a defect of a driver comes with every frame."""

@@ -15,6 +15,9 @@ _POLL_S = 0.1
 class SensorKey:
     """A key that nobody else publishes under."""
 
+    patience_s = 0.0
+    """How long ``check`` may wait for others [s]."""
+
     def wait(self, stop: threading.Event, refused: Callable[[SensorTaken], None]) -> bool:
         """Wait until this gateway may publish; ``refused`` is called as long as another one does.
 
@@ -44,6 +47,7 @@ class ClaimedKey(SensorKey):
     ) -> None:
         self._claims, self._sensor, self._sources = claims, sensor, sources
         self._name = sensor.key_name
+        self.patience_s = claims.lease_s
         claims.want(self._name)
 
     def wait(self, stop: threading.Event, refused: Callable[[SensorTaken], None]) -> bool:

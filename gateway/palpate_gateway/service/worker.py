@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections import Counter
+from functools import partial
 from math import inf
 from typing import Any, Literal
 
@@ -260,7 +261,7 @@ class SensorWorker:
                 self._give_up(error.problem)
             except DeviceError as error:
                 if not self.device.info.live:
-                    self._publisher.put(self.pipeline.finish())
+                    self.pipeline.finish(self._publisher.put)
                     raise
                 if self.serving:
                     backoff_s = BACKOFF_S[0]
@@ -288,7 +289,7 @@ class SensorWorker:
         info = self.device.info
         read_s = _SILENT_READ_S if info.live else _READ_S
         silence = SilenceTimer(max(LOST_S, 3.0 / info.rate_hz) if info.live else inf, read_s)
-        turn_s = _TURN_S if info.live else LATE_S
+        turn_s = _TURN_S + self._key.patience_s if info.live else LATE_S
         while not self._stop.is_set():
             self._turns.next(turn_s)
             try:
@@ -308,10 +309,10 @@ class SensorWorker:
             read_ns = time.monotonic_ns()
             self.silent = False
             if not readings:
-                self._publisher.put(self.pipeline.finish())
+                self.pipeline.finish(self._publisher.put)
                 self._report.tare_refused(self.pipeline.tare_error)
                 return True
-            self._publisher.put_read(self.pipeline.push(readings, read_ns), read_ns)
+            self.pipeline.push(readings, read_ns, partial(self._publisher.put, read_ns=read_ns))
             self._report.tare_refused(self.pipeline.tare_error)
             self.serving = True
             if self.zeroing is not None:

@@ -38,6 +38,7 @@ YIELD_S = 0.5
 notices that itself, sooner."""
 
 _LOOK_S = 0.05
+_SETTLED_LOOK_S = 0.5  # of one that holds all it wants: a rival's token wakes it
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +77,7 @@ class SensorClaims(Closing):
     ) -> None:
         self._liveliness = session.liveliness()
         self._station, self._session_id, self._instance = station, session_id, instance
-        self._lease_s = lease_s
+        self.lease_s = lease_s
         self._joined = joined
         self._own: dict[str, _Own] = {}
         self._others: dict[str, SensorClaim] = {}
@@ -121,14 +122,14 @@ class SensorClaims(Closing):
         """
         own = self._own[sensor]
         now_s = time.monotonic()
-        if own.claim.held and now_s - self._alive_s < self._lease_s:
+        if own.claim.held and now_s - self._alive_s < self.lease_s:
             self._alive_s = now_s
             return
         with self._changed:
             self._look()
             # Given up only because this process stood still, it is held again after a moment.
             self._changed.wait_for(
-                lambda: own.claim.held or own.rival is not None or self._closed, self._lease_s
+                lambda: own.claim.held or own.rival is not None or self._closed, self.lease_s
             )
             if not own.claim.held:
                 raise _taken(own.rival) if own.rival is not None else _unknown(own.claim)
@@ -175,12 +176,14 @@ class SensorClaims(Closing):
                     self._look()
                 except zenoh.ZError:  # the session is closing
                     return
-                self._changed.wait(_LOOK_S)
+                settled = all(own.claim.held and own.rival is None for own in self._own.values())
+                settled_s = min(_SETTLED_LOOK_S, 0.25 * self.lease_s)
+                self._changed.wait(settled_s if settled else _LOOK_S)
 
     def _look(self) -> None:
         """Bring every claim up to date; with the lock."""
         now_s = time.monotonic()
-        stood_still = now_s - self._alive_s >= self._lease_s
+        stood_still = now_s - self._alive_s >= self.lease_s
         self._alive_s = now_s
         sees = all(own.claim.held for own in self._own.values()) or self._sees(now_s)
         for own in self._own.values():

@@ -20,7 +20,7 @@ from palpate.bus.claims import ClaimWatch, SensorClaims
 from palpate.bus.delivery import Delivery
 from palpate.bus.endpoints import STATUS, Endpoint
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
-from palpate.bus.pubsub import Publisher, Subscriber
+from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
 from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
 from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
 from palpate.bus.ring import Alarm
@@ -239,6 +239,7 @@ class Session(Closing):
         depth: int = 1,
         sensors: Collection[str] = (),
         announced: bool = False,
+        rehearse: Callable[[ReceivedMessage[M]], None] | None = None,
     ) -> Subscriber[M]:
         """Subscribe to a topic of a station; None = the session's own.
 
@@ -246,6 +247,8 @@ class Session(Closing):
         ``QUEUE`` and ``EVERY`` ``capacity`` of them may wait, with ``NEWEST`` ``depth`` per sensor.
         Of ``sensor="*"`` those named in ``sensors`` are followed; with ``announced`` those that a
         gateway has claimed, and when a claim passes, the new holder at once; else any.
+        With ``NEWEST``, ``rehearse`` is called with the last message shortly before the next one is
+        due, while a consumer waits: see ``Subscriber``.
         """
         key = self._key(topic, sensor, service, instance, station)
         return self._keep(
@@ -260,6 +263,7 @@ class Session(Closing):
                 wall_clock_error_s=self.wall_clock_error_s,
                 sensors=sensors,
                 holders_of=self._holders_of(station) if announced else None,
+                rehearse=rehearse,
             )
         )
 

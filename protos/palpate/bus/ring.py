@@ -20,6 +20,9 @@ from palpate.process import Closing
 
 _WAKE = "palpate/wake"
 
+_LOOK_S = 0.05
+"""After it woke somebody, the alarm looks for new deadlines within this time [s]."""
+
 
 def is_wake(sample: zenoh.Sample) -> bool:
     """Whether a sample only ends a wait; every subscriber of the session gets it."""
@@ -61,12 +64,14 @@ class Alarm(Closing):
     def _run(self) -> None:
         with self._changed:
             while not self._closed:
-                now_s = time.monotonic()
+                now_s, look_s = time.monotonic(), math.inf
                 for sleeper, deadline_s in list(self._deadlines.items()):
                     if deadline_s <= now_s:
                         self._deadlines[sleeper] = math.inf
                         sleeper.wake()
-                self._next_s = self._earliest()
+                        # It will wait again, and need not notify this thread if that looks by then.
+                        look_s = now_s + _LOOK_S
+                self._next_s = min(self._earliest(), look_s)
                 # One that was set meanwhile saw the old instant and did not notify.
                 if self._earliest() < self._next_s:
                     continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from itertools import pairwise
 from math import isfinite
 
@@ -37,12 +37,16 @@ _FLAGS = {int(flag): flag for flag in QualityFlag}
 _NAME_MAX, _VERSION_MAX = 64, (1 << 32) - 1
 
 
-def _quality_from_wire(values: Iterable[int]) -> tuple[QualityFlag, ...]:
+def _quality_from_wire(values: Collection[int]) -> tuple[QualityFlag, ...]:
     """Flags, ascending, each once; those of a newer palpate become ``UNKNOWN``."""
+    if not values:
+        return ()
     return tuple(sorted({_FLAGS.get(value, QualityFlag.UNKNOWN) for value in values}))
 
 
 def _quality_to_wire(flags: tuple[QualityFlag, ...]) -> tuple[int, ...]:
+    if not flags:
+        return ()
     values = tuple(map(int, flags))
     if any(a >= b for a, b in pairwise(values)) or not all(value in _FLAGS for value in values):
         reject("quality", f"quality {values} are no flags in ascending order, each once")

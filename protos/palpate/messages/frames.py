@@ -112,6 +112,9 @@ class SensorType(IntEnum):
         return BIOTAC_LAYOUT if self is SensorType.BIOTAC else BIOTAC_SP_LAYOUT
 
 
+_ELECTRODES_VALID = {kind: kind.layout.electrodes_valid for kind in SensorType}
+
+
 @dataclass(frozen=True, slots=True)
 class Pose:
     """Position [m] and unit quaternion w x y z; sensor frame unless its name says another."""
@@ -179,7 +182,7 @@ class ElectrodeFrame:
     @property
     def electrodes_valid(self) -> bool:
         """Whether every electrode of this frame is good."""
-        mask = self.sensor_type.layout.electrodes_valid
+        mask = _ELECTRODES_VALID[self.sensor_type]
         return self.validity & mask == mask
 
 

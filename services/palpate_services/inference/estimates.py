@@ -177,12 +177,12 @@ def sample_of_frame(
 def quality_of_frame(frame: ElectrodeFrame, tare: Tare) -> tuple[QualityFlag, ...]:
     """What is to be said against a frame and its tare, whatever the model."""
     flags: tuple[QualityFlag, ...] = ()
-    # In 12 bits only 0 and 4095, the ends of the converter's range, are multiples of 4095.
-    if not (frame.electrodes % COUNTS_MAX).all():
+    counts = frame.electrodes.tolist()  # for so few numbers plain Python is faster than NumPy
+    if 0 in counts or COUNTS_MAX in counts:
         flags = (QualityFlag.SATURATED,)
-    tdc_valid = frame.validity >> frame.sensor_type.layout.tdc_bit & 1
-    if tdc_valid and abs(frame.tdc - tare.tdc) > TARE_TDC_COUNTS:
-        flags = (*flags, QualityFlag.UNTARED)
+    if abs(frame.tdc - tare.tdc) > TARE_TDC_COUNTS:
+        tdc_valid = frame.validity >> frame.sensor_type.layout.tdc_bit & 1
+        flags = (*flags, QualityFlag.UNTARED) if tdc_valid else flags
     return flags
 
 
@@ -230,8 +230,8 @@ def features_of(
         contact_location=outputs.get("contact_location") if in_contact else None,
         contact_location_sd=outputs.get("contact_location_sd") if in_contact else None,
         quality=_quality(sample, outputs, runtime, without=() if in_contact else _LOCATION),
-        bundle_name=runtime.manifest.name,
-        bundle_version=runtime.manifest.version,
+        bundle_name=runtime.name,
+        bundle_version=runtime.version,
     )
 
 
@@ -253,8 +253,8 @@ def field_of(
         displacement_sd=outputs.get("displacement_sd"),
         contact_force=None if force is None else force.reshape(-1, 3),
         quality=_quality(sample, outputs, runtime),
-        bundle_name=runtime.manifest.name,
-        bundle_version=runtime.manifest.version,
+        bundle_name=runtime.name,
+        bundle_version=runtime.version,
         coefficients=outputs.get("coefficients"),
         basis_sha256=b"" if runtime.basis is None else runtime.basis.sha256,
     )
@@ -273,8 +273,8 @@ def synthesis_of(
         tared_counts=outputs["tared_counts"],
         tared_counts_sd=outputs["tared_counts_sd"],
         quality=_quality(sample, outputs, runtime),
-        bundle_name=runtime.manifest.name,
-        bundle_version=runtime.manifest.version,
+        bundle_name=runtime.name,
+        bundle_version=runtime.version,
     )
 
 

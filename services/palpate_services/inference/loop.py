@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Generic, NoReturn, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 import numpy as np
 
@@ -160,7 +160,7 @@ class RateLimit:
         self._last.pop(sensor, None)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Taken(Generic[M]):
     """A message with its sample, and when [ns, monotonic] that was begun and done."""
 
@@ -168,6 +168,11 @@ class _Taken(Generic[M]):
     sample: Sample
     taken_ns: int
     sampled_ns: int
+
+
+def _stamp_of(received: ReceivedMessage[Any]) -> Stamp:
+    assert received.stamp is not None, "every message of these topics has a stamp"
+    return received.stamp
 
 
 def arrival_age_s(stamp: Stamp, arrived_ns: int) -> float | None:
@@ -210,6 +215,7 @@ class EstimatePublisher(Generic[M, E]):
         self._rate_limit = RateLimit(rate_hz)
         self._publishers: dict[str, Publisher[E]] = {}
         self._used: set[str] = set()
+        self._answered: ReceivedMessage[M] | None = None
         self._counts: Counter[str] = Counter()
         self._input = InputReport(health, _ERRORS, partial(show, models, health))
         self._stages = StageGauges()
@@ -223,14 +229,11 @@ class EstimatePublisher(Generic[M, E]):
 
         The model runs once for messages of different sensors that have the same bundle.
         """
-        if not messages:
-            beat(self._turn_s)
-            return
         began_ns = time.monotonic_ns()
-        for tick in _without_repetition(messages):
+        ticks = (messages,) if len(messages) == 1 else _without_repetition(messages)
+        for tick in ticks:
             samples: dict[Runtime, list[_Taken[M]]] = {}
             for received in tick:
-                beat(self._turn_s)
                 sensor = received.sensor
                 if self._sensors and sensor not in self._sensors:
                     continue
@@ -245,19 +248,35 @@ class EstimatePublisher(Generic[M, E]):
                 if isinstance(sample, EstimateRefusal):
                     self._refuse(received, sample.value, runtime)
                 elif runtime is not None:
-                    sampled_ns = time.monotonic_ns()
-                    samples.setdefault(runtime, []).append(
-                        _Taken(received, sample, taken_ns, sampled_ns)
-                    )
-            for runtime, taken in samples.items():
-                self._run(runtime, taken)
-        self._busy_ns += time.monotonic_ns() - began_ns
+                    taken = _Taken(received, sample, taken_ns, time.monotonic_ns())
+                    samples.setdefault(runtime, []).append(taken)
+                if len(messages) > 1:
+                    beat(self._turn_s)
+            for runtime, of_runtime in samples.items():
+                self._run(runtime, of_runtime)
+        beat(self._turn_s)
+        if messages:
+            self._busy_ns += time.monotonic_ns() - began_ns
+
+    def rehearse(self, last: ReceivedMessage[M]) -> None:
+        """Make the estimate of the last message once more, and publish nothing."""
+        runtime = self._models.of(last.sensor)
+        if last is not self._answered or runtime is None:
+            return
+        sample = self._sample(last, runtime)
+        if isinstance(sample, EstimateRefusal):
+            return
+        (outputs,) = runtime.run_all([sample.values])
+        if outputs is not None:
+            estimate = self._estimation.complete(last.message, sample, outputs, runtime)
+            self._publishers[last.sensor].encode(estimate)
+            STAGE_TIMINGS.encode(StageTimings(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
     def _sample(
         self, received: ReceivedMessage[M], runtime: Runtime | None
     ) -> Sample | EstimateRefusal:
         """What the model gets of a message, or why it gets nothing."""
-        stamp = self._stamp_of(received)
+        stamp = _stamp_of(received)
         if (refusal := self._age_limit.refusal(stamp)) is not None:
             return refusal
         if self._rate_limit.reached(received.sensor, stamp):
@@ -274,10 +293,10 @@ class EstimatePublisher(Generic[M, E]):
         outputs_of = runtime.run_all([one.sample.values for one in taken])
         infer_s = (time.monotonic_ns() - began_ns) * 1e-9
         for one, outputs in zip(taken, outputs_of, strict=True):
-            if outputs is None:
-                self._refuse(one.received, EstimateRefusal.NON_FINITE.value, runtime)
-                continue
             received = one.received
+            if outputs is None:
+                self._refuse(received, EstimateRefusal.NON_FINITE.value, runtime)
+                continue
             estimate = self._estimation.complete(received.message, one.sample, outputs, runtime)
             publisher = self._publisher(received.sensor)
             began_ns = time.monotonic_ns()
@@ -287,25 +306,22 @@ class EstimatePublisher(Generic[M, E]):
                 self._refuse(received, f"unpublishable_{error.reason}", runtime)
                 continue
             encode_s = (time.monotonic_ns() - began_ns) * 1e-9
-            stamp = self._stamp_of(received)
-            age_s = arrival_age_s(stamp, received.received_monotonic_ns)
-            waited_s = (one.taken_ns - received.received_monotonic_ns) * 1e-9
+            stamp, arrived_ns = _stamp_of(received), received.received_monotonic_ns
+            age_s = arrival_age_s(stamp, arrived_ns)
+            waited_s = (one.taken_ns - arrived_ns) * 1e-9 - received.decode_s
+            sample_s = (one.sampled_ns - one.taken_ns) * 1e-9
             timings = StageTimings(
-                age_s,
-                max(0.0, waited_s - received.decode_s),
-                received.decode_s,
-                (one.sampled_ns - one.taken_ns) * 1e-9,
-                infer_s,
-                encode_s,
+                age_s, max(0.0, waited_s), received.decode_s, sample_s, infer_s, encode_s
             )
             publisher.put_payload(payload, attachment=STAGE_TIMINGS.encode(timings))
+            self._answered = received
             self._stages.note(timings)
             self._rate_limit.note(received.sensor, stamp)
             self._counts["estimates_published"] += 1
             self._input.answered(received.sensor)
             # Latency counts from the reading, so that it holds the way through gateway and bus.
             # Only where the stamp says nothing of that it counts from the arrival.
-            since_ns = received.received_monotonic_ns if age_s is None else stamp.monotonic_ns
+            since_ns = arrived_ns if age_s is None else stamp.monotonic_ns
             self._latencies_ns.append(time.monotonic_ns() - since_ns)
 
     def _refuse(self, received: ReceivedMessage[M], reason: str, runtime: Runtime | None) -> None:
@@ -314,15 +330,10 @@ class EstimatePublisher(Generic[M, E]):
         self._input.refused(
             received.sensor,
             reason,
-            self._stamp_of(received),
+            _stamp_of(received),
             tare_id=getattr(received.message, "tare_id", NO_TARE),
             model="" if runtime is None else runtime.label,
         )
-
-    def _stamp_of(self, received: ReceivedMessage[M]) -> Stamp:
-        stamp = self._route.source.stamp_of(received.message)
-        assert stamp is not None, "every message of these topics has a stamp"
-        return stamp
 
     def _publisher(self, sensor: str) -> Publisher[E]:
         publisher = self._publishers.get(sensor)
@@ -451,6 +462,7 @@ def serve(
             sensors=config.sensors if len(config.sensors) > 1 else (),
             # A lossless replay takes all: its frames may come before the claim is known.
             announced=not (config.sensors or config.unannounced or config.delivery == "every"),
+            rehearse=publisher.rehearse,
         )
         refresh = partial(_refresh, messages, models, health)
         with HealthReporter(session, health, refresh=refresh):
@@ -466,8 +478,10 @@ def serve(
             # Withdrawn first, so that no client relies on this service while it drains.
             presence.not_ready()
             health.set_state(ServiceState.STOPPING, "draining")
+            # Of a live stream the newest that wait; of a replay all that are still on their way.
+            quiet_s = _QUIET_S if config.delivery == "every" else 0.0
             deadline = time.monotonic() + config.drain_s
-            while time.monotonic() < deadline and (left := messages.next_batch(_QUIET_S)):
+            while time.monotonic() < deadline and (left := messages.next_batch(quiet_s)):
                 publisher.take(left)
             messages.close()
             publisher.report(last=True)

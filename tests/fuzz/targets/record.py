@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 from tests.fuzz.streams import has_remedy
+from tests.gateway.pipelines import pushed
 
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.codec import ELECTRODE_FRAME
@@ -62,7 +63,7 @@ def _payloads(frames: int) -> list[bytes]:
     with device:
         pipeline.begin(device.identity, FileClock("a", 10**18))
         while readings := device.read(1.0):
-            for item in pipeline.push(readings, 0):
+            for item in pushed(pipeline, readings, 0):
                 if item.topic == "electrodes":
                     payloads.append(TOPICS[item.topic].codec.encode(item.message))
     return payloads

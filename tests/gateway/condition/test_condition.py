@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.pipelines import pushed
 
 from palpate.errors import DeviceError
 from palpate.messages import ElectrodeFrame, FaultKind
@@ -154,7 +155,7 @@ def capture(shared_data: Path) -> list[ElectrodeFrame]:
         made.begin(device.identity, FileClock(device.identity.serial, None))
         out: list[DueMessage] = []
         while got := device.read(1.0):
-            out += made.push(got, 0)
+            out += pushed(made, got, 0)
     return [item.message for item in out if isinstance(item.message, ElectrodeFrame)]
 
 

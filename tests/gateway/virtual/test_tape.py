@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.pipelines import pushed
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.tape import Tape, read_tape
@@ -162,7 +163,7 @@ def test_starts_untouched_so_that_a_tare_succeeds(tape_path: Write) -> None:
             pipeline.begin(device.identity, FileClock("x", None))
             out: list[DueMessage] = []
             while got := device.read(1.0):
-                out += pipeline.push(got, 0)
+                out += pushed(pipeline, got, 0)
         (tare,) = [item.message for item in out if isinstance(item.message, Tare)]
         rest = read_tape(path).specimens[0].rest_counts
         # After half an hour the core is 1.4 K short of its end: -3.4 % of conductivity.
