@@ -75,6 +75,10 @@ def _latency() -> str:
     text = _table(
         "frame stamp to estimate in the client | p50 | p99 | max | lost in all runs", rows
     )
+    stages = ", ".join(
+        f"{name.replace('_', ' ')} {_ms(value)}" for name, value in values["e2e.stages_s"].items()
+    )
+    text += f"\nThe stages of palpate's estimates, as the service notes them, medians: {stages}.\n"
     text += "\n" + _table(
         "load | frames | lost | p50 | p99",
         (

@@ -282,3 +282,27 @@ def test_json_logs(tmp_path: Path) -> None:
     _, rest = process.communicate(timeout=20)
     assert process.returncode == 0
     assert "router ends" in rest
+
+
+ONE_THREAD = """
+import sys, types
+from palpate_deploy.cli import app
+
+def run_service(*_):
+    import numpy, threadpoolctl
+    print([pool["num_threads"] for pool in threadpoolctl.threadpool_info()])
+
+processes = types.ModuleType("palpate_deploy.station.processes")
+processes.service_named, processes.run_service = str, run_service
+sys.modules[processes.__name__] = processes
+app.run("gateway", "virtual")
+"""
+
+
+def test_a_process_of_a_station_does_linear_algebra_in_one_thread() -> None:
+    """With two, the second kept a core busy with waiting, in a gateway that plays the twin."""
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_THREAD], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "[1]", done.stderr

@@ -23,7 +23,7 @@ from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate_deploy.bench.harness import SourceGate, read_rows
 from palpate_deploy.bench.load import LoadResult, ramp_rate, run_load, start_palpate
-from palpate_deploy.bench.results import Latency, finish, latency, progress_bar
+from palpate_deploy.bench.results import Latency, finish, latency, progress_bar, stage_medians
 from palpate_deploy.bench.station import SETTLE_S
 from palpate_deploy.station.host import free_endpoint
 from palpate_deploy.station.processes import FiniteRun
@@ -46,6 +46,8 @@ class Run:
 
     palpate: Latency
     floor: Latency
+    stages_s: dict[str, float]
+    """Median of each stage of palpate's estimates [s]."""
 
     @property
     def p50_ratio(self) -> float:
@@ -111,7 +113,7 @@ def run_e2e(
     finish(
         "e2e",
         _values(measured, loads, first_loss),
-        lambda: _print(measured, loads, first_loss, ramped=ramp),
+        lambda: _print(measured, loads, first_loss, ramped=ramp and bool(sensors)),
         as_json=as_json,
         save=save,
         out=out,
@@ -150,9 +152,11 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
             gate.set(True)  # a source that waits at its gate does not see the stop event
         for name in reversed(names):
             children.stop_one(name)
-        results = []
+        results: list[Latency] = []
+        stages_s: dict[str, float] = {}
         for out in outs:
             _, rows, _ = read_rows(out)
+            stages_s |= stage_medians(rows)  # the floor notes none
             # Frames before the first estimate had no tare and do not count as lost.
             lost = int(rows[-1, 0] - rows[0, 0] + 1 - len(rows)) if len(rows) else -1
             if not len(rows):
@@ -161,7 +165,7 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
                     remedy=f"see the logs in {children.folder / 'logs'}",
                 )
             results.append(latency(rows, warm_up=_WARM_UP, lost=lost))
-    return Run(results[_PALPATE], results[_FLOOR])
+    return Run(results[_PALPATE], results[_FLOOR], stages_s)
 
 
 def _start_floor(children: FiniteRun, model: Path, out: Path, gates: Path, core: str) -> None:
@@ -196,6 +200,10 @@ def _values(
         "e2e.p99_ratio_range": [round(p99[0], 3), round(p99[2], 3)],
         "e2e.p50_goal_met": p50[1] <= P50_GOAL,
         "e2e.p99_goal_met": p99[1] <= P99_GOAL,
+        "e2e.stages_s": {
+            name: float(np.median([run.stages_s.get(name, 0.0) for run in runs]))
+            for name in runs[0].stages_s
+        },
         "e2e.runs": [run.plain() for run in runs],
         **{f"load.{load.service}": load.plain() for load in loads},
         "load.goal_met": all(load.lost == 0 for load in loads),
@@ -224,7 +232,7 @@ def _print(
         title_justify="left",
     )
     for column in ("", "p50", "p99", "max", "estimates", "lost"):
-        table.add_column(column, justify="right" if column else "left")
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
     for number, run in enumerate(runs, 1):
         for name, side in (("palpate", run.palpate), ("floor", run.floor)):
             table.add_row(
@@ -241,6 +249,8 @@ def _print(
                 _against(_spread(runs, "p99_ratio")[place], P99_GOAL),
             )
     console.print(table)
+    stages = ", ".join(f"{name} {value * 1e3:.2f}" for name, value in runs[0].stages_s.items())
+    console.print(f"median stages of palpate [ms]: {stages}", soft_wrap=True, markup=False)
     for load in loads:
         for line in load.sentences():
             console.print(line, soft_wrap=True, markup=False)

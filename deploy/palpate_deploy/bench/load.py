@@ -9,17 +9,16 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.progress import Progress
 
 from palpate.messages import ServiceState
-from palpate_deploy.bench.harness import STAGES, read_rows
+from palpate_deploy.bench.harness import read_rows
+from palpate_deploy.bench.results import stage_medians
 from palpate_deploy.bench.station import wait_ready
 from palpate_deploy.diagnose.replay import total
 from palpate_deploy.station.host import join, private_profile, write_profile
@@ -205,18 +204,8 @@ def _account(
         float(p50),
         float(p99),
         cores,
-        _stages(STAGES, rows[:, 3:]),
+        stage_medians(rows),
     )
-
-
-def _stages(names: Iterable[str], rows: npt.NDArray[np.int64]) -> dict[str, float]:
-    """Median of each stage [s]; negative values stand for unknown ones."""
-    columns = zip(names, rows.T, strict=False)
-    return {
-        name: float(np.median(known)) * 1e-9
-        for name, column in columns
-        if len(known := column[column >= 0])
-    }
 
 
 def start_palpate(

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from palpate.errors import ConfigError
+from palpate_deploy.bench.harness import STAGES
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,16 @@ def rounds(rows: npt.NDArray[np.int64], *, pause_s: float = 0.3) -> list[npt.NDA
     """Rows cut where the source paused."""
     gaps = np.flatnonzero(np.diff(rows[:, 1]) > pause_s * 1e9) + 1
     return [part for part in np.split(rows, gaps) if len(part)]
+
+
+def stage_medians(rows: npt.NDArray[np.int64]) -> dict[str, float]:
+    """Median of each of ``STAGES`` [s], whose columns follow the first three of the rows [ns]."""
+    columns = zip(STAGES, rows.T[3:], strict=False)
+    return {
+        name: float(np.median(known)) * 1e-9
+        for name, column in columns
+        if len(known := column[column >= 0])
+    }
 
 
 def progress_bar() -> Progress:
