@@ -64,6 +64,7 @@ faults: $(VENV)/.dev  ## break what a station stands on, one after another: what
 	@failed=0; \
 	$(serving_bench) faults --out docs/results/serving/faults.json || failed=1; \
 	$(serving_bench) restart --times $(or $(TIMES),3) --out docs/results/serving/restart.json || failed=1; \
+	$(serving_bench) restart --times $(or $(TIMES),3) --only fem --only metrics --out docs/results/serving/restart-more.json || failed=1; \
 	$(serving_bench) swap --out docs/results/serving/swap.json || failed=1; \
 	$(BIN)/python docs/make_serving.py; exit $$failed
 

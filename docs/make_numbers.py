@@ -184,9 +184,39 @@ def _serving() -> Iterator[Claim]:
     yield Claim("README.md", "mesh at 100 Hz: {fields_lost} of {fields} lost", figures)
 
 
+def _restarts() -> Iterator[Claim]:
+    """Killed and hung processes, and the long run."""
+    trials = (
+        _read("serving/restart.json")["restart"] + _read("serving/restart-more.json")["restart"]
+    )
+    times = {
+        fault: [one["publishing_s"] for one in trials if one["fault"] == fault]
+        for fault in ("kill", "hang")
+    }
+    broken = [one for one in trials if one["fault"] in times]
+    back = sum(len(one["publishing_s"]) for one in broken)
+    soak = _read("serving/soak.json")["soak"]
+    figures = {
+        "processes": str(len(times["kill"])),
+        "back": f"{back:,}",
+        "tried": f"{back + sum(one['failed'] for one in broken):,}",
+        "kill": f"{max(map(max, times['kill'])):.1f}",
+        "hang": f"{max(map(max, times['hang'])):.1f}",
+        "lost": f"{sum(soak['lost'].values()):,}",
+        "received": f"{sum(soak['received'].values()):,}",
+    }
+    yield Claim(
+        "README.md",
+        "| {back} of {tried} times back ({processes} processes): killed ones within {kill} s, hung"
+        " ones within {hang} s",
+        figures,
+    )
+    yield Claim("README.md", "| {lost} of {received} messages lost", figures)
+
+
 def claims() -> list[Claim]:
     """Every figure of the documents that a result file holds."""
-    return [*_fem(), *_real_force(), *_twin(), *_serving()]
+    return [*_fem(), *_real_force(), *_twin(), *_serving(), *_restarts()]
 
 
 def main() -> None:

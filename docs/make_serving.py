@@ -98,10 +98,10 @@ def _latency() -> str:
 
 
 def _restarts() -> str:
-    values = _read("restart")
+    values, more = _read("restart"), _read("restart-more")
     goals = {"kill": 3.0, "hang": 10.0}
     rows = []
-    for trials in values["restart"]:
+    for trials in (*values["restart"], *more["restart"]):
         times = trials["publishing_s"]
         tried = len(times) + trials["failed"]
         rows.append(
@@ -119,7 +119,7 @@ def _restarts() -> str:
     text = _table("process | fault | back | p50 | max | goal | floor | met", rows)
     return _section(
         "Killed and hung processes until they publish again",
-        "palpate bench restart --times 20",
+        "palpate bench restart --times 20`, and with `--only fem --only metrics",
         values,
         text,
     )

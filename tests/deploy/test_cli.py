@@ -306,3 +306,10 @@ def test_a_process_of_a_station_does_linear_algebra_in_one_thread() -> None:
         [sys.executable, "-c", ONE_THREAD], env=environment, capture_output=True, text=True
     )
     assert done.stdout.strip() == "[1]", done.stderr
+
+
+@pytest.mark.parametrize("command", [["topic", "echo", "features"], ["tare", "finger"]])
+def test_a_negative_wait_is_refused(command: list[str]) -> None:
+    result = CliRunner().invoke(app, [*command, "--timeout-s", "-1"])
+    assert result.exit_code == 2
+    assert "--timeout-s" in result.output

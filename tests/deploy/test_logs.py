@@ -57,6 +57,17 @@ def test_text_for_people_has_no_fields(capsys: pytest.CaptureFixture[str]) -> No
     assert line(capsys, "text").endswith(" warning palpate.test: refused: tare_unknown")
 
 
+def test_json_is_harmless_in_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """Control characters beyond ASCII, and those that turn the direction of writing."""
+    configure("info", "json")
+    strange = "\x9b31m \u202e \u00b5"
+    _log.warning("%s", strange)
+    (only,) = capsys.readouterr().err.splitlines()
+    assert only.isascii()
+    assert only.isprintable()
+    assert json.loads(only)["message"] == strange
+
+
 def test_a_command_has_no_station(capsys: pytest.CaptureFixture[str]) -> None:
     configure("info", "json")
     _log.info("hello", extra=about("finger"))

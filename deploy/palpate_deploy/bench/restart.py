@@ -49,6 +49,7 @@ _IMPORTS: dict[str, tuple[str, ...]] = {
     "synthesis": ("zenoh", "numpy", "pydantic", "google.protobuf", "onnxruntime"),
     "recorder": ("zenoh", "numpy", "pydantic", "google.protobuf", "mcap.writer", "rerun"),
     "fem": ("zenoh", "numpy", "pydantic", "google.protobuf"),
+    "metrics": ("zenoh", "numpy", "pydantic", "google.protobuf", "prometheus_client"),
 }
 
 # It writes its process id and goes on for ever.
@@ -262,11 +263,13 @@ def _check(deadline_s: float, what: str, supervisor: Supervisor) -> None:
         )
 
 
-def run_restart(*, times: int, only: str, as_json: bool, save: bool, out: Path | None) -> int:
+def run_restart(
+    *, times: int, only: Sequence[str], as_json: bool, save: bool, out: Path | None
+) -> int:
     """Measure and print; 1 if a process did not come back each time, or not soon enough.
 
     Raises:
-        ConfigError: ``only`` names no process.
+        ConfigError: ``only`` names what is no process.
         PalpateError: The station does not start, or there is no history to append to.
     """
     with tempfile.TemporaryDirectory(prefix="palpate-restart-") as folder:
@@ -274,7 +277,7 @@ def run_restart(*, times: int, only: str, as_json: bool, save: bool, out: Path |
         profile = private_profile(
             "virtual", recorder={"out": folder}, models={"state": folder, "folder": folder}
         )
-        wanted = [service_named(only)] if only else list(profile.processes)
+        wanted = [service_named(name) for name in only] or list(profile.processes)
         if extra := [service for service in wanted if service not in profile.processes]:
             processes = (*profile.processes, *extra)
             profile = profile.model_copy(update={"processes": processes})

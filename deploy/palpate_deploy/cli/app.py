@@ -158,7 +158,7 @@ def tare(
         int,
         typer.Option(help="Frames (force/torque: readings) to average; 0 = the gateway's setting."),
     ] = 0,
-    timeout_s: Annotated[float, typer.Option(help="Longest time to wait [s].")] = 5.0,
+    timeout_s: Annotated[float, typer.Option(min=0, help="Longest time to wait [s].")] = 5.0,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
@@ -229,7 +229,7 @@ def echo(
     sensor: SensorOption = "*",
     count: Annotated[int, typer.Option(min=0, help="Number of messages; 0 = until Ctrl-C.")] = 0,
     timeout_s: Annotated[
-        float, typer.Option(help="Stop if no message comes for this long [s].")
+        float, typer.Option(min=0, help="Stop if no message comes for this long [s].")
     ] = 10.0,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,

@@ -152,12 +152,15 @@ def status(
     raise typer.Exit(run_status_bench(count=count, as_json=json_, save=save, out=out))
 
 
-@bench_app.command(epilog=example("palpate bench restart --times 3 --only features"))
+@bench_app.command(epilog=example("palpate bench restart --times 3 --only fem --only metrics"))
 def restart(
     times: Annotated[
         int, typer.Option(min=1, help="How often each process, with each fault.")
     ] = 20,
-    only: Annotated[str, typer.Option(help="Only this process, e.g. features or fem.")] = "",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this process, also one that is not among the usual ones; repeat."),
+    ] = None,
     out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
@@ -165,7 +168,7 @@ def restart(
     """Kill each process of a station and let it hang; measure when it publishes again."""
     from palpate_deploy.bench.restart import run_restart
 
-    raise typer.Exit(run_restart(times=times, only=only, as_json=json_, save=save, out=out))
+    raise typer.Exit(run_restart(times=times, only=only or [], as_json=json_, save=save, out=out))
 
 
 @bench_app.command(

@@ -79,7 +79,6 @@ def _json_formatter(where: dict[str, str]) -> logging.Formatter:
             "process": "pid",
         },
         static_fields={name: value for name, value in where.items() if value},
-        json_ensure_ascii=False,
     )
     formatter.converter = time.gmtime
     formatter.default_time_format, formatter.default_msec_format = "%Y-%m-%dT%H:%M:%S", "%s.%03dZ"
