@@ -98,7 +98,8 @@ def _latency() -> str:
 
 
 def _restarts() -> str:
-    values, more = _read("restart"), _read("restart-more")
+    values = _read("restart")
+    more = _read("restart-more") if (FOLDER / "restart-more.json").is_file() else {"restart": []}
     goals = {"kill": 3.0, "hang": 10.0}
     rows = []
     for trials in (*values["restart"], *more["restart"]):
