@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import importlib
 import importlib.util
@@ -161,3 +162,26 @@ def avoid_pauses() -> None:
     gc.freeze()
     gc.set_threshold(_YOUNG_OBJECTS, 20, 50)
     sys.setswitchinterval(_SWITCH_S)
+
+
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # mallopt(3), of glibc only
+_ARENAS = 2
+_LARGE_BYTES = 1 << 20
+
+
+def use_few_resources() -> None:
+    """Keep native libraries from wasting processor and memory. Call once, before NumPy is loaded.
+
+    Threads of linear algebra wait for one another by spinning: for products of some microseconds, a
+    hundred times a second, they keep a whole core busy. So there is one, unless the environment
+    says otherwise. And of glibc's many memory pools, one for each few threads, each keeps what its
+    busiest moment took: over hours a recorder grew by 30 MB/h. So there are two, and what is large
+    goes back to the system at once.
+    """
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    if sys.platform == "linux":
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        if mallopt is not None:
+            mallopt(_M_ARENA_MAX, _ARENAS)
+            mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)

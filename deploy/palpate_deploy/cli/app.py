@@ -5,7 +5,6 @@ They are imported when a command runs: ``palpate --help`` must not wait for NumP
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -99,10 +98,9 @@ def run(
     profile: ProfileOption = DEFAULT_PROFILE,
 ) -> None:
     """Run one process of a station in the foreground (`palpate up` starts all of them)."""
-    # Read when NumPy is loaded, below. Its threads wait for one another by spinning: for products
-    # of some microseconds, a hundred times a second, they kept a whole core busy.
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+    from palpate.process import use_few_resources
+
+    use_few_resources()  # before NumPy is loaded, below
     from palpate_deploy.station.processes import run_service, service_named
     from palpate_deploy.station.profile import load_profile
 
