@@ -97,14 +97,15 @@ def test_a_stuck_electrode_is_named_and_recovers(
     finger: Finger,
     served: Callable[..., SensorStatus],
     capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    # The errors are looked for in the log: the last one of a busy host may be a short silence.
     finger.fixed = {6: 3061}
     one = served(has(FaultKind.STUCK, "E7"))
     assert one.state is SensorState.LIVE
     assert one.message == "E7 stuck"
     now = bus.state(ServiceState.DEGRADED)
-    assert now.last_error.message == "sensor 'thumb': E7 stuck"
-    assert now.last_error.remedy.startswith("power the sensor off and on")
+    bus.until(lambda: "sensor 'thumb': E7 stuck -> power the sensor off and on" in caplog.text)
     assert now.gauges["stuck_channels"] == 1.0
     assert now.counters["channels_stuck"] == 1
 
@@ -136,11 +137,15 @@ def test_saturation_under_load_is_told_without_a_cry(
 
 
 def test_an_electrode_that_dies_at_rest_is_dead(
-    bus: Any, finger: Finger, served: Callable[..., SensorStatus]
+    bus: Any,
+    finger: Finger,
+    served: Callable[..., SensorStatus],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     finger.fixed = {18: 0}
     served(has(FaultKind.DEAD, "E19"))
-    assert "check plug and cable" in bus.state(ServiceState.DEGRADED).last_error.remedy
+    bus.state(ServiceState.DEGRADED)
+    bus.until(lambda: "E19 dead -> check plug and cable" in caplog.text)
     finger.fixed = {}
     served(lambda one, now: not one.faults and now.state is ServiceState.READY)
 
