@@ -172,11 +172,11 @@ _LARGE_BYTES = 1 << 20
 def use_few_resources() -> None:
     """Keep native libraries from wasting processor and memory. Call once, before NumPy is loaded.
 
-    Threads of linear algebra wait for one another by spinning: for products of some microseconds, a
-    hundred times a second, they keep a whole core busy. So there is one, unless the environment
-    says otherwise. And of glibc's many memory pools, one for each few threads, each keeps what its
-    busiest moment took: over hours a recorder grew by 30 MB/h. So there are two, and what is large
-    goes back to the system at once.
+    NumPy's threads wait for one another by spinning. Where products of some microseconds are
+    computed a hundred times a second, that keeps a whole core busy. So NumPy gets one thread,
+    unless the environment says otherwise. glibc gives every few threads a memory pool of their own,
+    and each pool keeps what its busiest moment took: a recorder grew by 30 MB/h. So there are two
+    pools, and large blocks go back to the system as soon as they are freed.
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")

@@ -69,7 +69,7 @@ class Alarm(Closing):
                     if deadline_s <= now_s:
                         self._deadlines[sleeper] = math.inf
                         sleeper.wake()
-                        # It will wait again, and need not notify this thread if that looks by then.
+                        # It soon sets its next alarm, and need not wake this thread for that.
                         look_s = now_s + _LOOK_S
                 self._next_s = min(self._earliest(), look_s)
                 # One that was set meanwhile saw the old instant and did not notify.

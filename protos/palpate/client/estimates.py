@@ -32,26 +32,16 @@ def ask_tare(session: Session, sensor: str, *, frames: int, timeout_s: float) ->
         RemoteError: The gateway refuses, e.g. because the finger is touched.
         StreamTimeout: No answer in time.
     """
-    request_id = uuid.uuid4().hex
-    with session.caller_token(request_id):
-        return session.query(
-            endpoints.TARE,
-            TareRequest(frames=frames, request_id=request_id),
-            sensor=sensor,
-            timeout_s=timeout_s,
-        )
+    request = TareRequest(frames=frames, request_id=uuid.uuid4().hex)
+    with session.caller_token(request.request_id):
+        return session.query(endpoints.TARE, request, sensor=sensor, timeout_s=timeout_s)
 
 
 def ask_zero(session: Session, sensor: str, *, readings: int, timeout_s: float) -> WrenchZero:
     """The zero that a force/torque sensor's gateway takes now; as ``ask_tare`` otherwise."""
-    request_id = uuid.uuid4().hex
-    with session.caller_token(request_id):
-        return session.query(
-            endpoints.ZERO,
-            WrenchZeroRequest(readings=readings, request_id=request_id),
-            sensor=sensor,
-            timeout_s=timeout_s,
-        )
+    request = WrenchZeroRequest(readings=readings, request_id=uuid.uuid4().hex)
+    with session.caller_token(request.request_id):
+        return session.query(endpoints.ZERO, request, sensor=sensor, timeout_s=timeout_s)
 
 
 OnSynthesis = Callable[[SynthesisReply], None]
