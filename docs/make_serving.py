@@ -100,7 +100,7 @@ def _latency() -> str:
 def _restarts() -> str:
     values = _read("restart")
     more = _read("restart-more") if (FOLDER / "restart-more.json").is_file() else {"restart": []}
-    goals = {"kill": 3.0, "hang": 10.0}
+    goals = {"kill": 3.0, "hang": 10.0, "end": 2.0}
     rows = []
     for trials in (*values["restart"], *more["restart"]):
         # A process that is told to end is to be gone; others are to publish again.
