@@ -80,6 +80,17 @@ def test_the_tare_of_a_finger_is_not_that_of_the_next() -> None:
     assert [tare.electrodes.shape for tare in tares] == [(24,)] * len(tares)
 
 
+def test_a_finger_that_is_exchanged_for_its_like_is_tared_anew() -> None:
+    """With the old tare the gateway would say that it is tared, and no service would use it."""
+    pipeline = Pipeline(INFO, tare_frames=FRAMES)
+    for number, serial in enumerate(("BT-1", "BT-1", "BT-2")):
+        kept = pipeline.ledger.current_id if number == 1 else NO_TARE
+        pipeline.begin(DeviceIdentity(serial, 1 / 4400), FileClock("s", 10**18))
+        assert pipeline.ledger.current_id == kept
+        made = pushed(pipeline, readings(SensorType.BIOTAC, number * FRAMES), 10**9 * (number + 1))
+        assert [tare.sensor_serial for tare in sent(made)[1]] == ([] if kept else [serial])
+
+
 class Exchanged(Device):
     """A device that is another kind each time it is opened."""
 

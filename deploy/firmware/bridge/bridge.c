@@ -7,7 +7,7 @@ enum { VERSION = 1 };
 enum { HELLO = 1, SLOTS = 2, STATUS = 3 };
 enum { READ_PROPERTY = 0x61, SERIAL_NUMBER = 0x15, FIRMWARE_VERSION = 0x13 };
 enum { CONVERSION_US = 50, BETWEEN_FINGERS_US = 10 };
-enum { HELLO_US = 2000000, STATUS_US = 1000000 };
+enum { HELLO_US = 500000, STATUS_US = 1000000 };
 enum { PAC = 0x80, ERROR = 0xA5 };
 
 /* Sampling commands besides PAC, which follows each: E1 to E19, PDC, TAC, TDC. */

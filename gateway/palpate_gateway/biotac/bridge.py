@@ -43,8 +43,8 @@ class BridgeOptions(FingerOptions):
         line: Serial line, e.g. ``/dev/serial/by-id/usb-...``.
         baud: [bit/s]; nominal on USB-CDC.
         source: The bridge's id; None = any, but only one on the line.
-        hello_s: How long to wait for a HELLO [s]; longer than the time between two of them. Without
-            it serial numbers stay unknown.
+        hello_s: How long to wait for a HELLO after the first packet [s]; longer than the time
+            between two of them. Without it serial numbers stay unknown.
     """
 
     line: str = Field(min_length=1)
@@ -93,13 +93,16 @@ class BridgeSource(SlotSource):
             raise
 
     def _wait_for_hello(self) -> None:
-        began_s = time.monotonic()
+        due_s = time.monotonic() + _FIRST_S
+        heard = False
         while self._hello is None:
-            waited_s = time.monotonic() - began_s
-            if self._source is None and waited_s >= _FIRST_S:
+            if not heard and self._source is not None:
+                # From the first packet on: a bridge that stood still sends its HELLO later, too.
+                heard, due_s = True, time.monotonic() + self._hello_s
+            if time.monotonic() >= due_s:
+                if heard:
+                    return
                 raise self._no_packet()
-            if waited_s >= max(self._hello_s, _FIRST_S):
-                return
             try:
                 self.read(_FIRST_S / 10)
             except DeviceTimeout:

@@ -76,7 +76,7 @@ class BiotacBridgeEmulator(SerialEmulator):
         slots_per_packet: int = 44,
         pac_first: bool = False,
         electrodes: int = ELECTRODES,
-        hello_s: float = 2.0,
+        hello_s: float = 0.5,
         status_s: float = 1.0,
         sequence: int = 0,
         clock_us: int = 0,

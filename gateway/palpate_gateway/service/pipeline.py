@@ -92,11 +92,12 @@ class Pipeline:
         return self._tares.error
 
     def begin(self, identity: DeviceIdentity, clock: ClockMap) -> None:
-        """The device was opened, or opened again; sequences and tares go on."""
+        """The device was opened, or opened again; sequences go on, and the tares of its finger."""
+        exchanged = identity.serial != self._serial
         self._serial = identity.serial
         kind = identity.sensor_type or self._info.sensor_type
-        if kind is not self._kind and self.ledger.current_id != NO_TARE:
-            # A finger with another number of electrodes: the old baseline is not its own.
+        if (exchanged or kind is not self._kind) and self.ledger.current_id != NO_TARE:
+            # Of another finger: the old baseline is not its own, and no service would use it.
             self.ledger.leave()
             if self._tares_itself:
                 self._tares.attempt()

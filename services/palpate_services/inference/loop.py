@@ -92,11 +92,6 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
         "no bundle serves this sensor",
         "load one: palpate model load NAME",
     ),
-    EstimateRefusal.CLOCK_SKEW: (
-        ErrorCode.INVALID_REQUEST,
-        "what comes was stamped in the future: the clocks of the hosts disagree",
-        "synchronise both hosts (chrony, PTP); see palpate status and palpate doctor",
-    ),
     EstimateRefusal.STALE: (
         ErrorCode.INVALID_REQUEST,
         "what comes is older than max_age_s",

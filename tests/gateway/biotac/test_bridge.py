@@ -179,6 +179,19 @@ def test_without_hello_the_line_names_the_finger(emulate: Emulate, finger: Finge
     assert_right(read_frames(device, lambda got: len(got) > 3), 0)
 
 
+def test_hello_is_waited_for_from_the_first_packet_on(
+    emulate: Emulate, finger: FingerQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bridge that stood still when it was opened says HELLO as late as its first packet."""
+    monkeypatch.setattr("palpate_gateway.biotac.bridge._FIRST_S", 30.0)
+    emulator = emulate(hello_s=0.5)
+    emulator.inject("silence", 1.5)
+    time.sleep(0.1)
+    device = finger(emulator.address, hello_s=1.0)
+    device.open()
+    assert device.identity.serial == "BT-EMU-1"
+
+
 def test_each_port_once(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     finger(emulator.address).open()
