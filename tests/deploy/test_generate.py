@@ -83,7 +83,7 @@ def test_both_data_sets_hold_what_was_executed(generated: GeneratedExperiment) -
     assert len(mixed) == 20 * len(mixed.experiment.trial_unit)
     difference = np.linalg.norm(mixed.simulated_force - mixed.experiment.force, axis=1)
     assert np.median(difference) < 0.1
-    assert mixed.basis.loss_mean_m < 1e-6
+    assert mixed.basis.loss_mean < 1e-6
     moved = np.linalg.norm(mixed.displacement(slice(0, len(mixed))), axis=2)
     assert moved.max(axis=1).min() > 0.2e-3
     assert len(mixed.mesh.subset) == 128

@@ -131,7 +131,7 @@ def test_mixed_rows_keep_their_fields(mixed: MixedDataset, mixed_rows: list[Mixe
         rows = mixed.experiment.rows_of(trial)
         np.testing.assert_allclose(mixed.displacement(rows), source.displacement, atol=2e-6)
         np.testing.assert_allclose(mixed.simulated_force[rows], source.simulated_force, rtol=1e-6)
-    assert mixed.basis.loss_mean_m < 1e-6
+    assert mixed.basis.loss_mean < 1e-6
     assert len(mixed.basis.modes) <= 3
 
 

@@ -35,8 +35,8 @@ def test_as_many_modes_as_the_loss_asks_for_and_no_more() -> None:
     basis = fit_basis(in_blocks(data, 17))
     # Without the fourth the loss is about 2 um, without the fifth about 0.1 um.
     assert len(basis.modes) == 4
-    assert 1e-8 < basis.loss_mean_m < 1e-6
-    assert len(fit_basis(in_blocks(data, 17), loss_mean_m=2e-5).modes) == 2
+    assert 1e-8 < basis.loss_mean < 1e-6
+    assert len(fit_basis(in_blocks(data, 17), loss_mean=2e-5).modes) == 2
     flat = basis.modes.reshape(4, -1)
     np.testing.assert_allclose(flat @ flat.T, np.eye(4), atol=1e-5)
 
@@ -48,8 +48,8 @@ def test_the_loss_is_what_the_stored_numbers_lose() -> None:
     coefficients = encode(basis, data)
     assert coefficients.dtype == np.float32
     distance = np.linalg.norm(basis.decode(coefficients).astype(float) - data, axis=2)
-    assert basis.loss_mean_m == pytest.approx(distance.mean(), rel=1e-6)
-    assert basis.loss_max_m == pytest.approx(distance.max(), rel=1e-6)
+    assert basis.loss_mean == pytest.approx(distance.mean(), rel=1e-6)
+    assert basis.loss_max == pytest.approx(distance.max(), rel=1e-6)
     assert loss(basis, in_blocks(data, 7)) == pytest.approx((distance.mean(), distance.max()))
 
 
@@ -66,9 +66,9 @@ def test_modes_are_the_best_ones() -> None:
 def test_more_modes_than_first_drawn_are_found() -> None:
     rng = np.random.default_rng(3)
     data = (1e-4 * rng.normal(size=(88, NODES, 3))).astype(np.float32)  # no structure at all
-    basis = fit_basis(in_blocks(data, 40), loss_mean_m=1e-9)
+    basis = fit_basis(in_blocks(data, 40), loss_mean=1e-9)
     assert 70 < len(basis.modes) <= 88
-    assert basis.loss_mean_m < 1e-9
+    assert basis.loss_mean < 1e-9
 
 
 def test_the_same_blocks_give_the_same_basis() -> None:
@@ -80,7 +80,7 @@ def test_the_same_blocks_give_the_same_basis() -> None:
 @pytest.mark.parametrize(
     ("blocks", "words"),
     [
-        ([], "no displacement fields"),
+        ([], "no fields"),
         ([np.zeros((2, 5, 3)), np.zeros((2, 6, 3))], "one mesh"),
         ([np.full((2, 5, 3), np.nan)], "not finite"),
     ],
@@ -92,4 +92,4 @@ def test_fields_that_make_no_basis_are_refused(blocks: list[FloatArray], words: 
 
 def test_a_loss_below_the_precision_is_refused() -> None:
     with pytest.raises(DatasetError, match="lose"):
-        fit_basis(in_blocks(fields(10, [1e-3]), 5), loss_mean_m=1e-20)
+        fit_basis(in_blocks(fields(10, [1e-3]), 5), loss_mean=1e-20)

@@ -214,8 +214,8 @@ def _generated_summary(result: GeneratedExperiment) -> dict[str, object]:
         "mixed_trials": len(mixed.experiment.trial_unit),
         "mixed_rows": len(mixed),
         "modes": len(mixed.basis.modes),
-        "field_loss_mean_um": mixed.basis.loss_mean_m * 1e6,
-        "field_loss_max_um": mixed.basis.loss_max_m * 1e6,
+        "field_loss_mean_um": mixed.basis.loss_mean * 1e6,
+        "field_loss_max_um": mixed.basis.loss_max * 1e6,
         "dropped": [list(pair) for pair in result.data.dropped],
         "seconds": {name: round(value, 1) for name, value in result.seconds.items()},
         "megabytes": {name: round(value / 1e6, 1) for name, value in result.bytes.items()},
@@ -409,7 +409,7 @@ def _processed_summary(
             "mixed_trials": done.mixed.experiment.trials,
             "mixed_rows": len(done.mixed),
             "modes": len(done.mixed.basis.modes),
-            "field_loss_mean_um": done.mixed.basis.loss_mean_m * 1e6,
+            "field_loss_mean_um": done.mixed.basis.loss_mean * 1e6,
             "unmixed": [list(pair) for pair in done.unmixed],
         }
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from palpate_training.cli import data, experiment, train
+from palpate_training.cli import data, experiment, report, train
 
 train_app = typer.Typer(
     no_args_is_help=True, help="Train networks and write model bundles.", rich_markup_mode=None
@@ -14,6 +14,7 @@ train_app.command("features")(train.train_features_command)
 train_app.command("field")(train.train_field)
 train_app.command("synthesis")(train.train_synthesis)
 train_app.command("twin")(train.train_twin)
+train_app.command("report")(report.train_report)
 train_app.command("upgrade")(train.train_upgrade)
 
 data_app = typer.Typer(

@@ -21,6 +21,7 @@ from palpate_training.datasets.experiment import (
     FieldBasis,
     FloatArray,
     MixedDataset,
+    SimulatedContact,
     SkinMesh,
 )
 from palpate_training.datasets.features import ELECTRODES
@@ -70,7 +71,7 @@ def mix(rows: TrialRows, simulated: SimulatedTrial, count: int = INCREMENTS) -> 
             f"{name}: the simulation is of {simulated.trajectory}",
             remedy="mix a trial with the simulation of its own trajectory",
         )
-    travel_m, force, displacement = _aligned(name, simulated)
+    travel_m, force, displacement, contact_force = _aligned(name, simulated)
     final_m = min(float(rows.travel_m[-1]), float(travel_m[-1]))
     if final_m <= 0.0:
         short = "experiment" if len(rows.travel_m) < 2 else "simulation"
@@ -90,6 +91,7 @@ def mix(rows: TrialRows, simulated: SimulatedTrial, count: int = INCREMENTS) -> 
         rows=measured,
         simulated_force=interpolate(at_m, travel_m, force),
         displacement=interpolate(at_m, travel_m, displacement),
+        contact_force=None if contact_force is None else interpolate(at_m, travel_m, contact_force),
     )
 
 
@@ -110,8 +112,8 @@ def interpolate(at: Floats, where: Floats, values: Values) -> Values:
 
 def _aligned(
     name: str, simulated: SimulatedTrial
-) -> tuple[Floats, Floats, npt.NDArray[np.float32]]:
-    """Travel since 0.5 N, force and displacement of the steps before the divergence."""
+) -> tuple[Floats, Floats, FloatArray, FloatArray | None]:
+    """Travel since 0.5 N, force and fields of the steps before the divergence."""
     believed = slice(0, simulated.converged)
     force = simulated.force[believed]
     if not (np.isfinite(force).all() and np.isfinite(simulated.displacement[believed]).all()):
@@ -139,7 +141,9 @@ def _aligned(
             remedy="give its steps in order of travel",
         )
     displacement = start.rows(simulated.displacement[believed])
-    return travel_m - travel_m[0], start.rows(force), displacement
+    contact = simulated.contact_force
+    contact_force = None if contact is None else start.rows(contact[believed])
+    return travel_m - travel_m[0], start.rows(force), displacement, contact_force
 
 
 def assemble_experiment(
@@ -165,42 +169,107 @@ def assemble_mixed(
     mesh: SkinMesh,
     provenance: Provenance,
     *,
+    contact_basis: FieldBasis | None = None,
     unit_names: tuple[str, ...] = (),
 ) -> MixedDataset:
     """The mixed data set; fields are compressed one by one, so ``mixed`` may be a stream.
 
+    With ``contact_basis`` it says how the indenter bears on the skin; every trial must know that.
+
     Raises:
         DatasetError: As in ``assemble_experiment``, or a field is of another mesh.
     """
-    found = [_compress(one, basis, mesh) for one in mixed]
-    experiment, order = _experiment([rows for rows, _, _ in found], provenance, unit_names)
+    rows, columns = [], []
+    for one in mixed:
+        _check_fields(one, mesh, contact=contact_basis is not None)
+        rows.append(one.rows)
+        column = {
+            "simulated_force": one.simulated_force.astype(np.float32),
+            "coefficients": encode(basis, one.displacement),
+        }
+        if contact_basis is not None and one.contact_force is not None:
+            column["forces"] = encode(contact_basis, one.contact_force)
+            column["centre"], column["normal"] = contact_of(
+                mesh, one.displacement, one.contact_force
+            )
+        columns.append(column)
+    experiment, order = _experiment(rows, provenance, unit_names)
+
+    def joined(name: str) -> FloatArray:
+        return np.concatenate([columns[i][name] for i in order])
+
+    contact = None
+    if contact_basis is not None:
+        contact = SimulatedContact(
+            joined("centre"), joined("normal"), joined("forces"), contact_basis
+        )
     return MixedDataset(
         experiment=experiment,
-        simulated_force=np.concatenate([found[i][1] for i in order]),
-        coefficients=np.concatenate([found[i][2] for i in order]),
+        simulated_force=joined("simulated_force"),
+        coefficients=joined("coefficients"),
         basis=basis,
         mesh=mesh,
+        contact=contact,
     )
 
 
-def _compress(
-    mixed: MixedRows, basis: FieldBasis, mesh: SkinMesh
-) -> tuple[TrialRows, FloatArray, FloatArray]:
-    """Rows, simulated force and coefficients of a trial, after checking it."""
-    count = len(mixed.rows.travel_m)
-    for what, values, expected in (
+def contact_of(
+    mesh: SkinMesh, displacement: FloatArray, contact_force: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Centre of pressure [m] and contact normal, each of shape (R, 3), of a trial's rows.
+
+    Both are means over the touched nodes, weighted with the part of the nodal force along the
+    deformed skin's normal: friction moves neither.
+
+    Args:
+        mesh: The skin.
+        displacement: Of every node [m], shape (R, V, 3).
+        contact_force: On the nodes of the outer surface [N], shape (R, O, 3); each row has some.
+    """
+    outer = mesh.outer_nodes
+    faces = np.searchsorted(outer, mesh.outer_faces)  # (F, 3), into the outer nodes
+    centres, normals = [], []
+    for moved, force in zip(displacement[:, outer], contact_force, strict=True):
+        points = mesh.nodes[outer] + moved
+        a, b, c = (points[faces[:, i]] for i in range(3))
+        area = np.cross(b - a, c - a)  # twice the area, outward
+        normal = np.zeros_like(points)
+        for corner in range(3):
+            np.add.at(normal, faces[:, corner], area)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        pressed = np.maximum(0.0, -np.sum(force * normal, axis=1))
+        centres.append(pressed @ points / pressed.sum())
+        mean = pressed @ normal
+        normals.append(mean / np.linalg.norm(mean))
+    return np.array(centres, np.float32), np.array(normals, np.float32)
+
+
+def _check_fields(mixed: MixedRows, mesh: SkinMesh, *, contact: bool) -> None:
+    """Check shapes and values of a trial's fields."""
+    count, name = len(mixed.rows.travel_m), trial_name(mixed.rows.header)
+    wanted: list[tuple[str, npt.NDArray[np.floating], tuple[int, ...]]] = [
         ("displacement", mixed.displacement, (count, *mesh.nodes.shape)),
         ("simulated force", mixed.simulated_force, (count, 3)),
-    ):
+    ]
+    if contact:
+        if mixed.contact_force is None:
+            raise DatasetError(
+                f"{name}: its simulation does not say how the indenter bears on the skin",
+                remedy="simulate it again, or leave the contact out of all trials",
+            )
+        outer = (count, len(mesh.outer_nodes), 3)
+        wanted.append(("contact force", mixed.contact_force, outer))
+    for what, values, expected in wanted:
         if values.shape != expected:
             raise DatasetError(
-                f"{trial_name(mixed.rows.header)}: {what} has shape {values.shape}, expected"
-                f" {expected}",
+                f"{name}: {what} has shape {values.shape}, expected {expected}",
                 remedy="simulate with the mesh that the data set names",
             )
         _check_finite(mixed.rows, what, values)
-    force = mixed.simulated_force.astype(np.float32)
-    return mixed.rows, force, encode(basis, mixed.displacement)
+    if contact and not np.any(wanted[-1][1], axis=(1, 2)).all():
+        raise DatasetError(
+            f"{name}: no node is touched in a row", remedy="leave out what is not in contact"
+        )
 
 
 def _experiment(

@@ -24,14 +24,15 @@ from palpate_training.datasets.experiment import (
     FieldBasis,
     FloatArray,
     MixedDataset,
+    SimulatedContact,
 )
 
 Floats = npt.NDArray[np.float64]
 Blocks = Callable[[], Iterable[FloatArray]]
-"""Gives the same blocks of displacement fields [m], each of shape (R, V, 3), each time."""
+"""Gives the same blocks of fields, each of shape (R, V, 3), each time."""
 
 LOSS_MEAN_M = 1e-6
-"""What the compressed form may lose on average [m]."""
+"""What the compressed form of displacements may lose on average [m]."""
 
 _FIRST_MODES = 64
 _OVERSAMPLING = 10
@@ -41,7 +42,7 @@ _OVERSAMPLING = 10
 def fit_basis(
     blocks: Blocks,
     *,
-    loss_mean_m: float = LOSS_MEAN_M,
+    loss_mean: float = LOSS_MEAN_M,
     count: int | None = None,
     seed: int = 0,
 ) -> FieldBasis:
@@ -49,8 +50,8 @@ def fit_basis(
 
     Args:
         blocks: The fields, block by block; called once for each pass.
-        loss_mean_m: The basis gets as many modes as it takes for the mean distance, over all nodes
-            and rows, between fields and their compressed form to be below this [m].
+        loss_mean: The basis gets as many modes as it takes for the mean distance, over all nodes
+            and rows, between fields and their compressed form to be below this [their unit].
         count: Number of modes, if not to be chosen by the loss.
         seed: Of the range finder.
 
@@ -71,25 +72,25 @@ def fit_basis(
         basis = _measured(blocks, FieldBasis(mean.astype(np.float32), shaped, 0.0, 0.0))
         if count is not None:
             return basis
-        if basis.loss_mean_m < loss_mean_m:
-            return _fewest(blocks, basis, loss_mean_m)
+        if basis.loss_mean < loss_mean:
+            return _fewest(blocks, basis, loss_mean)
         if wanted == most:
             raise DatasetError(
-                f"{wanted} modes lose {basis.loss_mean_m:.3g} m on average, allowed are"
-                f" {loss_mean_m:.3g} m",
+                f"{wanted} modes lose {basis.loss_mean:.3g} on average, allowed are"
+                f" {loss_mean:.3g}",
                 remedy="allow more; float32 holds a field of 1 mm to about 1e-10 m",
             )
         wanted = min(2 * wanted, most)
 
 
-def encode(basis: FieldBasis, displacement: FloatArray) -> FloatArray:
-    """Coefficients of fields, shape (R, K), of displacements [m], shape (R, V, 3)."""
-    flat = displacement.reshape(len(displacement), -1).astype(np.float64) - basis.mean.reshape(-1)
+def encode(basis: FieldBasis, fields: FloatArray) -> FloatArray:
+    """Coefficients, shape (R, K), of fields, shape (R, V, 3)."""
+    flat = fields.reshape(len(fields), -1).astype(np.float64) - basis.mean.reshape(-1)
     return np.asarray(flat @ basis.modes.reshape(len(basis.modes), -1).T, np.float32)
 
 
 def loss(basis: FieldBasis, blocks: Blocks) -> tuple[float, float]:
-    """Mean and largest distance of a node from its compressed form [m], over all rows."""
+    """Mean and largest distance of a node from its compressed form, over all rows."""
     total, nodes, largest = 0.0, 0, 0.0
     for block in blocks():
         rest = block - basis.decode(encode(basis, block))
@@ -101,17 +102,17 @@ def loss(basis: FieldBasis, blocks: Blocks) -> tuple[float, float]:
 
 
 def _measured(blocks: Blocks, basis: FieldBasis) -> FieldBasis:
-    mean_m, max_m = loss(basis, blocks)
-    return replace(basis, loss_mean_m=mean_m, loss_max_m=max_m)
+    mean, largest = loss(basis, blocks)
+    return replace(basis, loss_mean=mean, loss_max=largest)
 
 
-def _fewest(blocks: Blocks, enough: FieldBasis, loss_mean_m: float) -> FieldBasis:
+def _fewest(blocks: Blocks, enough: FieldBasis, loss_mean: float) -> FieldBasis:
     """The shortest beginning of the modes that is still good enough, by bisection."""
     too_few, best = 0, enough
     while len(best.modes) - too_few > 1:
         middle = (too_few + len(best.modes)) // 2
         tried = _measured(blocks, replace(enough, modes=enough.modes[:middle]))
-        if tried.loss_mean_m < loss_mean_m:
+        if tried.loss_mean < loss_mean:
             best = tried
         else:
             too_few = middle
@@ -129,14 +130,14 @@ def _mean(blocks: Blocks) -> tuple[Floats, int]:
             )
         if not np.isfinite(block).all():
             raise DatasetError(
-                f"displacement is not finite in row {rows} or after",
+                f"a field is not finite in row {rows} or after",
                 remedy="leave out what did not converge",
             )
         add = block.sum(axis=0, dtype=np.float64)
         total = add if total is None else total + add
         rows += len(block)
     if total is None or rows == 0:
-        raise DatasetError("no displacement fields", remedy="mix at least one trial")
+        raise DatasetError("no fields", remedy="mix at least one trial")
     return total / rows, rows
 
 
@@ -182,6 +183,16 @@ def subset(data: Data, trials: Sequence[int]) -> Data:
         experiment=_experiment(data.experiment, trials),
         simulated_force=data.simulated_force[rows],
         coefficients=data.coefficients[rows],
+        contact=None if data.contact is None else _contact(data.contact, rows),
+    )
+
+
+def _contact(
+    contact: SimulatedContact, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> SimulatedContact:
+    return replace(
+        contact,
+        **{name: getattr(contact, name)[rows] for name in ("centre", "normal", "coefficients")},
     )
 
 

@@ -206,8 +206,13 @@ def read_tables(
     schema: Hdf5Schema,
     columns: Mapping[str, StoredColumn],
     numbers: tuple[str, ...] = (),
+    *,
+    optional: Mapping[str, StoredColumn] | None = None,
+    optional_numbers: tuple[str, ...] = (),
 ) -> StoredTables:
     """Read a file and check its schema, units, types and content hash.
+
+    A file that has one of the ``optional`` columns has all of them, and ``optional_numbers``.
 
     Raises:
         DatasetError: It is missing, damaged, of another schema or version, lacks an array, has one
@@ -215,6 +220,8 @@ def read_tables(
     """
     with opened(path, extra="training") as file:
         schema.check(path, file)
+        if any(name in file for name in optional or ()):
+            columns, numbers = {**columns, **(optional or {})}, numbers + optional_numbers
         arrays = {
             name: read_array(path, file, name, column.unit, column.dtype)
             for name, column in columns.items()

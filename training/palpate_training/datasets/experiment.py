@@ -122,28 +122,53 @@ class SkinMesh:
     subset: IndexArray
     sha256: str
 
+    @property
+    def outer_nodes(self) -> IndexArray:
+        """Nodes of the outer surface, ascending, shape (O,)."""
+        return np.unique(self.outer_faces)
+
 
 @dataclass(frozen=True, slots=True)
 class FieldBasis:
-    """Displacement fields as few numbers: field = mean + coefficients @ modes.
+    """Fields of three values a node as few numbers: field = mean + coefficients @ modes.
+
+    All but the modes is in the unit of the fields: m of displacements, N of forces.
 
     Attributes:
-        mean: [m], shape (V, 3).
+        mean: Shape (V, 3).
         modes: Orthonormal over all 3 V values, shape (K, V, 3).
-        loss_mean_m: Mean nodal distance between the fields and their compressed form [m].
-        loss_max_m: Largest such distance of any node and row [m].
+        loss_mean: Mean nodal distance between the fields and their compressed form.
+        loss_max: Largest such distance of any node and row.
     """
 
     mean: FloatArray
     modes: FloatArray
-    loss_mean_m: float
-    loss_max_m: float
+    loss_mean: float
+    loss_max: float
 
     def decode(self, coefficients: FloatArray) -> FloatArray:
-        """Displacement [m], shape (N, V, 3), of coefficients (N, K)."""
+        """Fields, shape (N, V, 3), of coefficients (N, K)."""
         flat = self.modes.reshape(len(self.modes), -1)
         field = coefficients @ flat + self.mean.reshape(-1)
         return np.asarray(field.reshape(-1, *self.mean.shape), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedContact:
+    """How the indenter bears on the skin in the simulation, row by row.
+
+    Attributes:
+        centre: Centre of pressure on the deformed skin [m], shape (N, 3).
+        normal: Contact normal, out of the skin, of unit length, shape (N, 3).
+        coefficients: Of the contact forces of each row [N], shape (N, K).
+        basis: What they are coefficients of: forces on the nodes of the outer surface [N], shape
+            (O, 3).
+    """
+
+    centre: FloatArray
+    normal: FloatArray
+    coefficients: FloatArray
+    basis: FieldBasis
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +183,7 @@ class MixedDataset:
         coefficients: Of the field of each row, shape (N, K).
         basis: What they are coefficients of.
         mesh: Whose nodes move.
+        contact: How the indenter bears on the skin; None where the source does not say.
     """
 
     experiment: ExperimentDataset
@@ -165,6 +191,7 @@ class MixedDataset:
     coefficients: FloatArray
     basis: FieldBasis
     mesh: SkinMesh
+    contact: SimulatedContact | None = None
 
     def __post_init__(self) -> None:
         rows, modes = len(self.experiment), len(self.basis.modes)
@@ -174,6 +201,19 @@ class MixedDataset:
         _check_array("basis mean", self.basis.mean, self.mesh.nodes.shape, np.float32)
         for name in ("simulated_force", "coefficients"):
             _check_finite(self.experiment, name, getattr(self, name))
+        if self.contact is not None:
+            basis = self.contact.basis
+            outer = (len(self.mesh.outer_nodes), 3)
+            for name, array, shape in (
+                ("contact centre", self.contact.centre, (rows, 3)),
+                ("contact normal", self.contact.normal, (rows, 3)),
+                ("contact coefficients", self.contact.coefficients, (rows, len(basis.modes))),
+                ("contact basis modes", basis.modes, (len(basis.modes), *outer)),
+                ("contact basis mean", basis.mean, outer),
+            ):
+                _check_array(name, array, shape, np.float32)
+                if len(array) == rows:
+                    _check_finite(self.experiment, name, array)
 
     def __len__(self) -> int:
         return len(self.experiment)
@@ -285,7 +325,17 @@ MIXED_COLUMNS: dict[str, StoredColumn] = {
     "mesh/subset": StoredColumn("1", np.int32),
 }
 
+CONTACT_COLUMNS: dict[str, StoredColumn] = {
+    "contact/centre": StoredColumn("m", np.float32),
+    "contact/normal": StoredColumn("1", np.float32),
+    "contact/coefficients": StoredColumn("N", np.float32),
+    "contact/basis/mean": StoredColumn("N", np.float32),
+    "contact/basis/modes": StoredColumn("1", np.float32),
+}
+"""Of mixed data sets that say how the indenter bears on the skin."""
+
 _MIXED_NUMBERS = ("loss_mean_m", "loss_max_m", "mesh_sha256")
+_CONTACT_NUMBERS = ("contact_loss_mean_n", "contact_loss_max_n")
 
 
 def write_experiment(path: Path, data: ExperimentDataset) -> str:
@@ -304,7 +354,7 @@ def write_mixed(path: Path, data: MixedDataset) -> str:
     Raises:
         DatasetError: The disk refused.
     """
-    return write_tables(path, MIXED_SCHEMA, MIXED_COLUMNS, _mixed_tables(data))
+    return write_tables(path, MIXED_SCHEMA, _mixed_columns(data), _mixed_tables(data))
 
 
 def read_experiment(path: Path) -> ExperimentDataset:
@@ -324,25 +374,38 @@ def read_mixed(path: Path) -> MixedDataset:
     Raises:
         DatasetError: As for ``read_experiment``.
     """
-    tables = read_tables(path, MIXED_SCHEMA, MIXED_COLUMNS, _MIXED_NUMBERS)
+    tables = read_tables(
+        path,
+        MIXED_SCHEMA,
+        MIXED_COLUMNS,
+        _MIXED_NUMBERS,
+        optional=CONTACT_COLUMNS,
+        optional_numbers=_CONTACT_NUMBERS,
+    )
     arrays, numbers = tables.arrays, tables.numbers
 
-    def build() -> MixedDataset:
-        def part(group: str) -> dict[str, Any]:
-            """Arrays of a group, by their own names."""
-            prefix = f"{group}/"
-            return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+    def part(group: str) -> dict[str, Any]:
+        """Arrays of a group, by their own names."""
+        named = {k: v for k, v in arrays.items() if k.rpartition("/")[0] == group}
+        return {name.rpartition("/")[2]: array for name, array in named.items()}
 
+    def basis(group: str, loss_mean: str, loss_max: str) -> FieldBasis:
+        losses = float(numbers[loss_mean]), float(numbers[loss_max])
+        return FieldBasis(part(group)["mean"], part(group)["modes"], *losses)
+
+    def build() -> MixedDataset:
+        contact = None
+        if "contact/basis/modes" in arrays:
+            contact = SimulatedContact(
+                **part("contact"), basis=basis("contact/basis", *_CONTACT_NUMBERS)
+            )
         return MixedDataset(
             experiment=_experiment(tables),
             simulated_force=arrays["simulated_force"],
             coefficients=arrays["coefficients"],
-            basis=FieldBasis(
-                **part("basis"),
-                loss_mean_m=float(numbers["loss_mean_m"]),
-                loss_max_m=float(numbers["loss_max_m"]),
-            ),
+            basis=basis("basis", "loss_mean_m", "loss_max_m"),
             mesh=SkinMesh(**part("mesh"), sha256=str(numbers["mesh_sha256"])),
+            contact=contact,
         )
 
     return _named(path, build)
@@ -378,21 +441,29 @@ def _experiment_tables(data: ExperimentDataset) -> StoredTables:
     )
 
 
+def _mixed_columns(data: MixedDataset) -> dict[str, StoredColumn]:
+    return MIXED_COLUMNS if data.contact is None else {**MIXED_COLUMNS, **CONTACT_COLUMNS}
+
+
 def _mixed_tables(data: MixedDataset) -> StoredTables:
     experiment = _experiment_tables(data.experiment)
+    numbers: dict[str, float | str] = {
+        "loss_mean_m": data.basis.loss_mean,
+        "loss_max_m": data.basis.loss_max,
+        "mesh_sha256": data.mesh.sha256,
+    }
+    if data.contact is not None:
+        basis = data.contact.basis
+        numbers |= dict(zip(_CONTACT_NUMBERS, (basis.loss_mean, basis.loss_max), strict=True))
     return StoredTables(
         {
             **experiment.arrays,
             **{
                 name: attrgetter(name.replace("/", "."))(data)
-                for name in MIXED_COLUMNS.keys() - EXPERIMENT_COLUMNS.keys()
+                for name in _mixed_columns(data).keys() - EXPERIMENT_COLUMNS.keys()
             },
         },
-        {
-            "loss_mean_m": data.basis.loss_mean_m,
-            "loss_max_m": data.basis.loss_max_m,
-            "mesh_sha256": data.mesh.sha256,
-        },
+        numbers,
         experiment.provenance,
     )
 

@@ -136,8 +136,8 @@ def contents(kind: str, data: ExperimentDataset | MixedDataset) -> ExperimentCon
         plain,
         modes=len(data.basis.modes),
         nodes=len(data.mesh.nodes),
-        field_loss_mean_m=data.basis.loss_mean_m,
-        field_loss_max_m=data.basis.loss_max_m,
+        field_loss_mean_m=data.basis.loss_mean,
+        field_loss_max_m=data.basis.loss_max,
         force_rms_n=float(np.sqrt(np.mean((data.simulated_force - rows.force) ** 2))),
     )
 

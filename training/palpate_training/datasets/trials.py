@@ -101,6 +101,8 @@ class SimulatedTrial:
         force: Net force on the BioTac [N], shape (S, 3).
         displacement: Of every node from the pressurised state [m], shape (S, V, 3), float32.
         converged: How many of the steps count: those before a divergence.
+        contact_force: Force of the indenter on each node of the skin's outer surface [N], shape
+            (S, O, 3), float32, in the order of ``SkinMesh.outer_nodes``; None if it is not known.
     """
 
     trajectory: str
@@ -108,6 +110,7 @@ class SimulatedTrial:
     force: Floats
     displacement: npt.NDArray[np.float32]
     converged: int
+    contact_force: npt.NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +142,14 @@ class MixedRows:
         rows: The experiment, interpolated; its ``travel_m`` is evenly spaced from 0.
         simulated_force: Net force of the simulation there [N], shape (R, 3).
         displacement: Nodal displacement there [m], shape (R, V, 3), float32.
+        contact_force: Force of the indenter on each outer node there [N], shape (R, O, 3), float32;
+            None if it is not known.
     """
 
     rows: TrialRows
     simulated_force: Floats
     displacement: npt.NDArray[np.float32]
+    contact_force: npt.NDArray[np.float32] | None = None
 
 
 _log = logging.getLogger(__name__)

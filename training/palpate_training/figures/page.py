@@ -130,8 +130,8 @@ def _motion(folder: Path, mixed: MixedDataset) -> list[str]:
     text = draw_motion(folder / "motion.png", mixed.mesh, share, len(mixed))
     loss = (
         f"Fields are kept as {len(mixed.basis.modes)} coefficients a row; that loses"
-        f" {1e6 * mixed.basis.loss_mean_m:.3g} um in the mean and at most"
-        f" {1e6 * mixed.basis.loss_max_m:.3g} um of any node.\n"
+        f" {1e6 * mixed.basis.loss_mean:.3g} um in the mean and at most"
+        f" {1e6 * mixed.basis.loss_max:.3g} um of any node.\n"
     )
     return ["## Skin motion\n", *_picture("motion.png", text), loss]
 

@@ -19,7 +19,13 @@ import torch
 from torch import Tensor, nn
 
 from palpate.messages import COUNTS_MAX
-from palpate_training.learning.networks import PAPER_WIDTHS, Activation, Mlp, predict
+from palpate_training.learning.networks import (
+    PAPER_WIDTHS,
+    Activation,
+    Mlp,
+    Standardised,
+    predict,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +69,7 @@ def fit(
     augment: Callable[[Tensor, Tensor], Tensor] = lambda batch, rows: batch,
     on_epoch: OnEpoch | None = None,
 ) -> None:
-    """Train a network in place.
+    """Train a network in place, on torch's default device, and leave it there.
 
     The caller seeds torch before it makes the network: weights, order of rows and augmentation all
     come from torch's one generator, so the same seed gives the same weights.
@@ -80,7 +86,9 @@ def fit(
         on_epoch: Called after each epoch, for a progress bar.
     """
     torch.set_num_threads(config.threads)
-    x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
+    device = torch.get_default_device()
+    net.to(device)
+    x, y = torch.from_numpy(inputs).to(device), torch.from_numpy(targets).to(device)
     optimiser = torch.optim.Adam(
         net.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
@@ -91,7 +99,9 @@ def fit(
     best_score, best_epoch, weights = math.inf, 0, copy.deepcopy(net.state_dict())
     for epoch in range(1, config.epochs + 1):
         net.train()
-        for rows in torch.split(torch.randperm(len(x)), config.batch_rows):
+        # Dealt on the CPU, so that the order is the same on every device.
+        order = torch.randperm(len(x), device="cpu").to(device)
+        for rows in torch.split(order, config.batch_rows):
             loss = loss_of(net(augment(x[rows], rows)), y[rows])
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
@@ -159,7 +169,35 @@ def fit_quantity(
         raise ValueError("drift_sd needs the baseline of the training rows")
     torch.manual_seed(seed)
     net = Mlp(config.widths, inputs.shape[1], config.activation)
-    net.normalise_from(inputs, targets)
+    rest = torch.from_numpy(baseline) if baseline is not None and config.drift_sd > 0 else None
+
+    def warm(batch: Tensor, rows: Tensor) -> Tensor:
+        return batch if rest is None else drift(batch, rest[rows], config.drift_sd)
+
+    fit_standardised(net, (inputs, targets), validation, config, augment=warm, on_epoch=on_epoch)
+    return net
+
+
+def fit_standardised(
+    net: Standardised,
+    train: tuple[FloatArray, FloatArray],
+    validation: tuple[FloatArray, FloatArray] | None,
+    config: FeaturesFitConfig,
+    *,
+    augment: Callable[[Tensor, Tensor], Tensor] = lambda batch, rows: batch,
+    on_epoch: OnEpoch | None = None,
+) -> None:
+    """Train a network in place: smooth-L1 on standardised targets, stopped by the median distance.
+
+    Args:
+        net: With fresh weights; its constants are set from the training rows.
+        train: Inputs ``(N, I)`` and targets ``(N, O)``.
+        validation: The same of the rows to stop on; None = all epochs are run.
+        config: Settings.
+        augment: As in ``fit``.
+        on_epoch: Called after each epoch, for a progress bar.
+    """
+    net.normalise_from(*train)
     smooth_l1 = nn.SmoothL1Loss(beta=config.huber_beta)
 
     def loss_of(estimate: Tensor, truth: Tensor) -> Tensor:
@@ -172,22 +210,15 @@ def fit_quantity(
         residual = predict(net, validation[0]) - validation[1]
         return float(np.median(np.linalg.norm(residual, axis=1)))
 
-    rest = torch.from_numpy(baseline) if baseline is not None and config.drift_sd > 0 else None
-
-    def warm(batch: Tensor, rows: Tensor) -> Tensor:
-        return batch if rest is None else drift(batch, rest[rows], config.drift_sd)
-
     fit(
         net,
-        inputs,
-        targets,
+        *train,
         loss_of=loss_of,
         score_of=None if validation is None else median_error,
         config=config,
-        augment=warm,
+        augment=augment,
         on_epoch=on_epoch,
     )
-    return net
 
 
 def drift(tared: Tensor, baseline: Tensor, sd: float) -> Tensor:

@@ -24,15 +24,22 @@ from palpate_training.learning.field_code import FieldCode, FilmPooling
 PAPER_WIDTHS = (256, 128, 128)
 """Hidden layers of the paper's MLP."""
 
-Activation = Literal["silu", "relu"]
+Activation = Literal["silu", "relu", "tanh"]
 """The paper does not state its activation. SiLU won on validation blocks (training/LOG.md)."""
 
 _SMALLEST_SD = 1e-6
 """Keeps a channel that never moves (a dead electrode) from dividing by zero."""
 
 
-class Mlp(nn.Module):
-    """Tared counts ``(N, 19)`` -> one quantity, by default ``(N, 3)``, in its own unit.
+_ACTIVATIONS: dict[Activation, type[nn.Module]] = {
+    "silu": nn.SiLU,
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+}
+
+
+class Standardised(nn.Module):
+    """Inputs ``(N, I)`` -> one quantity ``(N, O)``, each in its own unit, by some layers.
 
     Standardisation of the inputs and of the outputs are constants of the graph, so that
     it runs without any knowledge of the training data.
@@ -43,26 +50,17 @@ class Mlp(nn.Module):
     output_mean: Tensor
     output_sd: Tensor
 
-    def __init__(
-        self,
-        widths: Sequence[int] = PAPER_WIDTHS,
-        inputs: int = ELECTRODES,
-        activation: Activation = "silu",
-        outputs: int = 3,
-    ) -> None:
+    def __init__(self, layers: nn.Module, inputs: int = ELECTRODES, outputs: int = 3) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        for before, after in zip((inputs, *widths[:-1]), widths, strict=True):
-            layers += [nn.Linear(before, after), nn.SiLU() if activation == "silu" else nn.ReLU()]
-        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+        self.layers = layers
         self.register_buffer("input_mean", torch.zeros(inputs))
         self.register_buffer("input_sd", torch.ones(inputs))
         self.register_buffer("output_mean", torch.zeros(outputs))
         self.register_buffer("output_sd", torch.ones(outputs))
 
-    def forward(self, tared_counts: Tensor) -> Tensor:
-        """Estimate of the quantity, shape ``(N, outputs)``."""
-        scaled = (tared_counts - self.input_mean) / self.input_sd
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Estimate of the quantity, shape ``(N, O)``."""
+        scaled = (inputs - self.input_mean) / self.input_sd
         estimate: Tensor = self.layers(scaled) * self.output_sd + self.output_mean
         return estimate
 
@@ -79,14 +77,39 @@ class Mlp(nn.Module):
             sd.copy_(torch.from_numpy(spread))
 
 
+class Mlp(Standardised):
+    """Tared counts ``(N, 19)`` -> one quantity, by default ``(N, 3)``, fully connected."""
+
+    def __init__(
+        self,
+        widths: Sequence[int] = PAPER_WIDTHS,
+        inputs: int = ELECTRODES,
+        activation: Activation = "silu",
+        outputs: int = 3,
+    ) -> None:
+        layers: list[nn.Module] = []
+        for before, after in zip((inputs, *widths[:-1]), widths, strict=True):
+            layers += [nn.Linear(before, after), _ACTIVATIONS[activation]()]
+        super().__init__(nn.Sequential(*layers, nn.Linear(widths[-1], outputs)), inputs, outputs)
+
+
 def predict(
     net: nn.Module, inputs: npt.NDArray[np.float32], *, batch_rows: int = 8192
 ) -> npt.NDArray[np.float32]:
-    """Run a network over rows: ``(N, I)`` -> ``(N, O)``."""
+    """Run a network over rows, where it lies: ``(N, I)`` -> ``(N, O)``."""
     net.eval()
+    device = device_of(net)
     with torch.inference_mode():
-        parts = [net(part).numpy() for part in torch.split(torch.from_numpy(inputs), batch_rows)]
+        parts = [
+            net(part.to(device)).cpu().numpy()
+            for part in torch.split(torch.from_numpy(inputs), batch_rows)
+        ]
     return np.concatenate(parts)
+
+
+def device_of(net: nn.Module) -> torch.device:
+    """Where the weights of a network lie."""
+    return next(net.parameters()).device
 
 
 FloatArray = npt.NDArray[np.float32]

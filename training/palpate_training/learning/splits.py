@@ -1,14 +1,17 @@
-"""Train, validation, test: whole blocks, groups, trajectories or sensors, never single rows.
+"""Train, validation, test: whole blocks, groups, trajectories or sensors, not single rows.
 
 Neighbouring rows of a recording are nearly copies of one another, so a split by rows flatters
-every model (the idle drift of an untouched sensor alone correlates with force). There is no
-function here that could make one.
+every model (the idle drift of an untouched sensor alone correlates with force). The only function
+here that makes one is ``rows_at_random``, which shows how much: what a model could gain at most.
+Its results are never called results.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -194,3 +197,141 @@ def unit_sets(data: ExperimentDataset) -> list[tuple[str, ...]]:
     present = [name for i, name in enumerate(data.unit_names) if bool(np.any(data.row_unit == i))]
     each = [(name,) for name in present]
     return each + ([tuple(present)] if len(present) > 1 else [])
+
+
+SplitName = Literal["trajectory", "execution", "point", "indenter", "unit", "neighbour"]
+"""What is held out: a unique trajectory on every unit; one execution of it; a point of an indenter
+with all its trajectories; an indenter; a unit. ``neighbour`` holds out rows at random."""
+
+SPLITS: tuple[SplitName, ...] = get_args(SplitName)
+
+ALL_UNITS = "all units"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fold:
+    """One training and its test.
+
+    Attributes:
+        split: What is held out.
+        test: On what is tested, as tables call it: a unit, "all units", "biotac-1 to biotac-2".
+        part: The indenter that is held out; empty in the other splits. Rows of all parts of a test
+            are put together.
+        rows: Rows of each side.
+    """
+
+    split: SplitName
+    test: str
+    part: str
+    rows: RowSplit
+
+
+def folds_of(data: ExperimentDataset, split: SplitName, *, seed: int = 0) -> list[Fold]:
+    """All trainings of a split.
+
+    ``execution`` differs from ``trajectory`` only where several units are trained on together.
+
+    Raises:
+        DatasetError: The data set has too few trajectories, points, indenters or units.
+    """
+    folds = list(_folds(data, split, seed))
+    if not folds:
+        raise DatasetError(
+            f"the data set cannot be split by {split}",
+            remedy="it needs two units, or two indenters on a unit",
+        )
+    return folds
+
+
+def _folds(data: ExperimentDataset, split: SplitName, seed: int) -> Iterator[Fold]:
+    sets = unit_sets(data)
+    if split == "unit":
+        yield from _unseen_units(data, seed)
+        return
+    if split == "indenter":
+        yield from _unseen_indenters(data, seed)
+        return
+    if split == "neighbour":
+        dealt = rows_at_random(len(data), seed=seed)
+    else:
+        dealt = by_group(_groups(data, split), seed=seed)
+    for units in sets[-1:] if split == "execution" else sets:
+        yield Fold(split, name_of_units(units), "", of_units(data, dealt, units))
+
+
+def _groups(data: ExperimentDataset, split: SplitName) -> Labels:
+    if split == "execution":
+        return data.trial
+    if split == "trajectory":
+        return data.row_trajectory
+    points = [name.rpartition("/")[0] or name for name in data.trajectories]
+    _, number = np.unique(points, return_inverse=True)
+    return number.astype(np.int32)[data.row_trajectory]
+
+
+def rows_at_random(count: int, *, seed: int = 0) -> RowSplit:
+    """Rows dealt one by one, so that each test row has neighbours on the training side.
+
+    What a model reaches here is no result: it shows the noise of single rows, which no model can
+    learn away.
+    """
+    return by_group(np.arange(count, dtype=np.int32), seed=seed)
+
+
+def _unseen_units(data: ExperimentDataset, seed: int) -> Iterator[Fold]:
+    """Each unit from each other one, and from all others together; nothing is calibrated."""
+    names = [units[0] for units in unit_sets(data) if len(units) == 1]
+    inner = by_trajectory(data, seed=seed)
+    validation = np.zeros(len(data), bool)
+    validation[inner.validation] = True
+    for test in names:
+        others = [name for name in names if name != test]
+        sets = [(name,) for name in others] + ([tuple(others)] if len(others) > 1 else [])
+        for seen in sets:
+            yield Fold(
+                "unit",
+                f"{' + '.join(seen)} to {test}",
+                "",
+                _sides(_of(data, seen), _of(data, (test,)), validation),
+            )
+
+
+def _unseen_indenters(data: ExperimentDataset, seed: int) -> Iterator[Fold]:
+    """Each indenter from the others, on units that met all of them, alone and together."""
+    indenter = np.array(data.indenters)[data.row_trajectory]
+    every = np.unique(indenter)
+    whole = [
+        units[0]
+        for units in unit_sets(data)
+        if len(units) == 1 and len(np.unique(indenter[_of(data, units)])) == len(every)
+    ]
+    sets = [(name,) for name in whole] + ([tuple(whole)] if len(whole) > 1 else [])
+    inner = by_trajectory(data, seed=seed)
+    validation = np.zeros(len(data), bool)
+    validation[inner.validation] = True
+    for units, held in itertools.product(sets, every if len(every) > 1 else []):
+        mine, its = _of(data, units), indenter == held
+        yield Fold(
+            "indenter",
+            name_of_units(units, len(unit_sets(data)) - 1),
+            str(held),
+            _sides(mine & ~its, mine & its, validation),
+        )
+
+
+def _of(data: ExperimentDataset, units: Sequence[str]) -> Mask:
+    """Rows of some units."""
+    return np.isin(data.row_unit, [data.unit_names.index(unit) for unit in units])
+
+
+def _sides(seen: Mask, test: Mask, validation: Mask) -> RowSplit:
+    """Train and validate on the seen rows, test on others."""
+    sides = (seen & ~validation, seen & validation, test, ~seen & ~test)
+    return RowSplit(*(np.flatnonzero(side) for side in sides))
+
+
+def name_of_units(units: Sequence[str], of: int | None = None) -> str:
+    """How tables call a set of units; ``of`` is how many there are where these may be fewer."""
+    if len(units) == 1:
+        return units[0]
+    return ALL_UNITS if of in (None, len(units)) else " + ".join(units)

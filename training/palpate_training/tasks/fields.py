@@ -161,7 +161,8 @@ def fit_on_norms(
     The loss of a row is ``sqrt((scale |error|)^2 + floor^2)``: an L2 norm, smooth at zero. The
     validation rows are scored by the same loss.
     """
-    seen, truth = (torch.from_numpy(part) for part in validation)
+    device = torch.get_default_device()
+    seen, truth = (torch.from_numpy(part).to(device) for part in validation)
 
     def loss_of(estimate: Tensor, wanted: Tensor) -> Tensor:
         squares = torch.sum(torch.square(scale * (estimate - wanted)), dim=1)

@@ -288,6 +288,6 @@ def facts_of(data: MixedDataset, seeds: int, config: FitConfig) -> dict[str, obj
         "trajectories": len(np.unique(data.experiment.row_trajectory)),
         "seeds": seeds,
         "nodes": len(data.mesh.nodes),
-        "basis_loss_mean_m": data.basis.loss_mean_m,
+        "basis_loss_mean_m": data.basis.loss_mean,
         "config": asdict(config),
     }

@@ -32,6 +32,10 @@ Floats = npt.NDArray[np.float64]
 SUBSET = 128
 """Nodes of the paper's fields."""
 
+FORCE_MODES = 160
+"""Modes of the contact forces. Their patches are small and many, so no number of modes holds them
+as a few hundred hold the displacement; the data set says what is lost."""
+
 
 @dataclass(frozen=True, slots=True)
 class AssembledSets:
@@ -66,6 +70,7 @@ def assemble(
     names = [name for name in store.ids() if file_of(folder, name).exists()]
     if not names:
         raise DatasetError(f"{folder} holds no trial", remedy="run the stages before")
+    outer = np.unique(fingertip.mesh.outer_faces)
     rows: dict[str, tuple[TrialRows, ...]] = {}
     simulated: dict[str, SimulatedTrial] = {}
     dropped: list[tuple[str, str]] = []
@@ -75,7 +80,7 @@ def assemble(
         if done.rows:
             rows[name] = done.rows
             simulated[name] = simulated_trial(
-                name, store.trajectory(name), done.believed, clearance_m
+                name, store.trajectory(name), done.believed, clearance_m, outer
             )
         on_progress(k + 1, len(names), "read")
     every = [one for some in rows.values() for one in some]
@@ -110,16 +115,32 @@ def join(
     mesh = skin_mesh(fingertip)
     on_progress(0, 1, "basis of the fields")
     basis = fit_basis(lambda: (trial.displacement for trial in simulated.values()))
+    on_progress(0, 1, "basis of the contact forces")
+    contact_basis = fit_basis(
+        lambda: (
+            trial.contact_force for trial in simulated.values() if trial.contact_force is not None
+        ),
+        count=FORCE_MODES,
+    )
     on_progress(0, 1, "mixed data set")
     mixed = assemble_mixed(
-        _mixed(rows, simulated, dropped), basis, mesh, provenance, unit_names=unit_names
+        _mixed(rows, simulated, dropped),
+        basis,
+        mesh,
+        provenance,
+        contact_basis=contact_basis,
+        unit_names=unit_names,
     )
     on_progress(1, 1, "mixed data set")
     return mixed
 
 
 def simulated_trial(
-    name: str, trajectory: SimulatedTrajectory, believed: int, clearance_m: float
+    name: str,
+    trajectory: SimulatedTrajectory,
+    believed: int,
+    clearance_m: float,
+    outer: npt.NDArray[np.int32],
 ) -> SimulatedTrial:
     """A simulated trajectory from first contact on, as it is mixed with trials.
 
@@ -128,17 +149,20 @@ def simulated_trial(
         trajectory: As simulated.
         believed: How many of its steps to take, one or more.
         clearance_m: How far from the skin its path starts [m].
+        outer: Nodes of the outer surface, ascending.
     """
     steps = trajectory.steps[:believed]
     poses = np.array([step.pose[:3] for step in steps])
     travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1) - clearance_m
     fields = np.array([step.displacement for step in steps], np.float32)
+    contact = np.array([step.indenter_force[outer] for step in steps], np.float32)
     return SimulatedTrial(
         trajectory=name,
         travel_m=np.concatenate([[0.0], travel]),
         force=np.concatenate([np.zeros((1, 3)), [step.force for step in steps]]),
         displacement=np.concatenate([np.zeros_like(fields[:1]), fields]),
         converged=len(steps) + 1,
+        contact_force=np.concatenate([np.zeros_like(contact[:1]), contact]),
     )
 
 

@@ -175,6 +175,7 @@ def _mix(
 ) -> tuple[MixedDataset, Dropped]:
     fingertip = store.fingertip()
     common, left_out = common_trajectories(rows, set(store.ids()))
+    outer = np.unique(fingertip.mesh.outer_faces)
     simulated: dict[str, SimulatedTrial] = {}
     believable: list[TrialRows] = []
     names = sorted({one.header.trajectory for one in common})
@@ -192,7 +193,7 @@ def _mix(
             else:
                 believable.append(one)
                 simulated.setdefault(
-                    name, simulated_trial(name, trajectory, believed, simulator.clearance_m)
+                    name, simulated_trial(name, trajectory, believed, simulator.clearance_m, outer)
                 )
                 continue
             left_out.append((trial_name(one.header), why))

@@ -104,7 +104,12 @@ def _trials(data: ExperimentDataset, names: Sequence[str], *, inside: bool) -> l
 def _fewer_modes(mixed: MixedDataset) -> MixedDataset:
     fields = mixed.displacement(slice(0, len(mixed)))
     basis = fit_basis(lambda: [fields], count=DATASET_MODES)
-    return replace(mixed, basis=basis, coefficients=encode(basis, fields))
+    contact = mixed.contact
+    if contact is not None:
+        forces = contact.basis.decode(contact.coefficients)
+        forces_basis = fit_basis(lambda: [forces], count=DATASET_MODES)
+        contact = replace(contact, basis=forces_basis, coefficients=encode(forces_basis, forces))
+    return replace(mixed, basis=basis, coefficients=encode(basis, fields), contact=contact)
 
 
 def _write_tape(

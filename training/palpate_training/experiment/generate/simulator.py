@@ -70,6 +70,10 @@ class SimulatedStep(Protocol):
         """Of every node from the pressurised state [m], shape (V, 3)."""
 
     @property
+    def indenter_force(self) -> npt.NDArray[np.floating[Any]]:
+        """Force of the indenter on every node [N], shape (V, 3)."""
+
+    @property
     def force(self) -> Floats:
         """Net force on the BioTac [N], shape (3,)."""
 

@@ -1,0 +1,107 @@
+"""Cells: kept by what decides them, made once, never half."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.errors import DatasetError
+from palpate_training.evaluation.cells import (
+    Cell,
+    cell_key,
+    cell_path,
+    cells_of,
+    make_cells,
+    read_cell,
+)
+from palpate_training.learning.splits import Fold, RowSplit
+
+ROWS = RowSplit(*(np.arange(start, start + 4) for start in (0, 4, 8, 12)))
+FOLD = Fold("trajectory", "all units", "", ROWS)
+
+
+def noise(rows: RowSplit, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(len(rows.test), 3))
+
+
+@dataclass(frozen=True)
+class Sometimes:
+    name: str
+    seeded: bool
+    source: str = "a test"
+    fit: Callable[..., Any] = noise
+
+
+@dataclass(frozen=True)
+class NoiseTask:
+    """Gives noise as estimates."""
+
+    name: str = "noise"
+    data_sha256: str = "00"
+    systems: tuple[Sometimes, ...] = (Sometimes("drawn", True), Sometimes("still", False))
+
+    def fit_and_test(self, system: Any, rows: RowSplit, seed: int) -> dict[str, Any]:
+        if system.name == "broken":
+            raise DatasetError("this one fails", remedy="leave it out")
+        return {"estimate": system.fit(rows, seed)}
+
+
+def test_only_what_is_random_is_made_for_each_seed() -> None:
+    cells = list(cells_of(NoiseTask(), [FOLD], [0, 1, 2]))
+    assert [(cell.system, cell.seed) for cell in cells] == [
+        ("drawn", 0), ("drawn", 1), ("drawn", 2), ("still", 0)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_each_cell_is_made_once(tmp_path: Path, workers: int) -> None:
+    task = NoiseTask()
+    cells = list(cells_of(task, [FOLD], [0, 1]))
+    told: list[bool] = []
+
+    def on_cell(_: Cell, made: bool) -> None:
+        told.append(made)
+
+    for _ in range(2):
+        make_cells([task], cells, tmp_path, workers=workers, on_cell=on_cell)
+    assert told == [True] * 3 + [False] * 3
+    for cell in cells:
+        found = read_cell(cell_path(tmp_path, task, cell))
+        np.testing.assert_array_equal(found.arrays["estimate"], noise(ROWS, cell.seed))
+        assert found.seconds >= 0.0
+
+
+def test_what_decides_a_cell_is_in_its_name() -> None:
+    task = NoiseTask()
+    cell = Cell("noise", FOLD, "drawn", 0)
+    fewer = replace(FOLD, rows=replace(ROWS, train=ROWS.train[1:]))
+    keys = {
+        cell_key(task, cell),
+        cell_key(task, replace(cell, seed=1)),
+        cell_key(task, replace(cell, system="still")),
+        cell_key(task, replace(cell, fold=fewer)),
+        cell_key(replace(task, data_sha256="01"), cell),
+    }
+    assert len(keys) == 5
+    assert cell_key(task, cell) == cell_key(task, replace(cell))
+
+
+def test_what_was_made_before_a_failure_is_kept(tmp_path: Path) -> None:
+    task = replace(NoiseTask(), systems=(Sometimes("drawn", True), Sometimes("broken", False)))
+    cells = list(cells_of(task, [FOLD], [0, 1]))
+    with pytest.raises(DatasetError, match="this one fails"):
+        make_cells([task], cells, tmp_path, workers=0, on_cell=lambda *_: None)
+    assert [cell_path(tmp_path, task, cell).exists() for cell in cells] == [True, True, False]
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cell.npz"
+    for content in (b"", b"PK\x03\x04 no archive"):
+        path.write_bytes(content)
+        with pytest.raises(DatasetError, match=r"cell\.npz is damaged"):
+            read_cell(path)

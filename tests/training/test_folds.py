@@ -1,0 +1,112 @@
+"""All trainings of a split: what is held out is nowhere on the training side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from palpate.errors import DatasetError
+from palpate_training.datasets.assembly import assemble_experiment
+from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.experiment import ExperimentDataset
+from palpate_training.datasets.trials import TrialRows
+from palpate_training.learning.splits import SPLITS, Fold, SplitName, folds_of
+
+UNITS = ("one", "two", "three")
+INDENTERS = ("cube", "ring", "sphere")
+
+
+@pytest.fixture
+def data(make_rows: Callable[..., TrialRows], provenance: Provenance) -> ExperimentDataset:
+    """Three units, the first of which met one indenter only; ten points, three presses each."""
+    trials = [
+        make_rows(unit, f"{indenter}/{point}/{press}")
+        for unit in UNITS
+        for indenter in (INDENTERS[2:] if unit == "one" else INDENTERS)
+        for point in range(10)
+        for press in ("normal", "angled-1", "angled-2")
+    ]
+    return assemble_experiment(trials, provenance, unit_names=UNITS)
+
+
+def names(data: ExperimentDataset, rows: np.ndarray) -> set[str]:
+    return {data.trajectories[k] for k in data.row_trajectory[rows]}
+
+
+def units(data: ExperimentDataset, rows: np.ndarray) -> set[str]:
+    return {data.unit_names[k] for k in data.row_unit[rows]}
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_no_row_is_on_two_sides(data: ExperimentDataset, split: SplitName) -> None:
+    for fold in folds_of(data, split):
+        sides = (fold.rows.train, fold.rows.validation, fold.rows.test)
+        assert all(len(side) for side in sides), fold.test
+        together = np.concatenate(sides)
+        assert len(np.unique(together)) == len(together)
+
+
+def held_out(folds: list[Fold]) -> list[str]:
+    return sorted({fold.test for fold in folds})
+
+
+def test_unseen_trajectories(data: ExperimentDataset) -> None:
+    folds = folds_of(data, "trajectory")
+    assert held_out(folds) == ["all units", "one", "three", "two"]
+    for fold in folds:
+        assert not names(data, fold.rows.train) & names(data, fold.rows.test)
+
+
+def test_unseen_executions_may_be_seen_on_another_unit(data: ExperimentDataset) -> None:
+    (fold,) = folds_of(data, "execution")
+    assert names(data, fold.rows.train) & names(data, fold.rows.test)
+    assert not set(data.trial[fold.rows.train]) & set(data.trial[fold.rows.test])
+
+
+def test_unseen_points(data: ExperimentDataset) -> None:
+    for fold in folds_of(data, "point"):
+        seen, held = (
+            {name.rpartition("/")[0] for name in names(data, rows)}
+            for rows in (fold.rows.train, fold.rows.test)
+        )
+        assert not seen & held
+
+
+def test_unseen_indenters(data: ExperimentDataset) -> None:
+    folds = folds_of(data, "indenter")
+    assert held_out(folds) == ["three", "two", "two + three"]
+    for fold in folds:
+        assert {name.partition("/")[0] for name in names(data, fold.rows.test)} == {fold.part}
+        assert fold.part not in {name.partition("/")[0] for name in names(data, fold.rows.train)}
+        assert "one" not in units(data, fold.rows.train)
+    both = [fold for fold in folds if fold.test == "two + three"]
+    rows = np.concatenate([fold.rows.test for fold in both])
+    assert len(np.unique(rows)) == len(rows) == np.isin(data.row_unit, (1, 2)).sum()
+
+
+def test_unseen_units(data: ExperimentDataset) -> None:
+    folds = folds_of(data, "unit")
+    assert len(folds) == 9
+    assert {"one to two", "two + three to one"} <= set(held_out(folds))
+    for fold in folds:
+        seen, held = fold.test.split(" to ")
+        assert units(data, fold.rows.train) == set(seen.split(" + "))
+        assert units(data, fold.rows.test) == {held}
+        assert len(fold.rows.test) == (data.row_unit == UNITS.index(held)).sum()
+
+
+def test_neighbours_are_on_both_sides(data: ExperimentDataset) -> None:
+    fold = folds_of(data, "neighbour")[-1]
+    assert set(data.trial[fold.rows.test]) <= set(data.trial[fold.rows.train])
+
+
+def test_one_unit_cannot_be_unseen(
+    make_rows: Callable[..., TrialRows], provenance: Provenance
+) -> None:
+    rows = [make_rows("one", f"cube/{k}/normal") for k in range(6)]
+    data = assemble_experiment(rows, provenance)
+    for split in ("unit", "indenter"):
+        with pytest.raises(DatasetError, match=f"cannot be split by {split}"):
+            folds_of(data, split)

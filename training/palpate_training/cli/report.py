@@ -1,0 +1,128 @@
+"""``palpate train report``: every system on every split of a data set, as one page."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from palpate.errors import ConfigError, DatasetError
+from palpate.process import typed_command
+
+if TYPE_CHECKING:
+    from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
+    from palpate_training.evaluation.cells import Cell
+
+console = Console()
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def train_report(
+    data: Annotated[
+        Path,
+        typer.Option(help="Folder with experiment.h5 and mixed.h5, or with the published files."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for report.html, report.md and study.json.")],
+    tasks: Annotated[str, typer.Option(help="Tasks, with commas between; empty = all.")] = "",
+    splits: Annotated[str, typer.Option(help="Splits, with commas between; empty = all.")] = "",
+    systems: Annotated[
+        str, typer.Option(help="Words of which a system's name has one; empty = all.")
+    ] = "",
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Seeds of unseen trajectories; other splits have one.")
+    ] = 5,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Only tests of all units together.")
+    ] = False,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 = one for each core.")] = 0,
+    device: Annotated[str, typer.Option(help="Where networks are trained: cpu or cuda.")] = "cpu",
+    cells: Annotated[
+        Path | None, typer.Option(help="Folder of finished trainings; by default OUT/cells.")
+    ] = None,
+) -> None:
+    """Train and test every system on every split; goes on where a run was killed.
+
+    palpate train report --data runs/twin --out runs/report
+
+    palpate train report --data runs/twin --out runs/quick --tasks force --splits trajectory --whole
+    """
+    from palpate_training.evaluation.page import write_pages
+    from palpate_training.evaluation.study import TASKS, Study, StudyPlan, write_study
+    from palpate_training.learning.splits import SPLITS
+
+    wanted = _words(splits)
+    unknown = [word for word in wanted if word not in SPLITS]
+    if unknown:
+        raise ConfigError(
+            f"there is no split {', '.join(unknown)}", remedy=f"one of: {', '.join(SPLITS)}"
+        )
+    plan = StudyPlan(
+        tasks=_words(tasks) or TASKS,
+        splits=tuple(split for split in SPLITS if not wanted or split in wanted),
+        systems=_words(systems),
+        seeds=tuple(range(seeds)),
+        whole=whole,
+    )
+    study = Study(*read_folder(data), plan)
+    folder = cells or out / "cells"
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(elapsed_when_finished=False),
+        console=console,
+    ) as progress:
+        bar = progress.add_task("trainings", total=len(study.cells))
+
+        def on_cell(cell: Cell, made: bool) -> None:
+            if not made:
+                # What was there before says nothing about how long the rest takes.
+                progress.reset(bar, start=True, completed=int(progress.tasks[0].completed) + 1)
+                return
+            progress.update(bar, advance=1, description=f"{cell.task}: {cell.system}"[:48])
+
+        study.make(folder, workers=workers or os.cpu_count() or 1, device=device, on_cell=on_cell)
+    values = study.results(folder)
+    write_study(out / "study.json", values)
+    for path in (out / "study.json", *write_pages(out, values, command=typed_command())):
+        console.print(f"wrote {path}", soft_wrap=True)
+
+
+def read_folder(folder: Path) -> tuple[ExperimentDataset, MixedDataset | None]:
+    """The data sets of a folder: generated, executed or published.
+
+    Raises:
+        DatasetError: There is none, or it is damaged.
+    """
+    from palpate_training.datasets.experiment import read_experiment, read_mixed
+    from palpate_training.datasets.published import published_file, read_published
+
+    if (folder / "experiment.h5").is_file():
+        mixed = folder / "mixed.h5"
+        return (
+            read_experiment(folder / "experiment.h5"),
+            read_mixed(mixed) if mixed.is_file() else None,
+        )
+    if any(published_file(folder, unit).is_file() for unit in (1, 2, 3)):
+        return read_published(folder, command=typed_command()), None
+    raise DatasetError(
+        f"{folder} holds neither experiment.h5 nor biotac1.hdf5",
+        remedy="generate a data set (palpate data generate), or name the folder of the published "
+        "files",
+    )

@@ -1,0 +1,268 @@
+"""One cell of a table: a system, trained on the rows of a fold from a seed, tested on the others.
+
+Cells are kept in a folder, each in a file named by a hash of all that decides it: the data, the
+rows of each side, the seed and the code of the system. So a run that was killed goes on where it
+was, and what has changed is made again. The work is spread over processes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import multiprocessing
+import os
+import sys
+import time
+import zipfile
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
+from palpate_training.datasets.container import add_array
+from palpate_training.learning import baselines, field_code, fit, networks
+from palpate_training.learning.splits import Fold, RowSplit
+from palpate_training.systems import samples
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+_SHARED_CODE = (baselines, field_code, fit, networks, samples)
+
+
+class Tested(Protocol):
+    """A system as the tables see it."""
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+
+    @property
+    def source(self) -> str:
+        """Where it is specified."""
+
+    @property
+    def seeded(self) -> bool:
+        """Whether its estimates depend on the seed."""
+
+    @property
+    def fit(self) -> Callable[..., Any]:
+        """Fits it; its module is the code that decides its estimates."""
+
+
+class Task(Protocol):
+    """What is estimated, by which systems; can be pickled."""
+
+    @property
+    def name(self) -> str:
+        """As files and tables call it."""
+
+    @property
+    def data_sha256(self) -> str:
+        """Content hash of the data set."""
+
+    @property
+    def systems(self) -> Sequence[Tested]:
+        """Every system that can be tested."""
+
+    def fit_and_test(self, system: Tested, rows: RowSplit, seed: int) -> Arrays:
+        """Train a system, and give what is kept of its test, row by row of ``rows.test``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A training and its test.
+
+    Attributes:
+        task: What is estimated.
+        fold: On which rows.
+        system: Name of the system.
+        seed: Of everything random in it.
+    """
+
+    task: str
+    fold: Fold
+    system: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class CellResult:
+    """What is kept of a cell.
+
+    Attributes:
+        arrays: Of its test, row by row.
+        seconds: How long training and test took [s].
+    """
+
+    arrays: Arrays
+    seconds: float
+
+
+def grouped(
+    results: Mapping[Cell, CellResult],
+) -> Iterator[tuple[tuple[str, str, str], list[list[Cell]]]]:
+    """Split, test and system, with the cells of each seed, their parts in the same order."""
+    groups: dict[tuple[str, str, str], dict[int, list[Cell]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for cell in results:
+        groups[cell.fold.split, cell.fold.test, cell.system][cell.seed].append(cell)
+    for key, by_seed in groups.items():
+        yield key, list(by_seed.values())
+
+
+def cells_of(task: Task, folds: Iterable[Fold], seeds: Sequence[int]) -> Iterator[Cell]:
+    """All cells; a system that does not depend on the seed has one a fold."""
+    for fold in folds:
+        for system in task.systems:
+            for seed in seeds if system.seeded else seeds[:1]:
+                yield Cell(task.name, fold, system.name, seed)
+
+
+def cell_key(task: Task, cell: Cell) -> str:
+    """Hash of all that decides a cell, hex."""
+    digest = hashlib.sha256()
+    facts = [task.name, task.data_sha256, cell.system, cell.seed, code_of(_system(task, cell))]
+    digest.update(json.dumps(facts).encode())
+    for side in ("train", "validation", "test"):
+        add_array(digest, side, getattr(cell.fold.rows, side))
+    return digest.hexdigest()[:32]
+
+
+@cache
+def _file_sha256(path: str) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def code_of(system: Tested) -> str:
+    """Hash of the modules that decide a system's estimates, hex."""
+    inner: Any = system.fit
+    while isinstance(inner, partial):
+        inner = inner.func
+    modules = [sys.modules[inner.__module__], *_SHARED_CODE]
+    return "".join(_file_sha256(str(module.__file__))[:16] for module in modules)
+
+
+def _system(task: Task, cell: Cell) -> Tested:
+    return next(system for system in task.systems if system.name == cell.system)
+
+
+def cell_path(folder: Path, task: Task, cell: Cell) -> Path:
+    """File of a cell."""
+    return folder / task.name / f"{cell_key(task, cell)}.npz"
+
+
+def read_cell(path: Path) -> CellResult:
+    """What is kept of a cell.
+
+    Raises:
+        DatasetError: The file is damaged; names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        return CellResult(arrays, float(arrays.pop("seconds")))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise DatasetError(
+            f"{path} is damaged: {error}", remedy="remove it and run the command again"
+        ) from error
+
+
+def make_cells(
+    tasks: Sequence[Task],
+    cells: Sequence[Cell],
+    folder: Path,
+    *,
+    workers: int,
+    device: str = "cpu",
+    on_cell: Callable[[Cell, bool], None],
+) -> None:
+    """Make the cells that the folder does not hold, in ``workers`` processes (0 = in this one).
+
+    Networks are trained on ``device``, as torch calls it. ``on_cell`` is told each cell, and
+    whether it had to be made.
+
+    Raises:
+        DatasetError: The disk refuses.
+    """
+    by_name = {task.name: task for task in tasks}
+    left = []
+    for cell in cells:
+        if cell_path(folder, by_name[cell.task], cell).exists():
+            on_cell(cell, False)
+        else:
+            left.append(cell)
+    if workers == 0:
+        for cell in left:
+            _keep(folder, by_name[cell.task], cell, _made(by_name[cell.task], cell))
+            on_cell(cell, True)
+        return
+    with ProcessPoolExecutor(
+        min(workers, max(1, len(left))),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_take_tasks,
+        initargs=(by_name, device),
+    ) as pool:
+        waiting = iter(left)
+        running: dict[Future[bytes], Cell] = {}
+        # A few at a time, so that what is asked for does not lie in memory for all cells.
+        for cell in waiting:
+            running[pool.submit(_work, cell)] = cell
+            if len(running) >= 2 * workers:
+                _finish_some(running, folder, by_name, on_cell)
+        while running:
+            _finish_some(running, folder, by_name, on_cell)
+
+
+def _finish_some(
+    running: dict[Future[bytes], Cell],
+    folder: Path,
+    tasks: dict[str, Task],
+    on_cell: Callable[[Cell, bool], None],
+) -> None:
+    for done in wait(running, return_when=FIRST_COMPLETED).done:
+        cell = running.pop(done)
+        _keep(folder, tasks[cell.task], cell, done.result())
+        on_cell(cell, True)
+
+
+_tasks: dict[str, Task] = {}
+
+
+def _take_tasks(tasks: dict[str, Task], device: str) -> None:
+    os.nice(5)  # so that the machine stays usable during a night's work
+    torch.set_default_device(device)
+    _tasks.update(tasks)
+
+
+def _work(cell: Cell) -> bytes:
+    return _made(_tasks[cell.task], cell)
+
+
+def _made(task: Task, cell: Cell) -> bytes:
+    began_s = time.monotonic()
+    arrays = task.fit_and_test(_system(task, cell), cell.fold.rows, cell.seed)
+    buffer = io.BytesIO()
+    kept: Any = {**arrays, "seconds": np.array(time.monotonic() - began_s)}
+    np.savez_compressed(buffer, **kept)
+    return buffer.getvalue()
+
+
+def _keep(folder: Path, task: Task, cell: Cell, content: bytes) -> None:
+    path = cell_path(folder, task, cell)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(path) as part:
+            part.write_bytes(content)
+    except OSError as error:
+        raise DatasetError(f"{path}: {error}", remedy="free some space, and run again") from error

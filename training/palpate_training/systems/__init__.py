@@ -1,0 +1,1 @@
+"""Systems that estimate from electrodes: the paper's, those that it cites, and ours."""

@@ -1,0 +1,241 @@
+"""Our networks: logarithms of the impedance, the finger's symmetry, attention over electrodes.
+
+What an electrode reads follows the film above it: its impedance is nearly inverse in the film's
+thickness, so the logarithm of the impedance, less its untouched value, is nearly the logarithm of
+the film's relative thickness, whatever the fluid's conductivity. The finger is symmetric, so a row
+and its mirror image are both true; an estimate is the mean of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
+from palpate.messages import COUNTS_MAX
+from palpate_training.learning.fit import FeaturesFitConfig, fit
+from palpate_training.learning.networks import Standardised, predict
+from palpate_training.systems.samples import (
+    Estimate,
+    FloatArray,
+    Quantity,
+    Samples,
+    System,
+    error_of,
+    impedance_ohm,
+)
+
+ASSUMED_REST = 3200.0
+"""Untouched counts of every electrode where the source does not hold them."""
+
+MIRROR_AXES = np.array([1.0, -1.0, 1.0], np.float32)
+MEMBERS = 5
+NOISE_COUNTS = 2.0
+MAGNITUDE_FLOOR_N = 0.5
+"""Forces count as their error over this plus their magnitude, to the power of a half."""
+
+OURS_CONFIG = FeaturesFitConfig(
+    epochs=120, patience=30, batch_rows=256, learning_rate=2e-3, weight_decay=1e-5, threads=2
+)
+
+
+def inputs_of(samples: Samples) -> FloatArray:
+    """Tared counts, and the fall of the logarithm of the impedance, (N, 38)."""
+    rest = np.where(np.isfinite(samples.rest), samples.rest, np.float32(ASSUMED_REST))
+    # Where the rest is assumed, it must leave room for the fall.
+    rest = np.clip(np.maximum(rest, 1.0 - samples.tared), 1.0, COUNTS_MAX - 1.0)
+    fall = np.log(impedance_ohm(rest)) - np.log(impedance_ohm(rest + samples.tared))
+    return np.hstack([samples.tared, fall]).astype(np.float32)
+
+
+def mirrored_inputs(inputs: Tensor) -> Tensor:
+    """The inputs (N, 38) of the mirror image."""
+    order = torch.from_numpy(np.concatenate([ELECTRODE_MIRROR, ELECTRODE_MIRROR + 19])).long()
+    return torch.index_select(inputs, 1, order.to(inputs.device))
+
+
+class ResidualLayers(nn.Module):
+    """Blocks of two layers that add to their input."""
+
+    def __init__(self, inputs: int, outputs: int, width: int = 256, blocks: int = 3) -> None:
+        super().__init__()
+        self.first = nn.Linear(inputs, width)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                nn.LayerNorm(width),
+                nn.Linear(width, width),
+                nn.SiLU(),
+                nn.Linear(width, width),
+            )
+            for _ in range(blocks)
+        )
+        self.head = nn.Linear(width, outputs)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Estimate of standardised inputs."""
+        hidden = self.first(inputs)
+        for block in self.blocks:
+            hidden = hidden + block(hidden)
+        estimate: Tensor = self.head(nn.functional.silu(hidden))
+        return estimate
+
+
+class ElectrodeAttention(nn.Module):
+    """Self-attention over the 19 electrodes, each with its values and its place.
+
+    Args:
+        outputs: Estimated values.
+        width: Of a token.
+        layers: Attention layers.
+        heads: Of each.
+    """
+
+    place: Tensor
+
+    def __init__(self, outputs: int, width: int = 64, layers: int = 3, heads: int = 4) -> None:
+        super().__init__()
+        place = (ELECTRODE_POSITIONS / 5e-3).astype(np.float32)
+        self.register_buffer("place", torch.from_numpy(place))
+        self.of_values = nn.Linear(2, width)
+        self.of_place = nn.Sequential(nn.Linear(3, width), nn.SiLU(), nn.Linear(width, width))
+        self.own = nn.Parameter(0.02 * torch.randn(len(place), width))
+        layer = nn.TransformerEncoderLayer(
+            width, heads, 2 * width, dropout=0.0, batch_first=True, norm_first=True
+        )
+        self.encoder = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
+        self.head = nn.Sequential(
+            nn.LayerNorm(width * len(place)),
+            nn.Linear(width * len(place), 128),
+            nn.SiLU(),
+            nn.Linear(128, outputs),
+        )
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Estimate of standardised inputs (N, 38)."""
+        values = torch.stack(inputs.chunk(2, dim=1), dim=2)  # (N, 19, 2)
+        tokens = self.of_values(values) + self.of_place(self.place) + self.own
+        estimate: Tensor = self.head(self.encoder(tokens).flatten(1))
+        return estimate
+
+
+@dataclass(frozen=True, slots=True)
+class Members:
+    """An ensemble whose estimate is the mean of its members', each of a row and its mirror image.
+
+    Attributes:
+        nets: The members.
+        undirected: Whether the estimates are made unit vectors.
+    """
+
+    nets: tuple[Standardised, ...]
+    undirected: bool
+
+    def estimate(self, samples: Samples) -> FloatArray:
+        """Estimates of rows, shape (N, 3)."""
+        inputs = inputs_of(samples)
+        mirrored = mirrored_inputs(torch.from_numpy(inputs)).numpy()
+        total = np.zeros((len(inputs), 3), np.float64)
+        for net in self.nets:
+            total += predict(net, inputs) + predict(net, mirrored) * MIRROR_AXES
+        mean = total / (2 * len(self.nets))
+        if self.undirected:
+            mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+        return mean.astype(np.float32)
+
+
+def fit_members(
+    layers: Callable[[], nn.Module],
+    members: int,
+    quantity: Quantity,
+    train: Samples,
+    validation: Samples,
+    seed: int,
+) -> Estimate:
+    """Train an ensemble, each member from other weights and in another order of rows."""
+    inputs, targets = inputs_of(train), train.truth(quantity)
+    mirrored = mirrored_inputs(torch.from_numpy(inputs)).numpy()
+    both = np.vstack([inputs, mirrored])
+    truths = np.vstack([targets, targets * MIRROR_AXES])
+    nets = []
+    for member in range(members):
+        torch.manual_seed(1000 * seed + member)
+        net = Standardised(layers(), inputs.shape[1])
+        _fit_member(net, both, truths, validation, quantity)
+        nets.append(net)
+    return Members(tuple(nets), quantity == "normal").estimate
+
+
+def _fit_member(
+    net: Standardised,
+    inputs: FloatArray,
+    targets: FloatArray,
+    validation: Samples,
+    quantity: Quantity,
+) -> None:
+    net.normalise_from(inputs, targets)
+    noise = torch.from_numpy(input_noise())
+    truth = validation.truth(quantity)
+    size = float(np.sqrt(np.square(targets - targets.mean(axis=0)).sum(axis=1).mean()))
+
+    def loss_of(estimate: Tensor, wanted: Tensor) -> Tensor:
+        squares = torch.square((estimate - wanted) / size).sum(dim=1)
+        distance = torch.sqrt(squares + 1e-4)
+        if quantity != "force":
+            return distance.mean()
+        # A newton matters less the harder the press: what a robot needs is a share of the force.
+        magnitude = torch.linalg.vector_norm(wanted, dim=1)
+        return (distance * size / torch.sqrt(MAGNITUDE_FLOOR_N + magnitude)).mean()
+
+    def noisy(batch: Tensor, rows: Tensor) -> Tensor:
+        # The same noise of an electrode in both of its inputs.
+        drawn = torch.randn_like(batch[:, : batch.shape[1] // 2]).repeat(1, 2)
+        return batch + noise.to(batch.device) * drawn
+
+    fit(
+        net,
+        inputs,
+        targets,
+        loss_of=loss_of,
+        score_of=lambda _: error_of(Members((net,), False).estimate(validation), truth),
+        config=OURS_CONFIG,
+        augment=noisy,
+    )
+
+
+def input_noise() -> FloatArray:
+    """What noise of the counts does to each input, by the slope at a usual rest, (38,)."""
+    low, high = np.log(impedance_ohm(np.array([ASSUMED_REST - 1.0, ASSUMED_REST + 1.0])))
+    per_input = np.repeat([1.0, (low - high) / 2.0], len(ELECTRODE_MIRROR))
+    return (NOISE_COUNTS * per_input).astype(np.float32)
+
+
+_EVERY: tuple[Quantity, ...] = ("location", "force", "centre", "normal")
+
+OURS = (
+    System(
+        "residual network",
+        "ours: log impedances, mirror images",
+        partial(fit_members, partial(ResidualLayers, 38, 3), 1),
+        _EVERY,
+        seeded=True,
+    ),
+    System(
+        "residual networks, mean of five",
+        "ours: log impedances, mirror images, ensemble",
+        partial(fit_members, partial(ResidualLayers, 38, 3), MEMBERS),
+        _EVERY,
+        seeded=True,
+    ),
+    System(
+        "attention over electrodes",
+        "ours: log impedances, mirror images",
+        partial(fit_members, partial(ElectrodeAttention, 3), 1),
+        _EVERY,
+        seeded=True,
+    ),
+)
