@@ -1,0 +1,134 @@
+"""The whole study on tiny data: every cell filled, goes on where it was, one JSON, two pages."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli.report import read_folder, train_report
+from palpate_training.datasets.assembly import assemble_experiment
+from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.experiment import ExperimentDataset, write_experiment
+from palpate_training.datasets.trials import TrialRows
+from palpate_training.evaluation.features import paper_weights, weighted_median
+from palpate_training.evaluation.page import PAPER_LABEL, tables_of, write_pages
+from palpate_training.evaluation.study import Study, StudyPlan, write_study
+
+SIMPLE = ("zero", "training mean", "ridge")
+
+
+@pytest.fixture
+def data(make_rows: Callable[..., TrialRows], provenance: Provenance) -> ExperimentDataset:
+    """Two units, two indenters, ten points each."""
+    trials = [
+        make_rows(unit, f"{indenter}/{point}/{press}")
+        for unit in ("biotac-1", "biotac-2")
+        for indenter in ("cube", "ring")
+        for point in range(10)
+        for press in ("normal", "angled-1")
+    ]
+    return assemble_experiment(trials, provenance)
+
+
+def made(data: ExperimentDataset, folder: Path, **plan: Any) -> dict[str, Any]:
+    study = Study(data, None, StudyPlan(systems=SIMPLE, **plan))
+    study.make(folder, workers=0)
+    return study.results(folder)
+
+
+def test_every_cell_of_every_split_is_filled(data: ExperimentDataset, tmp_path: Path) -> None:
+    values = made(data, tmp_path / "cells")
+    found = {(row["task"], row["split"], row["test"], row["system"]) for row in values["scores"]}
+    assert len(found) == len(values["scores"])
+    splits = {(task, split) for task, split, _, _ in found}
+    assert splits == {
+        (task, split)
+        for task in ("location", "force")
+        for split in ("trajectory", "execution", "point", "indenter", "unit", "neighbour")
+    }
+    assert ("force", "unit", "biotac-1 to biotac-2", "zero") in found
+    held = next(row for row in values["scores"] if row["split"] == "indenter")
+    assert set(held["parts"]) == {"cube", "ring"}
+
+
+def test_scores_are_those_of_the_estimates(data: ExperimentDataset, tmp_path: Path) -> None:
+    values = made(data, tmp_path, tasks=("force",), splits=("trajectory",))
+    plan = StudyPlan(tasks=("force",), splits=("trajectory",), systems=("zero",))
+    study = Study(data, None, plan)
+    rows = next(cell.fold.rows.test for cell in study.cells if cell.fold.test == "all units")
+    zero = next(
+        row for row in values["scores"] if row["test"] == "all units" and row["system"] == "zero"
+    )
+    force = np.linalg.norm(data.force[rows], axis=1)
+    assert zero["metrics"]["magnitude_n_median"] == pytest.approx(np.median(force), rel=1e-6)
+    assert zero["metrics"]["magnitude_over_norm_median_below_2n"] == pytest.approx(1.0)
+    low, high = zero["intervals"]["magnitude_n_median"]
+    assert low <= np.percentile(force, 50, method="lower") <= high
+
+
+def test_pages_show_the_json_beside_the_paper(data: ExperimentDataset, tmp_path: Path) -> None:
+    values = made(data, tmp_path / "cells", splits=("trajectory",))
+    write_study(tmp_path / "study.json", values)
+    read = json.loads((tmp_path / "study.json").read_text())
+    paths = write_pages(tmp_path, read, command="palpate train report")
+    markdown, page = (path.read_text() for path in paths)
+    assert "made by a test" in markdown
+    ridge = next(
+        row
+        for row in read["scores"]
+        if row["task"] == "location" and row["system"] == "ridge" and row["test"] == "biotac-1"
+    )
+    shown = f"{1e3 * ridge['metrics']['distance_m_median']:.2f}"
+    for text in (markdown, page):
+        assert shown in text
+    assert markdown.count(PAPER_LABEL) == 3
+    assert page.count("<table>") == sum(bool(table.rows) for table in tables_of(read))
+
+
+def test_a_study_that_holds_nothing_says_what_there_is(data: ExperimentDataset) -> None:
+    with pytest.raises(ConfigError, match="no system of these tasks"):
+        Study(data, None, StudyPlan(systems=("nobody",)))
+    with pytest.raises(ConfigError, match="no task 'forces'"):
+        Study(data, None, StudyPlan(tasks=("forces",)))
+    with pytest.raises(ConfigError, match="nothing is to be made"):
+        Study(data, None, StudyPlan(tasks=("field",)))
+
+
+def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_path: Path) -> None:
+    write_experiment(tmp_path / "experiment.h5", data)
+    options: dict[str, Any] = {
+        "data": tmp_path, "out": tmp_path / "out", "tasks": "force", "splits": "trajectory",
+        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 1, "device": "cpu",
+        "cells": None,
+    }  # fmt: skip
+    train_report(**options)
+    kept = sorted((tmp_path / "out" / "cells" / "force").glob("*.npz"))
+    times = [path.stat().st_mtime_ns for path in kept]
+    assert len(kept) == 2
+    train_report(**options)
+    assert [path.stat().st_mtime_ns for path in kept] == times
+    with pytest.raises(ConfigError, match="no split sideways"):
+        train_report(**{**options, "splits": "sideways"})
+    with pytest.raises(DatasetError, match="neither experiment"):
+        read_folder(tmp_path / "out")
+
+
+def test_weights_give_the_forces_the_paper_s_spread() -> None:
+    force = np.random.default_rng(0).exponential(2.5, 4000) + 0.5
+    weights = paper_weights(force)
+    mean = weights @ force
+    assert np.sqrt(weights @ (force - mean) ** 2) == pytest.approx(4.6, rel=0.05)
+    assert paper_weights(np.full(10, 3.0)) == pytest.approx(0.1)
+
+
+def test_a_weighted_median_is_that_of_repeated_values() -> None:
+    values = np.array([3.0, 1.0, np.nan, 2.0])
+    assert weighted_median(values, np.array([1.0, 1.0, 9.0, 1.0])) == 2.0
+    assert weighted_median(values, np.array([5.0, 1.0, 9.0, 1.0])) == 3.0
+    assert np.isnan(weighted_median(values[2:3], np.ones(1)))
