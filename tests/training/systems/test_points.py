@@ -71,8 +71,9 @@ def test_exports_with_standard_operators(make: object) -> None:
     assert_exports(net, torch.randn(5, inputs))
 
 
+@pytest.mark.slow
 def test_it_learns(make_samples: MakeSamples, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick = replace(points.POINTS_CONFIG, epochs=40, patience=40, batch_rows=64)
+    quick = replace(points.POINTS_CONFIG, epochs=30, patience=30, batch_rows=64)
     monkeypatch.setattr(points, "POINTS_CONFIG", quick)
     train, test = make_samples(300, seed=1), make_samples(200, seed=2)
     mean = np.repeat(train.force.mean(axis=0)[None], len(test), axis=0)

@@ -70,6 +70,7 @@ def test_exports_with_standard_operators(make: type) -> None:
     assert_exports(make(), 100.0 * torch.randn(5, 19))
 
 
+@pytest.mark.slow
 def test_both_learn(make_samples: MakeSamples, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, epochs in (("VOXEL_CONFIG", 10), ("PROJECTION_CONFIG", 80)):
         quick = replace(getattr(voxels, name), epochs=epochs, patience=epochs, batch_rows=64)
