@@ -21,8 +21,8 @@ def test_the_goal_is_for_every_trial() -> None:
     assert not _trials(1.0, failed=1).met
     assert _trials(7.0, 9.9, fault="hang").met
     assert not _trials(10.1, fault="hang").met
-    assert _trials(29.0, fault="end").met, "it has ended after 2.9 s"
-    assert not _trials(31.0, fault="end").met
+    assert _trials(19.0, fault="end").met, "it has ended after 1.9 s"
+    assert not _trials(21.0, fault="end").met
 
 
 @pytest.mark.slow

@@ -167,14 +167,19 @@ def test_what_cannot_be_split_is_named() -> None:
         by_group(np.array([0, 1], dtype=np.int32))
 
 
-def test_no_function_splits_rows_at_random() -> None:
+def test_a_single_function_splits_rows_at_random() -> None:
+    """And its name says so; what it gives is called no result (``folds_of``, ``neighbour``)."""
     public = [name for name, _ in inspect.getmembers(splits, inspect.isfunction) if name[0] != "_"]
     assert sorted(public) == [
         "by_group",
         "by_trajectory",
         "contiguous_folds",
         "dataclass",
+        "folds_of",
+        "get_args",
+        "name_of_units",
         "of_units",
+        "rows_at_random",
         "unit_sets",
         "unseen_sensor",
     ]

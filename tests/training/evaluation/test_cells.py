@@ -58,8 +58,7 @@ def test_only_what_is_random_is_made_for_each_seed() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_each_cell_is_made_once(tmp_path: Path, workers: int) -> None:
+def test_each_cell_is_made_once(tmp_path: Path) -> None:
     task = NoiseTask()
     cells = list(cells_of(task, [FOLD], [0, 1]))
     told: list[bool] = []
@@ -68,7 +67,7 @@ def test_each_cell_is_made_once(tmp_path: Path, workers: int) -> None:
         told.append(made)
 
     for _ in range(2):
-        make_cells([task], cells, tmp_path, workers=workers, on_cell=on_cell)
+        make_cells([task], cells, tmp_path, workers=0, on_cell=on_cell)
     assert told == [True] * 3 + [False] * 3
     for cell in cells:
         found = read_cell(cell_path(tmp_path, task, cell))

@@ -104,7 +104,7 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
     write_experiment(tmp_path / "experiment.h5", data)
     options: dict[str, Any] = {
         "data": tmp_path, "out": tmp_path / "out", "tasks": "force", "splits": "trajectory",
-        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 1, "device": "cpu",
+        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 2, "device": "cpu",
         "cells": None,
     }  # fmt: skip
     train_report(**options)
