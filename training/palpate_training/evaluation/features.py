@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -294,17 +294,16 @@ def ratios_to_paper(
     data: ExperimentDataset,
     results: Mapping[Cell, CellResult],
     *,
-    of: Callable[[RowErrors], Floats],
+    error: str,
     least_n: float = 0.0,
     most_n: float = np.inf,
-    ours: Iterable[str] = OUR_NAMES,
 ) -> dict[tuple[str, str, str], tuple[float, float, float]]:
     """Median error of each of ours over that of the best of the paper's three, with its interval.
 
     By split, test and system. Only rows between two forces [N] count. The best of the three is the
     one with the least error in that same test, which favours it.
     """
-    wanted = {*ours, *PAPER_SYSTEMS}
+    wanted = {*OUR_NAMES, *PAPER_SYSTEMS}
     kept = {cell: result for cell, result in results.items() if cell.system in wanted}
     drawn: dict[tuple[str, str], dict[str, tuple[float, Floats]]] = defaultdict(dict)
     for one in _tests(kept):
@@ -312,7 +311,7 @@ def ratios_to_paper(
         counts = (force_n >= least_n) & (force_n < most_n)
         truth = task.samples.truth(task.name)[one.rows].astype(np.float64)
         errors = [
-            np.where(counts, of(row_errors(task.name, each, truth)), np.nan)
+            np.where(counts, row_errors(task.name, each, truth)[error], np.nan)
             for each in one.estimates
         ]
         median = float(np.mean([_median(each) for each in errors]))
@@ -324,7 +323,7 @@ def ratios_to_paper(
         if not papers:
             continue
         best = min(papers, key=lambda one: one[0])
-        for name in ours:
+        for name in OUR_NAMES:
             if name in systems:
                 low, high = interval(systems[name][1] / best[1])
                 found[split, test, name] = (systems[name][0] / best[0], low, high)

@@ -16,7 +16,8 @@ from palpate_training.evaluation.intervals import drawn_medians, interval
 from palpate_training.learning.metrics import cluster_bootstrap, root_mean
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS, FieldSystem
-from palpate_training.systems.synthesis import SYNTHESIS_SYSTEMS, SynthesisSystem, counts_of
+from palpate_training.systems.synthesis import SYNTHESIS_SYSTEMS, SynthesisSystem
+from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
 
@@ -103,7 +104,7 @@ def score_fields(task: FieldTask, results: Mapping[Cell, CellResult]) -> list[Sc
 
 def score_synthesis(task: SynthesisTask, results: Mapping[Cell, CellResult]) -> list[Scores]:
     """The table of synthesis: root mean square [counts], median norm, and of each electrode."""
-    counts = counts_of(task.data)
+    counts = tared_counts(task.data)
     found = []
     for key, by_seed in grouped(results):
         rows = np.concatenate([cell.fold.rows.test for cell in by_seed[0]])

@@ -30,7 +30,6 @@ from palpate_training.evaluation.cells import (
 )
 from palpate_training.evaluation.features import (
     FeatureTask,
-    RowErrors,
     Scores,
     feature_task,
     ratios_to_paper,
@@ -231,12 +230,8 @@ class Study:
             "normal": [(angle, 0.0, float("inf"))],
         }[task.name]  # fmt: skip
         for error, least_n, most_n in wanted:
-
-            def of(errors: RowErrors, error: str = error) -> Any:
-                return errors[error]
-
             found = ratios_to_paper(
-                task, self._data_of(task), made, of=of, least_n=least_n, most_n=most_n
+                task, self._data_of(task), made, error=error, least_n=least_n, most_n=most_n
             )
             for (split, test, system), (ratio, low, high) in found.items():
                 yield {

@@ -172,7 +172,7 @@ def of_units(data: ExperimentDataset, split: RowSplit, units: Sequence[str]) -> 
             f"the data set has no unit {', '.join(unknown) or '(none was given)'}",
             remedy=f"choose from {', '.join(data.unit_names)}",
         )
-    wanted = np.isin(data.row_unit, [data.unit_names.index(unit) for unit in units])
+    wanted = _of(data, units)
 
     sides = {
         name: rows[wanted[rows]]

@@ -23,8 +23,8 @@ from palpate_training.learning.splits import RowSplit
 from palpate_training.systems.latent import fit_latents
 from palpate_training.systems.points import FITTED, PUBLISHED, Abstraction, PointNetPlus
 from palpate_training.systems.statistical import Scaling, boosted_trees
-from palpate_training.systems.synthesis import POINTS_CONFIG, counts_of, moved_nodes
-from palpate_training.tasks.fields import fit_field
+from palpate_training.systems.synthesis import POINTS_CONFIG, moved_nodes
+from palpate_training.tasks.fields import fit_field, tared_counts
 
 FloatArray = npt.NDArray[np.float32]
 Rows = npt.NDArray[np.int64]
@@ -87,7 +87,7 @@ def _of_code(
     data: MixedDataset, code: FieldCode, estimate: Callable[[FloatArray], npt.NDArray[np.floating]]
 ) -> WholeSkinEstimate:
     """From tared counts to coefficients to fields."""
-    counts = counts_of(data)
+    counts = tared_counts(data)
     return WholeSkinEstimate(data, lambda some: code.decode(estimate(counts[some])))
 
 
@@ -100,7 +100,7 @@ def fit_mean(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate
 def fit_ridge(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
     """Coefficients linear in the counts."""
     code = fit_code(data, rows.train, rows.validation)
-    x, y = counts_of(data), code.encode(data.coefficients)
+    x, y = tared_counts(data), code.encode(data.coefficients)
     line = baselines.ridge(x[rows.train], y[rows.train], x[rows.validation], y[rows.validation])
     return _of_code(data, code, line.predict)
 
@@ -108,7 +108,7 @@ def fit_ridge(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimat
 def fit_neighbours(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
     """Mean field of the three training rows whose counts are nearest."""
     code = fit_code(data, rows.train, rows.validation)
-    x, y = counts_of(data)[rows.train], code.encode(data.coefficients)[rows.train]
+    x, y = tared_counts(data)[rows.train], code.encode(data.coefficients)[rows.train]
     scale = Scaling.of(x)
     model = KNeighborsRegressor(3).fit(scale.apply(x), y)
     return _of_code(data, code, lambda counts: model.predict(scale.apply(counts)))
@@ -119,7 +119,7 @@ def fit_trees(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimat
     code = fit_code(data, rows.train, rows.validation)
     y = code.encode(data.coefficients)[rows.train]
     kept = min(TREE_MODES, code.size)
-    predicted = boosted_trees(counts_of(data)[rows.train], y[:, :kept], seed)
+    predicted = boosted_trees(tared_counts(data)[rows.train], y[:, :kept], seed)
 
     def estimate(counts: FloatArray) -> FloatArray:
         found = np.zeros((len(counts), code.size), np.float32)
@@ -134,7 +134,7 @@ def fit_points(
 ) -> NodeSubsetEstimate:
     """PointNet++ on the electrodes, to the 128 nodes, trained on their mean distance."""
     torch.manual_seed(seed)
-    x, y = counts_of(data), moved_nodes(data)
+    x, y = tared_counts(data), moved_nodes(data)
     net = Standardised(
         PointNetPlus(ELECTRODE_POSITIONS, 1, y.shape[1], layers), x.shape[1], y.shape[1]
     )
@@ -161,7 +161,7 @@ def fit_points(
 def fit_narang(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
     """Narang 2021, from the electrodes to the skin."""
     code = fit_code(data, rows.train, rows.validation)
-    x, y = counts_of(data)[rows.train], code.encode(data.coefficients)[rows.train]
+    x, y = tared_counts(data)[rows.train], code.encode(data.coefficients)[rows.train]
     signal, mesh = Scaling.of(x), Scaling.of(y)
     latents = fit_latents(
         signal.apply(x).astype(np.float32), mesh.apply(y).astype(np.float32),

@@ -16,7 +16,6 @@ import torch
 from sklearn.neighbors import KNeighborsRegressor
 from torch import Tensor
 
-from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import baselines
 from palpate_training.learning.field_code import fit_code, pooling
@@ -29,6 +28,7 @@ from palpate_training.systems.ruppel import CONFIG as RUPPEL_CONFIG
 from palpate_training.systems.ruppel import BranchedLayers, network_a, network_b, ruppel_inputs
 from palpate_training.systems.samples import samples_of
 from palpate_training.systems.statistical import Scaling, boosted_trees
+from palpate_training.tasks.fields import tared_counts
 from palpate_training.tasks.synthesis import fit_synthesis, synthesis_features
 
 FloatArray = npt.NDArray[np.float32]
@@ -50,11 +50,6 @@ class SynthesisSystem:
     seeded: bool = False
 
 
-def counts_of(data: MixedDataset) -> FloatArray:
-    """Tared electrodes of all rows [counts], shape (N, 19)."""
-    return np.asarray(data.experiment.tared * np.float32(COUNTS_MAX), np.float32)
-
-
 def moved_nodes(data: MixedDataset) -> FloatArray:
     """Displacement of the 128 nodes in all rows [m], shape (N, 128 * 3)."""
     modes = data.basis.modes[:, data.mesh.subset].reshape(len(data.basis.modes), -1)
@@ -70,7 +65,7 @@ def fit_zero(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
 
 def fit_mean(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """The mean of the training rows."""
-    mean = counts_of(data)[rows.train].mean(axis=0, dtype=np.float64).astype(np.float32)
+    mean = tared_counts(data)[rows.train].mean(axis=0, dtype=np.float64).astype(np.float32)
     return lambda some: np.repeat(mean[None], len(some), axis=0)
 
 
@@ -81,14 +76,14 @@ def _features(data: MixedDataset, rows: RowSplit) -> FloatArray:
 
 def fit_ridge(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """Linear in coefficients and pooled film."""
-    x, y = _features(data, rows), counts_of(data)
+    x, y = _features(data, rows), tared_counts(data)
     line = baselines.ridge(x[rows.train], y[rows.train], x[rows.validation], y[rows.validation])
     return lambda some: line.predict(x[some]).astype(np.float32)
 
 
 def fit_neighbours(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """Mean of the three training rows whose coefficients are nearest."""
-    y = counts_of(data)
+    y = tared_counts(data)
     # Modes are orthonormal: distances of coefficients are those of the fields.
     model = KNeighborsRegressor(3).fit(data.coefficients[rows.train], y[rows.train])
     return lambda some: np.asarray(model.predict(data.coefficients[some]), np.float32)
@@ -97,7 +92,7 @@ def fit_neighbours(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
 def fit_trees(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """Zai El Amri 2024: boosted trees on coefficients and pooled film."""
     x = _features(data, rows)
-    predicted = boosted_trees(x[rows.train], counts_of(data)[rows.train], seed)
+    predicted = boosted_trees(x[rows.train], tared_counts(data)[rows.train], seed)
     return lambda some: predicted(x[some])
 
 
@@ -123,7 +118,7 @@ def _fit_net(
 def fit_points(make: str, data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """A network on the 128 nodes: ``PointNet++`` or ``PointNet``."""
     torch.manual_seed(seed)
-    x, y = moved_nodes(data), counts_of(data)
+    x, y = moved_nodes(data), tared_counts(data)
     points = data.mesh.nodes[data.mesh.subset]
     if make == "PointNet":
         net = Standardised(PointNet(points, y.shape[1]), x.shape[1], y.shape[1])
@@ -138,14 +133,14 @@ def fit_ruppel(
 ) -> CountsOf:
     """Ruppel 2019, from contact location and force."""
     torch.manual_seed(seed)
-    x, y = ruppel_inputs(samples_of(data.experiment)), counts_of(data)
+    x, y = ruppel_inputs(samples_of(data.experiment)), tared_counts(data)
     return _fit_net(make(y.shape[1]), x, y, rows, RUPPEL_CONFIG)
 
 
 def fit_narang(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """Narang 2021, from the skin to the electrodes."""
     code = fit_code(data, rows.train, rows.validation)
-    x, y = code.encode(data.coefficients), counts_of(data)
+    x, y = code.encode(data.coefficients), tared_counts(data)
     mesh, signal = Scaling.of(x[rows.train]), Scaling.of(y[rows.train])
     given = mesh.apply(x).astype(np.float32)
     latents = fit_latents(
