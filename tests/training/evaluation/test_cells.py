@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
+from palpate_training.evaluation import cells
 from palpate_training.evaluation.cells import (
     Cell,
     cell_key,
@@ -20,6 +21,7 @@ from palpate_training.evaluation.cells import (
     read_cell,
 )
 from palpate_training.learning.splits import Fold, RowSplit
+from palpate_training.systems.fields import FIELD_SYSTEMS
 
 ROWS = RowSplit(*(np.arange(start, start + 4) for start in (0, 4, 8, 12)))
 FOLD = Fold("trajectory", "all units", "", ROWS)
@@ -52,24 +54,24 @@ class NoiseTask:
 
 
 def test_only_what_is_random_is_made_for_each_seed() -> None:
-    cells = list(cells_of(NoiseTask(), [FOLD], [0, 1, 2]))
-    assert [(cell.system, cell.seed) for cell in cells] == [
+    each = list(cells_of(NoiseTask(), [FOLD], [0, 1, 2]))
+    assert [(cell.system, cell.seed) for cell in each] == [
         ("drawn", 0), ("drawn", 1), ("drawn", 2), ("still", 0)
     ]  # fmt: skip
 
 
 def test_each_cell_is_made_once(tmp_path: Path) -> None:
     task = NoiseTask()
-    cells = list(cells_of(task, [FOLD], [0, 1]))
+    each = list(cells_of(task, [FOLD], [0, 1]))
     told: list[bool] = []
 
     def on_cell(_: Cell, made: bool) -> None:
         told.append(made)
 
     for _ in range(2):
-        make_cells([task], cells, tmp_path, workers=0, on_cell=on_cell)
+        make_cells([task], each, tmp_path, workers=0, on_cell=on_cell)
     assert told == [True] * 3 + [False] * 3
-    for cell in cells:
+    for cell in each:
         found = read_cell(cell_path(tmp_path, task, cell))
         np.testing.assert_array_equal(found.arrays["estimate"], noise(ROWS, cell.seed))
         assert found.seconds >= 0.0
@@ -90,12 +92,24 @@ def test_what_decides_a_cell_is_in_its_name() -> None:
     assert cell_key(task, cell) == cell_key(task, replace(cell))
 
 
+@pytest.mark.parametrize("module", ["systems/latent", "tasks/fields", "learning/fit"])
+def test_code_that_a_system_builds_on_is_in_its_name(
+    monkeypatch: pytest.MonkeyPatch, module: str
+) -> None:
+    before = cells.code_of(FIELD_SYSTEMS[-1])
+    original = cells._file_sha256
+    monkeypatch.setattr(
+        cells, "_file_sha256", lambda path: "changed" if module in path else original(path)
+    )
+    assert cells.code_of(FIELD_SYSTEMS[-1]) != before
+
+
 def test_what_was_made_before_a_failure_is_kept(tmp_path: Path) -> None:
     task = replace(NoiseTask(), systems=(Sometimes("drawn", True), Sometimes("broken", False)))
-    cells = list(cells_of(task, [FOLD], [0, 1]))
+    each = list(cells_of(task, [FOLD], [0, 1]))
     with pytest.raises(DatasetError, match="this one fails"):
-        make_cells([task], cells, tmp_path, workers=0, on_cell=lambda *_: None)
-    assert [cell_path(tmp_path, task, cell).exists() for cell in cells] == [True, True, False]
+        make_cells([task], each, tmp_path, workers=0, on_cell=lambda *_: None)
+    assert [cell_path(tmp_path, task, cell).exists() for cell in each] == [True, True, False]
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

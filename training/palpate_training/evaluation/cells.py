@@ -30,13 +30,11 @@ import torch
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.container import add_array
-from palpate_training.learning import baselines, field_code, fit, networks
 from palpate_training.learning.splits import Fold, RowSplit
-from palpate_training.systems import samples
 
 Arrays = dict[str, npt.NDArray[Any]]
 
-_SHARED_CODE = (baselines, field_code, fit, networks, samples)
+_CODE = "palpate_training."
 
 
 class Tested(Protocol):
@@ -145,12 +143,21 @@ def _file_sha256(path: str) -> str:
 
 
 def code_of(system: Tested) -> str:
-    """Hash of the modules that decide a system's estimates, hex."""
+    """Hash of the modules that decide a system's estimates, hex: its own and all they build on."""
     inner: Any = system.fit
     while isinstance(inner, partial):
         inner = inner.func
-    modules = [sys.modules[inner.__module__], *_SHARED_CODE]
-    return "".join(_file_sha256(str(module.__file__))[:16] for module in modules)
+    files: dict[str, str] = {}
+    waiting = [inner.__module__]
+    while waiting:
+        name = waiting.pop()
+        if name in files or not name.startswith(_CODE):
+            continue
+        module = sys.modules[name]
+        files[name] = _file_sha256(str(module.__file__))
+        # What a module imports by name knows where it was defined.
+        waiting += [str(getattr(value, "__module__", "")) for value in vars(module).values()]
+    return hashlib.sha256(json.dumps(sorted(files.items())).encode()).hexdigest()
 
 
 def _system(task: Task, cell: Cell) -> Tested:
@@ -204,7 +211,9 @@ def make_cells(
             left.append(cell)
     if workers == 0:
         for cell in left:
-            _keep(folder, by_name[cell.task], cell, _made(by_name[cell.task], cell))
+            with torch.device(device):
+                content = _made(by_name[cell.task], cell)
+            _keep(folder, by_name[cell.task], cell, content)
             on_cell(cell, True)
         return
     with ProcessPoolExecutor(
