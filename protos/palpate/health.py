@@ -46,6 +46,12 @@ _CHANGES_HZ = 5.0
 """So many statuses are sent at once one after another, and so many a second in the long run [Hz],
 however fast states change."""
 
+_LULL_MOST_S = 0.015
+"""A regular report waits this long for a lull at most [s]: frames come every 10 ms."""
+
+_AFTERWARDS_S = 0.002
+"""So long after its work on a message a process leaves the cores to those that wait for it [s]."""
+
 _DELIVERING = frozenset({SensorState.LIVE, SensorState.WARMING, SensorState.ZERO_LOST})
 
 
@@ -75,6 +81,18 @@ class Health:
         self._version = __version__
         self.changed = threading.Event()
         """Set when the state changed, so that the reporter publishes it at once."""
+        self._worked = threading.Event()
+
+    def worked(self) -> None:
+        """The process has just done its work on a message; others may wait for the result."""
+        if not self._worked.is_set():
+            self._worked.set()
+
+    def await_lull(self) -> None:
+        """Wait until regular work that can wait disturbs no message; not for long."""
+        self._worked.clear()
+        if self._worked.wait(_LULL_MOST_S):
+            time.sleep(_AFTERWARDS_S)
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a counter."""
@@ -285,9 +303,10 @@ class HealthReporter(Closing):
             earned_s = now_s
             self._stop.wait(max(_APART_S, -allowance / _CHANGES_HZ))
             due_s = self._health.settle()
-            self._health.changed.wait(
+            if not self._health.changed.wait(
                 self._period_s if due_s is None else min(self._period_s, due_s + _APART_S)
-            )
+            ):
+                self._health.await_lull()
 
     def close(self) -> None:
         """Report a last time and stop."""

@@ -66,8 +66,8 @@ class EstimatingConfig(StrictConfig):
     sensors: tuple[Name, ...] = ()
     unannounced: bool = False
     delivery: Literal["newest", "every"] = "newest"
-    keep_newest: int = Field(default=3, ge=1, le=100)
-    max_age_s: float | None = Field(default=0.03, gt=0)
+    keep_newest: int = Field(default=5, ge=1, le=100)
+    max_age_s: float | None = Field(default=0.05, gt=0)
     accept_replayed: bool = False
     batch_wait_s: float = Field(default=0.0, ge=0, le=0.002)
     drain_s: float = Field(default=1.5, ge=0, le=30)
@@ -98,7 +98,7 @@ class FieldServiceConfig(ElectrodesConfig):
     """
 
     bundle: str = "field-twin"
-    keep_newest: int = Field(default=1, ge=1, le=100)
+    keep_newest: int = Field(default=5, ge=1, le=100)
     max_age_s: float | None = Field(default=0.1, gt=0)
     rate_hz: float | None = Field(default=20.0, gt=0, le=1000)
 

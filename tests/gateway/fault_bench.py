@@ -105,6 +105,9 @@ class _Sink:
     _last: tuple[int, int] = (0, 0)
     _whole: int = 0
 
+    def encode(self, message: Any) -> bytes:
+        return b""
+
     def put(self, message: Any) -> None:
         if not isinstance(message, ElectrodeFrame | IndenterPoseFrame | WrenchFrame):
             return

@@ -272,3 +272,26 @@ def test_a_recorded_message_that_does_not_decode_goes_out(topic: str, refused: i
     (item,) = pushed(replay, [RecordedMessage(topic, b"damaged", 0.01)], 0)
     assert (item.topic, item.message) == (topic, b"damaged")
     assert replay.counters["tares_refused"] == refused
+
+
+def test_what_can_wait_waits_for_the_next_frame_at_most() -> None:
+    made, out = pipeline(live=True, tare_frames=10), list[DueMessage]()
+    for reading in readings(10):
+        made.push([reading], 0, out.append, follow_later=True)
+    assert len(frames(out)) == 10
+    assert not tares(out), "the tenth frame was not followed up"
+    made.follow_up(out.append)
+    assert len(tares(out)) == 1
+    asked = made.ask_tare(10)
+    made.push(readings(10, first=10), 0, out.append, follow_later=True)
+    assert not asked.done()
+    made.push(readings(1, first=20), 0, out.append, follow_later=True)
+    assert asked.result(0.0) == tares(out)[-1]
+
+
+def test_a_frame_of_the_finger_before_is_not_followed_up() -> None:
+    made, out = pipeline(live=True, tare_frames=10), list[DueMessage]()
+    made.push(readings(10), 0, out.append, follow_later=True)
+    made.begin(DeviceIdentity("BT2", 1 / 4400), LiveClock())
+    made.follow_up(out.append)
+    assert not tares(out)

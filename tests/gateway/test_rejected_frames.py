@@ -98,9 +98,11 @@ def test_a_name_too_long_for_a_frame_keeps_its_end() -> None:
 class SlowPipeline(Pipeline):
     """Takes 50 ms to stamp."""
 
-    def push(self, readings: Iterable[Reading], arrival_ns: int, put: Put) -> None:
+    def push(
+        self, readings: Iterable[Reading], arrival_ns: int, put: Put, *, follow_later: bool = False
+    ) -> None:
         time.sleep(0.05)
-        super().push(readings, arrival_ns, put)
+        super().push(readings, arrival_ns, put, follow_later=follow_later)
 
 
 class Waiter(Babbler):

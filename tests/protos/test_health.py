@@ -170,3 +170,32 @@ def test_a_process_tells_what_it_uses() -> None:
         assert time.monotonic() < deadline
     assert share <= (os.cpu_count() or 1) * 1.5
     assert ProcessUsage(2**22 + 5).gauges() == {}, "there is no such process"
+
+
+def test_a_regular_report_waits_for_the_lull_after_a_message(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(health_module, "_LULL_MOST_S", PATIENCE_S)
+    health = Health("features", "features")
+    health.worked()  # of a message before: its lull may be over
+    order: list[str] = []
+
+    def wait() -> None:
+        health.await_lull()
+        order.append("lull")
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    waiting.join(0.1)
+    order.append("message")
+    health.worked()
+    waiting.join(PATIENCE_S)
+    assert order == ["message", "lull"]
+
+
+def test_without_messages_no_report_waits_for_ever(link: LinkConfig) -> None:
+    health = Health("features", "features")
+    with Session.open(link) as session, HealthReporter(session, health, period_s=0.01):
+        states = session.subscriber(STATUS, delivery=Delivery.QUEUE)
+        for _ in range(3):
+            states.next(PATIENCE_S)

@@ -76,6 +76,7 @@ class BenchDevice(Device):
             self._due_s = time.monotonic() + self._period_s * (1 + self._options.phase)
         wait_s = self._due_s - time.monotonic()
         if wait_s > timeout_s:
+            time.sleep(timeout_s)
             raise DeviceTimeout("not due yet", remedy="wait longer")
         if wait_s > 0:
             time.sleep(wait_s)

@@ -73,6 +73,7 @@ def run(
     health.set_sensors(tuple(sensor.name for sensor in config.sensors))
     with Session.open(link, station=station) as session:
         workers: list[SensorWorker] = []
+        fingers = sum(device.info.sensor_type is not None for device in devices)
         claims = session.claims(session_id=session_id, instance=instance, lease_s=link.lease_s)
         for sensor, device in zip(config.sensors, devices, strict=True):
             # A live source must never wait for a slow subscriber, whatever the pace of others.
@@ -90,6 +91,7 @@ def run(
                 stop=stop,
                 wall=wall,
                 key=ClaimedKey(claims, sensor, sources),
+                fingers=fingers,
             )
             workers.append(worker)
             if isinstance(device, WrenchDevice):

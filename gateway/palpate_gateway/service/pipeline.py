@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -27,10 +28,11 @@ _HELD_WINDOWS = 10
 
 
 class Pipeline:
-    """One sensor's way from readings to messages. ``push`` and ``finish`` belong to one thread.
+    """One sensor's way from readings to messages; ``push`` to ``finish`` belong to one thread.
 
     A live sensor's frames go out at once, before its first tare with ``tare_id`` 0. A recording is
-    held back until its first tare exists, so that every frame carries one.
+    held back until its first tare exists, so that every frame carries one. Each frame is published
+    first; only then it counts for the sensor's condition and for tares (``follow_up``).
 
     Args:
         info: The device's facts.
@@ -70,6 +72,7 @@ class Pipeline:
         self.tare_frames = tare_frames
         self._serial = ""
         self._stamper = Stamper(info.origin, session_id)
+        self._published: deque[tuple[ElectrodeFrame, int]] = deque()  # and not followed up yet
         self._held: list[DueMessage] = []
         self._held_frames = 0
         # Without electrodes there is never a tare: the recording would be held back to its end.
@@ -107,6 +110,7 @@ class Pipeline:
         elif self.condition is not None:
             self.condition.begin()
         self._kind = kind
+        self._published.clear()  # of the time before, perhaps of another finger
         self._stamper.begin(
             clock,
             serial=identity.serial,
@@ -133,31 +137,46 @@ class Pipeline:
         """The sensor is away: nobody waits for its frames to tare."""
         self._tares.give_up(why)
 
-    def push(self, readings: Iterable[Reading], arrival_ns: int, put: Put) -> None:
-        """Stamp and tare readings.
+    def push(
+        self, readings: Iterable[Reading], arrival_ns: int, put: Put, *, follow_later: bool = False
+    ) -> None:
+        """Stamp readings, publish them, and follow up.
 
         Args:
             readings: In order of time.
             arrival_ns: Host monotonic clock when they arrived [ns].
             put: Gets what is to be published, in order.
+            follow_later: The last frame is not followed up; the caller does so, when it has time.
         """
         ledger = self.ledger
         for reading in readings:
+            self.follow_up(put)
             item = self._stamper.message(reading, arrival_ns, ledger.current_id)
             if isinstance(item.message, ElectrodeFrame):
-                # First of all, so that no consumer waits for the condition to be judged.
                 self._pass(item, put)
                 self._counts["missing_frames"] += item.message.stamp.missed_before
-                self._watch(item.message)
-                self._tare(item.message, item.due_ns, put)
+                self._published.append((item.message, item.due_ns))
             elif isinstance(reading, RecordedMessage):
                 self._count_recorded(reading)
                 put(item)
             else:
                 self._pass(item, put)
+        if not follow_later:
+            self.follow_up(put)
+
+    def follow_up(self, put: Put) -> None:
+        """Judge the sensor's condition by the frames that are out, and offer them to the tares.
+
+        With nothing to follow up it does nothing. ``put`` is that of ``push``.
+        """
+        while self._published:
+            frame, due_ns = self._published.popleft()
+            self._watch(frame)
+            self._tare(frame, due_ns, put)
 
     def finish(self, put: Put) -> None:
         """The source has ended: what is still held goes out untared."""
+        self.follow_up(put)
         self._tares.finish()
         if self._held_frames and self.tare_error is None:
             self._tares.error = DeviceError(

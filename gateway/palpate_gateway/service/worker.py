@@ -29,6 +29,7 @@ from palpate.messages import NO_TARE, Tare, TareRequest, WrenchZero, WrenchZeroR
 from palpate_gateway.clock.stamps import ArrivalClock, ClockMap, FileClock, LiveClock, PacedClock
 from palpate_gateway.clock.wall_clock import WallClock
 from palpate_gateway.device import Device
+from palpate_gateway.readings import Reading
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.publication import LATE_S, MessagePublisher
 from palpate_gateway.service.requests import SensorRequests
@@ -58,6 +59,13 @@ _STALL_S = 0.02
 still; what came meanwhile has not been read yet."""
 
 _SHORTEST_S = 1e-3
+
+_LEAD_S = 0.0018
+"""So long before the next frame of a live BioTac is due, the last one is followed up [s]: right
+after it was published, services and clients need the cores more."""
+
+_PAUSE_LEAST_S = 0.004
+"""Frames that come closer to one another are followed up at once [s]."""
 
 _REMEDY = "look at palpate status; tare when it is back"
 
@@ -117,6 +125,7 @@ class SensorWorker:
         stop: Ends the thread.
         wall: The wall clock of the process; None = a new one.
         key: The key under which it publishes; None = nobody else can.
+        fingers: How many tactile sensors the process reads, all together.
     """
 
     def __init__(
@@ -131,6 +140,7 @@ class SensorWorker:
         stop: threading.Event,
         wall: WallClock | None = None,
         key: SensorKey | None = None,
+        fingers: int = 1,
     ) -> None:
         self.name = name
         self.device = device
@@ -146,6 +156,10 @@ class SensorWorker:
         self.ended = threading.Event()
         """Set when the thread has nothing more to do."""
         self._turns = Turns()
+        self._fingers = fingers
+        self._calm_s = 0.0
+        self._delivered = False
+        """Whether readings went out that were not followed up yet."""
         self._hangs = False
         self._health = health
         self._pace = pace
@@ -250,6 +264,7 @@ class SensorWorker:
                 self._key.opened(self.device.identity.serial)
                 self._clock_map = self._clock()
                 self.pipeline.begin(self.device.identity, self._clock_map)
+                self._calm_s, self._delivered = self._calm(), False
                 if self._pump():
                     return
             except SensorTaken as error:
@@ -293,7 +308,7 @@ class SensorWorker:
         while not self._stop.is_set():
             self._turns.next(turn_s)
             try:
-                readings = self.device.read(min(silence.begin(), _READ_S))
+                readings = self._read(min(silence.begin(), _READ_S))
             except DeviceTimeout as error:
                 silence.timed_out()
                 if info.live and silence.silent_s >= self.device.gone_s:
@@ -312,16 +327,45 @@ class SensorWorker:
                 self.pipeline.finish(self._publisher.put)
                 self._report.tare_refused(self.pipeline.tare_error)
                 return True
-            self.pipeline.push(readings, read_ns, partial(self._publisher.put, read_ns=read_ns))
-            self._report.tare_refused(self.pipeline.tare_error)
-            self.serving = True
+            put = partial(self._publisher.put, read_ns=read_ns)
+            self.pipeline.push(readings, read_ns, put, follow_later=self._calm_s > 0.0)
+            self._health.worked()
+            self.serving = self._delivered = True
             if self.zeroing is not None:
                 self._turns.next(LATE_S)
                 self.zeroing.follow(readings)
-            lost = self._wrench is not None and self._wrench.zero_lost
-            self._report.delivers(self.pipeline.condition, zero_lost=lost)
+            if not self._calm_s:
+                self._follow_up()
             silence.arrived()
         return True
+
+    def _calm(self) -> float:
+        """How long after a frame the thread leaves the cores to others [s]; 0 = not at all."""
+        info = self.device.info
+        period_s = 1.0 / info.rate_hz
+        if not info.live or self.pipeline.condition is None:
+            return 0.0
+        # With many fingers, one's calm is another's frame.
+        return period_s - _LEAD_S if period_s >= self._fingers * _PAUSE_LEAST_S else 0.0
+
+    def _read(self, timeout_s: float) -> list[Reading]:
+        """The next readings; shortly before they are due, the last ones are followed up."""
+        if not self._delivered or self._calm_s >= timeout_s:
+            return self.device.read(timeout_s)
+        try:
+            return self.device.read(self._calm_s)
+        except DeviceTimeout:
+            self._follow_up()
+            self._publisher.rehearse()
+        return self.device.read(timeout_s - self._calm_s)
+
+    def _follow_up(self) -> None:
+        """What can wait of the work for the last readings: condition, tares, status."""
+        self._delivered = False
+        self.pipeline.follow_up(self._publisher.put)
+        self._report.tare_refused(self.pipeline.tare_error)
+        lost = self._wrench is not None and self._wrench.zero_lost
+        self._report.delivers(self.pipeline.condition, zero_lost=lost)
 
     def _give_up(self, why: str) -> None:
         """Fail the requests: they must not wait for a sensor that is gone."""

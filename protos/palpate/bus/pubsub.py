@@ -43,7 +43,8 @@ _RING_LARGE = 512
 """The same for fields, of up to 100 kB each."""
 
 _LEAD_S = 0.0014
-"""So long before the next message is due a waiting consumer gets ready for it [s]."""
+"""So long before the next frame of a sensor is due a waiting consumer gets ready for what comes of
+it [s]: all consumers before the frame, so that none is in the way of another's work on it."""
 
 _PAUSE_LEAST_S, _PAUSE_MOST_S = 0.004, 0.05
 """After a shorter pause the consumer still is ready; for a longer one it would be a waste [s]."""
@@ -156,6 +157,15 @@ HoldersOf = Callable[[str], frozenset[int]]
 """Which runs of gateways hold a sensor of this name, by their claims; empty = unannounced."""
 
 
+def _sampled_s(received: ReceivedMessage[Any]) -> float:
+    """When that was sampled of which a message tells, if just now; else when it came [s]."""
+    stamp, came_ns = received.stamp, received.received_monotonic_ns
+    if stamp is not None and stamp.clock_id == clock.CLOCK_ID:
+        if 0 <= came_ns - stamp.monotonic_ns < _PAUSE_LEAST_S * 1e9:
+            return stamp.monotonic_ns * 1e-9
+    return came_ns * 1e-9
+
+
 class _Source(Generic[M]):
     """What a subscriber keeps of one key."""
 
@@ -244,10 +254,10 @@ class Subscriber(Generic[M], Closing):
     that have holders.
 
     A consumer that waits with ``NEWEST`` for messages that come every few milliseconds gets ready
-    for each shortly before it is due: the last one is decoded once more and handed to ``rehearse``,
-    which does with it what the consumer does with a message, without effect. In the pause other
-    processes displace code and data of this one from the caches; fetched only when the message has
-    come, they cost it more time than the work itself (ADR 4).
+    shortly before the frame of each is due: the last one is decoded once more and handed to
+    ``rehearse``, which does with it what the consumer does with a message, without effect. In the
+    pause other processes displace code and data of this one from the caches; fetched only when the
+    message has come, they cost it more time than the work itself (ADR 4).
     """
 
     def __init__(
@@ -505,9 +515,10 @@ class Subscriber(Generic[M], Closing):
         if self._newest_wins:
             last, self._last = self._last, message
             if last is not None:
-                pause_s = (message.received_monotonic_ns - last.received_monotonic_ns) * 1e-9
+                sampled_s = _sampled_s(message)
+                pause_s = sampled_s - _sampled_s(last)
                 if _PAUSE_LEAST_S < pause_s < _PAUSE_MOST_S:
-                    self._ready_s = message.received_monotonic_ns * 1e-9 + pause_s - _LEAD_S
+                    self._ready_s = sampled_s + pause_s - _LEAD_S
                 else:
                     self._ready_s = math.inf
         if len(source.waiting) >= self._depth:

@@ -251,6 +251,7 @@ class EstimatePublisher(Generic[M, E]):
                 self._run(runtime, of_runtime)
         beat(self._turn_s)
         if messages:
+            self._health.worked()
             self._busy_ns += time.monotonic_ns() - began_ns
 
     def rehearse(self, last: ReceivedMessage[M]) -> None:
