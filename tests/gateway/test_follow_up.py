@@ -14,7 +14,7 @@ from palpate.bus.topics import ELECTRODES, TARE
 from palpate.config import StrictConfig
 from palpate.errors import DeviceTimeout
 from palpate.health import Health
-from palpate.messages import Origin, SensorType
+from palpate.messages import Origin, SensorState, SensorType
 from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import ElectrodeReading, Reading
 from palpate_gateway.service.pipeline import Pipeline, Put
@@ -91,11 +91,21 @@ class Sink:
 
 
 @pytest.mark.parametrize("pauses", [True, False])
-def test_the_frame_first_and_the_rest_before_the_next_one(*, pauses: bool) -> None:
+def test_the_frame_first_and_the_rest_before_the_next_one(
+    monkeypatch: pytest.MonkeyPatch, *, pauses: bool
+) -> None:
     events: list[str] = []
     device, stop = Prompt(events, pauses=pauses), threading.Event()
     publishers: Any = dict.fromkeys((ELECTRODES.name, TARE.name), Sink(events))
     health = Health("gateway", "test")
+    states: list[SensorState] = []
+    show = health.set_sensor_state
+
+    def note(name: str, state: SensorState, **how: Any) -> None:
+        states.append(state)
+        show(name, state, **how)
+
+    monkeypatch.setattr(health, "set_sensor_state", note)
     worker = SensorWorker(
         "w", device, Noted(device.info, events), publishers, health, pace="recorded", stop=stop
     )
@@ -109,3 +119,5 @@ def test_the_frame_first_and_the_rest_before_the_next_one(*, pauses: bool) -> No
         assert events == (published + between) * FRAMES
     else:  # the frame before is followed up when the next one has come, before that is stamped
         assert events == published + (between + published) * (FRAMES - 1) + between
+    assert states[0] is SensorState.STARTING
+    assert states[1] in (SensorState.LIVE, SensorState.WARMING), "told in either case"

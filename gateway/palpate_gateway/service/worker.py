@@ -327,6 +327,8 @@ class SensorWorker:
                 self.pipeline.finish(self._publisher.put)
                 self._report.tare_refused(self.pipeline.tare_error)
                 return True
+            if self._delivered:  # these came early
+                self._follow_up()
             put = partial(self._publisher.put, read_ns=read_ns)
             self.pipeline.push(readings, read_ns, put, follow_later=self._calm_s > 0.0)
             self._health.worked()

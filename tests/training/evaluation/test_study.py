@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -111,6 +112,11 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
     kept = sorted((tmp_path / "out" / "cells" / "force").glob("*.npz"))
     times = [path.stat().st_mtime_ns for path in kept]
     assert len(kept) == 2
+    page = (tmp_path / "out" / "report.html").read_text()
+    for name in ("forces", "force-errors", "force-press"):
+        picture = (tmp_path / "out" / f"{name}.png").read_bytes()
+        assert base64.b64encode(picture).decode() in page
+        assert f"({name}.png)" in (tmp_path / "out" / "report.md").read_text()
     train_report(**options)
     assert [path.stat().st_mtime_ns for path in kept] == times
     with pytest.raises(ConfigError, match="no split sideways"):
@@ -132,3 +138,22 @@ def test_a_weighted_median_is_that_of_repeated_values() -> None:
     assert weighted_median(values, np.array([1.0, 1.0, 9.0, 1.0])) == 2.0
     assert weighted_median(values, np.array([5.0, 1.0, 9.0, 1.0])) == 3.0
     assert np.isnan(weighted_median(values[2:3], np.ones(1)))
+
+
+def test_pictures_show_the_widest_test_of_unseen_trajectories(
+    data: ExperimentDataset, tmp_path: Path
+) -> None:
+    plan = StudyPlan(tasks=("location", "force"), splits=("trajectory",), systems=SIMPLE)
+    study = Study(data, None, plan)
+    study.make(tmp_path / "cells", workers=0)
+    pictures = study.draw(tmp_path / "cells", tmp_path)
+    assert [one["file"] for one in pictures] == [
+        "forces.png", "location-errors.png", "location-pairs.png",
+        "force-errors.png", "force-press.png",
+    ]  # fmt: skip
+    rows = {len(cell.fold.rows.test) for cell in study.cells if cell.fold.test == "all units"}
+    assert f"{rows.pop():,} rows" in pictures[1]["caption"]
+    other = Study(data, None, StudyPlan(tasks=("force",), splits=("point",), systems=SIMPLE))
+    other.make(tmp_path / "cells", workers=0)
+    drawn = other.draw(tmp_path / "cells", tmp_path)
+    assert [one["task"] for one in drawn] == [""], "trajectories were not tested"

@@ -107,6 +107,8 @@ def test_the_study_shows_the_errors_of_fields_and_counts(
     study = Study(mixed.experiment, mixed, plan)
     study.make(tmp_path, workers=0)
     values = study.results(tmp_path)
+    pictures = [one["file"] for one in study.draw(tmp_path, tmp_path)]
+    assert pictures == ["forces.png", "synthesis-map.png"]
     rows_of = {
         (cell.task, cell.fold.split, cell.fold.test): cell.fold.rows.test for cell in study.cells
     }

@@ -36,7 +36,9 @@ def train_report(
         Path,
         typer.Option(help="Folder with experiment.h5 and mixed.h5, or with the published files."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for report.html, report.md and study.json.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for report.html, report.md, pictures and study.json.")
+    ],
     tasks: Annotated[str, typer.Option(help="Tasks, with commas between; empty = all.")] = "",
     splits: Annotated[str, typer.Option(help="Splits, with commas between; empty = all.")] = "",
     systems: Annotated[
@@ -99,6 +101,7 @@ def train_report(
 
         study.make(folder, workers=workers or os.cpu_count() or 1, device=device, on_cell=on_cell)
     values = study.results(folder)
+    values["pictures"] = study.draw(folder, out)
     write_study(out / "study.json", values)
     for path in (out / "study.json", *write_pages(out, values, command=typed_command())):
         console.print(f"wrote {path}", soft_wrap=True)

@@ -6,6 +6,7 @@ data.
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -163,20 +164,31 @@ PAPER_LABEL = "*the paper, real BioTacs*"
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A heading of level 2 or 3 and a sentence, with a table below where there are rows."""
+    """A heading of level 2 or 3 and a sentence, with a table below where there are rows.
+
+    ``pictures`` are files with their captions.
+    """
 
     level: int
     heading: str
     text: str = ""
     columns: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
+    pictures: tuple[tuple[str, str], ...] = ()
 
 
 def tables_of(values: Mapping[str, Any]) -> Iterator[Table]:
     """All tables of a study, in order."""
     scores = values["scores"]
+
+    def pictures(task: str) -> tuple[tuple[str, str], ...]:
+        all_pictures = values.get("pictures", ())
+        return tuple((one["file"], one["caption"]) for one in all_pictures if one["task"] == task)
+
+    if pictures(""):
+        yield Table(2, "How strong the presses are", pictures=pictures(""))
     for task in dict.fromkeys(row["task"] for row in scores):
-        yield Table(2, TASK_WORDS[task])
+        yield Table(2, TASK_WORDS[task], pictures=pictures(task))
         for split in dict.fromkeys(row["split"] for row in scores if row["task"] == task):
             mine = [row for row in scores if row["task"] == task and row["split"] == split]
             yield from _of_split(task, split, mine)
@@ -268,6 +280,8 @@ def preface(values: Mapping[str, Any], command: str) -> list[str]:
 def write_pages(folder: Path, values: Mapping[str, Any], *, command: str) -> list[Path]:
     """Write ``report.md`` and ``report.html``; returns their paths.
 
+    The pictures of the study are in the folder already (``Study.draw``).
+
     Raises:
         DatasetError: The disk refused.
     """
@@ -275,7 +289,7 @@ def write_pages(folder: Path, values: Mapping[str, Any], *, command: str) -> lis
     paragraphs = preface(values, command)
     pages = {
         "report.md": _markdown(paragraphs, tables),
-        "report.html": _html(paragraphs, tables),
+        "report.html": _html(paragraphs, tables, folder),
     }
     for name, text in pages.items():
         with written_whole(folder / name) as part:
@@ -291,6 +305,7 @@ def _markdown(paragraphs: Sequence[str], tables: Sequence[Table]) -> str:
     for table in tables:
         parts.append(f"{'#' * table.level} {table.heading}\n")
         parts += [f"{table.text}\n"] * bool(table.text)
+        parts += [f"![{caption}]({file})\n" for file, caption in table.pictures]
         if table.rows:
             parts.append(markdown_table(table.columns, table.rows))
     return "\n".join(parts)
@@ -299,10 +314,13 @@ def _markdown(paragraphs: Sequence[str], tables: Sequence[Table]) -> str:
 _STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#30343b;max-width:78em;margin:2em auto;
 padding:0 1em}table{border-collapse:collapse;margin:.6em 0 1.6em}td,th{padding:.2em .7em;
 border-bottom:1px solid #e4e4e8;text-align:right;font-variant-numeric:tabular-nums}
+img{max-width:100%;display:block;margin:1em 0}
 td:first-child,th:first-child{text-align:left}tr:hover{background:#f3f6fa}code{background:#f3f4f6}"""
 
 
-def _html(paragraphs: Sequence[str], tables: Sequence[Table]) -> str:
+def _html(paragraphs: Sequence[str], tables: Sequence[Table], folder: Path) -> str:
+    """One file: pictures of the folder are in it."""
+
     def inline(text: str) -> str:
         safe = html.escape(text)
         for mark, tag in (("**", "b"), ("*", "i"), ("`", "code")):
@@ -323,6 +341,10 @@ def _html(paragraphs: Sequence[str], tables: Sequence[Table]) -> str:
     for table in tables:
         parts.append(f"<h{table.level}>{inline(table.heading)}</h{table.level}>")
         parts += [f"<p>{inline(table.text)}</p>"] * bool(table.text)
+        for file, caption in table.pictures:
+            content = base64.b64encode((folder / file).read_bytes()).decode()
+            source = f"data:image/png;base64,{content}"
+            parts.append(f'<img src="{source}" alt="{html.escape(caption)}">')
         if table.rows:
             body = "".join(cells(row, "td") for row in table.rows)
             parts.append(f"<table>{cells(table.columns, 'th')}{body}</table>")

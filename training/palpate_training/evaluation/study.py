@@ -35,6 +35,7 @@ from palpate_training.evaluation.features import (
     ratios_to_paper,
     score,
 )
+from palpate_training.evaluation.pictures import draw_forces, draw_task
 from palpate_training.evaluation.skin import (
     FieldTask,
     SynthesisTask,
@@ -184,11 +185,7 @@ class Study:
         scores: list[Scores] = []
         ratios: list[dict[str, Any]] = []
         for name, task in self.tasks.items():
-            made = {
-                cell: read_cell(cell_path(folder, task, cell))
-                for cell in self.cells
-                if cell.task == name
-            }
+            made = self._made(folder, name)
             scores += self._scores(task, made)
             if isinstance(task, FeatureTask):
                 ratios += list(self._ratios(task, made))
@@ -203,8 +200,30 @@ class Study:
             "ratios": ratios,
         }
 
-    def _data_of(self, task: FeatureTask) -> ExperimentDataset:
-        if task.name in ("location", "force"):
+    def draw(self, folder: Path, out: Path) -> list[dict[str, str]]:
+        """Draw the pictures of all tasks into ``out``, from cells that are all made.
+
+        Returns:
+            Of each its ``task``, ``file`` and ``caption``, for the page.
+
+        Raises:
+            DatasetError: A cell is missing or damaged, or the disk refused.
+        """
+        pictures = [draw_forces(out, self.experiment)]
+        for name, task in self.tasks.items():
+            pictures += draw_task(out, task, self._data_of(name), self._made(folder, name))
+        return [asdict(one) for one in pictures]
+
+    def _made(self, folder: Path, name: str) -> dict[Cell, CellResult]:
+        task = self.tasks[name]
+        return {
+            cell: read_cell(cell_path(folder, task, cell))
+            for cell in self.cells
+            if cell.task == name
+        }
+
+    def _data_of(self, name: str) -> ExperimentDataset:
+        if name in ("location", "force"):
             return self.experiment
         assert self.mixed is not None
         return self.mixed.experiment
@@ -215,7 +234,7 @@ class Study:
         if isinstance(task, SynthesisTask):
             return score_synthesis(task, made)
         assert isinstance(task, FeatureTask)
-        return score(task, self._data_of(task), made)
+        return score(task, self._data_of(task.name), made)
 
     def _ratios(self, task: FeatureTask, made: dict[Cell, CellResult]) -> Iterable[dict[str, Any]]:
         """Ours over the best of the paper's networks, where the goals count."""
@@ -231,7 +250,7 @@ class Study:
         }[task.name]  # fmt: skip
         for error, least_n, most_n in wanted:
             found = ratios_to_paper(
-                task, self._data_of(task), made, error=error, least_n=least_n, most_n=most_n
+                task, self._data_of(task.name), made, error=error, least_n=least_n, most_n=most_n
             )
             for (split, test, system), (ratio, low, high) in found.items():
                 yield {
