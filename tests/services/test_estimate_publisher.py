@@ -87,6 +87,7 @@ class Station:
 
         session = SimpleNamespace(publisher=publisher, wall_clock_error_s=0.05)
         health = SimpleNamespace(
+            worked=lambda: None,
             count=count,
             gauge=self.gauges.__setitem__,
             set_sensors=lambda sensors: setattr(self, "sensors", sensors),
