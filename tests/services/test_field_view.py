@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import importlib
-import os
 import threading
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -206,41 +203,3 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
         view.add("finger", dataclasses.replace(field, displacement=field.displacement[:-1]))
         view.flush()
         assert dict(view.counters) == {"view_wrong_mesh": 1}
-
-
-def test_a_closed_view_is_freed_without_a_garbage_collection(
-    make_frame: Frames, tmp_path: Path, until: Until
-) -> None:
-    """A service makes no full collection; a view in a circle stayed for each record it wrote."""
-    pytest.importorskip("rerun")
-    from palpate_services.viewer.record_view import LiveView, RerunView
-
-    meshes = MeshLibrary([str(bundles.write(tmp_path / "mine", "field"))])
-    frame = make_frame()
-    gone: list[weakref.ref[Any]] = []
-
-    def make() -> RerunView:
-        path = tmp_path / f"view{len(gone)}.rrd"
-        view = RerunView(path, title="view", meshes=meshes, live=True)
-        gone.append(weakref.ref(view))
-        return view
-
-    def draw() -> weakref.ref[Any]:
-        live = LiveView(make)
-        live.offer("finger", frame)
-        until(lambda: bool(list(tmp_path.glob("view*.rrd"))))
-        live.offer("finger", bundles.truth(frame.stamp))  # changes the layout
-        live.finish()
-        assert live.join(20.0)
-        return weakref.ref(live)
-
-    gc.collect()
-    gc.disable()
-    try:
-        gone.append(draw())
-        threads = len(os.listdir("/proc/self/task"))
-        gone += [draw() for _ in range(3)]
-        assert [one() for one in gone] == [None] * 8
-        until(lambda: len(os.listdir("/proc/self/task")) <= threads)
-    finally:
-        gc.enable()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from palpate.messages import ElectrodeFrame, ServiceState
 from palpate_services.config import RecorderConfig
 from palpate_services.recorder import writer as writer_module
 from palpate_services.recorder.writer import RecordFiles, leftovers, recover_all
+from palpate_services.viewer.live_view import LiveView, ViewPlan
 
 Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
@@ -257,11 +257,15 @@ def test_view_that_fails_leaves_the_record_alone(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
+    def crashed(plan: ViewPlan) -> LiveView:
+        plan.path.mkdir()  # no file can be written there
+        return LiveView(plan)
+
+    monkeypatch.setattr(writer_module, "LiveView", crashed)
     with open_files(rrd=True) as (files, health):
         for sequence in range(1, 21):
             files.write(sample(sequence))
-    (record,) = (tmp_path / "runs").iterdir()
+    (record,) = (tmp_path / "runs").glob("*.mcap")
     assert [item.sequence for item in read_record(record)] == list(range(1, 21))
     assert health.counters["view_failed"] == 1
 

@@ -10,7 +10,6 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from palpate_services.config import RecorderConfig
 from palpate_services.inference.loop import RateLimit
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.recorder import retention
-from palpate_services.viewer.record_view import LiveView, RerunView
+from palpate_services.viewer.live_view import LiveView, ViewMessage, ViewPlan
 from palpate_services.viewer.timeline import SensorTimeline
 
 
@@ -186,7 +185,7 @@ class RecordFiles:
         self._checked_s = 0.0
         self._tried_s = float("-inf")
         self._recovery = RecordRecovery(config.out, health)
-        self._meshes = MeshLibrary(config.bundles)
+        MeshLibrary(config.bundles)  # raises for one that is missing, which a view would only log
         self._retention = retention.Retention(config, station, health)
         self._kept_s = float("-inf")
         self._field_rate = RateLimit(config.field_rate_hz or None)
@@ -250,7 +249,7 @@ class RecordFiles:
         self._counts[f"recorded_{sample.topic}"] += 1
         self._counts["recorded_bytes"] += len(sample.payload)
         if self._view is not None and message is not None and sample.topic in SensorTimeline.TOPICS:
-            self._view.offer(sample.sensor, message)
+            self._view.offer(ViewMessage(sample.sensor, sample.topic, sample.payload))
 
     def _decode(self, topic: Topic[Any], sample: TapSample) -> Any:
         """The message; None if it cannot be decoded.
@@ -309,7 +308,7 @@ class RecordFiles:
         if problem is not None:
             self._fail(problem)
         for view in self._views:
-            view.join(VIEW_CLOSE_S)
+            view.close(VIEW_CLOSE_S)
         self.report()
 
     def _open(self) -> None:
@@ -325,15 +324,13 @@ class RecordFiles:
         self._size = self._unflushed = 0
         self._opened_s = time.monotonic()
         if self._config.rrd:
-            make = partial(
-                RerunView,
+            plan = ViewPlan(
                 path.with_suffix(".rrd"),
-                title=path.stem,
-                max_bytes=self._config.rrd_max_bytes,
-                meshes=self._meshes,
-                live=True,
+                path.stem,
+                self._config.rrd_max_bytes,
+                self._config.bundles,
             )
-            self._view = LiveView(make)
+            self._view = LiveView(plan)
             self._views.append(self._view)
         self._path = path
         self.says_ready()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -50,17 +50,12 @@ _POSITIONS = {
 def record_layout(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
     """Layout of a record: a tab for each sensor, its fingertip left, its signals right.
 
-    The tabs of ``with_fields``, the sensors that have fields, get one more row. The same sensors
-    have the same layout: its parts have random names, and Rerun keeps every name for ever.
+    The tabs of ``with_fields``, the sensors that have fields, get one more row.
     """
-    return _kept_layout(tuple(sensors.items())[:MAX_SENSORS], frozenset(with_fields))
-
-
-@lru_cache(maxsize=64)
-def _kept_layout(sensors: tuple[tuple[str, SensorType], ...], with_fields: frozenset[str]) -> Any:
     rrb = require("rerun.blueprint", extra="services")
     tabs = [
-        _sensor_tab(rrb, sensor, kind, fields=sensor in with_fields) for sensor, kind in sensors
+        _sensor_tab(rrb, sensor, kind, fields=sensor in with_fields)
+        for sensor, kind in list(sensors.items())[:MAX_SENSORS]
     ]
     return _screen(rrb, tabs, timeline=TIMELINE)
 

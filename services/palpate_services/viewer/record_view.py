@@ -7,11 +7,9 @@ module that uses Rerun, whose names change with each release.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import threading
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -20,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.bus.topics import TOPICS
-from palpate.errors import PalpateError, RecordingError
+from palpate.errors import RecordingError
 from palpate.files.bundle import FieldMesh
 from palpate.files.record import read_record
-from palpate.messages import FieldEstimate, FieldFrame, FloatArray, SensorType
+from palpate.messages import FloatArray, SensorType
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.layout import (
@@ -39,16 +37,6 @@ from palpate_services.viewer.surfaces import normals_of, shades
 from palpate_services.viewer.timeline import FieldRow, SensorTimeline, TimelineRow
 
 _log = logging.getLogger(__name__)
-
-PERIOD_S = 2.0
-"""Time between two updates of a live view [s]: short enough to follow, long enough for batches.
-Each costs 2 kB for each of twenty curves, at 0.5 s a third of the file."""
-
-CAPACITY = 100_000
-"""Messages that may wait for a live view; further ones are counted and left out."""
-
-FIELD_CAPACITY = 500
-"""Fields among them: 42 MB at 7,000 nodes each."""
 
 APPLICATION = "palpate"
 
@@ -89,11 +77,7 @@ class FieldDrawer:
         self._begun: set[str] = set()
 
     def draw(self, entity: str, rows: list[FieldRow], send: Send) -> None:
-        """Draw fields in order of time with ``send``; each mesh gets an entity below ``entity``.
-
-        ``send`` is a method of the view that owns this. Kept here, it would make a circle that only
-        a full garbage collection frees, which a service never makes: each view 10 MB a finger.
-        """
+        """Draw fields in order of time with ``send``; each mesh gets an entity below ``entity``."""
         for sha256, group in groupby(rows, key=lambda row: row.mesh_sha256):
             same = list(group)
             mesh = self._meshes.find(sha256)
@@ -236,17 +220,10 @@ class RerunView:
         self._with_fields |= with_fields
         drawn = dict(sorted(self._drawn.items()))
         layout = record_layout(drawn, with_fields=self._with_fields)
-        native = self._stream.to_native()
-        with _stored(self._rr, layout) as blueprint:
-            if self._open:
-                self._rr.bindings.send_blueprint(blueprint, True, True, recording=native)
-            else:
-                self._rr.bindings.save(
-                    path=str(self.path),
-                    default_blueprint=blueprint,
-                    recording=native,
-                    write_footer=not self._live,
-                )
+        if self._open:
+            self._stream.send_blueprint(layout)
+        else:
+            self._stream.save(self.path, layout, write_footer=not self._live)
         if not self._open:
             self._stream.send_recording_name(self._title)
             self._open = True
@@ -340,118 +317,6 @@ def _of_one_width(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
     """Rows by their number of values: two kinds where a finger was exchanged for an SP."""
     widths = dict.fromkeys(len(row.values) for row in rows)
     return [[row for row in rows if len(row.values) == width] for width in widths]
-
-
-@contextlib.contextmanager
-def _stored(rr: Any, layout: Any) -> Iterator[Any]:
-    """A layout in the form that Rerun sends; freed at the end of the block.
-
-    As its ``save`` and ``send_blueprint`` make it, which keep two threads and the layout for ever:
-    the stream of a layout holds a memory that holds the stream, until it is disconnected.
-    """
-    native = rr.bindings.new_blueprint(
-        application_id=APPLICATION,
-        make_default=False,
-        make_thread_default=False,
-        default_enabled=True,
-    )
-    stream = rr.RecordingStream._from_native(native)
-    stream.set_time("blueprint", sequence=0)
-    layout.to_blueprint()._log_to_stream(stream)
-    try:
-        yield stream.memory_recording().storage
-    finally:
-        stream.disconnect()
-
-
-def release_closed_views() -> None:
-    """End the threads of views that nobody holds any more: two each, which Rerun would keep."""
-    require("rerun", extra="services").bindings.flush_and_cleanup_orphaned_recordings()
-
-
-class LiveView:
-    """The view beside a running record, drawn in a thread of its own: it may fail, the record not.
-
-    Counts ``view_dropped`` (messages came too fast), ``view_failed`` (the view was given up), and
-    what the view counts, e.g. ``view_no_mesh``. ``make`` is called in that thread, because it
-    imports Rerun, which takes half a second: the record must not wait for it.
-    """
-
-    def __init__(self, make: Callable[[], RerunView]) -> None:
-        self._make = make
-        self._counts: Counter[str] = Counter()
-        self._lock = threading.Lock()
-        self._failed = False
-        # Fields have a limit of their own: 100,000 of them would take 8 GB.
-        self._room_for_fields = threading.Semaphore(FIELD_CAPACITY)
-        # Filled by the recorder's thread, emptied by the view's: append and popleft of a deque are
-        # atomic, so only the counts need the lock.
-        self._waiting: deque[tuple[str, Any]] = deque()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
-        self._thread.start()
-
-    def offer(self, sensor: str, message: Any) -> None:
-        """Hand over a decoded message; never blocks and never raises."""
-        if self._failed:
-            return
-        full = len(self._waiting) >= CAPACITY
-        if full or (_is_field(message) and not self._room_for_fields.acquire(blocking=False)):
-            self._count({"view_dropped": 1})
-            return
-        self._waiting.append((sensor, message))
-
-    def take_counts(self) -> Counter[str]:
-        """Counts since the last call."""
-        with self._lock:
-            counts, self._counts = self._counts, Counter()
-        return counts
-
-    def finish(self) -> None:
-        """Draw the rest and close the file, without waiting for it."""
-        self._stop.set()
-
-    def join(self, timeout_s: float) -> bool:
-        """Wait for the file to be closed; returns whether it is."""
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        try:
-            with self._make() as view:
-                while not self._stop.wait(PERIOD_S):
-                    self._draw(view)
-                self._draw(view)
-            del view
-            release_closed_views()
-        except Exception as error:
-            # A defect of the picture must be visible in the log, and must not stop the record.
-            if isinstance(error, PalpateError):
-                _log.warning("the view is given up, the record goes on: %s", error)
-            else:
-                _log.exception("the view is given up, the record goes on")
-            self._count({"view_failed": 1})
-            self._failed = True
-            self._waiting.clear()
-
-    def _draw(self, view: RerunView) -> None:
-        # Only what waits now: messages that arrive meanwhile are drawn in the next period.
-        for _ in range(len(self._waiting)):
-            sensor, message = self._waiting.popleft()
-            if _is_field(message):
-                self._room_for_fields.release()
-            view.add(sensor, message)
-        view.flush()
-        self._count(view.counters)
-        view.counters.clear()
-
-    def _count(self, events: Mapping[str, int]) -> None:
-        with self._lock:
-            self._counts.update(events)
-
-
-def _is_field(message: Any) -> bool:
-    return isinstance(message, FieldEstimate | FieldFrame)
 
 
 def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = ()) -> Path:
