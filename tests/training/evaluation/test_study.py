@@ -17,6 +17,7 @@ from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, write_experiment
 from palpate_training.datasets.trials import TrialRows
+from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.features import paper_weights, weighted_median
 from palpate_training.evaluation.page import PAPER_LABEL, tables_of, write_pages
 from palpate_training.evaluation.study import Study, StudyPlan, write_study
@@ -38,7 +39,7 @@ def data(make_rows: Callable[..., TrialRows], provenance: Provenance) -> Experim
 
 
 def made(data: ExperimentDataset, folder: Path, **plan: Any) -> dict[str, Any]:
-    study = Study(data, None, StudyPlan(systems=SIMPLE, **plan))
+    study = Study(ExperimentSource(data, None), StudyPlan(systems=SIMPLE, **plan))
     study.make(folder, workers=0)
     return study.results(folder)
 
@@ -61,7 +62,7 @@ def test_every_cell_of_every_split_is_filled(data: ExperimentDataset, tmp_path: 
 def test_scores_are_those_of_the_estimates(data: ExperimentDataset, tmp_path: Path) -> None:
     values = made(data, tmp_path, tasks=("force",), splits=("trajectory",))
     plan = StudyPlan(tasks=("force",), splits=("trajectory",), systems=("zero",))
-    study = Study(data, None, plan)
+    study = Study(ExperimentSource(data, None), plan)
     rows = next(cell.fold.rows.test for cell in study.cells if cell.fold.test == "all units")
     zero = next(
         row for row in values["scores"] if row["test"] == "all units" and row["system"] == "zero"
@@ -94,11 +95,11 @@ def test_pages_show_the_json_beside_the_paper(data: ExperimentDataset, tmp_path:
 
 def test_a_study_that_holds_nothing_says_what_there_is(data: ExperimentDataset) -> None:
     with pytest.raises(ConfigError, match="no system of these tasks"):
-        Study(data, None, StudyPlan(systems=("nobody",)))
+        Study(ExperimentSource(data, None), StudyPlan(systems=("nobody",)))
     with pytest.raises(ConfigError, match="no task 'forces'"):
-        Study(data, None, StudyPlan(tasks=("forces",)))
+        Study(ExperimentSource(data, None), StudyPlan(tasks=("forces",)))
     with pytest.raises(ConfigError, match="nothing is to be made"):
-        Study(data, None, StudyPlan(tasks=("field",)))
+        Study(ExperimentSource(data, None), StudyPlan(tasks=("field",)))
 
 
 def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_path: Path) -> None:
@@ -144,7 +145,7 @@ def test_pictures_show_the_widest_test_of_unseen_trajectories(
     data: ExperimentDataset, tmp_path: Path
 ) -> None:
     plan = StudyPlan(tasks=("location", "force"), splits=("trajectory",), systems=SIMPLE)
-    study = Study(data, None, plan)
+    study = Study(ExperimentSource(data, None), plan)
     study.make(tmp_path / "cells", workers=0)
     pictures = study.draw(tmp_path / "cells", tmp_path)
     assert [one["file"] for one in pictures] == [
@@ -153,7 +154,9 @@ def test_pictures_show_the_widest_test_of_unseen_trajectories(
     ]  # fmt: skip
     rows = {len(cell.fold.rows.test) for cell in study.cells if cell.fold.test == "all units"}
     assert f"{rows.pop():,} rows" in pictures[1]["caption"]
-    other = Study(data, None, StudyPlan(tasks=("force",), splits=("point",), systems=SIMPLE))
+    other = Study(
+        ExperimentSource(data, None), StudyPlan(tasks=("force",), splits=("point",), systems=SIMPLE)
+    )
     other.make(tmp_path / "cells", workers=0)
     drawn = other.draw(tmp_path / "cells", tmp_path)
     assert [one["task"] for one in drawn] == [""], "trajectories were not tested"

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from palpate_training.datasets.experiment import MixedDataset
+from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.study import Study, StudyPlan
 from palpate_training.learning.splits import RowSplit, by_trajectory, of_units
 from palpate_training.systems import fields, latent, ruppel, synthesis
@@ -104,7 +105,7 @@ def test_the_study_shows_the_errors_of_fields_and_counts(
     mixed: MixedDataset, tmp_path: Path
 ) -> None:
     plan = StudyPlan(tasks=("field", "synthesis"), splits=("trajectory", "unit"), systems=("zero",))
-    study = Study(mixed.experiment, mixed, plan)
+    study = Study(ExperimentSource(mixed.experiment, mixed), plan)
     study.make(tmp_path, workers=0)
     values = study.results(tmp_path)
     pictures = [one["file"] for one in study.draw(tmp_path, tmp_path)]

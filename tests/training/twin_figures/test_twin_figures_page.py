@@ -48,6 +48,8 @@ def test_page_with_everything(
     rng = np.random.default_rng(0)
     counts = 3000 + rng.normal(size=(6000, 19))
     rest = PlateLog(
+        "log1",
+        0.01 * np.arange(40.0),
         np.repeat([2400.0, 2700], [30, 10]),
         3000 - 300.0 * np.repeat([[0], [1]], [30, 10], axis=0) * np.ones(19),
         np.tile([0.0, 0, 1], (40, 1)),

@@ -134,7 +134,7 @@ def test_public_data_is_left_out_where_absent_and_refused_where_damaged(tmp_path
     with pytest.raises(DatasetError, match="contact_normal_logs"):
         read_plate_logs(tmp_path)
     np.savez(tmp_path / CONTACT_NORMAL, log1_pdc_raw=np.zeros(3))
-    with pytest.raises(DatasetError, match="log1_electrodes_raw"):
+    with pytest.raises(DatasetError, match="log1_unix_time_s"):
         read_plate_logs(tmp_path)
 
 
@@ -146,7 +146,7 @@ def plate_log() -> PlateLog:
     answer[1, 0], answer[1, 16], answer[2] = 409.5, -819, -2000
     pdc = np.array([2400.0, 2700, 2800])[state] + np.where(state > 0, np.arange(100), 0)
     normal = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0.6, 0.8]])[state]
-    return PlateLog(pdc, 3000 + answer[state], normal)
+    return PlateLog("log1", 0.01 * np.arange(100.0), pdc, 3000 + answer[state], normal)
 
 
 def test_plate_response_is_tared_and_ventral_only(plate_log: PlateLog) -> None:
@@ -158,9 +158,8 @@ def test_plate_response_is_tared_and_ventral_only(plate_log: PlateLog) -> None:
 
 
 def test_logs_never_touched_or_never_at_rest_are_left_out(plate_log: PlateLog) -> None:
-    untouched = PlateLog(
-        *(part[:40] for part in (plate_log.pdc, plate_log.electrodes, plate_log.normal))
-    )
+    parts = (plate_log.time_s, plate_log.pdc, plate_log.electrodes, plate_log.normal)
+    untouched = PlateLog("log2", *(part[:40] for part in parts))
     pressed = replace(plate_log, pdc=plate_log.pdc + 25 * np.arange(100))
     tilted = replace(plate_log, normal=np.tile([0, 0.6, 0.8], (100, 1)))
     assert plate_response([untouched, pressed, tilted]) is None

@@ -21,8 +21,8 @@ from palpate.errors import ConfigError, DatasetError
 from palpate.process import typed_command
 
 if TYPE_CHECKING:
-    from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
     from palpate_training.evaluation.cells import Cell
+    from palpate_training.evaluation.study import StudySource
 
 console = Console()
 
@@ -34,7 +34,10 @@ def _words(text: str) -> tuple[str, ...]:
 def train_report(
     data: Annotated[
         Path,
-        typer.Option(help="Folder with experiment.h5 and mixed.h5, or with the published files."),
+        typer.Option(
+            help="Folder with experiment.h5 and mixed.h5, with the published files, or with "
+            "lasa_force_calibration and lasa_contact_normal."
+        ),
     ],
     out: Annotated[
         Path, typer.Option(help="Folder for report.html, report.md, pictures and study.json.")
@@ -45,7 +48,7 @@ def train_report(
         str, typer.Option(help="Words of which a system's name has one; empty = all.")
     ] = "",
     seeds: Annotated[
-        int, typer.Option(min=1, help="Seeds of unseen trajectories; other splits have one.")
+        int, typer.Option(min=1, help="Seeds of the first split of a task; others have one.")
     ] = 5,
     whole: Annotated[
         bool, typer.Option("--whole", help="Only tests of all units together.")
@@ -62,8 +65,9 @@ def train_report(
 
     palpate train report --data runs/twin --out runs/quick --tasks force --splits trajectory --whole
     """
+    from palpate_training.evaluation.experiments import TASKS
     from palpate_training.evaluation.page import write_pages
-    from palpate_training.evaluation.study import TASKS, Study, StudyPlan, write_study
+    from palpate_training.evaluation.study import Study, StudyPlan, write_study
     from palpate_training.learning.splits import SPLITS
 
     wanted = _words(splits)
@@ -79,7 +83,7 @@ def train_report(
         seeds=tuple(range(seeds)),
         whole=whole,
     )
-    study = Study(*read_folder(data), plan)
+    study = Study(read_folder(data), plan)
     folder = cells or out / "cells"
     with Progress(
         TextColumn("{task.description}"),
@@ -107,25 +111,30 @@ def train_report(
         console.print(f"wrote {path}", soft_wrap=True)
 
 
-def read_folder(folder: Path) -> tuple[ExperimentDataset, MixedDataset | None]:
-    """The data sets of a folder: generated, executed or published.
+def read_folder(folder: Path) -> StudySource:
+    """The data of a folder: an experiment, generated, executed or published; or real recordings.
 
     Raises:
         DatasetError: There is none, or it is damaged.
     """
     from palpate_training.datasets.experiment import read_experiment, read_mixed
     from palpate_training.datasets.published import published_file, read_published
+    from palpate_training.evaluation.experiments import ExperimentSource
+    from palpate_training.evaluation.recordings import read_recordings
 
     if (folder / "experiment.h5").is_file():
         mixed = folder / "mixed.h5"
-        return (
+        return ExperimentSource(
             read_experiment(folder / "experiment.h5"),
             read_mixed(mixed) if mixed.is_file() else None,
         )
     if any(published_file(folder, unit).is_file() for unit in (1, 2, 3)):
-        return read_published(folder, command=typed_command()), None
+        return ExperimentSource(read_published(folder, command=typed_command()), None)
+    recordings = read_recordings(folder)
+    if recordings is not None:
+        return recordings
     raise DatasetError(
-        f"{folder} holds neither experiment.h5 nor biotac1.hdf5",
+        f"{folder} holds neither experiment.h5 nor biotac1.hdf5, nor real recordings",
         remedy="generate a data set (palpate data generate), or name the folder of the published "
-        "files",
+        "files, or one with lasa_force_calibration or lasa_contact_normal",
     )

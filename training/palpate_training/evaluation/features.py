@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
 from palpate_training.evaluation.intervals import drawn_medians, interval
 from palpate_training.learning.metrics import force_errors, location_errors
@@ -18,7 +17,7 @@ from palpate_training.systems.analytic import ANALYTIC
 from palpate_training.systems.ours import OURS
 from palpate_training.systems.perceptrons import PERCEPTRONS
 from palpate_training.systems.points import POINTS
-from palpate_training.systems.samples import Quantity, Samples, System
+from palpate_training.systems.samples import IndexArray, Quantity, Samples, System
 from palpate_training.systems.statistical import STATISTICAL
 from palpate_training.systems.voxels import VOXELS
 
@@ -53,13 +52,18 @@ class FeatureTask:
         name: The quantity.
         data_sha256: Content hash of the data set.
         samples: All rows.
+        cluster: What is drawn as a whole for intervals, of each row, shape (N,): its trajectory, or
+            its part of a recording.
+        angled: Whether the press of a row is angled, shape (N,).
         systems: That can estimate it.
     """
 
     name: Quantity
     data_sha256: str
     samples: Samples
-    systems: tuple[System, ...] = field(default=())
+    cluster: IndexArray
+    angled: npt.NDArray[np.bool_]
+    systems: tuple[System, ...]
 
     def fit_and_test(self, system: Tested, rows: RowSplit, seed: int) -> Arrays:
         """Train, and estimate the test rows: ``estimate``, shape (N, 3)."""
@@ -68,10 +72,9 @@ class FeatureTask:
         return {"estimate": estimate(self.samples.take(rows.test))}
 
 
-def feature_task(name: Quantity, data_sha256: str, samples: Samples) -> FeatureTask:
-    """The task of a quantity, with every system that can estimate it."""
-    systems = tuple(system for system in FEATURE_SYSTEMS if name in system.quantities)
-    return FeatureTask(name, data_sha256, samples, systems)
+def systems_of(quantity: Quantity) -> tuple[System, ...]:
+    """Every system that can estimate a quantity."""
+    return tuple(system for system in FEATURE_SYSTEMS if quantity in system.quantities)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,22 +176,19 @@ def _tests(results: Mapping[Cell, CellResult]) -> Iterator[_Test]:
         )
 
 
-def score(
-    task: FeatureTask, data: ExperimentDataset, results: Mapping[Cell, CellResult]
-) -> list[Scores]:
+def score(task: FeatureTask, results: Mapping[Cell, CellResult]) -> list[Scores]:
     """The table of a task: one row for each split, test and system."""
-    angled = np.array([not name.endswith("/normal") for name in data.trajectories])
     headlines = HEADLINES[task.name]
     found = []
     for one in _tests(results):
         tested = TestedRows(
             truth=task.samples.truth(task.name)[one.rows].astype(np.float64),
-            force_n=_magnitude(data, one.rows),
-            angled=angled[data.row_trajectory[one.rows]],
+            force_n=_magnitude(task, one.rows),
+            angled=task.angled[one.rows],
             part=one.part,
         )
         errors = [row_errors(task.name, each, tested.truth) for each in one.estimates]
-        cluster = data.row_trajectory[one.rows]
+        cluster = task.cluster[one.rows]
         found.append(
             Scores(
                 task=task.name,
@@ -210,8 +210,8 @@ def score(
     return found
 
 
-def _magnitude(data: ExperimentDataset, rows: npt.NDArray[np.int64]) -> Floats:
-    return np.asarray(np.linalg.norm(data.force[rows].astype(np.float64), axis=1))
+def _magnitude(task: FeatureTask, rows: npt.NDArray[np.int64]) -> Floats:
+    return np.asarray(np.linalg.norm(task.samples.force[rows].astype(np.float64), axis=1))
 
 
 def summary(errors: Sequence[RowErrors], tested: TestedRows) -> dict[str, float]:
@@ -262,8 +262,10 @@ def paper_weights(force_n: Floats) -> Floats:
     """Weight of each row with which |F| has the paper's standard deviation, shape (N,).
 
     Of all such weights the most even: exponential in the force. Rows that vary too little, or more
-    already, keep equal weights.
+    already, or whose force is not known, keep equal weights.
     """
+    if not np.isfinite(force_n).all():
+        return np.full(len(force_n), 1.0 / len(force_n))
     scaled = (force_n - force_n.mean()) / max(float(force_n.max()), 1e-9)
 
     def spread(tilt: float) -> tuple[float, Floats]:
@@ -291,7 +293,6 @@ def weighted_median(values: Floats, weights: Floats) -> float:
 
 def ratios_to_paper(
     task: FeatureTask,
-    data: ExperimentDataset,
     results: Mapping[Cell, CellResult],
     *,
     error: str,
@@ -307,15 +308,16 @@ def ratios_to_paper(
     kept = {cell: result for cell, result in results.items() if cell.system in wanted}
     drawn: dict[tuple[str, str], dict[str, tuple[float, Floats]]] = defaultdict(dict)
     for one in _tests(kept):
-        force_n = _magnitude(data, one.rows)
-        counts = (force_n >= least_n) & (force_n < most_n)
+        force_n = _magnitude(task, one.rows)
+        # An unknown force counts where every force does.
+        counts = ~((force_n < least_n) | (force_n >= most_n))
         truth = task.samples.truth(task.name)[one.rows].astype(np.float64)
         errors = [
             np.where(counts, row_errors(task.name, each, truth)[error], np.nan)
             for each in one.estimates
         ]
         median = float(np.mean([_median(each) for each in errors]))
-        medians = drawn_medians(errors, data.row_trajectory[one.rows])
+        medians = drawn_medians(errors, task.cluster[one.rows])
         drawn[one.split, one.test][one.system] = (median, medians)
     found = {}
     for (split, test), systems in drawn.items():

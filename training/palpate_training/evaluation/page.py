@@ -24,6 +24,10 @@ SPLIT_WORDS = {
     "execution": "Unseen execution: the same press may have been seen on another unit",
     "point": "Unseen point, with all its presses",
     "indenter": "Unseen indenter",
+    "block": "Unseen blocks of 18 s: every fifth is tested, five times in turn",
+    "tail": "The last 20 % of each recording",
+    "touch": "Unseen touches: every fifth is tested, five times in turn",
+    "log": "Unseen logs, of another time",
     "unit": "Unseen BioTac, nothing calibrated",
     "neighbour": "Not a result: neighbouring rows in training, which shows what is left to gain",
 }
@@ -266,14 +270,14 @@ def _of_split(task: str, split: str, rows: Sequence[Row]) -> Iterator[Table]:
 def preface(values: Mapping[str, Any], command: str) -> list[str]:
     """Paragraphs on top: which data, and what the numbers are."""
     sources = "; ".join(dict.fromkeys(one["source"] for one in values["sources"]))
-    rows = values["rows"]
+    rows = ", ".join(f"{count:,} {what}" for what, count in values["rows"].items())
     return [
-        f"Data: **{sources}**; {rows['experiment']:,} rows of the experiment, {rows['mixed']:,} "
-        "mixed rows with fields. Rows called the paper's are of its real BioTacs and its own data.",
+        f"Data: **{sources}**; {rows}. Rows called the paper's are of its real BioTacs and its own "
+        "data.",
         f"Made by `{command}`.",
-        "Brackets are 95 % intervals, whole trajectories drawn with replacement. A system that "
-        "depends on a seed is shown as the mean over its seeds. Re-weighted medians give the "
-        "forces the spread that they have in the paper.",
+        "Brackets are 95 % intervals, whole trajectories (touches, blocks) drawn with replacement. "
+        "A system that depends on a seed is shown as the mean over its seeds. Re-weighted medians "
+        "give the forces the spread that they have in the paper.",
     ]
 
 

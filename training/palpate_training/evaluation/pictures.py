@@ -1,7 +1,8 @@
 """Pictures of a study: errors as boxes, a press in time, pairs on the skin, electrodes on the map.
 
-They show the split of unseen trajectories, and are drawn from what is kept of the trainings. Which
-press is shown follows from a rule, not from how it looks: the trial whose error is the median.
+They show what the first split of a task holds out, and are drawn from what is kept of the
+trainings. Which press is shown follows from a rule, not from how it looks: the trial whose error is
+the median.
 """
 
 from __future__ import annotations
@@ -42,14 +43,18 @@ from palpate_training.figures.style import (
     new_figure,
     unit_colour,
 )
+from palpate_training.learning.splits import SplitName
 from palpate_training.systems.synthesis import SYNTHESIS_SYSTEMS
 from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
 Made = Mapping[Cell, CellResult]
 
-SHOWN_SPLIT = "trajectory"
-
+_HELD_OUT = {
+    "trajectory": "unseen trajectories",
+    "block": "unseen blocks of 18 s",
+    "touch": "unseen touches",
+}
 _UNITS = {"distance_m": ("mm", 1e3), "magnitude_n": ("N", 1.0), "angle_rad": ("rad", 1.0)}
 _WHAT = {"distance_m": "distance", "magnitude_n": "error of the magnitude", "angle_rad": "angle"}
 
@@ -78,24 +83,35 @@ class _Shown:
     estimate: Floats
 
 
-def draw_task(folder: Path, task: Any, data: ExperimentDataset, made: Made) -> list[Picture]:
-    """Draw what there is to show of a task; nothing if its trajectories were not tested.
+def draw_task(
+    folder: Path,
+    task: Any,
+    data: ExperimentDataset | None,
+    made: Made,
+    *,
+    split: SplitName = "trajectory",
+) -> list[Picture]:
+    """Draw what there is to show of a task; nothing if the split was not tested.
+
+    Without ``data``, which is that of an experiment, errors alone are drawn.
 
     Raises:
         DatasetError: The disk refused.
     """
     if not isinstance(task, FeatureTask | SynthesisTask):
         return []
-    shown = _shown(made)
+    shown = _shown(made, split)
     if not shown:
         return []
     drawn: list[tuple[str, Callable[[Path], str]]] = []
     if isinstance(task, SynthesisTask):
         drawn.append(("map", lambda path: _draw_map(path, task, shown)))
     else:
-        drawn.append(("errors", lambda path: _draw_errors(path, task, shown)))
+        drawn.append(("errors", lambda path: _draw_errors(path, task, shown, split)))
         pair = _compared(task, shown)
-        if task.name == "force":
+        if data is None:
+            pass
+        elif task.name == "force":
             drawn.append(("press", lambda path: _draw_press(path, task, data, pair)))
         elif task.name in ("location", "centre"):
             drawn.append(("pairs", lambda path: _draw_pairs(path, task, pair)))
@@ -130,12 +146,12 @@ def draw_forces(folder: Path, data: ExperimentDataset) -> Picture:
     return Picture("", "forces.png", caption)
 
 
-def _shown(made: Made) -> list[_Shown]:
-    """The widest test of the split that is shown, a system after another."""
+def _shown(made: Made, shown_split: SplitName) -> list[_Shown]:
+    """The widest test of a split, a system after another."""
     tests: dict[str, list[_Shown]] = {}
     for (split, test, system), by_seed in grouped(made):
         cells = by_seed[0]
-        if split == SHOWN_SPLIT:
+        if split == shown_split:
             tests.setdefault(test, []).append(
                 _Shown(
                     system,
@@ -163,7 +179,7 @@ def _compared(task: FeatureTask, shown: Sequence[_Shown]) -> list[_Shown]:
     return found or list(shown[:1])
 
 
-def _draw_errors(path: Path, task: FeatureTask, shown: Sequence[_Shown]) -> str:
+def _draw_errors(path: Path, task: FeatureTask, shown: Sequence[_Shown], split: SplitName) -> str:
     """A box of every system, best on top."""
     error = HEADLINES[task.name][0]
     unit, factor = _UNITS[error]
@@ -198,7 +214,7 @@ def _draw_errors(path: Path, task: FeatureTask, shown: Sequence[_Shown]) -> str:
     return finish(
         figure,
         path,
-        f"{task.name.capitalize()}: unseen trajectories",
+        f"{task.name.capitalize()}: {_HELD_OUT[split]}",
         f"{len(shown[0].rows):,} rows. Box: interquartile range (IQR); solid line: median; dashed:"
         " mean; whiskers: 1.5 IQR, rounded down to the nearest value. Green: ours; yellow: the"
         " paper's networks. Boxes may leave the picture on the right.",

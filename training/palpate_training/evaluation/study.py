@@ -6,19 +6,15 @@ What the page shows is in that file, so tables and documents never disagree with
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Protocol, get_args
 
 from palpate import __version__
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate_training.datasets.experiment import (
-    ExperimentDataset,
-    MixedDataset,
-    content_sha256,
-)
+from palpate_training.datasets.container import Provenance
 from palpate_training.evaluation.cells import (
     Cell,
     CellResult,
@@ -28,35 +24,45 @@ from palpate_training.evaluation.cells import (
     make_cells,
     read_cell,
 )
+from palpate_training.evaluation.experiments import TASKS
 from palpate_training.evaluation.features import (
     FeatureTask,
     Scores,
-    feature_task,
     ratios_to_paper,
     score,
 )
-from palpate_training.evaluation.pictures import draw_forces, draw_task
+from palpate_training.evaluation.pictures import Made, Picture
 from palpate_training.evaluation.skin import (
     FieldTask,
     SynthesisTask,
-    of_one_unit,
     score_fields,
     score_synthesis,
 )
-from palpate_training.learning.splits import ALL_UNITS, Fold, SplitName, folds_of
-from palpate_training.systems.samples import Quantity, samples_of
+from palpate_training.learning.splits import Fold, SplitName
 
-TASKS = (*get_args(Quantity), "field", "synthesis")
 
-TASK_SPLITS: dict[str, tuple[SplitName, ...]] = {
-    "location": ("trajectory", "execution", "point", "indenter", "unit", "neighbour"),
-    "force": ("trajectory", "execution", "point", "indenter", "unit", "neighbour"),
-    "centre": ("trajectory", "point", "indenter", "unit", "neighbour"),
-    "normal": ("trajectory", "point", "indenter", "unit", "neighbour"),
-    "field": ("trajectory", "point", "indenter", "unit", "neighbour"),
-    "synthesis": ("trajectory", "point", "indenter", "neighbour"),
-}
-"""Synthesis has no unseen unit: its network is of one unit."""
+class StudySource(Protocol):
+    """Data that a study is made of."""
+
+    def task(self, name: str) -> Task | None:
+        """A task by name; None if the data does not hold it."""
+
+    def splits(self, task: str) -> tuple[SplitName, ...]:
+        """Splits of a task; of the first all seeds are trained."""
+
+    def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
+        """Trainings of a split; ``whole``: only those of all units together."""
+
+    @property
+    def provenance(self) -> tuple[Provenance, ...]:
+        """Where the data comes from."""
+
+    @property
+    def row_counts(self) -> dict[str, int]:
+        """Rows of each data set."""
+
+    def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
+        """Draw what there is to show of each task into ``out``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +73,7 @@ class StudyPlan:
         tasks: Names of tasks.
         splits: Names of splits; a task leaves out those that it does not have.
         systems: Words of which a system's name must contain one; empty = all.
-        seeds: Seeds of ``trajectory``; of the other splits the first alone.
+        seeds: Seeds of the first split of a task; of the other splits the first alone.
         split_seed: Deals trajectories and points to the sides.
         whole: Only the folds of all units together; for a first look.
     """
@@ -81,22 +87,19 @@ class StudyPlan:
 
 
 class Study:
-    """Tasks and cells of one or two data sets.
+    """Tasks and cells of some data.
 
     Args:
-        experiment: For location and force.
-        mixed: For the other tasks; None leaves them out.
+        source: The data.
         plan: What is to be made.
 
     Raises:
-        ConfigError: A task is not known or the data does not hold it, or no cell is left.
+        ConfigError: A task is not known, or no cell is left.
     """
 
-    def __init__(
-        self, experiment: ExperimentDataset, mixed: MixedDataset | None, plan: StudyPlan
-    ) -> None:
+    def __init__(self, source: StudySource, plan: StudyPlan) -> None:
         self.plan = plan
-        self.experiment, self.mixed = experiment, mixed
+        self.source = source
         self.tasks: dict[str, Task] = {}
         self.cells: list[Cell] = []
         for name in plan.tasks:
@@ -108,51 +111,21 @@ class Study:
             )
 
     def _add(self, name: str) -> None:
-        task, data = self._task(name)
-        if task is None or data is None:
+        if name not in TASKS:
+            raise ConfigError(f"there is no task {name!r}", remedy=f"one of: {', '.join(TASKS)}")
+        plan = self.plan
+        task = self.source.task(name)
+        if task is None:
             return
         self.tasks[name] = task
-        for split in TASK_SPLITS[name]:
-            if split not in self.plan.splits:
+        for number, split in enumerate(self.source.splits(name)):
+            if split not in plan.splits:
                 continue
-            folds = self._folds(name, data, split)
-            seeds = self.plan.seeds if split == "trajectory" else self.plan.seeds[:1]
+            folds = self.source.folds(name, split, seed=plan.split_seed, whole=plan.whole)
+            seeds = plan.seeds if number == 0 else plan.seeds[:1]
             self.cells += [
                 cell for cell in cells_of(task, folds, seeds) if self._wanted(cell.system)
             ]
-
-    def _task(self, name: str) -> tuple[Task | None, ExperimentDataset | None]:
-        if name not in TASKS:
-            raise ConfigError(f"there is no task {name!r}", remedy=f"one of: {', '.join(TASKS)}")
-        if name in ("location", "force"):
-            digest = content_sha256(self.experiment)
-            return (
-                feature_task("force" if name == "force" else "location", digest,
-                             samples_of(self.experiment)),
-                self.experiment,
-            )  # fmt: skip
-        if self.mixed is None:
-            return None, None
-        digest = content_sha256(self.mixed)
-        rows = self.mixed.experiment
-        if name in ("centre", "normal"):
-            if self.mixed.contact is None:
-                return None, None
-            samples = samples_of(rows, self.mixed.contact)
-            return feature_task("centre" if name == "centre" else "normal", digest, samples), rows
-        if name == "field":
-            return FieldTask(digest, self.mixed), rows
-        return SynthesisTask(digest, self.mixed), rows
-
-    def _folds(self, name: str, data: ExperimentDataset, split: SplitName) -> list[Fold]:
-        folds = folds_of(data, split, seed=self.plan.split_seed)
-        if name == "synthesis":
-            assert self.mixed is not None
-            return of_one_unit(folds, self.mixed)
-        if not self.plan.whole:
-            return folds
-        together = [fold for fold in folds if fold.test == ALL_UNITS or " + " in fold.test]
-        return together or folds
 
     def _wanted(self, system: str) -> bool:
         words = self.plan.systems
@@ -192,9 +165,8 @@ class Study:
         return {
             "schema": "palpate.study 1",
             "palpate": __version__,
-            "sources": [asdict(self.experiment.provenance)]
-            + ([] if self.mixed is None else [asdict(self.mixed.experiment.provenance)]),
-            "rows": {"experiment": len(self.experiment), "mixed": len(self.mixed or ())},
+            "sources": [asdict(one) for one in self.source.provenance],
+            "rows": self.source.row_counts,
             "plan": asdict(self.plan),
             "scores": [asdict(one) for one in scores],
             "ratios": ratios,
@@ -209,10 +181,8 @@ class Study:
         Raises:
             DatasetError: A cell is missing or damaged, or the disk refused.
         """
-        pictures = [draw_forces(out, self.experiment)]
-        for name, task in self.tasks.items():
-            pictures += draw_task(out, task, self._data_of(name), self._made(folder, name))
-        return [asdict(one) for one in pictures]
+        made = {name: (task, self._made(folder, name)) for name, task in self.tasks.items()}
+        return [asdict(one) for one in self.source.draw(out, made)]
 
     def _made(self, folder: Path, name: str) -> dict[Cell, CellResult]:
         task = self.tasks[name]
@@ -222,19 +192,13 @@ class Study:
             if cell.task == name
         }
 
-    def _data_of(self, name: str) -> ExperimentDataset:
-        if name in ("location", "force"):
-            return self.experiment
-        assert self.mixed is not None
-        return self.mixed.experiment
-
     def _scores(self, task: Task, made: dict[Cell, CellResult]) -> list[Scores]:
         if isinstance(task, FieldTask):
             return score_fields(task, made)
         if isinstance(task, SynthesisTask):
             return score_synthesis(task, made)
         assert isinstance(task, FeatureTask)
-        return score(task, self._data_of(task.name), made)
+        return score(task, made)
 
     def _ratios(self, task: FeatureTask, made: dict[Cell, CellResult]) -> Iterable[dict[str, Any]]:
         """Ours over the best of the paper's networks, where the goals count."""
@@ -249,9 +213,7 @@ class Study:
             "normal": [(angle, 0.0, float("inf"))],
         }[task.name]  # fmt: skip
         for error, least_n, most_n in wanted:
-            found = ratios_to_paper(
-                task, self._data_of(task.name), made, error=error, least_n=least_n, most_n=most_n
-            )
+            found = ratios_to_paper(task, made, error=error, least_n=least_n, most_n=most_n)
             for (split, test, system), (ratio, low, high) in found.items():
                 yield {
                     "task": task.name, "split": split, "test": test, "system": system,

@@ -40,6 +40,9 @@ CONTACT_NORMAL = Path("lasa_contact_normal") / "contact_normal_logs.npz"
 
 UNTOUCHED_COUNTS = 10
 TOUCHED_COUNTS = 30
+TOUCH_GAP_S = 0.5
+"""Untouched for so long, and the next touch begins [s]."""
+
 VENTRAL_COS = float(np.cos(np.radians(20.0)))
 """A press is ventral within so much of +z, the direction in which a plate pushes the finger."""
 
@@ -52,15 +55,34 @@ class PlateLog:
     """One log of a plate that is pressed on the pad.
 
     Attributes:
+        name: In the archive.
+        time_s: Wall clock [s], shape (T,).
         pdc: Raw static pressure [counts], shape (T,).
         electrodes: Raw counts [counts], shape (T, 19).
         normal: Direction in which the plate pushes, sensor frame, unit, shape (T, 3); +z is
             ventral. The archive holds the last known one where nothing touches.
     """
 
+    name: str
+    time_s: Floats
     pdc: Floats
     electrodes: Floats
     normal: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class TouchedRows:
+    """When a log is touched.
+
+    Attributes:
+        rows: Rows in which it is touched, shape (S,).
+        touch: Number of the touch of each, from zero, shape (S,).
+        rest: Mean of the untouched rows [counts], shape (19,).
+    """
+
+    rows: npt.NDArray[np.int64]
+    touch: npt.NDArray[np.int64]
+    rest: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,18 +109,31 @@ def read_plate_logs(folder: Path) -> tuple[PlateLog, ...]:
     path = folder / CONTACT_NORMAL
     if not path.is_file():
         return ()
-    parts = ("pdc_raw", "electrodes_raw", "contact_normal")
+    parts = ("unix_time_s", "pdc_raw", "electrodes_raw", "contact_normal")
 
     def wanted(held: Sequence[str]) -> list[str]:
         logs = sorted({key.partition("_")[0] for key in held})
         return [f"{log}_{part}" for log in logs for part in parts]
 
     remedy = "give the archive of the LASA contact-normal logs"
-    arrays = iter(read_archive(path, wanted, remedy=remedy).values())
+    arrays = read_archive(path, wanted, remedy=remedy)
+    logs = dict.fromkeys(key.partition("_")[0] for key in arrays)
     return tuple(
-        PlateLog(*(values.astype(np.float64) for values in log))
-        for log in zip(arrays, arrays, arrays, strict=True)
+        PlateLog(log, *(arrays[f"{log}_{part}"].astype(np.float64) for part in parts))
+        for log in logs
     )
+
+
+def touched_rows(log: PlateLog) -> TouchedRows | None:
+    """When a log is touched; None if never, or if nothing tells how it reads untouched."""
+    values, often = np.unique(log.pdc, return_counts=True)
+    above = log.pdc - values[np.argmax(often)]
+    untouched = np.abs(above) <= UNTOUCHED_COUNTS
+    rows = np.flatnonzero(above > TOUCHED_COUNTS)
+    if np.count_nonzero(untouched) < _UNTOUCHED_SAMPLES or not rows.size:
+        return None
+    touch = np.concatenate([[0], np.cumsum(np.diff(log.time_s[rows]) > TOUCH_GAP_S)])
+    return TouchedRows(rows, touch, log.electrodes[untouched].mean(axis=0))
 
 
 def plate_response(logs: Sequence[PlateLog]) -> PlateResponse | None:
@@ -117,14 +152,11 @@ def plate_response(logs: Sequence[PlateLog]) -> PlateResponse | None:
 
 def _ventral(log: PlateLog) -> Floats:
     """Tared electrodes under a ventral plate, shape (S, 19)."""
-    values, often = np.unique(log.pdc, return_counts=True)
-    above = log.pdc - values[np.argmax(often)]
-    untouched = np.abs(above) <= UNTOUCHED_COUNTS
-    if np.count_nonzero(untouched) < _UNTOUCHED_SAMPLES:
+    found = touched_rows(log)
+    if found is None:
         return np.empty((0, log.electrodes.shape[1]))
-    rest = log.electrodes[untouched].mean(axis=0)
-    ventral = (above > TOUCHED_COUNTS) & (log.normal[:, 2] > VENTRAL_COS)
-    return np.asarray((log.electrodes[ventral] - rest) / COUNTS_MAX)
+    ventral = found.rows[log.normal[found.rows, 2] > VENTRAL_COS]
+    return np.asarray((log.electrodes[ventral] - found.rest) / COUNTS_MAX)
 
 
 FLAT_INDENTERS = ("cube",)

@@ -85,6 +85,28 @@ def contiguous_folds(
     return splits
 
 
+def last_part(
+    recording: Labels, *, share: float = 0.2, validation_share: float = 0.1, guard_rows: int = 100
+) -> RowSplit:
+    """Test the end of each recording; the part before it validates.
+
+    Args:
+        recording: Recording of every row, shape ``(N,)``; rows in order of time.
+        share: Of each recording that is tested.
+        validation_share: Of each recording that validates.
+        guard_rows: Rows left out on either side of a border between two sides.
+    """
+    test, validation = np.zeros(len(recording), bool), np.zeros(len(recording), bool)
+    for one in np.unique(recording):
+        rows = np.flatnonzero(recording == one)
+        end, middle = (
+            round(len(rows) * (1.0 - part)) for part in (share, share + validation_share)
+        )
+        test[rows[end:]] = True
+        validation[rows[middle:end]] = True
+    return _guarded(validation, test, recording, guard_rows)
+
+
 def unseen_sensor(
     sensor: Labels, block: Labels, *, test_sensor: int, guard_rows: int = 100
 ) -> RowSplit:
@@ -199,9 +221,13 @@ def unit_sets(data: ExperimentDataset) -> list[tuple[str, ...]]:
     return each + ([tuple(present)] if len(present) > 1 else [])
 
 
-SplitName = Literal["trajectory", "execution", "point", "indenter", "unit", "neighbour"]
+SplitName = Literal[
+    "trajectory", "execution", "point", "indenter", "block", "tail", "touch", "log", "unit",
+    "neighbour",
+]  # fmt: skip
 """What is held out: a unique trajectory on every unit; one execution of it; a point of an indenter
-with all its trajectories; an indenter; a unit. ``neighbour`` holds out rows at random."""
+with all its trajectories; an indenter; of long recordings a block, the end, one touch of many, or a
+log that was recorded at another time; a unit. ``neighbour`` holds out rows at random."""
 
 SPLITS: tuple[SplitName, ...] = get_args(SplitName)
 
@@ -215,8 +241,8 @@ class Fold:
     Attributes:
         split: What is held out.
         test: On what is tested, as tables call it: a unit, "all units", "biotac-1 to biotac-2".
-        part: The indenter that is held out; empty in the other splits. Rows of all parts of a test
-            are put together.
+        part: The indenter, or the number of the blocks, that is held out; empty in the other
+            splits. Rows of all parts of a test are put together.
         rows: Rows of each side.
     """
 

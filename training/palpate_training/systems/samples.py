@@ -7,7 +7,7 @@ in it comes from the seed, so the same rows and seed give the same estimates.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -56,6 +56,14 @@ class Samples:
     def take(self, rows: Rows) -> Samples:
         """Some of the rows."""
         return Samples(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Samples]) -> Samples:
+        """The rows of several, one after another."""
+        names = [field.name for field in fields(cls)]
+        return cls(
+            **{name: np.concatenate([getattr(one, name) for one in parts]) for name in names}
+        )
 
     def truth(self, quantity: Quantity) -> FloatArray:
         """A quantity of every row, shape (N, 3)."""

@@ -1,0 +1,112 @@
+"""An experiment as the study sees it: presses on known points, simulated, executed or published."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    MixedDataset,
+    content_sha256,
+)
+from palpate_training.evaluation.cells import Task
+from palpate_training.evaluation.features import FeatureTask, systems_of
+from palpate_training.evaluation.pictures import Made, Picture, draw_forces, draw_task
+from palpate_training.evaluation.skin import FieldTask, SynthesisTask, of_one_unit
+from palpate_training.learning.splits import ALL_UNITS, Fold, SplitName, folds_of
+from palpate_training.systems.samples import Quantity, samples_of
+
+TASKS = (*get_args(Quantity), "field", "synthesis")
+
+TASK_SPLITS: dict[str, tuple[SplitName, ...]] = {
+    "location": ("trajectory", "execution", "point", "indenter", "unit", "neighbour"),
+    "force": ("trajectory", "execution", "point", "indenter", "unit", "neighbour"),
+    "centre": ("trajectory", "point", "indenter", "unit", "neighbour"),
+    "normal": ("trajectory", "point", "indenter", "unit", "neighbour"),
+    "field": ("trajectory", "point", "indenter", "unit", "neighbour"),
+    "synthesis": ("trajectory", "point", "indenter", "neighbour"),
+}
+"""Synthesis has no unseen unit: its network is of one unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentSource:
+    """One or two data sets of an experiment.
+
+    Attributes:
+        experiment: For location and force.
+        mixed: For the other tasks; None leaves them out.
+    """
+
+    experiment: ExperimentDataset
+    mixed: MixedDataset | None
+
+    def task(self, name: str) -> Task | None:
+        """A task by name; None if the data does not hold it."""
+        if name in ("location", "force"):
+            return self._features("force" if name == "force" else "location", self.experiment)
+        if self.mixed is None:
+            return None
+        if name in ("centre", "normal"):
+            if self.mixed.contact is None:
+                return None
+            return self._features("centre" if name == "centre" else "normal", self.mixed)
+        digest = content_sha256(self.mixed)
+        return (FieldTask if name == "field" else SynthesisTask)(digest, self.mixed)
+
+    def _features(self, name: Quantity, data: ExperimentDataset | MixedDataset) -> FeatureTask:
+        rows = data.experiment if isinstance(data, MixedDataset) else data
+        contact = data.contact if isinstance(data, MixedDataset) else None
+        angled = np.array([not each.endswith("/normal") for each in rows.trajectories])
+        return FeatureTask(
+            name,
+            content_sha256(data),
+            samples_of(rows, contact),
+            cluster=rows.row_trajectory,
+            angled=angled[rows.row_trajectory],
+            systems=systems_of(name),
+        )
+
+    def splits(self, task: str) -> tuple[SplitName, ...]:
+        """Splits of a task; of the first all seeds are trained."""
+        return TASK_SPLITS[task]
+
+    def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
+        """Trainings of a split; ``whole``: only those of all units together."""
+        folds = folds_of(self._rows(task), split, seed=seed)
+        if task == "synthesis":
+            assert self.mixed is not None
+            return of_one_unit(folds, self.mixed)
+        together = [fold for fold in folds if fold.test == ALL_UNITS or " + " in fold.test]
+        return together if whole and together else folds
+
+    def _rows(self, task: str) -> ExperimentDataset:
+        if task in ("location", "force"):
+            return self.experiment
+        assert self.mixed is not None
+        return self.mixed.experiment
+
+    @property
+    def provenance(self) -> tuple[Provenance, ...]:
+        """Where the data comes from."""
+        mixed = () if self.mixed is None else (self.mixed.experiment.provenance,)
+        return (self.experiment.provenance, *mixed)
+
+    @property
+    def row_counts(self) -> dict[str, int]:
+        """Rows of each data set."""
+        mixed = {} if self.mixed is None else {"mixed rows with fields": len(self.mixed)}
+        return {"rows of the experiment": len(self.experiment), **mixed}
+
+    def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
+        """Draw what there is to show of each task into ``out``."""
+        pictures = [draw_forces(out, self.experiment)]
+        for name, (task, results) in made.items():
+            pictures += draw_task(out, task, self._rows(name), results)
+        return pictures
