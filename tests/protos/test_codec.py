@@ -23,8 +23,8 @@ from palpate.codec import (
     Codec,
 )
 from palpate.errors import PalpateError, WireError
-from palpate.messages import ElectrodeFrame, FieldFrame, Origin, Stamp
-from palpate.v1 import common_pb2, frames_pb2, service_pb2
+from palpate.messages import ElectrodeFrame, FeatureEstimate, FieldFrame, Origin, Stamp
+from palpate.v1 import common_pb2, estimates_pb2, frames_pb2, service_pb2
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "v1"
 BY_NAME = {codec.schema.rpartition(".")[2]: codec for codec in CODECS}
@@ -132,16 +132,68 @@ def test_a_bad_frame_is_refused_on_both_sides(
     assert named in str(caught.value)
 
 
+def touched(estimate: FeatureEstimate) -> FeatureEstimate:
+    """With a centre of pressure and a contact normal, which the published example has not."""
+    return dataclasses.replace(
+        estimate,
+        centre_of_pressure=np.array([0.001, -0.001, -0.007], np.float32),
+        centre_of_pressure_sd=np.array([0.0001, 0.0002, 0.0003], np.float32),
+        contact_normal=np.array([0.0, 0.6, -0.8], np.float32),
+        contact_normal_sd=0.0625,
+    )
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("field", ["force", "force_sd", "contact_location"])
+@pytest.mark.parametrize(
+    "field",
+    [
+        "force",
+        "force_sd",
+        "contact_location",
+        "centre_of_pressure",
+        "centre_of_pressure_sd",
+        "contact_normal",
+    ],
+)
 def test_non_finite_estimates_are_refused(
     examples: dict[str, Any], field: str, value: float
 ) -> None:
-    bad = getattr(examples["FeatureEstimate"], field).copy()
+    good = touched(examples["FeatureEstimate"])
+    bad = getattr(good, field).copy()
     bad[1] = value
     with pytest.raises(WireError, match=field) as caught:
-        FEATURE_ESTIMATE.encode(dataclasses.replace(examples["FeatureEstimate"], **{field: bad}))
+        FEATURE_ESTIMATE.encode(dataclasses.replace(good, **{field: bad}))
     assert caught.value.reason == "non_finite"
+
+
+def test_a_normal_and_a_centre_of_pressure_are_complete_and_of_a_contact(
+    examples: dict[str, Any],
+) -> None:
+    good = touched(examples["FeatureEstimate"])
+    decoded = FEATURE_ESTIMATE.decode(FEATURE_ESTIMATE.encode(good))
+    assert decoded.contact_normal_sd == good.contact_normal_sd
+    np.testing.assert_array_equal(decoded.centre_of_pressure, good.centre_of_pressure)
+    lone = {"contact_location": None, "contact_location_sd": None}
+    for changes, reason in (
+        ({"contact_normal": np.array([0, 0, -2], np.float32)}, "normal"),
+        ({"contact_normal_sd": None}, "normal"),
+        ({"contact_normal_sd": -0.1}, "negative_sd"),
+        ({"contact_normal_sd": np.nan}, "non_finite"),
+        ({"centre_of_pressure_sd": None}, "centre"),
+        ({**lone, "in_contact": False}, "centre"),
+        ({**lone, "in_contact": False, "centre_of_pressure": None}, "normal"),
+    ):
+        with pytest.raises(WireError) as caught:
+            FEATURE_ESTIMATE.encode(dataclasses.replace(good, **changes))
+        assert caught.value.reason == reason, changes
+    message = estimates_pb2.FeatureEstimate.FromString(FEATURE_ESTIMATE.encode(good))
+    message.contact_normal.z = -2.0
+    with pytest.raises(WireError, match="no unit vector"):
+        FEATURE_ESTIMATE.decode(message.SerializeToString())
+    message.contact_normal.z = -0.8
+    message.ClearField("centre_of_pressure_sd")
+    with pytest.raises(WireError, match="without centre_of_pressure_sd"):
+        FEATURE_ESTIMATE.decode(message.SerializeToString())
 
 
 def test_nan_in_a_field_is_refused_with_its_row(examples: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from palpate import clock
 from palpate.files.bundle import Bundle, Manifest, read_bundle, write_bundle
-from palpate.files.tasks import TASKS
+from palpate.files.tasks import TASKS, tensors_of
 from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,
@@ -35,6 +35,24 @@ THRESHOLD_N = 0.2
 BASELINE_COUNTS = 2000.0
 
 
+NORMAL = "contact_normal"
+DORSAL = np.array([0.0, 0.0, 1.0], np.float32)
+EVERY_OUTPUT = tuple(
+    tensor.name for tensor in (*TASKS["features"].outputs, *TASKS["features"].optional)
+)
+
+
+def width_of(name: str) -> int:
+    """Values of an output of the features task."""
+    return 1 if name == f"{NORMAL}_sd" else 3
+
+
+def weights_of(at: int, name: str, inputs: int) -> Any:
+    """Weights of the output with this number."""
+    shape = (inputs, width_of(name))
+    return np.random.default_rng(at).normal(0, 0.01, shape).astype(np.float32)
+
+
 @dataclasses.dataclass
 class Recipe:
     """What the graph of a test bundle looks like; the defaults make a good one."""
@@ -42,22 +60,39 @@ class Recipe:
     inputs: tuple[str, ...] = ("electrodes",)
     width: int = 19
     outputs: tuple[str, ...] = ("force", "force_sd", "contact_location", "contact_location_sd")
+    """Which outputs; ``EVERY_OUTPUT`` has those of a contact, too."""
+
+    long_normal: bool = False
+    """The contact normal is twice as long as it should be."""
     dtype: int = onnx.TensorProto.FLOAT
     poison: bool = False
     opset: int = 17
 
     def model(self) -> Any:
-        """The graph: each output is ``electrodes @ W``; a deviation is its magnitude."""
+        """The graph: each output is ``electrodes @ W``; a deviation is its magnitude.
+
+        A contact normal is divided by its length.
+        """
         nodes, weights, source = [], [], self.inputs[0]
         if self.dtype != onnx.TensorProto.FLOAT:
             nodes.append(helper.make_node("Cast", [source], ["cast"], to=onnx.TensorProto.FLOAT))
             source = "cast"
         for at, name in enumerate(self.outputs):
-            values = np.random.default_rng(at).normal(0, 0.01, (self.width, 3)).astype(np.float32)
+            values = weights_of(at, name, self.width)
             weights.append(onnx.numpy_helper.from_array(values, f"w_{name}"))
-            raw = f"raw_{name}" if name.endswith("_sd") or self.poison else name
+            plain = not (name.endswith("_sd") or name == NORMAL or self.poison)
+            raw = name if plain else f"raw_{name}"
             nodes.append(helper.make_node("MatMul", [source, f"w_{name}"], [raw]))
-            if name.endswith("_sd"):
+            if name == NORMAL:
+                share = np.array([1.0 / (1 + self.long_normal)], np.float32)
+                weights.append(onnx.numpy_helper.from_array(share, "share"))
+                # An untouched sensor has a direction, too.
+                weights.append(onnx.numpy_helper.from_array(DORSAL, "dorsal"))
+                nodes.append(helper.make_node("Add", [raw, "dorsal"], ["shifted"]))
+                nodes.append(helper.make_node("ReduceL2", ["shifted"], ["length"], axes=[1]))
+                nodes.append(helper.make_node("Mul", ["length", "share"], ["divisor"]))
+                nodes.append(helper.make_node("Div", ["shifted", "divisor"], [name]))
+            elif name.endswith("_sd"):
                 nodes.append(helper.make_node("Abs", [raw], [name]))
             elif self.poison:  # zero / zero on every input
                 nodes.append(helper.make_node("Sub", [raw, raw], [f"zero_{name}"]))
@@ -67,7 +102,7 @@ class Recipe:
             nodes,
             "test",
             [tensor(name, self.dtype, ["N", self.width]) for name in self.inputs],
-            [tensor(name, onnx.TensorProto.FLOAT, ["N", 3]) for name in self.outputs],
+            [tensor(name, onnx.TensorProto.FLOAT, ["N", width_of(name)]) for name in self.outputs],
             weights,
         )
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", self.opset)])
@@ -106,20 +141,25 @@ def make_bundle(tmp_path: Path) -> MakeBundle:
         **changes: Any,
     ) -> Path:
         good = Recipe()
-        contract = TASKS["features"]
-        payload = (recipe or good).model().SerializeToString() if model is None else model
+        made_of = recipe or good
+        every = set(made_of.outputs) == set(EVERY_OUTPUT)
+        names = EVERY_OUTPUT if every else good.outputs
+        takes, gives = tensors_of("features", 0, optional=names)
+        payload = made_of.model().SerializeToString() if model is None else model
         rng = np.random.default_rng(7)
         golden = {"electrodes": rng.normal(0, 100, (8, 19)).astype(np.float32)}
-        for at, name in enumerate(good.outputs):
-            weights = np.random.default_rng(at).normal(0, 0.01, (19, 3)).astype(np.float32)
-            values = golden["electrodes"] @ weights + np.float32(golden_shift)
+        for at, name in enumerate(names):
+            values = golden["electrodes"] @ weights_of(at, name, 19) + np.float32(golden_shift)
+            if name == NORMAL:
+                values += DORSAL
+                values /= np.linalg.norm(values, axis=1, keepdims=True) / (1 + made_of.long_normal)
             golden[name] = np.abs(values) if name.endswith("_sd") else values
         manifest = Manifest(
             name="test",
             version=1,
             task="features",
-            inputs=contract.inputs,
-            outputs=contract.outputs + contract.optional,
+            inputs=takes,
+            outputs=gives,
             sensor_type="BIOTAC",
             contact_threshold_n=THRESHOLD_N,
             training_data_sha256="0" * 64,

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from palpate.codec import FEATURE_ESTIMATE
+from palpate.errors import BundleError
 from palpate.files.bundle import Bundle, read_bundle
+from palpate.files.tasks import TASKS
 from palpate.messages import ElectrodeFrame, FeatureEstimate, SensorType, Tare
 from palpate_services.inference.estimates import EstimateRefusal, estimate, tared_counts
 from palpate_services.inference.model import Runtime, load
 
 Frames = Callable[..., ElectrodeFrame]
+
+FEATURES = TASKS["features"]
+EVERY_OUTPUT = tuple(tensor.name for tensor in (*FEATURES.outputs, *FEATURES.optional))
 
 
 @pytest.fixture
@@ -107,3 +113,36 @@ def test_answer_that_is_not_finite(
     tare = make_tare()
     tare.electrodes[3] = np.inf  # the codec refuses such a tare; the estimator does not rely on it
     assert estimate(make_frame(), tare, runtime) is EstimateRefusal.NON_FINITE
+
+
+def test_centre_of_pressure_and_contact_normal_are_those_of_the_model(
+    make_bundle: Callable[..., Path],
+    recipe: Any,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+) -> None:
+    every = recipe(outputs=EVERY_OUTPUT)
+    frame, tare = make_frame(60), make_tare()
+    keen = load(read_bundle(make_bundle(every, contact_threshold_n=0.0)), "features")
+    answer = estimate(frame, tare, keen)
+    model = keen.run(tared_counts(frame, tare))
+    assert isinstance(answer, FeatureEstimate)
+    assert model is not None
+    np.testing.assert_array_equal(answer.centre_of_pressure, model["centre_of_pressure"])
+    np.testing.assert_array_equal(answer.centre_of_pressure_sd, model["centre_of_pressure_sd"])
+    np.testing.assert_array_equal(answer.contact_normal, model["contact_normal"])
+    assert answer.contact_normal_sd == model["contact_normal_sd"][0]
+    assert FEATURE_ESTIMATE.decode(FEATURE_ESTIMATE.encode(answer)).contact_normal is not None
+    deaf = load(read_bundle(make_bundle(every, contact_threshold_n=1e3)), "features")
+    nothing = estimate(frame, tare, deaf)
+    assert isinstance(nothing, FeatureEstimate)
+    for name in EVERY_OUTPUT[2:]:
+        assert getattr(nothing, name) is None, name
+
+
+def test_a_contact_normal_that_is_no_unit_vector_is_no_estimate(
+    make_bundle: Callable[..., Path], recipe: Any
+) -> None:
+    bundle = read_bundle(make_bundle(recipe(outputs=EVERY_OUTPUT, long_normal=True)))
+    with pytest.raises(BundleError, match="no unit vector"):
+        load(bundle, "features")

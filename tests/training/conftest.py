@@ -56,6 +56,10 @@ def press_data(provenance: Provenance) -> Callable[..., FeatureDataset]:
             sensor_names=("finger",),
             provenance=provenance,
             contact_location=location,
+            centre_of_pressure=location + np.float32(0.001),
+            contact_normal=np.where(
+                touching[:, None], place / np.linalg.norm(place, axis=1, keepdims=True), np.nan
+            ).astype(np.float32),
             in_contact=touching,
             time_ns=np.arange(n, dtype=np.int64) * 10_000_000,
         )

@@ -21,6 +21,7 @@ from palpate_training.datasets.experiment import (
     read_mixed,
     write_mixed,
 )
+from palpate_training.datasets.export import features
 from palpate_training.datasets.trials import MixedRows, SimulatedTrial, TrialRows
 
 
@@ -162,3 +163,18 @@ def test_forces_are_brought_to_the_same_displacements(make_rows: Callable[..., T
     mixed = mix(rows, simulated)
     assert mixed.contact_force is not None
     np.testing.assert_allclose(mixed.contact_force[:, 1], mixed.simulated_force, atol=1e-5)
+
+
+def test_features_of_a_mixed_data_set_know_centre_and_normal(touched: MixedDataset) -> None:
+    contact = touched.contact
+    assert contact is not None
+    rows = features(touched, untouched_rows=1)
+    assert rows.in_contact is not None
+    assert rows.centre_of_pressure is not None
+    assert rows.contact_normal is not None
+    np.testing.assert_array_equal(rows.centre_of_pressure[rows.in_contact], contact.centre)
+    np.testing.assert_array_equal(rows.contact_normal[rows.in_contact], contact.normal)
+    assert np.isnan(rows.contact_normal[~rows.in_contact]).all()
+    assert features(touched.experiment).contact_normal is None
+    with pytest.raises(DatasetError, match="contact_normal has length 2"):
+        replace(rows, contact_normal=2 * rows.contact_normal)

@@ -30,19 +30,21 @@ MakeData = Callable[..., FeatureDataset]
 QUICK = FeaturesFitConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
 
 
-def make_graph(*, location: bool = True) -> FeaturesGraph:
+def make_graph(*, contact: bool = True) -> FeaturesGraph:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     inputs = rng.normal(0, 300, (200, 19)).astype(np.float32)
-    nets = [Mlp(), Mlp()]
-    nets[0].normalise_from(inputs, rng.normal(0, 3, (200, 3)).astype(np.float32))
-    nets[1].normalise_from(inputs, rng.normal(0, 0.004, (200, 3)).astype(np.float32))
+    nets = [Mlp() for _ in range(4)]
+    for net, size in zip(nets, (3.0, 0.004, 0.003, 0.6), strict=True):
+        net.normalise_from(inputs, rng.normal(0, size, (200, 3)).astype(np.float32))
     sd = np.array([0.1, 0.2, 0.3], dtype=np.float32)
-    return (
-        FeaturesGraph(nets[0], sd, nets[1], np.float32(0.01) * sd)
-        if location
-        else FeaturesGraph(nets[0], sd)
-    )
+    small = np.float32(0.01) * sd
+    heads = {
+        "contact_normal": (nets[3], sd[:1]),
+        "centre_of_pressure": (nets[2], small),
+        "contact_location": (nets[1], small),
+    }
+    return FeaturesGraph(nets[0], sd, heads if contact else None)
 
 
 def to_onnx(graph: FeaturesGraph) -> bytes:
@@ -75,16 +77,16 @@ def write(folder: Path, graph: FeaturesGraph) -> bytes:
     )
 
 
-@pytest.mark.parametrize("location", [True, False])
-def test_bundle_round_trip(tmp_path: Path, *, location: bool) -> None:
-    digest = write(tmp_path / "b", make_graph(location=location))
+@pytest.mark.parametrize("contact", [True, False])
+def test_bundle_round_trip(tmp_path: Path, *, contact: bool) -> None:
+    digest = write(tmp_path / "b", make_graph(contact=contact))
     bundle = read_bundle(tmp_path / "b")
     assert bundle.sha256 == digest
     assert bundle.manifest.metrics["parity_max"] < export.PARITY_MAX
     session = onnxruntime.InferenceSession(bundle.model, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
     assert names == [info.name for info in bundle.manifest.outputs]
-    assert len(names) == (4 if location else 2)
+    assert len(names) == (8 if contact else 2)
     for name, values in zip(
         names, session.run(None, {"electrodes": bundle.golden["electrodes"]}), strict=True
     ):
@@ -142,10 +144,20 @@ def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
     bundle = read_bundle(tmp_path / "bundle")
     metrics = bundle.manifest.metrics
     assert bundle.sha256 == report.digest
-    assert set(seen) == {"force", "contact location"}
+    assert set(seen) == {"force", "contact location", "centre of pressure", "contact normal"}
     assert bundle.manifest.training_data_sha256 == data.content_sha256()
     assert metrics["force_magnitude_median_n"] < metrics["constant_force_magnitude_median_n"]
-    assert metrics["location_distance_median_m"] < metrics["constant_location_distance_median_m"]
+    for headline in (
+        "location_distance_median_m",
+        "centre_of_pressure_distance_median_m",
+        "normal_angle_median_rad",
+    ):
+        assert metrics[headline] < 0.7 * metrics[f"constant_{headline}"]
+        stem, _, unit = headline.rpartition("_")
+        low, high = (metrics[f"{stem}_ci95_{end}_{unit}"] for end in ("low", "high"))
+        assert low < metrics[headline] < high
+    normals = bundle.golden["contact_normal"]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
     assert metrics["contact_found_share"] > 0.8
     assert 0.05 <= bundle.manifest.contact_threshold_n < 1.0
     known = bundle.manifest.training_range
@@ -153,7 +165,8 @@ def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
     assert known.rows == report.rows[0]
     assert known.data_sha256 == data.content_sha256()
     assert bundle.known_inputs is not None
-    force, location = known.outputs
+    force, location, centre = known.outputs
+    assert centre.name == "centre_of_pressure"
     assert 0 < force.length_max <= np.linalg.norm(data.force, axis=1).max() * 1.00001
     assert data.contact_location is not None
     low, high = np.nanmin(data.contact_location, axis=0), np.nanmax(data.contact_location, axis=0)

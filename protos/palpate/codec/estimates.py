@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import pairwise
-from math import isfinite
+from math import hypot, isfinite
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from palpate.messages import (
     StageTimings,
     SynthesisEstimate,
 )
+from palpate.messages.estimates import UNIT_TOLERANCE
 from palpate.v1 import estimates_pb2
 
 _FLAGS = {int(flag): flag for flag in QualityFlag}
@@ -62,6 +63,18 @@ def _check_bundle(name: str, version: int) -> tuple[str, int]:
     return name, version
 
 
+def _check_normal(normal: FloatArray, sd: float) -> float:
+    """The standard deviation of a contact normal that may be sent."""
+    x, y, z = normal.tolist()
+    if abs(hypot(x, y, z) - 1.0) > UNIT_TOLERANCE:
+        reject("normal", f"contact_normal = ({x}, {y}, {z}) is no unit vector")
+    if not isfinite(sd):
+        reject("non_finite", f"contact_normal_sd = {sd} is not finite")
+    if sd < 0:
+        reject("negative_sd", f"contact_normal_sd = {sd} is negative")
+    return sd
+
+
 def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
     location = location_sd = None
     if msg.HasField("contact_location"):
@@ -73,6 +86,22 @@ def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
         location_sd = vector3_from_wire(
             msg.contact_location_sd, "contact_location_sd", deviation=True
         )
+    centre = centre_sd = None
+    if msg.HasField("centre_of_pressure"):
+        if not msg.HasField("centre_of_pressure_sd"):
+            reject("centre", "centre_of_pressure comes without centre_of_pressure_sd")
+        if not msg.in_contact:
+            reject("centre", "centre_of_pressure comes although in_contact is false")
+        centre = vector3_from_wire(msg.centre_of_pressure, "centre_of_pressure")
+        centre_sd = vector3_from_wire(
+            msg.centre_of_pressure_sd, "centre_of_pressure_sd", deviation=True
+        )
+    normal = normal_sd = None
+    if msg.HasField("contact_normal"):
+        if not msg.in_contact:
+            reject("normal", "contact_normal comes although in_contact is false")
+        normal = vector3_from_wire(msg.contact_normal, "contact_normal")
+        normal_sd = _check_normal(normal, msg.contact_normal_sd)
     if not msg.HasField("force") or not msg.HasField("force_sd"):
         reject("force", "force or force_sd is missing")
     force_sd = vector3_from_wire(msg.force_sd, "force_sd", deviation=True)
@@ -88,6 +117,10 @@ def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
         location_sd,
         _quality_from_wire(msg.quality),
         *_check_bundle(msg.bundle_name, msg.bundle_version),
+        centre,
+        centre_sd,
+        normal,
+        normal_sd,
     )
 
 
@@ -115,6 +148,21 @@ def _features_encode(estimate: FeatureEstimate) -> bytes:
             "contact_location_sd",
             deviation=True,
         )
+    if estimate.centre_of_pressure is not None:
+        if estimate.centre_of_pressure_sd is None or not estimate.in_contact:
+            reject("centre", "centre_of_pressure needs centre_of_pressure_sd and in_contact")
+        vector3_to_wire(estimate.centre_of_pressure, msg.centre_of_pressure, "centre_of_pressure")
+        vector3_to_wire(
+            estimate.centre_of_pressure_sd,
+            msg.centre_of_pressure_sd,
+            "centre_of_pressure_sd",
+            deviation=True,
+        )
+    if estimate.contact_normal is not None:
+        if estimate.contact_normal_sd is None or not estimate.in_contact:
+            reject("normal", "contact_normal needs contact_normal_sd and in_contact")
+        vector3_to_wire(estimate.contact_normal, msg.contact_normal, "contact_normal")
+        msg.contact_normal_sd = _check_normal(estimate.contact_normal, estimate.contact_normal_sd)
     return msg.SerializeToString()
 
 

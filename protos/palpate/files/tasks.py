@@ -46,8 +46,19 @@ TASKS: dict[str, TaskContract] = {
     "features": TaskContract(
         inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),
         outputs=(_tensor("force", 3, "N"), _tensor("force_sd", 3, "N")),
-        optional=(_tensor("contact_location", 3, "m"), _tensor("contact_location_sd", 3, "m")),
-        together=(("contact_location", "contact_location_sd"),),
+        optional=(
+            _tensor("contact_location", 3, "m"),
+            _tensor("contact_location_sd", 3, "m"),
+            _tensor("centre_of_pressure", 3, "m"),
+            _tensor("centre_of_pressure_sd", 3, "m"),
+            _tensor("contact_normal", 3, "1"),
+            _tensor("contact_normal_sd", 1, "rad"),
+        ),
+        together=(
+            ("contact_location", "contact_location_sd"),
+            ("centre_of_pressure", "centre_of_pressure_sd"),
+            ("contact_normal", "contact_normal_sd"),
+        ),
     ),
     "field": TaskContract(
         inputs=(_tensor("electrodes", _ELECTRODES, "tared counts"),),

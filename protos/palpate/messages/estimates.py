@@ -82,6 +82,10 @@ class QualityFlag(IntEnum):
     """The bundle does not say what it was trained on, so the two above cannot be known."""
 
 
+UNIT_TOLERANCE = 1e-3
+"""How much the length of a contact normal may differ from one."""
+
+
 @dataclass(frozen=True, slots=True)
 class FeatureEstimate:
     """Electrodes -> features.
@@ -94,6 +98,12 @@ class FeatureEstimate:
         contact_location: Position of the indenter's tip [m], shape ``(3,)``; None without contact
             or where the bundle does not estimate it.
         contact_location_sd: One standard deviation per axis [m], shape ``(3,)``; None likewise.
+        centre_of_pressure: Mean of the touched skin, weighted by the pressure [m], shape ``(3,)``;
+            None likewise.
+        centre_of_pressure_sd: One standard deviation per axis [m], shape ``(3,)``; None likewise.
+        contact_normal: Unit vector out of the skin where it is touched, shape ``(3,)``; None
+            likewise.
+        contact_normal_sd: One standard deviation of its angle [rad]; None likewise.
     """
 
     source: Stamp
@@ -108,6 +118,10 @@ class FeatureEstimate:
     quality: tuple[QualityFlag, ...] = ()
     bundle_name: str = ""
     bundle_version: int = 0
+    centre_of_pressure: FloatArray | None = None
+    centre_of_pressure_sd: FloatArray | None = None
+    contact_normal: FloatArray | None = None
+    contact_normal_sd: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

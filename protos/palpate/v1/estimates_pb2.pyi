@@ -26,7 +26,7 @@ QUALITY_FLAG_EXTRAPOLATING: QualityFlag
 QUALITY_FLAG_RANGE_UNKNOWN: QualityFlag
 
 class FeatureEstimate(_message.Message):
-    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "in_contact", "force", "force_sd", "contact_location", "contact_location_sd", "quality", "bundle_name", "bundle_version")
+    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "in_contact", "force", "force_sd", "contact_location", "contact_location_sd", "quality", "bundle_name", "bundle_version", "centre_of_pressure", "centre_of_pressure_sd", "contact_normal", "contact_normal_sd")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
     BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -39,6 +39,10 @@ class FeatureEstimate(_message.Message):
     QUALITY_FIELD_NUMBER: _ClassVar[int]
     BUNDLE_NAME_FIELD_NUMBER: _ClassVar[int]
     BUNDLE_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CENTRE_OF_PRESSURE_FIELD_NUMBER: _ClassVar[int]
+    CENTRE_OF_PRESSURE_SD_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_NORMAL_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_NORMAL_SD_FIELD_NUMBER: _ClassVar[int]
     source: _common_pb2.Stamp
     sensor_serial: str
     bundle_sha256: bytes
@@ -51,7 +55,11 @@ class FeatureEstimate(_message.Message):
     quality: _containers.RepeatedScalarFieldContainer[QualityFlag]
     bundle_name: str
     bundle_version: int
-    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., in_contact: _Optional[bool] = ..., force: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., force_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., quality: _Optional[_Iterable[_Union[QualityFlag, str]]] = ..., bundle_name: _Optional[str] = ..., bundle_version: _Optional[int] = ...) -> None: ...
+    centre_of_pressure: _common_pb2.Vector3
+    centre_of_pressure_sd: _common_pb2.Vector3
+    contact_normal: _common_pb2.Vector3
+    contact_normal_sd: float
+    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., in_contact: _Optional[bool] = ..., force: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., force_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., quality: _Optional[_Iterable[_Union[QualityFlag, str]]] = ..., bundle_name: _Optional[str] = ..., bundle_version: _Optional[int] = ..., centre_of_pressure: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., centre_of_pressure_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_normal: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_normal_sd: _Optional[float] = ...) -> None: ...
 
 class FieldEstimate(_message.Message):
     __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "mesh_sha256", "displacement", "displacement_sd", "contact_force", "quality", "bundle_name", "bundle_version", "coefficients", "basis_sha256")

@@ -216,6 +216,7 @@ def features_of(
 ) -> FeatureEstimate:
     """The features of a frame, from its sample and what the model made of it."""
     force = outputs["force"]
+    normal = outputs.get("contact_normal")
     # In doubles and without NumPy: three values are faster so, and the threshold is a double.
     x, y, z = force.tolist()
     in_contact = sqrt(x * x + y * y + z * z) >= runtime.contact_threshold_n
@@ -229,13 +230,27 @@ def features_of(
         force_sd=outputs["force_sd"],
         contact_location=outputs.get("contact_location") if in_contact else None,
         contact_location_sd=outputs.get("contact_location_sd") if in_contact else None,
-        quality=_quality(sample, outputs, runtime, without=() if in_contact else _LOCATION),
+        quality=_quality(sample, outputs, runtime, without=() if in_contact else _OF_CONTACT),
         bundle_name=runtime.name,
         bundle_version=runtime.version,
+        centre_of_pressure=outputs.get("centre_of_pressure") if in_contact else None,
+        centre_of_pressure_sd=outputs.get("centre_of_pressure_sd") if in_contact else None,
+        contact_normal=normal if in_contact else None,
+        contact_normal_sd=float(outputs["contact_normal_sd"][0])
+        if in_contact and normal is not None
+        else None,
     )
 
 
-_LOCATION = ("contact_location", "contact_location_sd")
+_OF_CONTACT = (
+    "contact_location",
+    "contact_location_sd",
+    "centre_of_pressure",
+    "centre_of_pressure_sd",
+    "contact_normal",
+    "contact_normal_sd",
+)
+"""Outputs that mean nothing without a contact."""
 
 
 def field_of(

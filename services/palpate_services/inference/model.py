@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Collection, Mapping, Sequence
-from math import asinh, isfinite
+from math import asinh, hypot, isfinite
 from operator import gt, lt
 from types import ModuleType
 from typing import Any
@@ -28,6 +28,7 @@ from palpate.messages import (
     TrainingRange,
     ValueRange,
 )
+from palpate.messages.estimates import UNIT_TOLERANCE
 from palpate.process import require
 from palpate_services.inference.basis import basis_of
 from palpate_services.inference.onnx_file import has_external_data
@@ -161,6 +162,8 @@ WARM_UP_RUNS = 50
 
 _ALIGN = 16  # float32 values to a 64-byte cache line, the alignment ONNX Runtime's own buffers have
 
+_FEW_OUTPUTS = 8 * _ALIGN  # those of the features task: up to so many plain Python is faster
+
 _REMEDY = "export the bundle again with palpate_training, or serve another one"
 
 _DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(int64)": "int64"}
@@ -292,8 +295,13 @@ class Runtime:
         return {name: values[start:stop] for name, start, stop in self._slices}
 
     def _plausible(self, values: FloatArray) -> bool:
-        """Whether all values are finite and no standard deviation is negative."""
-        if values.size > _FEW:
+        """Whether all values are finite, no standard deviation is negative, a normal is a unit."""
+        if any(
+            abs(hypot(*values[start:stop].tolist()) - 1.0) > UNIT_TOLERANCE
+            for start, stop in self._directions
+        ):
+            return False
+        if values.size > _FEW_OUTPUTS:
             return bool(np.isfinite(values).all()) and all(
                 values[start:stop].min() >= 0 for start, stop in self._deviations
             )
@@ -387,6 +395,9 @@ class Runtime:
         self._deviations = [
             (start, stop) for name, start, stop in self._slices if name.endswith("_sd")
         ]
+        self._directions = [
+            (start, stop) for name, start, stop in self._slices if name == "contact_normal"
+        ]
         self._output: FloatArray = np.zeros(end, np.float32)
         self._binding = self._session.io_binding()
         self._binding.bind_input(
@@ -402,8 +413,8 @@ class Runtime:
             outputs = self.run(silence)
         if outputs is None:
             raise BundleError(
-                f"{self._label}: the output for an untouched sensor (all zero) is not finite, or a "
-                "standard deviation is negative",
+                f"{self._label}: the output for an untouched sensor (all zero) is not finite, a "
+                "standard deviation is negative, or a contact normal is no unit vector",
                 remedy=_REMEDY,
             )
 

@@ -15,7 +15,6 @@ from palpate.errors import ConfigError
 from palpate.files.hdf5 import schema_of
 from palpate.process import typed_command
 from palpate_training.cli.experiment import new_table, print_trials, show
-from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
 from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
@@ -148,11 +147,7 @@ def data_features(
     palpate data features twin.h5 twin-features.h5
     """
     _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
-    rows = features(
-        data.experiment if isinstance(data, MixedDataset) else data,
-        untouched_rows=untouched_rows,
-        assumed_rest=assumed_rest,
-    )
+    rows = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
     write_dataset(out, rows)
     console.print(contents(rows, str(out)))
 

@@ -182,7 +182,7 @@ UNTOUCHED_ROWS = 3
 
 
 def features(
-    data: ExperimentDataset,
+    data: ExperimentDataset | MixedDataset,
     *,
     untouched_rows: int = UNTOUCHED_ROWS,
     assumed_rest: int | None = None,
@@ -192,7 +192,8 @@ def features(
     Rounding to counts moves a tared value by up to 0.5 counts (1.2e-4 of full scale).
 
     Args:
-        data: Every row is at 0.5 N or more, so in contact.
+        data: Every row is at 0.5 N or more, so in contact. A mixed data set may know the centre of
+            pressure and the contact normal.
         untouched_rows: Rows put before each trial at rest: baseline counts, zero force, no contact
             location.
         assumed_rest: Rest of every electrode [counts] in trials without one, such as
@@ -205,6 +206,8 @@ def features(
     Raises:
         DatasetError: The rest of a trial is not known, and none is to be assumed.
     """
+    contact = data.contact if isinstance(data, MixedDataset) else None
+    data = data.experiment if isinstance(data, MixedDataset) else data
     rest = data.trial_rest.copy()
     unknown = np.isnan(rest).any(axis=1)
     if unknown.any():
@@ -237,6 +240,12 @@ def features(
         sensor_names=data.unit_names,
         provenance=data.provenance,
         contact_location=_where(touching, data.location[source], np.nan),
+        centre_of_pressure=None
+        if contact is None
+        else _where(touching, contact.centre[source], np.nan),
+        contact_normal=None
+        if contact is None
+        else _where(touching, contact.normal[source], np.nan),
         in_contact=touching,
     )
 

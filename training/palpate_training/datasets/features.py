@@ -16,6 +16,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
+from palpate.messages.estimates import UNIT_TOLERANCE
 from palpate_training.datasets.container import (
     Provenance,
     StoredColumn,
@@ -53,6 +54,9 @@ class FeatureDataset:
         provenance: Where it comes from.
         contact_location: Tip of the indenter [m], sensor frame, shape ``(N, 3)``; NaN where there
             is no contact; None where it is not known.
+        centre_of_pressure: Mean of the touched skin, weighted by the pressure [m], sensor frame,
+            shape ``(N, 3)``; NaN where there is no contact; None where it is not known.
+        contact_normal: Unit vector out of the skin where it is touched, shape ``(N, 3)``; likewise.
         in_contact: Whether the indenter touches, shape ``(N,)``; None = not known.
         time_ns: Time of the row [ns] on one clock per sensor, shape ``(N,)``; None = not known.
     """
@@ -66,6 +70,8 @@ class FeatureDataset:
     sensor_names: tuple[str, ...]
     provenance: Provenance
     contact_location: FloatArray | None = None
+    centre_of_pressure: FloatArray | None = None
+    contact_normal: FloatArray | None = None
     in_contact: BoolArray | None = None
     time_ns: TimeArray | None = None
     name: str = field(default="dataset", compare=False)
@@ -121,9 +127,15 @@ FEATURE_COLUMNS: dict[str, FeatureColumn] = {
     "block": FeatureColumn("1", np.int32),
     "sensor": FeatureColumn("1", np.int32),
     "contact_location": FeatureColumn("m", np.float32, (3,), optional=True),
+    "centre_of_pressure": FeatureColumn("m", np.float32, (3,), optional=True),
+    "contact_normal": FeatureColumn("1", np.float32, (3,), optional=True),
     "in_contact": FeatureColumn("1", np.bool_, optional=True),
     "time_ns": FeatureColumn("ns", np.int64, optional=True),
 }
+
+
+OF_CONTACT = ("contact_location", "centre_of_pressure", "contact_normal")
+"""Columns that only a contact has."""
 
 
 def _check_shapes(data: FeatureDataset) -> None:
@@ -152,18 +164,26 @@ def _check_shapes(data: FeatureDataset) -> None:
 
 def _check_values(data: FeatureDataset) -> None:
     must_be_finite = {"baseline": data.baseline, "force": data.force}
-    if data.contact_location is not None:
-        touching = data.in_contact if data.in_contact is not None else np.ones(len(data), np.bool_)
-        # Where nothing touches there is no location, so NaN is right there and only there.
-        must_be_finite["contact_location"] = np.where(
-            touching[:, None], data.contact_location, np.float32(0)
-        )
+    touching = data.in_contact if data.in_contact is not None else np.ones(len(data), np.bool_)
+    for name in OF_CONTACT:
+        if name in data.arrays():
+            # Where nothing touches there is none, so NaN is right there and only there.
+            must_be_finite[name] = np.where(touching[:, None], getattr(data, name), np.float32(0))
     for name, values in must_be_finite.items():
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if bad.size:
             raise DatasetError(
                 f"{data.name}: {name} is not finite in row {bad[0]} ({bad.size} rows in all)",
                 remedy="drop these rows where the data set is made",
+            )
+    if data.contact_normal is not None:
+        length = np.linalg.norm(data.contact_normal[touching], axis=1)
+        wrong = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
+        if wrong.size:
+            raise DatasetError(
+                f"{data.name}: contact_normal has length {length[wrong[0]]:.4g} in row"
+                f" {np.flatnonzero(touching)[wrong[0]]} ({wrong.size} rows in all)",
+                remedy="divide each normal by its length where the data set is made",
             )
     above = np.flatnonzero((data.electrodes > COUNTS_MAX).any(axis=1))
     if above.size:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
 from palpate_training.evaluation.intervals import drawn_medians, interval
-from palpate_training.learning.metrics import force_errors, location_errors
+from palpate_training.learning.metrics import angles, force_errors, location_errors
 from palpate_training.learning.splits import RowSplit
 from palpate_training.systems.analytic import ANALYTIC
 from palpate_training.systems.ours import OURS
@@ -130,10 +130,7 @@ def row_errors(quantity: Quantity, estimate: Floats, truth: Floats) -> RowErrors
         return location_errors(estimate, truth)
     if quantity == "force":
         return force_errors(estimate, truth)
-    norms = np.linalg.norm(estimate, axis=1) * np.linalg.norm(truth, axis=1)
-    cosine = np.sum(estimate * truth, axis=1) / np.where(norms > 0, norms, 1.0)
-    # A vector of length zero counts as perpendicular.
-    return {"angle_rad": np.arccos(np.clip(cosine, -1.0, 1.0))}
+    return {"angle_rad": angles(estimate, truth)}
 
 
 HEADLINES: dict[str, tuple[str, ...]] = {

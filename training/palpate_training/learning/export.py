@@ -64,8 +64,9 @@ def export_features(
 ) -> bytes:
     """Write a ``features`` bundle, or nothing.
 
-    A force may differ by 1e-5 N, a location by 1e-5 of the training targets' standard deviation
-    (1e-5 m would be no demand), and an answer larger than one of these units relative to itself.
+    A force may differ by 1e-5 N, a normal by 1e-5, a location by 1e-5 of the training targets'
+    standard deviation (1e-5 m would be no demand), and an answer larger than one of these units
+    relative to itself.
 
     Args:
         folder: Folder of the bundle; must not exist.
@@ -104,8 +105,10 @@ def export_features(
 
 def features_scale(graph: FeaturesGraph) -> Allowed:
     """What differences of the ``features`` task are divided by."""
-    location = 1.0 if graph.location is None else float(graph.location.output_sd.max())
-    scales = [1.0, 1.0, location, location]
+    scales = [1.0, 1.0]
+    for name in graph.names:
+        sd = graph.contact[name].get_buffer("output_sd")
+        scales += 2 * [1.0 if name == "contact_normal" else float(sd.max())]
     # float32 resolves relative to the value: 30 N cannot be as exact as 1 N.
     return lambda i, right: np.maximum(scales[i], np.linalg.norm(right, axis=1, keepdims=True))
 

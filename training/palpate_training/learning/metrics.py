@@ -80,6 +80,17 @@ def force_metrics(estimate: Float, truth: Float) -> dict[str, float]:
     return summary
 
 
+def angles(estimate: Float, truth: Float) -> npt.NDArray[np.float64]:
+    """Angle between two vectors of every row [rad], shape ``(N,)``.
+
+    A vector of length zero counts as perpendicular.
+    """
+    estimate, truth = _pair(estimate, truth)
+    norms = np.linalg.norm(estimate, axis=1) * np.linalg.norm(truth, axis=1)
+    cosine = np.sum(estimate * truth, axis=1) / np.where(norms > 0, norms, 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
 def location_errors(estimate: Float, truth: Float) -> dict[str, npt.NDArray[np.float64]]:
     """Distance of every row: ``distance_m``, shape ``(N,)``; positions [m], shape ``(N, 3)``."""
     estimate, truth = _pair(estimate, truth)

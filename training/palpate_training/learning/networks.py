@@ -8,7 +8,7 @@ compute with the same numbers and the file is half as large.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -134,43 +134,47 @@ class FeaturesGraph(nn.Module):
     Args:
         force: Tared counts -> force [N].
         force_sd: Residual standard deviation per axis on validation rows [N], shape ``(3,)``.
-        location: Tared counts -> contact location [m], or None.
-        location_sd: Likewise [m], shape ``(3,)``, or None.
+        contact: Network and standard deviation of quantities that only a contact has, by the name
+            of their output: ``contact_location`` and ``centre_of_pressure`` [m] with one per axis,
+            ``contact_normal`` with that of its angle [rad], shape ``(1,)``. Normals are made unit
+            vectors.
     """
-
-    # Not named as the outputs are: ONNX wants every name once.
-    force_spread: Tensor
-    location_spread: Tensor
 
     def __init__(
         self,
         force: Mlp,
         force_sd: FloatArray,
-        location: Mlp | None = None,
-        location_sd: FloatArray | None = None,
+        contact: Mapping[str, tuple[Mlp, FloatArray]] | None = None,
     ) -> None:
         super().__init__()
+        given = contact or {}
+        # In the order of the contract. Buffers are not named as outputs are: ONNX wants every name
+        # once.
+        self.names = tuple(one.name for one in TASKS["features"].optional if one.name in given)
         self.force = force
-        self.location = location
+        self.contact = nn.ModuleDict({name: given[name][0] for name in self.names})
         _register(self, force_spread=force_sd.astype(np.float32))
-        if (location is None) != (location_sd is None):
-            raise ValueError("give location and location_sd, or neither")
-        if location_sd is not None:
-            _register(self, location_spread=location_sd.astype(np.float32))
+        for name in self.names:
+            _register(self, **{f"{name}_spread": given[name][1].astype(np.float32)})
 
     def forward(self, electrodes: Tensor) -> tuple[Tensor, ...]:
-        """Tared counts ``(N, 19)`` -> the task's outputs in order, each ``(N, 3)``."""
+        """Tared counts ``(N, 19)`` -> the task's outputs in order."""
         rows = electrodes.shape[0]
-        outputs = [self.force(electrodes), self.force_spread.expand(rows, 3)]
-        if self.location is not None:
-            outputs += [self.location(electrodes), self.location_spread.expand(rows, 3)]
+        outputs = [self.force(electrodes), self.get_buffer("force_spread").expand(rows, 3)]
+        for name, net in self.contact.items():
+            estimate = net(electrodes)
+            if name == "contact_normal":
+                estimate = nn.functional.normalize(estimate, dim=1)
+            spread = self.get_buffer(f"{name}_spread")
+            outputs += [estimate, spread.expand(rows, len(spread))]
         return tuple(outputs)
 
     @property
     def outputs(self) -> tuple[TensorInfo, ...]:
         """What it gives, as the contract names it."""
         contract = TASKS["features"]
-        return contract.outputs + (contract.optional if self.location is not None else ())
+        given = {*self.names, *(f"{name}_sd" for name in self.names)}
+        return contract.outputs + tuple(one for one in contract.optional if one.name in given)
 
 
 class FieldGraph(nn.Module):

@@ -1,8 +1,9 @@
-"""The bundle of the ``features`` task: force and contact location, held out by press.
+"""The bundle of the ``features`` task: force and what only a contact has, held out by press.
 
 Force is learned from all rows, untouched ones included, so that nothing reads as nothing; contact
-location only from rows in contact. What is reported was measured with exactly the weights that are
-shipped: nothing is refitted on the held-out presses afterwards.
+location, centre of pressure and contact normal only from rows in contact. What is reported was
+measured with exactly the weights that are shipped: nothing is refitted on the held-out presses
+afterwards.
 
 Force and contact location on held-out trajectories, with the paper's network and metrics.
 
@@ -22,11 +23,18 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.messages import COUNTS_MAX, TrainingRange
 from palpate_training.datasets.experiment import ExperimentDataset
-from palpate_training.datasets.features import FeatureDataset, open_dataset
+from palpate_training.datasets.features import (
+    OF_CONTACT,
+    BoolArray,
+    FeatureDataset,
+    IndexArray,
+    open_dataset,
+)
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_features, refuse_existing
 from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.metrics import (
+    angles,
     cluster_bootstrap,
     force_errors,
     force_metrics,
@@ -140,22 +148,28 @@ def train_features(
     threshold = _contact_threshold(data, validated, split)
     metrics = _force_report(data, x, predict(force, x[split.test]), split, threshold)
 
-    location, location_sd = None, None
-    if data.contact_location is not None and data.in_contact is not None:
-        where = data.contact_location
+    contact: dict[str, tuple[Mlp, FloatArray]] = {}
+    for quantity, wanted, touching in _of_contact(data):
         fit_on, stop_on, test_on = (
-            rows[data.in_contact[rows]] for rows in (split.train, split.validation, split.test)
+            rows[touching[rows]] for rows in (split.train, split.validation, split.test)
         )
         if min(len(fit_on), len(stop_on), len(test_on)) == 0:
             raise DatasetError(
                 f"{dataset_path}: a side of the split has no row in contact",
                 remedy="record more presses",
             )
-        location = fit("contact location", where, fit_on, stop_on)
-        location_sd = _residual_sd(predict(location, x[stop_on]), where[stop_on])
-        metrics |= _location_report(data, x, where, predict(location, x[test_on]), fit_on, test_on)
+        net = fit(quantity.replace("_", " "), wanted, fit_on, stop_on)
+        stopped = predict(net, x[stop_on])
+        if quantity == NORMAL:
+            sd = np.asarray(rms(angles(stopped, wanted[stop_on])[:, None]), np.float32)
+        else:
+            sd = _residual_sd(stopped, wanted[stop_on])
+        contact[quantity] = net, sd
+        metrics |= _contact_report(
+            quantity, x, wanted, predict(net, x[test_on]), fit_on, test_on, data.group
+        )
 
-    graph = FeaturesGraph(force, force_sd, location, location_sd)
+    graph = FeaturesGraph(force, force_sd, contact)
     digest = export_features(
         bundle_dir,
         graph,
@@ -173,7 +187,8 @@ def train_features(
         normalisation={
             "inputs": "standardised by mean and sd of the training rows, inside the graph",
             "force_sd": "constant per axis: rms residual on the validation presses",
-            "contact_location_sd": "likewise, rows in contact",
+            "of a contact": "standard deviations likewise, from rows in contact; of a normal that"
+            " of its angle",
             "contact_threshold_n": f"{1 - FALSE_CONTACT_SHARE:.1%} of the untouched validation rows"
             f" are estimated below it; at least {MIN_CONTACT_THRESHOLD_N} N",
         },
@@ -189,9 +204,10 @@ def train_features(
 def features_range(data: FeatureDataset, rows: Rows) -> TrainingRange:
     """Range of networks that were trained on rows; contact locations of those in contact only."""
     outputs = [ends_of("force", "N", data.force[rows])]
-    if data.contact_location is not None and data.in_contact is not None:
-        where = data.contact_location[rows[data.in_contact[rows]]]
-        outputs.append(replace(ends_of("contact_location", "m", where), length_max=0.0))
+    for quantity, values, touching in _of_contact(data):
+        if quantity != NORMAL:  # a unit vector has no range that a press could leave
+            where = values[rows[touching[rows]]]
+            outputs.append(replace(ends_of(quantity, "m", where), length_max=0.0))
     return TrainingRange(
         source=f"{len(rows)} training rows of {data.provenance.source}",
         data_sha256=data.content_sha256(),
@@ -200,6 +216,18 @@ def features_range(data: FeatureDataset, rows: Rows) -> TrainingRange:
         outputs=tuple(outputs),
         combinations=True,
     )
+
+
+NORMAL = "contact_normal"
+
+
+def _of_contact(data: FeatureDataset) -> list[tuple[str, FloatArray, BoolArray]]:
+    """Quantities that only a contact has, as far as they are known: name, values, contact."""
+    touching = data.in_contact
+    if touching is None:
+        return []
+    known = data.arrays()
+    return [(name, getattr(data, name), touching) for name in OF_CONTACT if name in known]
 
 
 def _residual_sd(estimate: FloatArray, truth: FloatArray) -> FloatArray:
@@ -248,25 +276,46 @@ def _force_report(
     return metrics
 
 
-def _location_report(
-    data: FeatureDataset,
+def _contact_report(
+    quantity: str,
     x: FloatArray,
-    where: FloatArray,
+    wanted: FloatArray,
     estimate: FloatArray,
     fit_on: Rows,
     test_on: Rows,
+    group: IndexArray,
 ) -> dict[str, float]:
-    metrics = location_metrics(estimate, where[test_on])
+    """Metrics of a location or a normal; its median beside those of the constant and the line."""
+    truth = wanted[test_on]
+    if quantity == NORMAL:
+        headline = "normal_angle_median_rad"
+        errors = angles(estimate, truth)
+        metrics = {
+            headline: float(np.median(errors)),
+            "normal_angle_mean_rad": float(errors.mean()),
+        }
+    else:
+        prefix = quantity.removeprefix("contact_")
+        headline = f"{prefix}_distance_median_m"
+        errors = location_errors(estimate, truth)["distance_m"]
+        metrics = {
+            name.replace("location", prefix, 1): value
+            for name, value in location_metrics(estimate, truth).items()
+        }
     for model, fitted in (
-        ("constant", baselines.constant(x[fit_on], where[fit_on])),
-        ("linear", baselines.linear(x[fit_on], where[fit_on])),
+        ("constant", baselines.constant(x[fit_on], wanted[fit_on])),
+        ("linear", baselines.linear(x[fit_on], wanted[fit_on])),
     ):
-        baseline = location_metrics(fitted.predict(x[test_on]), where[test_on])
-        metrics[f"{model}_location_distance_median_m"] = baseline["location_distance_median_m"]
-    ends = cluster_bootstrap(location_errors(estimate, where[test_on]), data.group[test_on])
-    low, high = ends["distance_m"]
-    metrics["location_distance_median_ci95_low_m"] = low
-    metrics["location_distance_median_ci95_high_m"] = high
+        other = fitted.predict(x[test_on])
+        others = (
+            angles(other, truth)
+            if quantity == NORMAL
+            else location_errors(other, truth)["distance_m"]
+        )
+        metrics[f"{model}_{headline}"] = float(np.median(others))
+    ends = cluster_bootstrap({"error": errors}, group[test_on])
+    stem, _, unit = headline.rpartition("_")
+    metrics[f"{stem}_ci95_low_{unit}"], metrics[f"{stem}_ci95_high_{unit}"] = ends["error"]
     return metrics
 
 
