@@ -39,14 +39,14 @@ def test_a_bundle_that_training_writes_is_served(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     from palpate_training.datasets.features import write_dataset
     from palpate_training.datasets.ingest import ingest_record
-    from palpate_training.learning.fit import FeaturesFitConfig
+    from palpate_training.learning.features_net import FeaturesNetConfig
     from palpate_training.tasks.features import train_features
 
     record = tmp_path / "virtual.mcap"
     write_virtual_record(record, frames=6000, seed=3)
     dataset = tmp_path / "virtual.h5"
     write_dataset(dataset, ingest_record(record, command="test", licence="Apache-2.0"))
-    config = FeaturesFitConfig(epochs=4, patience=4, batch_rows=256)
+    config = FeaturesNetConfig(width=64, blocks=1, epochs=4, patience=4)
     report = train_features(dataset, tmp_path / "bundle" / "1", config=config)
     bundle = read_bundle(tmp_path / "bundle" / "1")
     assert bundle.sha256 == report.digest

@@ -22,29 +22,29 @@ from palpate_training.learning.export import (
     features_scale,
     onnx_bytes,
 )
-from palpate_training.learning.fit import FeaturesFitConfig
+from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.networks import FeaturesGraph, Mlp
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
-QUICK = FeaturesFitConfig(widths=(32, 32), epochs=25, batch_rows=64, drift_sd=0.005)
+QUICK = FeaturesNetConfig(width=32, blocks=1, epochs=25, batch_rows=64)
 
 
 def make_graph(*, contact: bool = True) -> FeaturesGraph:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     inputs = rng.normal(0, 300, (200, 19)).astype(np.float32)
-    nets = [Mlp() for _ in range(4)]
-    for net, size in zip(nets, (3.0, 0.004, 0.003, 0.6), strict=True):
-        net.normalise_from(inputs, rng.normal(0, size, (200, 3)).astype(np.float32))
+    sizes = np.repeat([3.0, 0.004, 0.003, 0.6], 3)[: 12 if contact else 3]
+    net = Mlp(outputs=len(sizes))
+    net.normalise_from(inputs, (sizes * rng.normal(size=(200, len(sizes)))).astype(np.float32))
     sd = np.array([0.1, 0.2, 0.3], dtype=np.float32)
     small = np.float32(0.01) * sd
-    heads = {
-        "contact_normal": (nets[3], sd[:1]),
-        "centre_of_pressure": (nets[2], small),
-        "contact_location": (nets[1], small),
+    spreads = {
+        "contact_location": small,
+        "centre_of_pressure": small,
+        "contact_normal": sd[:1],
     }
-    return FeaturesGraph(nets[0], sd, heads if contact else None)
+    return FeaturesGraph(net, sd, spreads if contact else None)
 
 
 def to_onnx(graph: FeaturesGraph) -> bytes:
@@ -106,7 +106,7 @@ def test_a_model_that_differs_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     graph = make_graph()
     other = make_graph()
     with torch.no_grad():
-        next(iter(other.force.layers.parameters()))[0, 0] += 0.05
+        next(iter(other.net.parameters()))[0, 0] += 0.05
     wrong = to_onnx(other)
     with pytest.raises(BundleError, match=r"differs from torch by .* in force"):
         parity(graph, wrong, rows())
@@ -144,7 +144,7 @@ def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
     bundle = read_bundle(tmp_path / "bundle")
     metrics = bundle.manifest.metrics
     assert bundle.sha256 == report.digest
-    assert set(seen) == {"force", "contact location", "centre of pressure", "contact normal"}
+    assert set(seen) == {"features", "features, with mirror images"}
     assert bundle.manifest.training_data_sha256 == data.content_sha256()
     assert metrics["force_magnitude_median_n"] < metrics["constant_force_magnitude_median_n"]
     for headline in (

@@ -11,6 +11,7 @@ from tests.training.systems.conftest import MakeSamples, assert_exports
 
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX
+from palpate_training.learning.features_net import MIRROR_AXES, ResidualLayers
 from palpate_training.systems import ours
 from palpate_training.systems.samples import error_of, impedance_ohm
 
@@ -53,7 +54,7 @@ def test_an_estimate_of_the_mirror_image_is_the_mirror_image(
         if "five" in system.name:
             continue
         estimate = system.fit("force", train, test, 0)
-        np.testing.assert_allclose(estimate(image), estimate(test) * ours.MIRROR_AXES, atol=1e-4)
+        np.testing.assert_allclose(estimate(image), estimate(test) * MIRROR_AXES, atol=1e-4)
 
 
 def test_normals_are_unit_vectors_and_it_learns(
@@ -78,7 +79,7 @@ def test_noise_of_both_inputs_is_that_of_the_counts() -> None:
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: ours.ResidualLayers(38, 3), lambda: ours.ElectrodeAttention(3)]
+    "make", [lambda: ResidualLayers(38, 3), lambda: ours.ElectrodeAttention(3)]
 )
 def test_exports_with_standard_operators(make: object) -> None:
     torch.manual_seed(0)

@@ -105,10 +105,10 @@ def export_features(
 
 def features_scale(graph: FeaturesGraph) -> Allowed:
     """What differences of the ``features`` task are divided by."""
+    sd = graph.net.output_sd.reshape(-1, 3)  # type: ignore[operator]
     scales = [1.0, 1.0]
-    for name in graph.names:
-        sd = graph.contact[name].get_buffer("output_sd")
-        scales += 2 * [1.0 if name == "contact_normal" else float(sd.max())]
+    for name, spread in zip(graph.names, sd[1:], strict=True):
+        scales += 2 * [1.0 if name == "contact_normal" else float(spread.max())]
     # float32 resolves relative to the value: 30 N cannot be as exact as 1 N.
     return lambda i, right: np.maximum(scales[i], np.linalg.norm(right, axis=1, keepdims=True))
 

@@ -129,43 +129,43 @@ def _register(module: nn.Module, **constants: npt.NDArray[Any]) -> None:
 
 
 class FeaturesGraph(nn.Module):
-    """The ``features`` task: one network for each quantity, and constant standard deviations.
+    """The ``features`` task: estimates of one network, and constant standard deviations.
 
     Args:
-        force: Tared counts -> force [N].
+        net: Tared counts ``(N, 19)`` -> force [N], then what only a contact has, ``(N, 3 Q)``.
         force_sd: Residual standard deviation per axis on validation rows [N], shape ``(3,)``.
-        contact: Network and standard deviation of quantities that only a contact has, by the name
-            of their output: ``contact_location`` and ``centre_of_pressure`` [m] with one per axis,
-            ``contact_normal`` with that of its angle [rad], shape ``(1,)``. Normals are made unit
+        contact_sd: The same of what only a contact has, by the name of its output, in the order of
+            the contract: ``contact_location`` and ``centre_of_pressure`` [m], one per axis;
+            ``contact_normal``, that of its angle [rad], shape ``(1,)``. Normals are made unit
             vectors.
     """
 
     def __init__(
         self,
-        force: Mlp,
+        net: nn.Module,
         force_sd: FloatArray,
-        contact: Mapping[str, tuple[Mlp, FloatArray]] | None = None,
+        contact_sd: Mapping[str, FloatArray] | None = None,
     ) -> None:
         super().__init__()
-        given = contact or {}
-        # In the order of the contract. Buffers are not named as outputs are: ONNX wants every name
-        # once.
+        given = contact_sd or {}
         self.names = tuple(one.name for one in TASKS["features"].optional if one.name in given)
-        self.force = force
-        self.contact = nn.ModuleDict({name: given[name][0] for name in self.names})
+        if self.names != tuple(given):
+            raise ValueError(f"{tuple(given)} are not in the order of the contract")
+        self.net = net
+        # Not named as the outputs are: ONNX wants every name once.
         _register(self, force_spread=force_sd.astype(np.float32))
         for name in self.names:
-            _register(self, **{f"{name}_spread": given[name][1].astype(np.float32)})
+            _register(self, **{f"{name}_spread": given[name].astype(np.float32)})
 
     def forward(self, electrodes: Tensor) -> tuple[Tensor, ...]:
         """Tared counts ``(N, 19)`` -> the task's outputs in order."""
         rows = electrodes.shape[0]
-        outputs = [self.force(electrodes), self.get_buffer("force_spread").expand(rows, 3)]
-        for name, net in self.contact.items():
-            estimate = net(electrodes)
+        force, *contact = torch.split(self.net(electrodes), 3, dim=1)
+        outputs = [force, self.get_buffer("force_spread").expand(rows, 3)]
+        for name, estimate in zip(self.names, contact, strict=True):
+            spread = self.get_buffer(f"{name}_spread")
             if name == "contact_normal":
                 estimate = nn.functional.normalize(estimate, dim=1)
-            spread = self.get_buffer(f"{name}_spread")
             outputs += [estimate, spread.expand(rows, len(spread))]
         return tuple(outputs)
 

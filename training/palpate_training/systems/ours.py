@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate.messages import COUNTS_MAX
+from palpate_training.learning.features_net import MIRROR_AXES, ResidualLayers
 from palpate_training.learning.fit import FeaturesFitConfig, fit
 from palpate_training.learning.networks import Standardised, predict
 from palpate_training.systems.samples import (
@@ -33,7 +34,6 @@ from palpate_training.systems.samples import (
 ASSUMED_REST = 3200.0
 """Untouched counts of every electrode where the source does not hold them."""
 
-MIRROR_AXES = np.array([1.0, -1.0, 1.0], np.float32)
 MEMBERS = 5
 NOISE_COUNTS = 2.0
 MAGNITUDE_FLOOR_N = 0.5
@@ -57,32 +57,6 @@ def mirrored_inputs(inputs: Tensor) -> Tensor:
     """The inputs (N, 38) of the mirror image."""
     order = torch.from_numpy(np.concatenate([ELECTRODE_MIRROR, ELECTRODE_MIRROR + 19])).long()
     return torch.index_select(inputs, 1, order.to(inputs.device))
-
-
-class ResidualLayers(nn.Module):
-    """Blocks of two layers that add to their input."""
-
-    def __init__(self, inputs: int, outputs: int, width: int = 256, blocks: int = 3) -> None:
-        super().__init__()
-        self.first = nn.Linear(inputs, width)
-        self.blocks = nn.ModuleList(
-            nn.Sequential(
-                nn.LayerNorm(width),
-                nn.Linear(width, width),
-                nn.SiLU(),
-                nn.Linear(width, width),
-            )
-            for _ in range(blocks)
-        )
-        self.head = nn.Linear(width, outputs)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Estimate of standardised inputs."""
-        hidden = self.first(inputs)
-        for block in self.blocks:
-            hidden = hidden + block(hidden)
-        estimate: Tensor = self.head(nn.functional.silu(hidden))
-        return estimate
 
 
 class ElectrodeAttention(nn.Module):

@@ -32,6 +32,13 @@ from palpate_training.datasets.features import (
 )
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_features, refuse_existing
+from palpate_training.learning.features_net import (
+    FeaturesNet,
+    FeaturesNetConfig,
+    FeaturesRows,
+    fit_features_net,
+    score_of,
+)
 from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.metrics import (
     angles,
@@ -71,10 +78,9 @@ _log = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 OnEpoch = Callable[[str, int, int], None]
-"""Called with the quantity, the epoch and the number of epochs at most."""
+"""Called with what is trained, the epoch and the number of epochs at most."""
 
-FEATURES_CONFIG = FeaturesFitConfig(epochs=40, patience=12, batch_rows=512)
-"""Under two minutes for 100,000 rows on one core."""
+FEATURES_CONFIG = FeaturesNetConfig()
 
 FALSE_CONTACT_SHARE = 0.001
 """One untouched frame in a thousand may read as contact."""
@@ -106,7 +112,7 @@ def train_features(
     *,
     name: str = "features",
     version: int = 1,
-    config: FeaturesFitConfig = FEATURES_CONFIG,
+    config: FeaturesNetConfig = FEATURES_CONFIG,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FeaturesReport:
@@ -122,54 +128,64 @@ def train_features(
     data = open_dataset(dataset_path)
     split = by_group(data.group, seed=seed)
     x = data.tared_counts
+    of_contact = _of_contact(data)
+    for side in (split.train, split.validation, split.test):
+        if of_contact and not of_contact[0][2][side].any():
+            raise DatasetError(
+                f"{dataset_path}: a side of the split has no row in contact",
+                remedy="record more presses",
+            )
+    targets = np.hstack([data.force, *(values for _, values, _ in of_contact)])
+    train, validation = (
+        FeaturesRows(x[rows], targets[rows]) for rows in (split.train, split.validation)
+    )
+    rest = data.baseline.mean(axis=0, dtype=np.float64).astype(np.float32)
 
-    def fit(quantity: str, targets: FloatArray, fit_on: Rows, stop_on: Rows) -> Mlp:
+    def fit(label: str, *, symmetric: bool) -> FeaturesNet:
         done = 0
 
         def tick() -> None:
             nonlocal done
             done += 1
             if on_epoch is not None:
-                on_epoch(quantity, done, config.epochs)
+                on_epoch(label, done, config.epochs)
 
-        return fit_quantity(
-            x[fit_on],
-            targets[fit_on],
-            (x[stop_on], targets[stop_on]),
-            baseline=data.baseline[fit_on],
-            config=config,
-            seed=seed,
-            on_epoch=tick,
+        return fit_features_net(
+            train, validation, rest, symmetric=symmetric, config=config, seed=seed, on_epoch=tick
         )
 
-    force = fit("force", data.force, split.train, split.validation)
-    validated = predict(force, x[split.validation])
-    force_sd = _residual_sd(validated, data.force[split.validation])
-    threshold = _contact_threshold(data, validated, split)
-    metrics = _force_report(data, x, predict(force, x[split.test]), split, threshold)
+    # A finger may be too uneven for its mirror image to teach anything.
+    nets = (fit("features", symmetric=False), fit("features, with mirror images", symmetric=True))
+    net = min(nets, key=lambda one: score_of(one, validation))
 
-    contact: dict[str, tuple[Mlp, FloatArray]] = {}
-    for quantity, wanted, touching in _of_contact(data):
-        fit_on, stop_on, test_on = (
-            rows[touching[rows]] for rows in (split.train, split.validation, split.test)
+    validated, tested = (predict(net, x[rows]) for rows in (split.validation, split.test))
+    threshold = _contact_threshold(data, validated[:, :3], split)
+    metrics = _force_report(data, x, tested[:, :3], split, threshold)
+    metrics["symmetric"] = float(net.symmetric)
+    contact_sd: dict[str, FloatArray] = {}
+    for number, (quantity, wanted, touching) in enumerate(of_contact, start=1):
+        part = slice(3 * number, 3 * number + 3)
+        seen, stopped, test = (
+            touching[rows] for rows in (split.train, split.validation, split.test)
         )
-        if min(len(fit_on), len(stop_on), len(test_on)) == 0:
-            raise DatasetError(
-                f"{dataset_path}: a side of the split has no row in contact",
-                remedy="record more presses",
-            )
-        net = fit(quantity.replace("_", " "), wanted, fit_on, stop_on)
-        stopped = predict(net, x[stop_on])
+        truth = wanted[split.validation][stopped]
         if quantity == NORMAL:
-            sd = np.asarray(rms(angles(stopped, wanted[stop_on])[:, None]), np.float32)
+            spread = rms(angles(validated[stopped, part], truth)[:, None])
         else:
-            sd = _residual_sd(stopped, wanted[stop_on])
-        contact[quantity] = net, sd
+            spread = rms(validated[stopped, part] - truth)
+        contact_sd[quantity] = np.asarray(spread, np.float32)
         metrics |= _contact_report(
-            quantity, x, wanted, predict(net, x[test_on]), fit_on, test_on, data.group
+            quantity,
+            x,
+            wanted,
+            tested[test, part],
+            split.train[seen],
+            split.test[test],
+            data.group,
         )
 
-    graph = FeaturesGraph(force, force_sd, contact)
+    force_sd = _residual_sd(validated[:, :3], data.force[split.validation])
+    graph = FeaturesGraph(net, force_sd, contact_sd)
     digest = export_features(
         bundle_dir,
         graph,
@@ -185,7 +201,8 @@ def train_features(
         ),
         metrics=metrics,
         normalisation={
-            "inputs": "standardised by mean and sd of the training rows, inside the graph",
+            "inputs": "tared counts and logarithms of impedances for an assumed rest, standardised"
+            " by mean and sd of the training rows, inside the graph",
             "force_sd": "constant per axis: rms residual on the validation presses",
             "of a contact": "standard deviations likewise, from rows in contact; of a normal that"
             " of its angle",
