@@ -46,7 +46,7 @@ def test_a_bundle_that_training_writes_is_served(tmp_path: Path) -> None:
     write_virtual_record(record, frames=6000, seed=3)
     dataset = tmp_path / "virtual.h5"
     write_dataset(dataset, ingest_record(record, command="test", licence="Apache-2.0"))
-    config = FeaturesNetConfig(width=64, blocks=1, epochs=4, patience=4)
+    config = FeaturesNetConfig(members=1, width=64, blocks=1, epochs=4, patience=4)
     report = train_features(dataset, tmp_path / "bundle" / "1", config=config)
     bundle = read_bundle(tmp_path / "bundle" / "1")
     assert bundle.sha256 == report.digest

@@ -27,7 +27,7 @@ from palpate_training.learning.networks import FeaturesGraph, Mlp
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
-QUICK = FeaturesNetConfig(width=32, blocks=1, epochs=25, batch_rows=64)
+QUICK = FeaturesNetConfig(members=2, width=32, blocks=1, epochs=25, batch_rows=64)
 
 
 def make_graph(*, contact: bool = True) -> FeaturesGraph:
@@ -144,7 +144,7 @@ def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
     bundle = read_bundle(tmp_path / "bundle")
     metrics = bundle.manifest.metrics
     assert bundle.sha256 == report.digest
-    assert set(seen) == {"features", "features, with mirror images"}
+    assert set(seen) == {"features", "features, mirror images", "features, other members"}
     assert bundle.manifest.training_data_sha256 == data.content_sha256()
     assert metrics["force_magnitude_median_n"] < metrics["constant_force_magnitude_median_n"]
     for headline in (

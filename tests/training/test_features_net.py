@@ -20,7 +20,7 @@ from palpate_training.learning.features_net import (
 )
 from palpate_training.learning.networks import Standardised, predict
 
-QUICK = FeaturesNetConfig(width=48, blocks=1, epochs=40, patience=40, batch_rows=64)
+QUICK = FeaturesNetConfig(members=2, width=48, blocks=1, epochs=40, patience=40, batch_rows=64)
 REST = np.linspace(2900, 3300, 19).astype(np.float32)
 
 
@@ -37,7 +37,7 @@ def rows_of(count: int, seed: int, *, contact: float = 1.0) -> FeaturesRows:
 
 
 def test_inputs_are_counts_and_the_fall_of_the_log_impedance() -> None:
-    net = FeaturesNet(Standardised(ResidualLayers(38, 3, 8, 1), 38), REST, symmetric=True)
+    net = FeaturesNet([Standardised(ResidualLayers(38, 3, 8, 1), 38)], REST, symmetric=True)
     tared = np.random.default_rng(0).normal(0, 300, (5, 19)).astype(np.float32)
     inputs = net.inputs_of(torch.from_numpy(tared)).numpy()
     np.testing.assert_array_equal(inputs[:, :19], tared)
@@ -74,7 +74,7 @@ def test_rows_without_a_contact_teach_the_force_alone() -> None:
 
 def test_the_same_seed_gives_the_same_network() -> None:
     train, test = rows_of(200, 1), rows_of(50, 2)
-    quick = FeaturesNetConfig(width=16, blocks=1, epochs=3, batch_rows=64)
+    quick = FeaturesNetConfig(members=1, width=16, blocks=1, epochs=3, batch_rows=64)
     first, again, other = (
         predict(
             fit_features_net(train, test, REST, symmetric=True, config=quick, seed=seed),

@@ -7,7 +7,9 @@ the mean of that of a row and of its mirror image; whether that helps is decided
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +37,7 @@ class FeaturesNetConfig(FitConfig):
     """Settings of a training of all features.
 
     Attributes:
+        members: Networks whose estimates are averaged; each has weights and an order of its own.
         width: Of the residual layers.
         blocks: Number of residual blocks, of two layers each.
     """
@@ -43,6 +46,7 @@ class FeaturesNetConfig(FitConfig):
     patience: int = 25
     batch_rows: int = 256
     learning_rate: float = 2e-3
+    members: int = 3
     width: int = 256
     blocks: int = 3
     threads: int = 2
@@ -78,7 +82,7 @@ class FeaturesNet(nn.Module):
     """Tared counts ``(N, 19)`` -> some quantities ``(N, 3 Q)``, three values each.
 
     Args:
-        net: Inputs ``(N, 38)`` -> quantities.
+        nets: Members, inputs ``(N, 38)`` -> quantities; the estimate is their mean.
         rest: Untouched counts that are assumed of every finger [counts], shape ``(19,)``.
         symmetric: Whether the estimate is the mean of that of a row and of its mirror image.
     """
@@ -88,22 +92,23 @@ class FeaturesNet(nn.Module):
     order: Tensor
     signs: Tensor
 
-    def __init__(self, net: Standardised, rest: FloatArray, *, symmetric: bool) -> None:
+    def __init__(self, nets: Sequence[Standardised], rest: FloatArray, *, symmetric: bool) -> None:
         super().__init__()
-        self.net = net
+        self.nets = nn.ModuleList(nets)
         self.symmetric = symmetric
         self.register_buffer("rest", torch.from_numpy(rest.astype(np.float32)))
         self.register_buffer("log_rest", _log_impedance(self.rest))
         order = np.concatenate([ELECTRODE_MIRROR, ELECTRODE_MIRROR + len(rest)])
         self.register_buffer("order", torch.from_numpy(order).long())
-        mirrored = np.tile(MIRROR_AXES, len(net.output_sd) // 3)
+        mirrored = np.tile(MIRROR_AXES, len(nets[0].output_sd) // 3)
         signs = 0.5 * np.stack([np.ones_like(mirrored), mirrored])
         self.register_buffer("signs", torch.from_numpy(signs))
 
     @property
     def output_sd(self) -> Tensor:
         """Standard deviation of the training targets, shape ``(3 Q,)``."""
-        return self.net.output_sd
+        sd: Tensor = self.nets[0].get_buffer("output_sd")
+        return sd
 
     def inputs_of(self, tared: Tensor) -> Tensor:
         """Tared counts and the fall of the logarithm of the impedance, ``(N, 38)``."""
@@ -114,11 +119,13 @@ class FeaturesNet(nn.Module):
         """Estimates of tared counts."""
         inputs = self.inputs_of(tared)
         if not self.symmetric:
-            estimate: Tensor = self.net(inputs)
-            return estimate
+            return self._mean_of(inputs)
         both = torch.stack([inputs, torch.index_select(inputs, 1, self.order)], dim=1)
-        mean: Tensor = (self.net(both) * self.signs).sum(dim=1)  # (N, 2, 3 Q) -> (N, 3 Q)
-        return mean
+        return (self._mean_of(both) * self.signs).sum(dim=1)  # (N, 2, 3 Q) -> (N, 3 Q)
+
+    def _mean_of(self, inputs: Tensor) -> Tensor:
+        estimates: list[Tensor] = [net(inputs) for net in self.nets]
+        return torch.stack(estimates).sum(dim=0) / len(estimates)
 
 
 def _log_impedance(counts: Tensor) -> Tensor:
@@ -146,50 +153,57 @@ def fit_features_net(
     rest: FloatArray,
     *,
     symmetric: bool,
+    begun: Sequence[Standardised] = (),
     config: FeaturesNetConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FeaturesNet:
-    """Train; the weights of the epoch with the best ``score_of`` are kept.
+    """Train; of each member the weights of the epoch with the best ``score_of`` are kept.
 
     Args:
         train: Rows to learn from.
         validation: Rows to stop on.
         rest: Untouched counts that are assumed of every finger [counts], shape ``(19,)``.
         symmetric: Whether mirror images are learned from, too, and averaged.
+        begun: The first members, if they have been trained before.
         config: Settings.
         seed: Of the weights, the order of the rows and the noise.
         on_epoch: Called after each epoch, for a progress bar.
     """
     config = config or FeaturesNetConfig()
+    members = [
+        *begun,
+        *(
+            _fit_member(train, validation, rest, symmetric, config, 1000 * seed + member, on_epoch)
+            for member in range(len(begun), config.members)
+        ),
+    ]
+    return FeaturesNet(members, rest, symmetric=symmetric).eval()
+
+
+def _fit_member(
+    train: FeaturesRows,
+    validation: FeaturesRows,
+    rest: FloatArray,
+    symmetric: bool,
+    config: FeaturesNetConfig,
+    seed: int,
+    on_epoch: OnEpoch | None,
+) -> Standardised:
     torch.manual_seed(seed)
     quantities = train.targets.shape[1] // 3
     size = 2 * train.tared.shape[1]
     layers = ResidualLayers(size, 3 * quantities, config.width, config.blocks)
-    net = FeaturesNet(Standardised(layers, size, 3 * quantities), rest, symmetric=symmetric)
+    member = Standardised(layers, size, 3 * quantities)
+    net = FeaturesNet([member], rest, symmetric=symmetric)
     with torch.inference_mode():
         inputs = net.inputs_of(torch.from_numpy(train.tared)).numpy()
     targets = train.targets
     if symmetric:
         inputs = np.vstack([inputs, inputs[:, net.order.numpy()]])
         targets = np.vstack([targets, targets * np.tile(MIRROR_AXES, quantities)])
-    _normalise(net.net, inputs, targets)
-    sizes = sizes_of(train.targets)
+    _normalise(member, inputs, targets)
     noise = torch.from_numpy(_input_noise(rest))
-
-    def loss_of(estimate: Tensor, wanted: Tensor) -> Tensor:
-        parts = []
-        for number, (guess, truth) in enumerate(
-            zip(torch.split(estimate, 3, dim=1), torch.split(wanted, 3, dim=1), strict=True)
-        ):
-            known = ~torch.isnan(truth[:, 0])
-            error = torch.where(known[:, None], guess - truth, 0.0) / float(sizes[number])
-            distance = torch.sqrt(torch.square(error).sum(dim=1) + _SMOOTH)
-            if number == 0:
-                magnitude = torch.linalg.vector_norm(truth, dim=1)
-                distance = distance * float(sizes[0]) / torch.sqrt(FORCE_FLOOR_N + magnitude)
-            parts.append((distance * known).sum() / known.sum().clamp(min=1))
-        return torch.stack(parts).sum()
 
     def noisy(batch: Tensor, rows: Tensor) -> Tensor:
         # The same noise of an electrode in both of its inputs.
@@ -197,16 +211,33 @@ def fit_features_net(
         return batch + noise.to(batch.device) * drawn
 
     fit(
-        net.net,
+        member,
         inputs,
         targets,
-        loss_of=loss_of,
+        loss_of=partial(_loss, sizes_of(train.targets)),
         score_of=lambda _: score_of(net, validation),
         config=config,
         augment=noisy,
         on_epoch=on_epoch,
     )
-    return net.eval()
+    return member
+
+
+def _loss(sizes: FloatArray, estimate: Tensor, wanted: Tensor) -> Tensor:
+    """Sum over the quantities of the mean distance, over the quantity's spread."""
+    parts = []
+    for number, (guess, truth) in enumerate(
+        zip(torch.split(estimate, 3, dim=1), torch.split(wanted, 3, dim=1), strict=True)
+    ):
+        size = float(sizes[number])
+        known = ~torch.isnan(truth[:, 0])
+        error = torch.where(known[:, None], guess - truth, 0.0) / size
+        distance = torch.sqrt(torch.square(error).sum(dim=1) + _SMOOTH)
+        if number == 0:
+            magnitude = torch.linalg.vector_norm(truth, dim=1)
+            distance = distance * size / torch.sqrt(FORCE_FLOOR_N + magnitude)
+        parts.append((distance * known).sum() / known.sum().clamp(min=1))
+    return torch.stack(parts).sum()
 
 
 def score_of(net: FeaturesNet, rows: FeaturesRows) -> float:

@@ -141,22 +141,34 @@ def train_features(
     )
     rest = data.baseline.mean(axis=0, dtype=np.float64).astype(np.float32)
 
-    def fit(label: str, *, symmetric: bool) -> FeaturesNet:
+    def fit(label: str, members: int, begun: FeaturesNet | None, *, symmetric: bool) -> FeaturesNet:
+        at_most = (members - (0 if begun is None else len(begun.nets))) * config.epochs
         done = 0
 
         def tick() -> None:
             nonlocal done
             done += 1
             if on_epoch is not None:
-                on_epoch(label, done, config.epochs)
+                on_epoch(label, done, at_most)
 
         return fit_features_net(
-            train, validation, rest, symmetric=symmetric, config=config, seed=seed, on_epoch=tick
+            train,
+            validation,
+            rest,
+            symmetric=symmetric,
+            begun=() if begun is None else tuple(begun.nets),  # type: ignore[arg-type]
+            config=replace(config, members=members),
+            seed=seed,
+            on_epoch=tick,
         )
 
     # A finger may be too uneven for its mirror image to teach anything.
-    nets = (fit("features", symmetric=False), fit("features, with mirror images", symmetric=True))
-    net = min(nets, key=lambda one: score_of(one, validation))
+    plain = fit("features", 1, None, symmetric=False)
+    mirrored = fit("features, mirror images", 1, None, symmetric=True)
+    best = min((plain, mirrored), key=lambda one: score_of(one, validation))
+    net = best
+    if config.members > 1:
+        net = fit("features, other members", config.members, best, symmetric=best.symmetric)
 
     validated, tested = (predict(net, x[rows]) for rows in (split.validation, split.test))
     threshold = _contact_threshold(data, validated[:, :3], split)
