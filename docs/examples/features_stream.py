@@ -21,6 +21,8 @@ def main(count: int) -> None:
             for number, estimate in enumerate(estimates, 1):
                 x, y, z = estimate.force
                 place = estimate.contact_location
+                if estimate.centre_of_pressure is not None:  # of newer bundles: on the skin
+                    place = estimate.centre_of_pressure
                 where = "no contact" if place is None else f"at {place * 1e3} mm"
                 print(f"{estimate.source.sequence:6}  {x:6.2f} {y:6.2f} {z:6.2f} N  {where}")
                 if number == count:

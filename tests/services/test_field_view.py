@@ -17,7 +17,7 @@ from palpate.bus.topics import FIELD, FIELD_TRUTH, SYNTHESIS
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError
 from palpate.files.record import read_record
-from palpate.messages import ElectrodeFrame, Stamp, SynthesisEstimate, Tare
+from palpate.messages import ElectrodeFrame, FeatureEstimate, Stamp, SynthesisEstimate, Tare
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.repository import MeshLibrary, Repository
 from palpate_services.recorder.service import run_recorder
@@ -203,3 +203,18 @@ def test_a_field_with_other_nodes_than_its_mesh_is_counted(
         view.add("finger", dataclasses.replace(field, displacement=field.displacement[:-1]))
         view.flush()
         assert dict(view.counters) == {"view_wrong_mesh": 1}
+
+
+def test_a_force_is_drawn_where_it_acts(make_frame: Frames) -> None:
+    """At the centre of pressure of a bundle that knows it, else at the contact location."""
+    place, centre = np.full(3, 0.002, np.float32), np.full(3, 0.001, np.float32)
+    older = FeatureEstimate(
+        make_frame().stamp, "BT", bytes(32), 5, True, place, place, place, place
+    )
+    newer = dataclasses.replace(older, centre_of_pressure=centre, centre_of_pressure_sd=place)
+    timeline = SensorTimeline()
+    timeline.add(older)
+    timeline.add(newer)
+    rows = timeline.take()
+    assert [row.at[0] for row in rows["arrow/estimate"]] == [place[0], centre[0]]
+    assert [row.values[0] for row in rows["location/estimate"]] == [place[0], place[0]]

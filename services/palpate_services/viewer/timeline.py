@@ -212,7 +212,7 @@ class SensorTimeline:
         ``electrodes/raw`` or ``electrodes/tared``: counts, values of shape ``(19,)`` (SP: 24).
         ``pressure``: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28);
         NaN where not valid. Of ``truth`` and ``estimate`` each: ``force/...`` [N], shape ``(3,)``;
-        ``arrow/...``, the same at instants whose contact location is known or known to be absent;
+        ``arrow/...``, the same at instants when it is known where it acts, or that nothing touches;
         ``location/...`` [m], shape ``(3,)`` or None; ``field/...``, each a ``FieldRow``.
         ``error/force`` [N] and ``error/location`` [m]: magnitudes, shape ``(1,)``.
         ``synthesised``: tared counts synthesised from a field, shape ``(19,)``.
@@ -239,7 +239,9 @@ class SensorTimeline:
     def _add_estimate(self, estimate: FeatureEstimate) -> None:
         instant = self._matcher.add(estimate)
         location = estimate.contact_location
-        row = _row(estimate.source, estimate.force, at=location)
+        # The centre of pressure is where the force acts; the location may be off the skin.
+        acts_at = location if estimate.centre_of_pressure is None else estimate.centre_of_pressure
+        row = _row(estimate.source, estimate.force, at=acts_at)
         self._rows["force/estimate"].append(row)
         self._rows["arrow/estimate"].append(row)
         self._rows["location/estimate"].append(_row(estimate.source, location))
