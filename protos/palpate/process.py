@@ -187,15 +187,3 @@ def use_few_resources() -> None:
         if mallopt is not None:
             mallopt(_M_ARENA_MAX, _ARENAS)
             mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
-
-
-def release_free_memory() -> None:
-    """Give memory that is free inside the C library's pools back to the system; takes about 1 ms.
-
-    A pool is a patchwork of what is used and what is free. Messages of many sizes make it grow
-    slowly although no more is used: a recorder by 3 MB/h. Does nothing without glibc.
-    """
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)

@@ -19,7 +19,6 @@ from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import RecordWriter, is_being_written, recover
 from palpate.health import Health
 from palpate.messages import ServiceState
-from palpate.process import release_free_memory
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.loop import RateLimit
 from palpate_services.inference.repository import MeshLibrary
@@ -281,7 +280,7 @@ class RecordFiles:
         self.report()
 
     def _keep(self, now_s: float) -> None:
-        """Remove old records, within what the present one has left of the room, and free memory."""
+        """Remove old records, within what the present one has left of the room."""
         self._kept_s = now_s
         present = 0
         if self._writer is not None:
@@ -289,7 +288,6 @@ class RecordFiles:
             with contextlib.suppress(OSError):  # a view is there after its first update, if at all
                 present += self._writer.path.with_suffix(".rrd").stat().st_size
         self._retention.apply(present)
-        release_free_memory()
 
     def report(self) -> None:
         """Hand the counters to health."""
