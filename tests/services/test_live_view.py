@@ -93,7 +93,7 @@ def test_all_is_drawn_and_the_process_ends(
 
 
 def test_the_recorder_does_not_load_rerun() -> None:
-    """It keeps memory for ever: a recorder that loaded it grew by 2 to 6 MB/h."""
+    """It keeps memory of all that it ever drew, and a recorder may run for months."""
     code = "import sys, palpate_services.recorder.service; assert 'rerun' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
