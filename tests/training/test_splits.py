@@ -177,6 +177,7 @@ def test_a_single_function_splits_rows_at_random() -> None:
         "dataclass",
         "folds_of",
         "get_args",
+        "last_part",
         "name_of_units",
         "of_units",
         "rows_at_random",
