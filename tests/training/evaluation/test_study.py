@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -160,3 +164,46 @@ def test_pictures_show_the_widest_test_of_unseen_trajectories(
     other.make(tmp_path / "cells", workers=0)
     drawn = other.draw(tmp_path / "cells", tmp_path)
     assert [one["task"] for one in drawn] == [""], "trajectories were not tested"
+
+
+def test_workers_do_not_outlive_a_command_that_was_killed(
+    data: ExperimentDataset, tmp_path: Path
+) -> None:
+    write_experiment(tmp_path / "experiment.h5", data)
+    code = (
+        "from pathlib import Path\n"
+        "from palpate_training.cli.report import train_report\n"
+        f"folder = Path({str(tmp_path)!r})\n"
+        "train_report(folder, folder / 'out', systems='mean of five', workers=2)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL) as command:
+        workers: list[int] = []
+        deadline = time.monotonic() + 60
+        while len(workers) < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+            workers = _workers_of(command.pid)
+        time.sleep(1.0)  # they have begun to import or to train
+        command.kill()
+    assert len(workers) == 2
+    deadline = time.monotonic() + 30
+    while any(map(_lives, workers)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(_lives, workers))
+
+
+def _workers_of(pid: int) -> list[int]:
+    found = []
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError, ValueError):
+            child = int(entry.name)
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"spawn_main" in (entry / "cmdline").read_bytes():
+                found.append(child)
+    return found
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False

@@ -30,6 +30,7 @@ import torch
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.container import add_array
+from palpate_training.experiment.generate.workers import end_with_parent
 from palpate_training.learning.splits import Fold, RowSplit
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -249,6 +250,7 @@ _tasks: dict[str, Task] = {}
 
 
 def _take_tasks(tasks: dict[str, Task], device: str) -> None:
+    end_with_parent()
     os.nice(5)  # so that the machine stays usable during a night's work
     torch.set_default_device(device)
     _tasks.update(tasks)

@@ -41,7 +41,7 @@ class TaskRunner(Protocol):
         """End the workers."""
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """Let a worker not outlive a command that was killed: the pool would wait for ever."""
     parent = parent_process()
     assert parent is not None
@@ -60,7 +60,7 @@ class WorkerProcesses:
         self._workers = workers
         # Spawned: forked children would share locks of threads that they do not have.
         self._pool = ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=_end_with_parent
+            workers, mp_context=get_context("spawn"), initializer=end_with_parent
         )
 
     def run(
