@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from palpate.bus.topics import sensor_key
+from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, sensor_key
 from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
 from palpate.errors import RecordingError, WireError
 from palpate.files.record import (
@@ -229,6 +230,27 @@ def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, A
     kept = [item.sequence for item in read_record(target)]
     assert kept == list(range(1, len(kept) + 1))
     assert written - len(kept) <= 30
+
+
+def test_a_record_leaves_nothing_to_the_garbage_collector(
+    tmp_path: Path,
+) -> None:
+    """It comes to a recorder once in hours; until then 20 kB of each schema stayed behind."""
+
+    def write_all(number: int) -> None:
+        with RecordWriter(tmp_path / f"{number}.mcap") as writer:
+            for topic in (ELECTRODES, FEATURES, FIELD, SYNTHESIS):
+                key = sensor_key("lab", "finger", topic.name)
+                writer.write(key, topic.codec.schema, b"x", log_time_ns=number)
+
+    write_all(0)
+    gc.collect()
+    gc.disable()
+    try:
+        write_all(1)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
 
 
 def test_a_long_record_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None:
