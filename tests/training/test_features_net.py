@@ -9,6 +9,7 @@ import torch
 
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX
+from palpate_training.learning.export import onnx_bytes, run_onnx
 from palpate_training.learning.features_net import (
     MIRROR_AXES,
     FeaturesNet,
@@ -18,7 +19,7 @@ from palpate_training.learning.features_net import (
     fit_features_net,
     score_of,
 )
-from palpate_training.learning.networks import Standardised, predict
+from palpate_training.learning.networks import FeaturesGraph, Standardised, predict
 
 QUICK = FeaturesNetConfig(members=2, width=48, blocks=1, epochs=40, patience=40, batch_rows=64)
 REST = np.linspace(2900, 3300, 19).astype(np.float32)
@@ -84,3 +85,17 @@ def test_the_same_seed_gives_the_same_network() -> None:
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
+
+
+def test_a_batch_has_the_bits_of_single_rows_in_onnx() -> None:
+    """A service computes frames of several sensors together; none may change another's estimate."""
+    torch.manual_seed(0)
+    rows = np.random.default_rng(1).normal(0, 50, (400, 19)).astype(np.float32)
+    member = Standardised(ResidualLayers(38, 3, 64, 2), 38)
+    net = FeaturesNet([member], REST, symmetric=True).eval()
+    inputs = net.inputs_of(torch.from_numpy(rows)).numpy()
+    member.normalise_from(inputs, rows[:, :3])
+    graph = FeaturesGraph(net, np.ones(3, np.float32))
+    model = onnx_bytes(graph, "electrodes", torch.zeros(4, 19), ["force", "force_sd"])
+    together, one_by_one = run_onnx(model, "electrodes", rows)
+    assert together[0].tobytes() == one_by_one[0].tobytes()

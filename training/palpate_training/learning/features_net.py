@@ -29,6 +29,7 @@ FORCE_FLOOR_N = 0.5
 """Forces count as their error over this plus their magnitude, to the power of a half: a newton
 matters less the harder the press."""
 
+_LANES = 16
 _SMOOTH = 1e-4  # of a normalised distance's square, so that its root has a slope at zero
 
 
@@ -130,7 +131,11 @@ class FeaturesNet(nn.Module):
 
 def _log_impedance(counts: Tensor) -> Tensor:
     """Logarithm of the impedance, but for a constant; counts are kept one inside of their range."""
-    return torch.log(COUNTS_MAX / counts.clamp(1.0, COUNTS_MAX - 1.0) - 1.0)
+    # Processors take 16 logarithms at once and the rest one by one, in other bits. Rows of 19 would
+    # have other bits in a batch than alone; rows of a whole number of sixteens do not.
+    width = counts.shape[-1]
+    whole = nn.functional.pad(counts, (0, -width % _LANES), value=1.0)
+    return torch.log(COUNTS_MAX / whole.clamp(1.0, COUNTS_MAX - 1.0) - 1.0)[..., :width]
 
 
 @dataclass(frozen=True, slots=True)
