@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,6 +11,7 @@ import torch
 
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX
+from palpate_training.learning import features_net
 from palpate_training.learning.export import onnx_bytes, run_onnx
 from palpate_training.learning.features_net import (
     MIRROR_AXES,
@@ -85,6 +88,20 @@ def test_the_same_seed_gives_the_same_network() -> None:
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
+
+
+def test_a_common_drift_since_the_tare_is_hardly_a_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    train, test = rows_of(800, 1), rows_of(200, 2)
+    one = replace(QUICK, members=1)
+    drifted = np.array([[-20.0], [20.0]], np.float32).repeat(19, axis=1)
+
+    def force_of_drift() -> float:
+        net = fit_features_net(train, test, REST, symmetric=False, config=one)
+        return float(np.linalg.norm(predict(net, drifted)[:, :3], axis=1).mean())
+
+    seen = force_of_drift()
+    monkeypatch.setattr(features_net, "DRIFT_COUNTS", 0.0)
+    assert seen < 0.5 * force_of_drift()
 
 
 def test_a_batch_has_the_bits_of_single_rows_in_onnx() -> None:

@@ -20,6 +20,7 @@ from palpate_training.cli.report import read_folder, train_report
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, write_experiment
+from palpate_training.datasets.export import export_published
 from palpate_training.datasets.trials import TrialRows
 from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.features import paper_weights, weighted_median
@@ -128,6 +129,29 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
         train_report(**{**options, "splits": "sideways"})
     with pytest.raises(DatasetError, match="neither experiment"):
         read_folder(tmp_path / "out")
+
+
+def test_the_published_layout_goes_through_the_same_command(
+    make_rows: Callable[..., TrialRows], provenance: Provenance, tmp_path: Path
+) -> None:
+    """Without untouched counts, which those files do not hold: ours has to assume them."""
+    trials = [
+        make_rows(f"biotac-{unit}", f"cube/{point}/normal")
+        for unit in (1, 2, 3)
+        for point in range(10)
+    ]
+    export_published(tmp_path / "published", assemble_experiment(trials, provenance))
+    train_report(
+        data=tmp_path / "published", out=tmp_path / "out", tasks="location, force",
+        splits="trajectory", systems="ridge, attention", seeds=1, whole=True, workers=0,
+        device="cpu", cells=None,
+    )  # fmt: skip
+    values = json.loads((tmp_path / "out" / "study.json").read_text())
+    assert "biotac1.hdf5" in values["sources"][0]["source"]
+    assert len(values["scores"]) == 4
+    for row in values["scores"]:
+        error = "distance_m_median" if row["task"] == "location" else "magnitude_n_median"
+        assert np.isfinite(row["metrics"][error])
 
 
 def test_weights_give_the_forces_the_paper_s_spread() -> None:
