@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import itertools
 import os
 import struct
@@ -46,7 +45,6 @@ _CHUNK_BYTES = 1 << 20
 _INDICES = "_Writer__chunk_indices"
 
 
-@functools.cache
 def descriptor_set(message_type: type[PbMessage]) -> bytes:
     """Serialised ``FileDescriptorSet`` of a message's file and its imports: MCAP's schema."""
     files = descriptor_pb2.FileDescriptorSet()

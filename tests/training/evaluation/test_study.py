@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.features import paper_weights, weighted_median
 from palpate_training.evaluation.page import PAPER_LABEL, tables_of, write_pages
 from palpate_training.evaluation.study import Study, StudyPlan, write_study
+from palpate_training.systems import ours
 
 SIMPLE = ("zero", "training mean", "ridge")
 
@@ -132,9 +134,13 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
 
 
 def test_the_published_layout_goes_through_the_same_command(
-    make_rows: Callable[..., TrialRows], provenance: Provenance, tmp_path: Path
+    make_rows: Callable[..., TrialRows],
+    provenance: Provenance,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Without untouched counts, which those files do not hold: ours has to assume them."""
+    monkeypatch.setattr(ours, "OURS_CONFIG", replace(ours.OURS_CONFIG, epochs=2))
     trials = [
         make_rows(f"biotac-{unit}", f"cube/{point}/normal")
         for unit in (1, 2, 3)
@@ -143,7 +149,7 @@ def test_the_published_layout_goes_through_the_same_command(
     export_published(tmp_path / "published", assemble_experiment(trials, provenance))
     train_report(
         data=tmp_path / "published", out=tmp_path / "out", tasks="location, force",
-        splits="trajectory", systems="ridge, attention", seeds=1, whole=True, workers=0,
+        splits="trajectory", systems="ridge, residual networks", seeds=1, whole=True, workers=0,
         device="cpu", cells=None,
     )  # fmt: skip
     values = json.loads((tmp_path / "out" / "study.json").read_text())
