@@ -59,7 +59,7 @@ def narrowed_m2(width_m: float) -> float:
 
 @pytest.mark.parametrize(("width_m", "short_of_beam"), [(WIDE_M, 0.05), (NARROW_M, 0.1)])
 def test_the_cross_section_narrows_as_a_beam_says(width_m: float, short_of_beam: float) -> None:
-    """The walls hold a short strip more than they hold a beam."""
+    """A short strip with clamped end faces is stiffer than a beam."""
     place, taken = gap(width_m)
     assert (taken >= -1e-12).all()
     assert np.argmax(taken) == len(place) // 2

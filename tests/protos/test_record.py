@@ -232,9 +232,7 @@ def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, A
     assert written - len(kept) <= 30
 
 
-def test_a_record_leaves_nothing_to_the_garbage_collector(
-    tmp_path: Path,
-) -> None:
+def test_a_record_leaves_nothing_to_the_garbage_collector(tmp_path: Path) -> None:
     """It comes to a recorder once in hours; until then 20 kB of each schema stayed behind."""
 
     def write_all(number: int) -> None:
