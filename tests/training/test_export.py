@@ -23,7 +23,8 @@ from palpate_training.learning.export import (
     onnx_bytes,
 )
 from palpate_training.learning.features_net import FeaturesNetConfig
-from palpate_training.learning.networks import FeaturesGraph, Mlp
+from palpate_training.learning.graphs import FeaturesGraph
+from palpate_training.learning.networks import Mlp
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]

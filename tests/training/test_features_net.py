@@ -11,18 +11,18 @@ import torch
 
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX
-from palpate_training.learning import features_net
+from palpate_training.learning import electrode_nets
+from palpate_training.learning.electrode_nets import MIRROR_AXES, ResidualLayers
 from palpate_training.learning.export import onnx_bytes, run_onnx
 from palpate_training.learning.features_net import (
-    MIRROR_AXES,
     FeaturesNet,
     FeaturesNetConfig,
     FeaturesRows,
-    ResidualLayers,
     fit_features_net,
     score_of,
 )
-from palpate_training.learning.networks import FeaturesGraph, Standardised, predict
+from palpate_training.learning.graphs import FeaturesGraph
+from palpate_training.learning.networks import Standardised, predict
 
 QUICK = FeaturesNetConfig(members=2, width=48, blocks=1, epochs=40, patience=40, batch_rows=64)
 REST = np.linspace(2900, 3300, 19).astype(np.float32)
@@ -43,7 +43,7 @@ def rows_of(count: int, seed: int, *, contact: float = 1.0) -> FeaturesRows:
 def test_inputs_are_counts_and_the_fall_of_the_log_impedance() -> None:
     net = FeaturesNet([Standardised(ResidualLayers(38, 3, 8, 1), 38)], REST, symmetric=True)
     tared = np.random.default_rng(0).normal(0, 300, (5, 19)).astype(np.float32)
-    inputs = net.inputs_of(torch.from_numpy(tared)).numpy()
+    inputs = net.inputs(torch.from_numpy(tared)).numpy()
     np.testing.assert_array_equal(inputs[:, :19], tared)
 
     def log_impedance(counts: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
@@ -100,7 +100,7 @@ def test_a_common_drift_since_the_tare_is_hardly_a_force(monkeypatch: pytest.Mon
         return float(np.linalg.norm(predict(net, drifted)[:, :3], axis=1).mean())
 
     seen = force_of_drift()
-    monkeypatch.setattr(features_net, "DRIFT_COUNTS", 0.0)
+    monkeypatch.setattr(electrode_nets, "DRIFT_COUNTS", 0.0)
     assert seen < 0.5 * force_of_drift()
 
 
@@ -110,7 +110,7 @@ def test_a_batch_has_the_bits_of_single_rows_in_onnx() -> None:
     rows = np.random.default_rng(1).normal(0, 50, (400, 19)).astype(np.float32)
     member = Standardised(ResidualLayers(38, 3, 64, 2), 38)
     net = FeaturesNet([member], REST, symmetric=True).eval()
-    inputs = net.inputs_of(torch.from_numpy(rows)).numpy()
+    inputs = net.inputs(torch.from_numpy(rows)).numpy()
     member.normalise_from(inputs, rows[:, :3])
     graph = FeaturesGraph(net, np.ones(3, np.float32))
     model = onnx_bytes(graph, "electrodes", torch.zeros(4, 19), ["force", "force_sd"])

@@ -142,4 +142,4 @@ def mixed(make_mixed: Callable[..., MixedDataset]) -> MixedDataset:
 @pytest.fixture(scope="session")
 def quick() -> FieldFitConfig:
     """Short trainings of narrow networks."""
-    return FieldFitConfig(widths=(48, 48), epochs=40, patience=40, batch_rows=64)
+    return FieldFitConfig(members=2, width=48, blocks=1, epochs=40, patience=40, batch_rows=64)

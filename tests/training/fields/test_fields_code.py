@@ -10,13 +10,8 @@ import pytest
 from palpate.anatomy import CORE_RADIUS_M, core_normal
 from palpate.errors import DatasetError
 from palpate_training.datasets.experiment import MixedDataset
-from palpate_training.learning.field_code import (
-    RADII_M,
-    SITES,
-    FieldCode,
-    fit_code,
-    pooling,
-)
+from palpate_training.learning.field_code import FieldCode, fit_code, mirror_nodes, mirrored
+from palpate_training.learning.film import MIRRORED_FILM, RADII_M, SITES, pooling
 from palpate_training.learning.splits import RowSplit, by_trajectory
 from palpate_training.tasks.synthesis import synthesis_features
 
@@ -140,3 +135,40 @@ def test_features_are_what_the_fields_give(
 def test_a_mesh_without_inside_is_refused(mixed: MixedDataset) -> None:
     with pytest.raises(DatasetError, match="no inner faces"):
         pooling(replace(mixed.mesh, inner_faces=np.zeros((0, 3), np.int32)))
+
+
+def test_a_mirrored_field_has_the_same_coefficients_but_for_signs(
+    mixed: MixedDataset, split: RowSplit, code: FieldCode
+) -> None:
+    order, signs = mirror_nodes(mixed.mesh), code.signs
+    assert order is not None
+    assert signs is not None
+    assert set(signs.tolist()) == {1.0, -1.0}
+    rows = split.train[::9]
+    flat = mixed.displacement(rows).reshape(len(rows), -1)
+    image = mirrored(flat.astype(float), order)
+    np.testing.assert_allclose(mirrored(image, order), flat, atol=1e-12)
+    wanted = code.project(flat) * signs
+    error = np.abs(code.project(image.astype(np.float32)) - wanted).max()
+    assert error < 0.03 * np.abs(wanted).max()
+
+
+def test_a_lopsided_mesh_has_no_mirror_image(mixed: MixedDataset, split: RowSplit) -> None:
+    nodes = mixed.mesh.nodes.copy()
+    nodes[5, 1] += 1e-4
+    lopsided = replace(mixed, mesh=replace(mixed.mesh, nodes=nodes))
+    assert mirror_nodes(lopsided.mesh) is None
+    code = fit_code(lopsided, split.train, split.validation, mode_counts=(4,))
+    assert code.signs is None
+    known = mixed.coefficients[split.train].astype(float)
+    np.testing.assert_allclose(code.centre, known.mean(axis=0), atol=1e-9)
+
+
+def test_the_film_of_a_mirrored_field_is_the_mirrored_film(
+    mixed: MixedDataset, split: RowSplit
+) -> None:
+    film, order = pooling(mixed.mesh), mirror_nodes(mixed.mesh)
+    assert order is not None
+    field = mixed.displacement(split.test[:5]).astype(float)
+    image = mirrored(field.reshape(5, -1), order).reshape(field.shape)
+    np.testing.assert_allclose(film.pool(image), film.pool(field)[:, MIRRORED_FILM], atol=2e-7)

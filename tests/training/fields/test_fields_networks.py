@@ -12,12 +12,13 @@ import onnxruntime
 import pytest
 import torch
 
+from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import export
 from palpate_training.learning.export import onnx_bytes
-from palpate_training.learning.networks import FieldGraph, SynthesisGraph
+from palpate_training.learning.graphs import FieldGraph, SynthesisGraph
 from palpate_training.learning.splits import RowSplit, by_trajectory, of_units
 from palpate_training.tasks.fields import (
     FieldFitConfig,
@@ -70,8 +71,11 @@ def test_standardisation_comes_from_the_training_rows(
     mixed: MixedDataset, held: RowSplit, model: FieldModel
 ) -> None:
     counts = tared_counts(mixed)[held.train]
-    np.testing.assert_allclose(model.net.input_mean.numpy(), counts.mean(axis=0), rtol=1e-4)
     assert np.abs(counts).max() > 500, "counts, not parts of full scale"
+    inputs = model.net.inputs.of(np.vstack([counts, counts[:, ELECTRODE_MIRROR]]))
+    for member in model.net.nets:
+        mean = member.get_buffer("input_mean").numpy()
+        np.testing.assert_allclose(mean, inputs.mean(axis=0), rtol=1e-3, atol=1e-4)
 
 
 def test_synthesis_follows_the_film(
@@ -89,7 +93,7 @@ def test_small_modes_are_not_blown_up(
     mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig
 ) -> None:
     net = fit_synthesis(mixed, held, config=replace(quick, epochs=1)).net
-    sd = net.mlp.input_sd.numpy()
+    sd = net.nets[0].get_buffer("input_sd").numpy()
     modes, film = sd[: net.modes], sd[net.modes :]
     assert modes.min() == pytest.approx(0.1 * modes.max())
     assert film.min() < 0.1 * modes.max()
@@ -126,7 +130,7 @@ def test_field_bundle(mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path
         mixed, tmp_path / "f", name="field-test", config=quick, on_epoch=lambda: epochs.append(1)
     )
     bundle = read_bundle(tmp_path / "f")
-    assert len(epochs) == quick.epochs
+    assert len(epochs) == quick.members * quick.epochs
     assert bundle.manifest.task == "field"
     assert "biotac-1, biotac-2" in bundle.manifest.trained_on
     assert metrics["skill_subset"] > 0.3
@@ -175,7 +179,7 @@ def test_field_bundle_has_its_basis_and_knows_its_rows(
     (displacement,) = rows.outputs
     longest = np.linalg.norm(mixed.displacement(units.train), axis=2).max()
     assert displacement.length_max == pytest.approx(longest, rel=1e-5)
-    assert rows.rows == len(units.train) + quick.rest_rows(units.train)
+    assert rows.rows == len(units.train) + quick.rest_rows(len(units.train))
 
 
 def test_synthesis_bundle_is_of_one_unit(
@@ -264,3 +268,29 @@ def test_a_test_row_is_never_trained_on(
         first, second = fit(data, held, config=config), fit(changed, held, config=config)
         for one, two in zip(first.net.parameters(), second.net.parameters(), strict=True):
             assert torch.equal(one, two)
+
+
+def test_mirrored_electrodes_give_the_mirrored_field(
+    mixed: MixedDataset, held: RowSplit, model: FieldModel
+) -> None:
+    counts = tared_counts(mixed)[held.test]
+    even = model.net.inputs.rest
+    assert torch.equal(even, even[torch.from_numpy(ELECTRODE_MIRROR).long()])
+    estimate = model.coefficients(counts)
+    image = model.coefficients(np.ascontiguousarray(counts[:, ELECTRODE_MIRROR]))
+    signs = model.code.signs
+    assert signs is not None
+    np.testing.assert_allclose(image, estimate * signs, atol=1e-4 * np.abs(estimate).max())
+
+
+def test_unknown_untouched_counts_are_assumed(
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig
+) -> None:
+    """The published files do not hold them."""
+    unknown = np.full_like(mixed.experiment.trial_rest, np.nan)
+    data = replace(mixed, experiment=replace(mixed.experiment, trial_rest=unknown))
+    config = replace(quick, members=1, epochs=2)
+    assert np.isfinite(fit_field(data, held, config=config).coefficients(tared_counts(data))).all()
+    fitted = fit_synthesis(data, held, config=config)
+    features = synthesis_features(data, fitted.code, fitted.pooling)
+    assert np.isfinite(fitted.counts(features)).all()

@@ -16,8 +16,7 @@ from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.study import Study, StudyPlan
 from palpate_training.learning.splits import RowSplit, by_trajectory, of_units
 from palpate_training.systems import fields, latent, ruppel, synthesis
-from palpate_training.tasks.fields import FieldFitConfig, fit_field, tared_counts
-from palpate_training.tasks.synthesis import fit_synthesis
+from palpate_training.tasks.fields import FieldFitConfig, tared_counts
 
 LEARNT = 0.75
 """Error beside that of the training mean, at most."""
@@ -39,8 +38,8 @@ def short(monkeypatch: pytest.MonkeyPatch, quick: FieldFitConfig) -> None:
     monkeypatch.setattr(
         synthesis, "RUPPEL_CONFIG", replace(ruppel.CONFIG, epochs=15, patience=15, batch_rows=64)
     )
-    monkeypatch.setattr(fields, "fit_field", partial(fit_field, config=quick))
-    monkeypatch.setattr(synthesis, "fit_synthesis", partial(fit_synthesis, config=quick))
+    for module in (fields, synthesis):
+        monkeypatch.setattr(module, "FieldFitConfig", partial(replace, quick))
 
 
 def set_points(monkeypatch: pytest.MonkeyPatch, module: ModuleType, *, epochs: int) -> None:

@@ -11,7 +11,7 @@ from tests.training.systems.conftest import MakeSamples, assert_exports
 
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX
-from palpate_training.learning.features_net import MIRROR_AXES, ResidualLayers
+from palpate_training.learning.electrode_nets import ASSUMED_REST, MIRROR_AXES, ResidualLayers
 from palpate_training.systems import ours
 from palpate_training.systems.samples import error_of, impedance_ohm
 
@@ -72,7 +72,7 @@ def test_normals_are_unit_vectors_and_it_learns(
 
 def test_noise_of_both_inputs_is_that_of_the_counts() -> None:
     sd = ours.input_noise()
-    rest = np.array([ours.ASSUMED_REST, ours.ASSUMED_REST + ours.NOISE_COUNTS])
+    rest = np.array([ASSUMED_REST, ASSUMED_REST + ours.NOISE_COUNTS])
     change = np.log(impedance_ohm(rest))
     assert sd[0] == ours.NOISE_COUNTS
     assert sd[19] == pytest.approx(change[0] - change[1], rel=0.02)

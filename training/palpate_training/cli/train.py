@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,10 +17,10 @@ from palpate_training.datasets.features import open_dataset
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
 Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
 Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
-Epochs = Annotated[int, typer.Option(min=1, help="Passes over the training rows at most.")]
+Epochs = Annotated[int, typer.Option(min=1, help="Passes over the rows at most, each network.")]
 Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
 
-EPOCHS = 150
+EPOCHS = 80
 """The default of ``FieldFitConfig``, whose module needs torch."""
 
 console = Console()
@@ -79,51 +78,6 @@ def train_synthesis(
         unit=unit, name=name, version=version, seed=seed,
     )  # fmt: skip
     _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
-
-
-def train_twin(
-    mixed: Mixed,
-    experiment: Annotated[Path, typer.Argument(help="Purely experimental data set (.h5).")],
-    out: Annotated[Path, typer.Argument(help="Folder for twin.md, its figures and JSON.")],
-    seeds: Annotated[int, typer.Option(min=1, help="Networks of each kind.")] = 3,
-    split_seed: Annotated[int, typer.Option(help="Seed of the split.")] = 0,
-    epochs: Epochs = EPOCHS,
-) -> None:
-    """Field, synthesis, force and location on unseen trajectories, beside the paper's numbers.
-
-    palpate train twin mixed.h5 experiment.h5 docs/results/twin-learning
-    """
-    from palpate_training.datasets.experiment import read_experiment, read_mixed
-    from palpate_training.tasks.features import (
-        PAPER_CONFIG,
-        evaluate_features,
-        features_networks,
-    )
-    from palpate_training.tasks.fields import FieldFitConfig, evaluate_field
-    from palpate_training.tasks.report import write_report
-    from palpate_training.tasks.results import networks
-    from palpate_training.tasks.synthesis import evaluate_synthesis
-
-    fields, presses = read_mixed(mixed), read_experiment(experiment)
-    with _progress() as progress:
-        total = networks(fields.experiment, seeds) + features_networks(presses, seeds)
-        task = progress.add_task("networks", total=total)
-
-        def tick() -> None:
-            progress.advance(task)
-
-        config = FieldFitConfig(epochs=epochs)
-        paper = replace(PAPER_CONFIG, epochs=min(epochs, PAPER_CONFIG.epochs))
-        reports = [
-            evaluate(fields, seeds=seeds, split_seed=split_seed, config=config, on_network=tick)
-            for evaluate in (evaluate_field, evaluate_synthesis)
-        ]
-        reports += evaluate_features(
-            presses, seeds=seeds, split_seed=split_seed, config=paper, on_network=tick
-        )
-    command = typed_command()
-    for path in write_report(out, reports, fields.mesh, command=command, seeds=seeds):
-        console.print(f"wrote {path}")
 
 
 def train_force_real(
@@ -204,8 +158,8 @@ def _bundle(
     from palpate_training.tasks.fields import FieldFitConfig
 
     with _progress() as progress:
-        bar = progress.add_task(task, total=epochs)
         config = FieldFitConfig(epochs=epochs)
+        bar = progress.add_task(task, total=epochs * config.members)
         return train(
             read_mixed(data), out, config=config, on_epoch=lambda: progress.advance(bar), **options
         )

@@ -22,7 +22,7 @@ from palpate.files.training_range import KnownInputs
 from palpate.messages import SensorType, TensorInfo, TrainingRange
 from palpate.process import require
 from palpate_training.datasets.experiment import SkinMesh
-from palpate_training.learning.networks import FeaturesGraph, FieldGraph, SynthesisGraph
+from palpate_training.learning.graphs import FeaturesGraph, FieldGraph, SynthesisGraph
 
 _log = logging.getLogger(__name__)
 

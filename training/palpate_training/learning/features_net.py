@@ -1,8 +1,7 @@
 """The network that the ``features`` task ships: all quantities from one, mirror images included.
 
-Inputs are tared counts and the fall of the logarithm of the impedance, which follows the film above
-an electrode (``systems/ours.py`` says why). A finger is nearly symmetric, so the estimate may be
-the mean of that of a row and of its mirror image; whether that helps is decided on validation rows.
+A finger is nearly symmetric, so the estimate may be the mean of that of a row and of its mirror
+image; whether that helps is decided on validation rows.
 """
 
 from __future__ import annotations
@@ -14,26 +13,18 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from palpate.anatomy import ELECTRODE_MIRROR
-from palpate.messages import COUNTS_MAX
+from palpate_training.learning.electrode_nets import MIRROR_AXES, ElectrodeNet, ResidualLayers
 from palpate_training.learning.fit import FitConfig, OnEpoch, fit
 from palpate_training.learning.networks import Standardised, predict
 
 FloatArray = npt.NDArray[np.float32]
 
-MIRROR_AXES = np.array([1.0, -1.0, 1.0], np.float32)
-NOISE_COUNTS = 2.0
-DRIFT_COUNTS = 10.0
-"""Standard deviation of what all electrodes of a training row have drifted alike since the tare:
-half a kelvin. A network that never saw it takes 20 counts for 0.85 N (training/LOG.md)."""
-
 FORCE_FLOOR_N = 0.5
 """Forces count as their error over this plus their magnitude, to the power of a half: a newton
 matters less the harder the press."""
 
-_LANES = 16
 _SMOOTH = 1e-4  # of a normalised distance's square, so that its root has a slope at zero
 
 
@@ -57,33 +48,7 @@ class FeaturesNetConfig(FitConfig):
     threads: int = 2
 
 
-class ResidualLayers(nn.Module):
-    """Blocks of two layers that add to their input."""
-
-    def __init__(self, inputs: int, outputs: int, width: int = 256, blocks: int = 3) -> None:
-        super().__init__()
-        self.first = nn.Linear(inputs, width)
-        self.blocks = nn.ModuleList(
-            nn.Sequential(
-                nn.LayerNorm(width),
-                nn.Linear(width, width),
-                nn.SiLU(),
-                nn.Linear(width, width),
-            )
-            for _ in range(blocks)
-        )
-        self.head = nn.Linear(width, outputs)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Estimate of standardised inputs."""
-        hidden = self.first(inputs)
-        for block in self.blocks:
-            hidden = hidden + block(hidden)
-        estimate: Tensor = self.head(nn.functional.silu(hidden))
-        return estimate
-
-
-class FeaturesNet(nn.Module):
+class FeaturesNet(ElectrodeNet):
     """Tared counts ``(N, 19)`` -> some quantities ``(N, 3 Q)``, three values each.
 
     Args:
@@ -92,54 +57,9 @@ class FeaturesNet(nn.Module):
         symmetric: Whether the estimate is the mean of that of a row and of its mirror image.
     """
 
-    rest: Tensor
-    log_rest: Tensor
-    order: Tensor
-    signs: Tensor
-
     def __init__(self, nets: Sequence[Standardised], rest: FloatArray, *, symmetric: bool) -> None:
-        super().__init__()
-        self.nets = nn.ModuleList(nets)
-        self.symmetric = symmetric
-        self.register_buffer("rest", torch.from_numpy(rest.astype(np.float32)))
-        self.register_buffer("log_rest", _log_impedance(self.rest))
-        order = np.concatenate([ELECTRODE_MIRROR, ELECTRODE_MIRROR + len(rest)])
-        self.register_buffer("order", torch.from_numpy(order).long())
-        mirrored = np.tile(MIRROR_AXES, len(nets[0].output_sd) // 3)
-        signs = 0.5 * np.stack([np.ones_like(mirrored), mirrored])
-        self.register_buffer("signs", torch.from_numpy(signs))
-
-    @property
-    def output_sd(self) -> Tensor:
-        """Standard deviation of the training targets, shape ``(3 Q,)``."""
-        sd: Tensor = self.nets[0].get_buffer("output_sd")
-        return sd
-
-    def inputs_of(self, tared: Tensor) -> Tensor:
-        """Tared counts and the fall of the logarithm of the impedance, ``(N, 38)``."""
-        fall = self.log_rest - _log_impedance(self.rest + tared)
-        return torch.cat([tared, fall], dim=1)
-
-    def forward(self, tared: Tensor) -> Tensor:
-        """Estimates of tared counts."""
-        inputs = self.inputs_of(tared)
-        if not self.symmetric:
-            return self._mean_of(inputs)
-        both = torch.stack([inputs, torch.index_select(inputs, 1, self.order)], dim=1)
-        return (self._mean_of(both) * self.signs).sum(dim=1)  # (N, 2, 3 Q) -> (N, 3 Q)
-
-    def _mean_of(self, inputs: Tensor) -> Tensor:
-        estimates: list[Tensor] = [net(inputs) for net in self.nets]
-        return torch.stack(estimates).sum(dim=0) / len(estimates)
-
-
-def _log_impedance(counts: Tensor) -> Tensor:
-    """Logarithm of the impedance, but for a constant; counts are kept one inside of their range."""
-    # Processors take 16 logarithms at once and the rest one by one, in other bits. Rows of 19 would
-    # have other bits in a batch than alone; rows of a whole number of sixteens do not.
-    width = counts.shape[-1]
-    whole = nn.functional.pad(counts, (0, -width % _LANES), value=1.0)
-    return torch.log(COUNTS_MAX / whole.clamp(1.0, COUNTS_MAX - 1.0) - 1.0)[..., :width]
+        signs = np.tile(MIRROR_AXES, len(nets[0].output_sd) // 3)
+        super().__init__(nets, rest, signs if symmetric else None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,21 +125,11 @@ def _fit_member(
     layers = ResidualLayers(size, 3 * quantities, config.width, config.blocks)
     member = Standardised(layers, size, 3 * quantities)
     net = FeaturesNet([member], rest, symmetric=symmetric)
-    with torch.inference_mode():
-        inputs = net.inputs_of(torch.from_numpy(train.tared)).numpy()
-    targets = train.targets
+    inputs, targets = net.inputs.of(train.tared), train.targets
     if symmetric:
-        inputs = np.vstack([inputs, inputs[:, net.order.numpy()]])
+        inputs = np.vstack([inputs, inputs[:, net.inputs.order.numpy()]])
         targets = np.vstack([targets, targets * np.tile(MIRROR_AXES, quantities)])
     _normalise(member, inputs, targets)
-    slope = torch.from_numpy(_input_slope(rest))
-
-    def noisy(batch: Tensor, rows: Tensor) -> Tensor:
-        noise = NOISE_COUNTS * torch.randn_like(batch[:, : size // 2])
-        drift = DRIFT_COUNTS * torch.randn_like(batch[:, :1])
-        # The same counts of an electrode in both of its inputs.
-        return batch + slope.to(batch.device) * (noise + drift).repeat(1, 2)
-
     fit(
         member,
         inputs,
@@ -227,7 +137,7 @@ def _fit_member(
         loss_of=partial(_loss, sizes_of(train.targets)),
         score_of=lambda _: score_of(net, validation),
         config=config,
-        augment=noisy,
+        augment=lambda batch, _: net.inputs.noisy(batch),
         on_epoch=on_epoch,
     )
     return member
@@ -276,9 +186,3 @@ def _normalise(net: Standardised, inputs: FloatArray, targets: FloatArray) -> No
     net.normalise_from(inputs, known)
     spread = np.maximum(np.nanstd(targets.astype(np.float64), axis=0), 1e-6)
     net.output_sd.copy_(torch.from_numpy(spread))
-
-
-def _input_slope(rest: FloatArray) -> FloatArray:
-    """What a count more of an electrode at rest adds to each input, (38,)."""
-    low, high = (_log_impedance(torch.from_numpy(rest + step)).numpy() for step in (-1.0, 1.0))
-    return np.concatenate([np.ones_like(low), (low - high) / 2.0]).astype(np.float32)

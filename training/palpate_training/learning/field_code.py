@@ -4,10 +4,9 @@ The data set's own basis was fitted to all its rows, held-out ones included. Its
 orthonormal, so the principal components of the *training* rows' coefficients are exactly the POD
 modes of the training rows' fields; nothing of a held-out trajectory shapes them.
 
-How near the skin is to every electrode: the film's thickness, pooled with kernels.
-
-The core is a half-cylinder about the x axis with a spherical tip about the origin
-(docs/conventions.md), so its normal is radial.
+Where the mesh is its own mirror image, so are the modes, but for a sign each: they are those of the
+training rows and of their mirror images together. A mirrored field then has the same coefficients,
+those of the odd modes with the other sign.
 """
 
 from __future__ import annotations
@@ -17,16 +16,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from palpate.anatomy import CORE_RADIUS_M, ELECTRODE_POSITIONS, EXCITATION_POSITIONS, core_normal
 from palpate.errors import DatasetError
 from palpate_training.datasets.experiment import MixedDataset, SkinMesh
+from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.splits import Rows
 
 FloatArray = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
 
-MODE_COUNTS = (8, 16, 24, 32, 48, 64)
-"""Numbers of modes to choose from; 64 of a skin of 6870 nodes are 2.6 MB in half precision."""
+MODE_COUNTS = (8, 16, 24, 32, 48, 64, 96)
+"""Numbers of modes to choose from; 96 of a skin of 6870 nodes are 4.0 MB in half precision."""
+
+MIRROR_TOLERANCE_M = 1e-6
+"""A node further from the mirror image of every other has none [m]."""
 
 TRUNCATION_LIMIT_M = 5e-6
 """Enough modes are those that lose no more on validation rows, mean over rows and nodes [m]: a
@@ -48,6 +52,8 @@ class FieldCode:
         rotation: From the data set's coefficients to these, shape (C, K).
         truncation_m: Number of modes -> mean nodal distance between validation fields and their
             projection on so many modes [m], half precision included.
+        signs: What a mirror image makes of each coefficient, 1 or -1, shape (K,); None = the mesh
+            is not its own mirror image.
     """
 
     mean: FloatArray
@@ -56,6 +62,7 @@ class FieldCode:
     centre: FloatArray
     rotation: FloatArray
     truncation_m: dict[int, float]
+    signs: FloatArray | None
 
     @property
     def size(self) -> int:
@@ -104,36 +111,88 @@ def fit_code(
         DatasetError: The training rows all have the same field.
     """
     known = data.coefficients[train].astype(np.float64)
+    flat = data.basis.modes.reshape(known.shape[1], -1).astype(np.float64)
+    offset = data.basis.mean.reshape(-1).astype(np.float64)
     centre = known.mean(axis=0)
-    values, vectors = np.linalg.eigh(
-        np.cov(known - centre, rowvar=False).reshape(2 * [len(centre)])
-    )
-    if not values[-1] > 0:
+    mean = centre @ flat + offset
+    if not np.ptp(known, axis=0).any():
         raise DatasetError(
             "the fields of all training rows are the same",
             remedy="generate a data set in which the skin moves",
         )
-    rank = int(np.sum(values > values[-1] * 1e-12))
-    rotation = vectors[:, ::-1][:, : min(rank, max(mode_counts))]
-    flat = data.basis.modes.reshape(len(centre), -1).astype(np.float64)
+    order = mirror_nodes(data.mesh)
+    if order is None:
+        values, rotation = np.linalg.eigh(_scatter(known - centre))
+        signs = None
+    else:
+        mean = 0.5 * (mean + mirrored(mean[None], order)[0])
+        centre = (mean - offset) @ flat.T
+        values, rotation, signs = _modes_by_sign(known - centre, flat, order)
+    largest_first = np.argsort(-values)
+    values, rotation = values[largest_first], rotation[:, largest_first]
+    rank = min(int(np.sum(values > values[0] * 1e-12)), max(mode_counts))
+    rotation = rotation[:, :rank]
     modes = rotation.T @ flat
     scale = np.abs(modes).max(axis=1)
     code = FieldCode(
-        mean=(centre @ flat + data.basis.mean.reshape(-1)).astype(np.float32),
+        mean=mean.astype(np.float32),
         modes=(modes / scale[:, None]).astype(np.float16),
         scale=scale.astype(np.float32),
         centre=centre.astype(np.float32),
         rotation=rotation.astype(np.float32),
         truncation_m={},
+        signs=None if signs is None else signs[largest_first][:rank].astype(np.float32),
     )
     seen = np.unique(validation[np.linspace(0, len(validation) - 1, _CHOICE_ROWS).astype(int)])
     lost: dict[int, float] = {}
-    for count in sorted({min(count, rotation.shape[1]) for count in mode_counts}):
+    for count in sorted({min(count, rank) for count in mode_counts}):
         shorter = _first(code, count, lost)
         lost[count] = _truncation(data, shorter, seen)
         if lost[count] <= limit_m:
             break
     return _first(code, max(lost), lost)
+
+
+def _scatter(values: Floats) -> Floats:
+    """Mean outer product of rows (N, C), shape (C, C)."""
+    return np.asarray(values.T @ values / len(values), np.float64)
+
+
+def _modes_by_sign(known: Floats, flat: Floats, order: Rows) -> tuple[Floats, Floats, Floats]:
+    """Principal directions of rows and their mirror images; each keeps or changes its sign.
+
+    Args:
+        known: Coefficients of the rows less those of the mean, shape (N, C).
+        flat: Orthonormal modes that they belong to, shape (C, 3V).
+        order: Node that is the mirror image of each node, shape (V,).
+
+    Returns:
+        Variances (C,), directions (C, C) in columns, and their signs (C,).
+    """
+    reflection = mirrored(flat, order) @ flat.T
+    turned, basis = np.linalg.eigh(0.5 * (reflection + reflection.T))
+    values, directions, signs = [], [], []
+    for sign in (1.0, -1.0):
+        part = basis[:, turned * sign > 0]
+        variances, vectors = np.linalg.eigh(_scatter(known @ part))
+        values.append(variances)
+        directions.append(part @ vectors)
+        signs.append(np.full(len(variances), sign))
+    return np.concatenate(values), np.hstack(directions), np.concatenate(signs)
+
+
+def mirror_nodes(mesh: SkinMesh) -> Rows | None:
+    """The node that is the mirror image of each node, shape (V,); None if one has none."""
+    image = mesh.nodes * MIRROR_AXES
+    distance, nearest = cKDTree(mesh.nodes).query(image)
+    one_to_one = len(np.unique(nearest)) == len(nearest)
+    return nearest if one_to_one and distance.max() <= MIRROR_TOLERANCE_M else None
+
+
+def mirrored(fields: Floats, order: Rows) -> Floats:
+    """Mirror images of fields of vectors (N, 3V), by ``mirror_nodes``."""
+    vectors = fields.reshape(len(fields), -1, 3)
+    return np.asarray((vectors[:, order] * MIRROR_AXES).reshape(fields.shape), np.float64)
 
 
 def _first(code: FieldCode, count: int, lost: dict[int, float]) -> FieldCode:
@@ -143,6 +202,7 @@ def _first(code: FieldCode, count: int, lost: dict[int, float]) -> FieldCode:
         scale=code.scale[:count],
         rotation=code.rotation[:, :count],
         truncation_m=lost,
+        signs=None if code.signs is None else code.signs[:count],
     )
 
 
@@ -153,87 +213,3 @@ def _truncation(data: MixedDataset, code: FieldCode, rows: Rows) -> float:
         lost = code.decode(code.encode(data.coefficients[part])) - data.displacement(part)
         total += float(np.linalg.norm(lost, axis=2).mean(axis=1).sum())
     return total / len(rows)
-
-
-Floats = npt.NDArray[np.float64]
-
-SITES: Floats = np.vstack([ELECTRODE_POSITIONS, EXCITATION_POSITIONS])
-"""Centres of E1..E19 and of the excitation electrodes X1..X4 [m], shape (23, 3), sensor frame."""
-
-RADII_M = (1.25e-3, 2.5e-3, 5e-3)
-"""Radius of an electrode's disc, its diameter, and what surrounds it [m] (learning notes, 6.5)."""
-
-_THINNEST_REST_M = 5e-5
-"""Film of a coarse mesh that touches the core at rest; keeps its relative thickness finite [m]."""
-
-
-@dataclass(frozen=True, slots=True)
-class FilmPooling:
-    """Linear map from nodal displacement to the change of the film near every electrode.
-
-    Attributes:
-        nodes: Inner nodes that any site looks at, shape (I,).
-        normals: The core's outward normal below each, shape (I, 3).
-        weights: Share of each node in each pooled value, shape (I, P), columns sum to 1; P is 23
-            sites times three radii, site by site.
-        rest_m: Pooled thickness of the film in the untouched state [m], shape (P,), positive.
-    """
-
-    nodes: npt.NDArray[np.int64]
-    normals: FloatArray
-    weights: FloatArray
-    rest_m: FloatArray
-
-    def pool(self, displacement: npt.NDArray[np.floating]) -> FloatArray:
-        """Change of the pooled film [m], shape (N, P), of displacements [m], shape (N, V, 3).
-
-        Negative where the skin comes nearer to the core.
-        """
-        change = np.sum(displacement[:, self.nodes] * self.normals, axis=2)
-        return np.asarray(change @ self.weights, np.float32)
-
-
-def pooling(mesh: SkinMesh) -> FilmPooling:
-    """Kernel ``(1 - (d/r)^2)^2`` on the core's surface, weighted by the nodes' share of the area.
-
-    A site with no inner node within the radius takes the nearest one.
-
-    Raises:
-        DatasetError: The mesh has no inner surface.
-    """
-    if not len(mesh.inner_faces):
-        raise DatasetError(
-            "the skin mesh has no inner faces, so the film under it is unknown",
-            remedy="generate the data set anew with a mesh that marks its inner surface",
-        )
-    inner = np.unique(mesh.inner_faces).astype(np.int64)
-    points = mesh.nodes[inner]
-    normals = core_normal(points)
-    axis = np.minimum(points[:, :1], 0.0) * [[1.0, 0.0, 0.0]]
-    film = np.sum((points - axis) * normals, axis=1) - CORE_RADIUS_M
-    foot = axis + CORE_RADIUS_M * normals
-    area = _nodal_area(mesh, inner)
-    distance = np.linalg.norm(foot[:, None] - SITES[None], axis=2)  # (I, 23)
-    columns = []
-    for site in range(len(SITES)):
-        for radius in RADII_M:
-            near = np.maximum(1.0 - (distance[:, site] / radius) ** 2, 0.0) ** 2 * area
-            if near.sum() <= 0:
-                near[np.argmin(distance[:, site])] = 1.0
-            columns.append(near / near.sum())
-    weights = np.stack(columns, axis=1)
-    used = np.flatnonzero(weights.any(axis=1))
-    return FilmPooling(
-        nodes=inner[used],
-        normals=normals[used].astype(np.float32),
-        weights=weights[used].astype(np.float32),
-        rest_m=np.maximum(film @ weights, _THINNEST_REST_M).astype(np.float32),
-    )
-
-
-def _nodal_area(mesh: SkinMesh, inner: npt.NDArray[np.int64]) -> Floats:
-    corners = mesh.nodes[mesh.inner_faces]  # (G, 3, 3)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    third = np.linalg.norm(cross, axis=1) / 6.0
-    area = np.bincount(mesh.inner_faces.ravel(), np.repeat(third, 3), minlength=len(mesh.nodes))
-    return np.asarray(area[inner], np.float64)

@@ -24,7 +24,7 @@ from palpate_training.systems.latent import fit_latents
 from palpate_training.systems.points import FITTED, PUBLISHED, Abstraction, PointNetPlus
 from palpate_training.systems.statistical import Scaling, boosted_trees
 from palpate_training.systems.synthesis import POINTS_CONFIG, moved_nodes
-from palpate_training.tasks.fields import fit_field, tared_counts
+from palpate_training.tasks.fields import FieldFitConfig, fit_field, tared_counts
 
 FloatArray = npt.NDArray[np.float32]
 Rows = npt.NDArray[np.int64]
@@ -94,7 +94,8 @@ def _of_code(
 def fit_mean(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
     """The mean field of the training rows."""
     code = fit_code(data, rows.train, rows.validation)
-    return _of_code(data, code, lambda counts: np.zeros((len(counts), code.size), np.float32))
+    mean = code.encode(data.coefficients)[rows.train].mean(axis=0)
+    return _of_code(data, code, lambda counts: np.repeat(mean[None], len(counts), axis=0))
 
 
 def fit_ridge(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
@@ -175,17 +176,9 @@ def fit_narang(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstima
 
 
 def fit_modes(members: int, data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
-    """Ours: a network to the coefficients of the skin's modes; mean of some networks."""
-    code = fit_code(data, rows.train, rows.validation)
-    models = [
-        fit_field(data, rows, code=code, seed=1000 * seed + member) for member in range(members)
-    ]
-
-    def estimate(counts: FloatArray) -> FloatArray:
-        each = [model.coefficients(counts) for model in models]
-        return np.asarray(np.mean(each, axis=0), np.float32)
-
-    return _of_code(data, code, estimate)
+    """Ours: networks to the coefficients of the skin's modes; the mean of some."""
+    model = fit_field(data, rows, config=FieldFitConfig(members=members), seed=seed)
+    return _of_code(data, model.code, model.coefficients)
 
 
 FIELD_SYSTEMS = (

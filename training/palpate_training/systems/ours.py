@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate.messages import COUNTS_MAX
-from palpate_training.learning.features_net import MIRROR_AXES, ResidualLayers
+from palpate_training.learning.electrode_nets import ASSUMED_REST, MIRROR_AXES, ResidualLayers
 from palpate_training.learning.fit import FeaturesFitConfig, fit
 from palpate_training.learning.networks import Standardised, predict
 from palpate_training.systems.samples import (
@@ -30,9 +30,6 @@ from palpate_training.systems.samples import (
     error_of,
     impedance_ohm,
 )
-
-ASSUMED_REST = 3200.0
-"""Untouched counts of every electrode where the source does not hold them."""
 
 MEMBERS = 5
 NOISE_COUNTS = 2.0

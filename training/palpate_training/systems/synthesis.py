@@ -18,7 +18,8 @@ from torch import Tensor
 
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import baselines
-from palpate_training.learning.field_code import fit_code, pooling
+from palpate_training.learning.field_code import fit_code
+from palpate_training.learning.film import pooling
 from palpate_training.learning.fit import FitConfig, fit
 from palpate_training.learning.networks import Standardised, predict
 from palpate_training.learning.splits import RowSplit
@@ -28,7 +29,7 @@ from palpate_training.systems.ruppel import CONFIG as RUPPEL_CONFIG
 from palpate_training.systems.ruppel import BranchedLayers, network_a, network_b, ruppel_inputs
 from palpate_training.systems.samples import samples_of
 from palpate_training.systems.statistical import Scaling, boosted_trees
-from palpate_training.tasks.fields import tared_counts
+from palpate_training.tasks.fields import FieldFitConfig, tared_counts
 from palpate_training.tasks.synthesis import fit_synthesis, synthesis_features
 
 FloatArray = npt.NDArray[np.float32]
@@ -151,12 +152,9 @@ def fit_narang(data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
 
 def fit_film(members: int, data: MixedDataset, rows: RowSplit, seed: int) -> CountsOf:
     """Ours: modes, and the film near each electrode with its logarithm; mean of some networks."""
-    code = fit_code(data, rows.train, rows.validation)
-    models = [
-        fit_synthesis(data, rows, code=code, seed=1000 * seed + member) for member in range(members)
-    ]
-    x = synthesis_features(data, code, models[0].pooling)
-    return lambda some: np.mean([model.counts(x[some]) for model in models], axis=0)
+    model = fit_synthesis(data, rows, config=FieldFitConfig(members=members), seed=seed)
+    x = synthesis_features(data, model.code, model.pooling)
+    return lambda some: model.counts(x[some])
 
 
 SYNTHESIS_SYSTEMS = (

@@ -4,10 +4,6 @@ Force is learned from all rows, untouched ones included, so that nothing reads a
 location, centre of pressure and contact normal only from rows in contact. What is reported was
 measured with exactly the weights that are shipped: nothing is refitted on the held-out presses
 afterwards.
-
-Force and contact location on held-out trajectories, with the paper's network and metrics.
-
-For every unit a network of its own, and one of all units tested on each, as in the paper's table.
 """
 
 from __future__ import annotations
@@ -21,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.messages import COUNTS_MAX, TrainingRange
-from palpate_training.datasets.experiment import ExperimentDataset
+from palpate.messages import TrainingRange
 from palpate_training.datasets.features import (
     OF_CONTACT,
     BoolArray,
@@ -39,7 +34,7 @@ from palpate_training.learning.features_net import (
     fit_features_net,
     score_of,
 )
-from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
+from palpate_training.learning.graphs import FeaturesGraph
 from palpate_training.learning.metrics import (
     angles,
     cluster_bootstrap,
@@ -49,30 +44,9 @@ from palpate_training.learning.metrics import (
     location_metrics,
     rms,
 )
-from palpate_training.learning.networks import FeaturesGraph, Mlp, predict
+from palpate_training.learning.networks import predict
 from palpate_training.learning.ranges import ends_of, known_inputs
-from palpate_training.learning.splits import (
-    Rows,
-    RowSplit,
-    by_group,
-    by_trajectory,
-    of_units,
-    unit_sets,
-)
-from palpate_training.tasks.results import (
-    ALL,
-    MEAN,
-    OWN,
-    RIDGE,
-    ZERO,
-    ModelResult,
-    OnNetwork,
-    TaskReport,
-    averaged,
-    label_of,
-    stack_seeds,
-    tick,
-)
+from palpate_training.learning.splits import Rows, RowSplit, by_group
 
 _log = logging.getLogger(__name__)
 
@@ -346,76 +320,3 @@ def _contact_report(
     stem, _, unit = headline.rpartition("_")
     metrics[f"{stem}_ci95_low_{unit}"], metrics[f"{stem}_ci95_high_{unit}"] = ends["error"]
     return metrics
-
-
-Floating = npt.NDArray[np.floating]
-
-PAPER_CONFIG = FeaturesFitConfig(epochs=60, patience=20)
-"""The paper's layers; epochs at most."""
-
-Metrics = Callable[[Floating, Floating], dict[str, float]]
-RowErrors = Callable[[Floating, Floating], dict[str, npt.NDArray[np.float64]]]
-_QUANTITIES: dict[str, tuple[Metrics, RowErrors, tuple[str, ...]]] = {
-    "force": (force_metrics, force_errors, ("magnitude_n", "angle_rad")),
-    "location": (location_metrics, location_errors, ("distance_m",)),
-}
-
-
-def features_networks(data: ExperimentDataset, seeds: int) -> int:
-    """How many networks ``evaluate_features`` trains."""
-    return len(_QUANTITIES) * seeds * len(unit_sets(data))
-
-
-def evaluate_features(
-    data: ExperimentDataset,
-    *,
-    seeds: int = 3,
-    split_seed: int = 0,
-    config: FeaturesFitConfig = PAPER_CONFIG,
-    draws: int = 2000,
-    on_network: OnNetwork | None = None,
-) -> list[TaskReport]:
-    """Reports on force and on contact location, every unit and all units."""
-    split = by_trajectory(data, seed=split_seed)
-    sets = unit_sets(data)
-    x = np.asarray(data.tared * np.float32(COUNTS_MAX), np.float32)
-    reports = []
-    for quantity, (metrics_of, errors_of, headlines) in _QUANTITIES.items():
-        y: FloatArray = getattr(data, quantity)
-        results: list[ModelResult] = []
-        nets: dict[tuple[str, ...], list[Mlp]] = {}
-        held = {units: of_units(data, split, units) for units in sets}
-        for units, fold in held.items():
-            nets[units] = []
-            for seed in range(seeds):
-                sides = x[fold.train], y[fold.train], (x[fold.validation], y[fold.validation])
-                nets[units].append(fit_quantity(*sides, config=config, seed=seed))
-                tick(on_network)
-        for units, fold in held.items():
-            seen, test = x[fold.train], x[fold.test]
-            line = baselines.ridge(seen, y[fold.train], x[fold.validation], y[fold.validation])
-            estimates: dict[str, list[Floating]] = {
-                MEAN: [baselines.constant(seen, y[fold.train]).predict(test)],
-                RIDGE: [line.predict(test)],
-                OWN: [predict(net, test) for net in nets[units]],
-            }
-            # A location of zero is the origin of the frame, so zero is a baseline for force only.
-            if quantity == "force":
-                estimates = {ZERO: [baselines.zero(seen, y[fold.train]).predict(test)], **estimates}
-            if len(units) == 1 and len(sets) > 1:
-                estimates[ALL] = [predict(net, test) for net in nets[sets[-1]]]
-            truth, cluster = y[fold.test], data.row_trajectory[fold.test]
-            for model, each in estimates.items():
-                errors = [errors_of(one, truth) for one in each]
-                stacked = stack_seeds(errors, headlines)
-                found = [metrics_of(one, truth) for one in each]
-                ends = cluster_bootstrap(stacked, cluster, draws=draws)
-                results.append(averaged(label_of(units), model, found, ends))
-        facts: dict[str, object] = {
-            "source": data.provenance.source,
-            "rows": len(data),
-            "trajectories": len(np.unique(data.row_trajectory)),
-            "seeds": seeds,
-        }
-        reports.append(TaskReport(quantity, results, facts))
-    return reports

@@ -1,9 +1,7 @@
 """Electrodes -> displacement field of the skin: train, test on held-out trajectories, ship.
 
-Every specimen has a network of its own; where there are several, one more is trained on all of them
-and tested on each, because electrode values differ from specimen to specimen. The network that
-ships is by default the one for all, since the finger of a robot is none of the training specimens.
-What is reported was measured with exactly the weights that are shipped.
+The network that ships is by default one for all specimens, since the finger of a robot is none of
+the training specimens. What is reported was measured with exactly the weights that are shipped.
 
 Networks are trained on coefficients of modes, never on whole fields. Modes are orthonormal, so the
 root mean square error over the nodes is the norm of the coefficients' error over the root of the
@@ -22,35 +20,26 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX, TrainingRange
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
-from palpate_training.learning import baselines
+from palpate_training.learning.electrode_nets import (
+    DRIFT_COUNTS,
+    NOISE_COUNTS,
+    ElectrodeNet,
+    ResidualLayers,
+    rest_of,
+)
 from palpate_training.learning.export import export_fields, refuse_existing
 from palpate_training.learning.field_code import FieldCode, fit_code
 from palpate_training.learning.fit import FitConfig, OnEpoch, fit
+from palpate_training.learning.graphs import FieldGraph
 from palpate_training.learning.metrics import field_errors, field_summary, join
-from palpate_training.learning.networks import FieldGraph, Mlp, predict
+from palpate_training.learning.networks import Standardised, device_of, predict
 from palpate_training.learning.ranges import ends_of, known_inputs, longest_of
 from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
-from palpate_training.tasks.results import (
-    ALL,
-    MEAN,
-    OWN,
-    RIDGE,
-    ZERO,
-    Errors,
-    ModelResult,
-    OnNetwork,
-    ResultPicture,
-    TaskReport,
-    facts_of,
-    label_of,
-    name_of,
-    result_of,
-    tick,
-    typical,
-)
+from palpate_training.tasks.results import Errors
 
 FloatArray = npt.NDArray[np.float32]
 Estimate = Callable[[Rows], FloatArray]
@@ -66,26 +55,30 @@ class FieldFitConfig(FitConfig):
     """Settings of a training of a field or synthesis network.
 
     Attributes:
+        members: Networks whose estimates are averaged; each has weights and an order of its own.
+        width: Of the residual layers.
+        blocks: Number of residual blocks, of two layers each.
         rest_share: Untouched rows added to the training rows, as a share of them. The data set
             starts at 0.5 N; without them an untouched finger would be an extrapolation.
-        rest_noise_counts: Standard deviation of the electrodes of such a row [counts].
     """
 
-    widths: Sequence[int] = (256, 256, 128)
-    epochs: int = 150
-    patience: int = 30
+    epochs: int = 80
+    patience: int = 25
+    learning_rate: float = 2e-3
+    members: int = 3
+    width: int = 256
+    blocks: int = 3
     rest_share: float = 0.05
-    rest_noise_counts: float = 3.0
 
-    def rest_rows(self, train: Rows) -> int:
-        """How many untouched rows are added to some training rows."""
-        return math.ceil(self.rest_share * len(train))
+    def rest_rows(self, rows: int) -> int:
+        """How many untouched rows are added to so many training rows."""
+        return math.ceil(self.rest_share * rows)
 
-    def untouched_rows(self, train: Rows, seed: int) -> FloatArray:
-        """Tared counts of untouched rows, shape (N, 19)."""
-        shape = (self.rest_rows(train), ELECTRODES)
-        noise = np.random.default_rng(seed).normal(0, self.rest_noise_counts, shape)
-        return noise.astype(np.float32)
+    def layers(self, inputs: int, outputs: int) -> Standardised:
+        """A member before its training."""
+        return Standardised(
+            ResidualLayers(inputs, outputs, self.width, self.blocks), inputs, outputs
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +90,7 @@ class FieldModel:
         code: What they are coefficients of.
     """
 
-    net: Mlp
+    net: ElectrodeNet
     code: FieldCode
 
     def coefficients(self, tared_counts: FloatArray) -> FloatArray:
@@ -108,6 +101,11 @@ class FieldModel:
 def tared_counts(data: MixedDataset) -> FloatArray:
     """Tared electrodes of all rows [counts], shape (N, 19)."""
     return np.asarray(data.experiment.tared * np.float32(COUNTS_MAX), np.float32)
+
+
+def rest_counts(data: MixedDataset, rows: Rows) -> FloatArray:
+    """Untouched counts of the fingers of some rows, their mean [counts], shape (19,)."""
+    return rest_of(data.experiment.trial_rest[np.unique(data.experiment.trial[rows])])
 
 
 def fit_field(
@@ -121,32 +119,86 @@ def fit_field(
 ) -> FieldModel:
     """Train electrodes -> field on the training rows of a split; code None = modes of these rows.
 
-    The seed decides weights, order of rows and noise of the untouched rows.
+    The seed decides weights, order of rows and noise.
     """
     config = config or FieldFitConfig()
     code = code or fit_code(data, split.train, split.validation)
-    x, y = tared_counts(data), code.encode(data.coefficients)
-    zero = code.project(np.zeros((1, len(code.mean)), np.float32))
-
-    torch.manual_seed(seed)
-    net = Mlp(config.widths, ELECTRODES, outputs=code.size)
-    net.normalise_from(x[split.train], y[split.train])
-    untouched = config.untouched_rows(split.train, seed)
-    fit_on_norms(
-        net,
-        np.vstack([x[split.train], untouched]),
-        np.vstack([y[split.train], np.repeat(zero, len(untouched), axis=0)]),
-        (x[split.validation], y[split.validation]),
+    y = code.encode(data.coefficients)
+    net = fit_coefficients(
+        tared_counts(data),
+        y,
+        split,
+        rest_counts(data, split.train),
+        untouched=code.project(np.zeros((1, len(code.mean)), np.float32)),
+        signs=code.signs,
         scale=1e3 / math.sqrt(code.nodes),
-        floor=0.01,
         config=config,
+        seed=seed,
         on_epoch=on_epoch,
     )
     return FieldModel(net, code)
 
 
+def fit_coefficients(
+    counts: FloatArray,
+    coefficients: FloatArray,
+    split: RowSplit,
+    rest: FloatArray,
+    *,
+    untouched: FloatArray,
+    signs: FloatArray | None,
+    scale: float,
+    config: FieldFitConfig,
+    seed: int,
+    on_epoch: OnEpoch | None,
+) -> ElectrodeNet:
+    """Train electrodes -> coefficients of a field, mirror images included where there are any.
+
+    Args:
+        counts: Tared counts of all rows, shape (N, 19).
+        coefficients: Of all rows, shape (N, K).
+        split: Rows to learn from and to stop on.
+        rest: Untouched counts that are assumed of every finger, shape (19,).
+        untouched: Coefficients of an untouched finger, shape (1, K).
+        signs: What a mirror image makes of each coefficient, shape (K,); None = there is none.
+        scale: Makes an error of coefficients one of about 1.
+        config: Settings.
+        seed: Of weights, order of rows and noise.
+        on_epoch: Called after each epoch, for a progress bar.
+    """
+    given, wanted = counts[split.train], coefficients[split.train]
+    if signs is not None:
+        given = np.vstack([given, given[:, ELECTRODE_MIRROR]])
+        wanted = np.vstack([wanted, wanted * signs])
+    still = config.rest_rows(len(wanted))
+    given = np.vstack([given, np.zeros((still, given.shape[1]), np.float32)])
+    wanted = np.vstack([wanted, np.repeat(untouched, still, axis=0)])
+    members = []
+    for member in range(config.members):
+        torch.manual_seed(1000 * seed + member)
+        layers = config.layers(2 * given.shape[1], wanted.shape[1])
+        net = ElectrodeNet([layers], rest, signs)
+        inputs = net.inputs.of(given)
+        layers.normalise_from(inputs[: len(inputs) - still], wanted[: len(wanted) - still])
+        fit_on_norms(
+            net,
+            layers,
+            inputs,
+            wanted,
+            (counts[split.validation], coefficients[split.validation]),
+            scale=scale,
+            floor=0.01,
+            config=config,
+            augment=net.inputs.noisy,
+            on_epoch=on_epoch,
+        )
+        members.append(layers)
+    return ElectrodeNet(members, rest, signs).to(device_of(members[0])).eval()
+
+
 def fit_on_norms(
     net: nn.Module,
+    layers: Standardised,
     inputs: FloatArray,
     targets: FloatArray,
     validation: tuple[FloatArray, FloatArray],
@@ -154,100 +206,49 @@ def fit_on_norms(
     scale: float,
     floor: float,
     config: FieldFitConfig,
+    augment: Callable[[Tensor], Tensor] = lambda batch: batch,
+    estimate_of: Callable[[Tensor], Tensor] = lambda estimate: estimate,
     on_epoch: OnEpoch | None,
 ) -> None:
-    """Train in place on the norm of each row's error.
+    """Train a member in place on the norm of each row's error.
 
     The loss of a row is ``sqrt((scale |error|)^2 + floor^2)``: an L2 norm, smooth at zero. The
     validation rows are scored by the same loss.
+
+    Args:
+        net: The network whose only member is trained; what the validation rows are given to.
+        layers: The member.
+        inputs: Of the member, shape (N, I).
+        targets: Of the network, shape (N, O).
+        validation: Inputs and targets of the network.
+        scale: Of an error.
+        floor: Scaled error below which the loss is no longer straight.
+        config: Settings.
+        augment: Inputs of the member -> inputs that it sees.
+        estimate_of: What the member gives -> what the network gives.
+        on_epoch: Called after each epoch, for a progress bar.
     """
     device = torch.get_default_device()
+    net.to(device)
     seen, truth = (torch.from_numpy(part).to(device) for part in validation)
 
-    def loss_of(estimate: Tensor, wanted: Tensor) -> Tensor:
+    def distance(estimate: Tensor, wanted: Tensor) -> Tensor:
         squares = torch.sum(torch.square(scale * (estimate - wanted)), dim=1)
         return torch.sqrt(squares + floor**2).mean()
 
-    def score_of(net: nn.Module) -> float:
+    def score_of(_: nn.Module) -> float:
         with torch.inference_mode():
-            return float(loss_of(net(seen), truth))
+            return float(distance(net(seen), truth))
 
     fit(
-        net,
+        layers,
         inputs,
         targets,
-        loss_of=loss_of,
+        loss_of=lambda estimate, wanted: distance(estimate_of(estimate), wanted),
         score_of=score_of,
         config=config,
+        augment=lambda batch, _: augment(batch),
         on_epoch=on_epoch,
-    )
-
-
-def evaluate_field(
-    data: MixedDataset,
-    *,
-    seeds: int = 3,
-    split_seed: int = 0,
-    config: FieldFitConfig | None = None,
-    draws: int = 2000,
-    on_network: OnNetwork | None = None,
-) -> TaskReport:
-    """Electrodes -> field, every unit and all units."""
-    split = by_trajectory(data.experiment, seed=split_seed)
-    counts = tared_counts(data)
-    sets = unit_sets(data.experiment)
-    held = {units: of_units(data.experiment, split, units) for units in sets}
-    fitted: dict[tuple[str, ...], dict[str, list[Estimate]]] = {}
-    modes: dict[str, object] = {}
-    for units in sets:
-        fold = held[units]
-        code = fit_code(data, fold.train, fold.validation)
-        modes[label_of(units)] = {
-            "modes": code.size,
-            "truncation_m": {str(n): float(f"{v:.4g}") for n, v in code.truncation_m.items()},
-        }
-        y = code.encode(data.coefficients)
-        sides = (counts[fold.train], y[fold.train], counts[fold.validation], y[fold.validation])
-        line = baselines.ridge(*sides)
-        still = baselines.constant(*sides[:2])
-        nets = []
-        for seed in range(seeds):
-            nets.append(fit_field(data, fold, code=code, config=config, seed=seed))
-            tick(on_network)
-        fitted[units] = {
-            MEAN: [_estimate(still.predict, code, counts)],
-            RIDGE: [_estimate(line.predict, code, counts)],
-            OWN: [_estimate(model.coefficients, code, counts) for model in nets],
-        }
-
-    results: list[ModelResult] = []
-    force_n, error = {}, {}
-    picture = None
-    for units in sets:
-        rows = held[units].test
-        models = {ZERO: [_still(data)], **fitted[units]}
-        if len(units) == 1 and len(sets) > 1:
-            models[ALL] = fitted[sets[-1]][OWN]
-        errors = field_row_errors(data, rows, models)
-        results += [
-            result_of(
-                label_of(units), model, each, errors[ZERO][0], data, rows, draws, field_summary
-            )
-            for model, each in errors.items()
-        ]
-        if len(units) == 1:
-            force_n[units[0]] = np.linalg.norm(data.experiment.force[rows], axis=1)
-            error[units[0]] = errors[OWN][0]["all_m"]
-        row = rows[typical(errors[OWN][0]["all_m"], data.experiment.force[rows])]
-        truth = data.displacement(row[None])[0]
-        picture = ResultPicture(
-            force_n, error, name_of(data, int(row)), truth, fitted[units][OWN][0](row[None])[0]
-        )
-    return TaskReport(
-        "field",
-        results,
-        {"modes": modes, **facts_of(data, seeds, config or FieldFitConfig())},
-        picture,
     )
 
 
@@ -321,7 +322,8 @@ def field_bundle(
         trained_on=trained_on_line(data, units, split),
         metrics=metrics,
         normalisation={
-            "electrodes": "standardised by the training rows, inside the graph",
+            "electrodes": "tared counts and logarithms of impedances for an assumed rest,"
+            " standardised by the training rows, inside the graph",
             "displacement": f"{code.size} modes of the training rows, half precision in the graph",
             "displacement_sd": "constant per node: rms length of the error on validation rows",
         },
@@ -335,8 +337,11 @@ def seen_rows(
     data: MixedDataset, rows: Rows, config: FieldFitConfig, seed: int
 ) -> tuple[FloatArray, Rows]:
     """All inputs (N, 19) of a training on rows, untouched ones included, and the press of each."""
-    untouched = config.untouched_rows(rows, seed)
-    none: Rows = np.full(len(untouched), -1)
+    rng = np.random.default_rng(seed)
+    count = config.rest_rows(len(rows))
+    noise = rng.normal(0, NOISE_COUNTS, (count, ELECTRODES))
+    untouched = (noise + rng.normal(0, DRIFT_COUNTS, (count, 1))).astype(np.float32)
+    none: Rows = np.full(count, -1)
     presses = np.concatenate([data.experiment.row_trajectory[rows], none])
     return np.vstack([tared_counts(data)[rows], untouched]), presses
 

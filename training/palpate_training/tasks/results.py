@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +12,13 @@ import numpy.typing as npt
 from rich.table import Table
 
 from palpate.files.atomic import written_whole
-from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
 from palpate_training.figures.style import markdown_table
-from palpate_training.learning.fit import FitConfig
 from palpate_training.learning.metrics import (
     Rows64,
     cluster_bootstrap,
     force_errors,
     force_metrics,
-    root_mean,
 )
-from palpate_training.learning.splits import Rows, unit_sets
 
 Labels = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
@@ -165,88 +161,9 @@ OnNetwork = Callable[[], None]
 ZERO, MEAN, RIDGE, OWN, ALL = "zero", "training mean", "ridge", "network", "network, all units"
 
 
-@dataclass(frozen=True, slots=True)
-class ResultPicture:
-    """What the figure of a task shows.
-
-    Attributes:
-        force_n: True force magnitude of the held-out rows [N], by unit.
-        error: Their error by unit: mean over all nodes [m], or norm in R^19 [counts].
-        example: What the example is, for its title.
-        truth: Field (V, 3) [m] or tared counts (19,) of the example.
-        estimate: The same, estimated.
-    """
-
-    force_n: dict[str, Rows64]
-    error: dict[str, Rows64]
-    example: str
-    truth: FloatArray
-    estimate: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class TaskReport:
-    """Results of one task.
-
-    Attributes:
-        task: ``field``, ``synthesis``, ``force`` or ``location``.
-        results: One for each model and unit.
-        facts: What produced them.
-        picture: For the figure, if the task has one.
-    """
-
-    task: str
-    results: list[ModelResult]
-    facts: dict[str, object] = field(default_factory=dict)
-    picture: ResultPicture | None = None
-
-
-def networks(data: ExperimentDataset, seeds: int) -> int:
-    """How many networks ``evaluate_field`` and ``evaluate_synthesis`` train together."""
-    sets = unit_sets(data)
-    return seeds * (len(sets) + sum(len(units) == 1 for units in sets))
-
-
-def typical(error: Rows64, force: FloatArray) -> int:
-    """The row whose error (N,) is the median among the half with the larger force (N, 3) [N]."""
-    magnitude = np.linalg.norm(force, axis=1)
-    hard = np.flatnonzero(magnitude >= np.median(magnitude))
-    return int(hard[np.argsort(error[hard], kind="stable")[len(hard) // 2]])
-
-
 def stack_seeds(errors: Sequence[Errors], names: Sequence[str]) -> dict[str, Rows64]:
     """Errors of every row and seed by name, each of shape ``(N, S)``."""
     return {name: np.stack([one[name] for one in errors], axis=1) for name in names}
-
-
-def interval_of(errors: Sequence[Errors], cluster: Labels, draws: int) -> dict[str, Interval]:
-    """95 % intervals of the headline numbers, whole trajectories drawn with replacement."""
-    if "subset_m" in errors[0]:
-        stacked = stack_seeds(errors, ("subset_m", "all_m"))
-        wanted = {f"nodal_{name}": values for name, values in stacked.items()}
-        return cluster_bootstrap(
-            wanted, cluster, statistic=lambda values: float(np.nanmean(values)), draws=draws
-        )
-    stacked = stack_seeds(errors, ("mean_square", "l2_counts"))
-    squares = {"electrode_rmse_counts": stacked["mean_square"]}
-    rmse = cluster_bootstrap(squares, cluster, statistic=root_mean, draws=draws)
-    norm = {"electrode_l2_median_counts": stacked["l2_counts"]}
-    return rmse | cluster_bootstrap(norm, cluster, draws=draws)
-
-
-def result_of(
-    test: str,
-    model: str,
-    errors: Sequence[Errors],
-    zero: Errors,
-    data: MixedDataset,
-    rows: Rows,
-    draws: int,
-    summary: Callable[[Errors, Errors], dict[str, float]],
-) -> ModelResult:
-    """One row of the table, averaged over seeds."""
-    interval = interval_of(errors, data.experiment.row_trajectory[rows], draws)
-    return averaged(test, model, [summary(one, zero) for one in errors], interval)
 
 
 def averaged(
@@ -266,28 +183,3 @@ def tick(on_network: OnNetwork | None) -> None:
     """One more network is trained."""
     if on_network is not None:
         on_network()
-
-
-def label_of(units: Sequence[str]) -> str:
-    """How a set of units is called in tables."""
-    return units[0] if len(units) == 1 else "all units"
-
-
-def name_of(data: MixedDataset, row: int) -> str:
-    """Trial and force of a row, for the title of a picture."""
-    trial = int(data.experiment.trial[row])
-    force = float(np.linalg.norm(data.experiment.force[row]))
-    return f"{data.experiment.trial_name(trial)}, {force:.1f} N"
-
-
-def facts_of(data: MixedDataset, seeds: int, config: FitConfig) -> dict[str, object]:
-    """What produced the results of a task."""
-    return {
-        "source": data.experiment.provenance.source,
-        "rows": len(data),
-        "trajectories": len(np.unique(data.experiment.row_trajectory)),
-        "seeds": seeds,
-        "nodes": len(data.mesh.nodes),
-        "basis_loss_mean_m": data.basis.loss_mean,
-        "config": asdict(config),
-    }

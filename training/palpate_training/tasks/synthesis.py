@@ -15,43 +15,40 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import TrainingRange
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
-from palpate_training.learning import baselines
 from palpate_training.learning.export import export_fields, refuse_existing
-from palpate_training.learning.field_code import FieldCode, FilmPooling, fit_code, pooling
+from palpate_training.learning.field_code import FieldCode, fit_code
+from palpate_training.learning.film import (
+    MIRRORED_FILM,
+    SMALLEST_MODE,
+    FilmNet,
+    FilmPooling,
+    pooling,
+)
 from palpate_training.learning.fit import OnEpoch
+from palpate_training.learning.graphs import SynthesisGraph
 from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
-from palpate_training.learning.networks import FilmNet, Mlp, SynthesisGraph, predict
+from palpate_training.learning.networks import device_of, predict
 from palpate_training.learning.ranges import ends_of, longest_of
-from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
+from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units
 from palpate_training.tasks.fields import (
     FieldFitConfig,
     fields_of,
     fit_on_norms,
+    rest_counts,
     spread_rows,
     tared_counts,
     trained_on_line,
     truncation_metrics,
 )
-from palpate_training.tasks.results import (
-    MEAN,
-    OWN,
-    RIDGE,
-    ZERO,
-    ModelResult,
-    OnNetwork,
-    ResultPicture,
-    TaskReport,
-    facts_of,
-    name_of,
-    result_of,
-    tick,
-    typical,
-)
 
 FloatArray = npt.NDArray[np.float32]
+
+MODE_COUNTS = (8, 16, 24, 32, 48, 64)
+"""Fewer than of a field that is estimated: what lies near an electrode is in the pooled film."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,88 +97,46 @@ def fit_synthesis(
 ) -> SynthesisModel:
     """Train field -> electrodes; the arguments are those of ``fit_field``."""
     config = config or FieldFitConfig()
-    code = code or fit_code(data, split.train, split.validation)
+    code = code or fit_code(data, split.train, split.validation, mode_counts=MODE_COUNTS)
     film = pooling(data.mesh)
     x, y = synthesis_features(data, code, film), tared_counts(data)
+    rest = rest_counts(data, split.train)
+    given, wanted = x[split.train], y[split.train]
+    frame = FilmNet([], code.size, film.rest_m, rest)
+    if code.signs is not None:
+        signs = np.concatenate([code.signs, np.ones(len(film.rest_m), np.float32)])
+        order = np.concatenate([np.arange(code.size), code.size + MIRRORED_FILM])
+        falls = frame.fall_of(torch.from_numpy(wanted))[:, ELECTRODE_MIRROR]
+        given = np.vstack([given, given[:, order] * signs])
+        wanted = np.vstack([wanted, frame.counts_of(falls).numpy()])
+    wide = frame.widen(torch.from_numpy(given)).numpy()
+    falls = frame.fall_of(torch.from_numpy(wanted))
     zero = _features(np.zeros((1, *data.mesh.nodes.shape), np.float32), code, film)
-
-    torch.manual_seed(seed)
-    width = code.size + 2 * len(film.rest_m)
-    net = FilmNet(Mlp(config.widths, width, outputs=ELECTRODES), code.size, film.rest_m)
-    net.normalise_from(x[split.train], y[split.train])
-    rest = config.rest_rows(split.train)
-    fit_on_norms(
-        net,
-        np.vstack([x[split.train], np.repeat(zero, rest, axis=0)]),
-        np.vstack([y[split.train], np.zeros((rest, ELECTRODES), np.float32)]),
-        (x[split.validation], y[split.validation]),
-        scale=1.0 / math.sqrt(ELECTRODES),
-        floor=1.0,
-        config=config,
-        on_epoch=on_epoch,
-    )
-    return SynthesisModel(net, code, film)
-
-
-def evaluate_synthesis(
-    data: MixedDataset,
-    *,
-    seeds: int = 3,
-    split_seed: int = 0,
-    config: FieldFitConfig | None = None,
-    draws: int = 2000,
-    on_network: OnNetwork | None = None,
-) -> TaskReport:
-    """Field -> electrodes, every unit; the arguments are those of ``evaluate_field``."""
-    split = by_trajectory(data.experiment, seed=split_seed)
-    counts = tared_counts(data)
-    film = pooling(data.mesh)
-    results: list[ModelResult] = []
-    force_n, error = {}, {}
-    picture = None
-    for units in unit_sets(data.experiment):
-        if len(units) > 1:
-            continue
-        fold = of_units(data.experiment, split, units)
-        rows = fold.test
-        code = fit_code(data, fold.train, fold.validation)
-        x = synthesis_features(data, code, film)
-        sides = (x[fold.train], counts[fold.train], x[fold.validation], counts[fold.validation])
-        estimates: dict[str, list[npt.NDArray[np.floating]]] = {
-            ZERO: [baselines.zero(*sides[:2]).predict(x[rows])],
-            MEAN: [baselines.constant(*sides[:2]).predict(x[rows])],
-            RIDGE: [baselines.ridge(*sides).predict(x[rows])],
-            OWN: [],
-        }
-        for seed in range(seeds):
-            model = fit_synthesis(data, fold, code=code, config=config, seed=seed)
-            estimates[OWN].append(model.counts(x[rows]))
-            tick(on_network)
-        errors = {
-            name: [electrode_errors(one, counts[rows]) for one in each]
-            for name, each in estimates.items()
-        }
-        made = [
-            result_of(units[0], model, each, errors[ZERO][0], data, rows, draws, electrode_summary)
-            for model, each in errors.items()
-        ]
-        per_electrode = np.sqrt(np.mean(np.square(estimates[OWN][0] - counts[rows]), axis=0))
-        for i, value in enumerate(per_electrode):
-            made[-1].metrics[f"rmse_e{i + 1:02d}_counts"] = float(value)
-        results += made
-        force_n[units[0]] = np.linalg.norm(data.experiment.force[rows], axis=1)
-        error[units[0]] = errors[OWN][0]["l2_counts"]
-        at = typical(error[units[0]], data.experiment.force[rows])
-        picture = ResultPicture(
-            force_n,
-            error,
-            name_of(data, int(rows[at])),
-            counts[rows[at]],
-            np.asarray(estimates[OWN][0][at], np.float32),
+    still = config.rest_rows(len(wanted))
+    untouched = np.repeat(frame.widen(torch.from_numpy(zero)).numpy(), still, axis=0)
+    members = []
+    for member in range(config.members):
+        torch.manual_seed(1000 * seed + member)
+        layers = config.layers(wide.shape[1], ELECTRODES)
+        layers.normalise_from(wide, falls.numpy())
+        modes = layers.input_sd[: code.size]
+        modes.clamp_(min=SMALLEST_MODE * float(modes.max()))
+        net = FilmNet([layers], code.size, film.rest_m, rest)
+        fit_on_norms(
+            net,
+            layers,
+            np.vstack([wide, untouched]),
+            np.vstack([wanted, np.zeros((still, ELECTRODES), np.float32)]),
+            (x[split.validation], y[split.validation]),
+            scale=1.0 / math.sqrt(ELECTRODES),
+            floor=1.0,
+            config=config,
+            estimate_of=net.counts_of,
+            on_epoch=on_epoch,
         )
-    return TaskReport(
-        "synthesis", results, facts_of(data, seeds, config or FieldFitConfig()), picture
-    )
+        members.append(layers)
+    whole = FilmNet(members, code.size, film.rest_m, rest).to(device_of(members[0])).eval()
+    return SynthesisModel(whole, code, film)
 
 
 def synthesis_bundle(

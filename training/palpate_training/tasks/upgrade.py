@@ -96,11 +96,10 @@ def with_coefficients(bundle: Bundle) -> Bundle:
     manifest = bundle.manifest
     if any(tensor.name == "coefficients" for tensor in manifest.outputs):
         return bundle
-    model, modes = _exposed(bundle.model)
+    width = manifest.outputs[0].shape[1]
+    model, modes = _exposed(bundle.model, width)
     names = {tensor.name for tensor in manifest.outputs} | {"coefficients"}
-    inputs, outputs = tensors_of(
-        "field", manifest.outputs[0].shape[1] // 3, optional=names, modes=modes
-    )
+    inputs, outputs = tensors_of("field", width // 3, optional=names, modes=modes)
     together, _ = run_onnx(model, "electrodes", bundle.golden["electrodes"])
     answers = dict(zip([tensor.name for tensor in outputs], together, strict=True))
     for name, wanted in bundle.golden.items():
@@ -123,8 +122,11 @@ def with_coefficients(bundle: Bundle) -> Bundle:
     )
 
 
-def _exposed(model: bytes) -> tuple[bytes, int]:
-    """The graph with the output ``coefficients`` in its place, and their number."""
+def _exposed(model: bytes, width: int) -> tuple[bytes, int]:
+    """The graph with the output ``coefficients`` in its place, and their number.
+
+    They are what is multiplied with the modes, whose rows are fields of so many values.
+    """
     onnx: Any = require("onnx", extra="training")
     graph = (loaded := onnx.load_from_string(model)).graph
     sizes = {one.name: tuple(one.dims) for one in graph.initializer}
@@ -133,7 +135,7 @@ def _exposed(model: bytes) -> tuple[bytes, int]:
         if node.op_type != "MatMul":
             continue
         size = sizes.get(cast.get(node.input[1], node.input[1]), ())
-        if len(size) != 2:
+        if len(size) != 2 or size[1] != width:
             continue
         name = node.input[0]
         for other in graph.node:
