@@ -55,7 +55,7 @@ def test_all_shipped_bundles_know_one_another_and_the_tape(played: list[object])
         assert {bundle.mesh.sha256} == meshes
     folders = [resolve(f"{task}-twin") for task in ("features", "field", "synthesis")]
     size = sum(file.stat().st_size for folder in folders for file in folder.iterdir())
-    assert size <= 15e6
+    assert size <= 25e6, "the goal for all that ships"
 
 
 def test_shipped_networks_feel_presses_that_they_were_not_trained_on(
