@@ -9,6 +9,7 @@ row, and an estimate may be the mean of that of a row and of its mirror image.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX
+from palpate_training.learning.fit import FitConfig
 from palpate_training.learning.networks import Standardised
 
 FloatArray = npt.NDArray[np.float32]
@@ -56,6 +58,30 @@ class ResidualLayers(nn.Module):
             hidden = hidden + block(hidden)
         estimate: Tensor = self.head(nn.functional.silu(hidden))
         return estimate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MembersConfig(FitConfig):
+    """Settings of a training of several residual networks.
+
+    Attributes:
+        members: Networks whose estimates are averaged; each has weights and an order of its own.
+        width: Of the residual layers.
+        blocks: Number of residual blocks, of two layers each.
+    """
+
+    epochs: int = 80
+    patience: int = 25
+    learning_rate: float = 2e-3
+    members: int = 3
+    width: int = 256
+    blocks: int = 3
+
+    def member(self, inputs: int, outputs: int) -> Standardised:
+        """A member before its training."""
+        return Standardised(
+            ResidualLayers(inputs, outputs, self.width, self.blocks), inputs, outputs
+        )
 
 
 class ElectrodeInputs(nn.Module):

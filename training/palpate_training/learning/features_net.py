@@ -15,8 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from palpate_training.learning.electrode_nets import MIRROR_AXES, ElectrodeNet, ResidualLayers
-from palpate_training.learning.fit import FitConfig, OnEpoch, fit
+from palpate_training.learning.electrode_nets import MIRROR_AXES, ElectrodeNet, MembersConfig
+from palpate_training.learning.fit import OnEpoch, fit
 from palpate_training.learning.networks import Standardised, predict
 
 FloatArray = npt.NDArray[np.float32]
@@ -29,22 +29,9 @@ _SMOOTH = 1e-4  # of a normalised distance's square, so that its root has a slop
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FeaturesNetConfig(FitConfig):
-    """Settings of a training of all features.
+class FeaturesNetConfig(MembersConfig):
+    """Settings of a training of all features."""
 
-    Attributes:
-        members: Networks whose estimates are averaged; each has weights and an order of its own.
-        width: Of the residual layers.
-        blocks: Number of residual blocks, of two layers each.
-    """
-
-    epochs: int = 80
-    patience: int = 25
-    batch_rows: int = 256
-    learning_rate: float = 2e-3
-    members: int = 3
-    width: int = 256
-    blocks: int = 3
     threads: int = 2
 
 
@@ -122,8 +109,7 @@ def _fit_member(
     torch.manual_seed(seed)
     quantities = train.targets.shape[1] // 3
     size = 2 * train.tared.shape[1]
-    layers = ResidualLayers(size, 3 * quantities, config.width, config.blocks)
-    member = Standardised(layers, size, 3 * quantities)
+    member = config.member(size, 3 * quantities)
     net = FeaturesNet([member], rest, symmetric=symmetric)
     inputs, targets = net.inputs.of(train.tared), train.targets
     if symmetric:

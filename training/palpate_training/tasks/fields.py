@@ -28,12 +28,12 @@ from palpate_training.learning.electrode_nets import (
     DRIFT_COUNTS,
     NOISE_COUNTS,
     ElectrodeNet,
-    ResidualLayers,
+    MembersConfig,
     rest_of,
 )
 from palpate_training.learning.export import export_fields, refuse_existing
 from palpate_training.learning.field_code import FieldCode, fit_code
-from palpate_training.learning.fit import FitConfig, OnEpoch, fit
+from palpate_training.learning.fit import OnEpoch, fit
 from palpate_training.learning.graphs import FieldGraph
 from palpate_training.learning.metrics import field_errors, field_summary, join
 from palpate_training.learning.networks import Standardised, device_of, predict
@@ -51,34 +51,19 @@ _CHUNK_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldFitConfig(FitConfig):
+class FieldFitConfig(MembersConfig):
     """Settings of a training of a field or synthesis network.
 
     Attributes:
-        members: Networks whose estimates are averaged; each has weights and an order of its own.
-        width: Of the residual layers.
-        blocks: Number of residual blocks, of two layers each.
         rest_share: Untouched rows added to the training rows, as a share of them. The data set
             starts at 0.5 N; without them an untouched finger would be an extrapolation.
     """
 
-    epochs: int = 80
-    patience: int = 25
-    learning_rate: float = 2e-3
-    members: int = 3
-    width: int = 256
-    blocks: int = 3
     rest_share: float = 0.05
 
     def rest_rows(self, rows: int) -> int:
         """How many untouched rows are added to so many training rows."""
         return math.ceil(self.rest_share * rows)
-
-    def layers(self, inputs: int, outputs: int) -> Standardised:
-        """A member before its training."""
-        return Standardised(
-            ResidualLayers(inputs, outputs, self.width, self.blocks), inputs, outputs
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,21 +97,19 @@ def fit_field(
     data: MixedDataset,
     split: RowSplit,
     *,
-    code: FieldCode | None = None,
     config: FieldFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> FieldModel:
-    """Train electrodes -> field on the training rows of a split; code None = modes of these rows.
+    """Train electrodes -> field on the training rows of a split, in modes of these rows.
 
     The seed decides weights, order of rows and noise.
     """
     config = config or FieldFitConfig()
-    code = code or fit_code(data, split.train, split.validation)
-    y = code.encode(data.coefficients)
+    code = fit_code(data, split.train, split.validation)
     net = fit_coefficients(
         tared_counts(data),
-        y,
+        code.encode(data.coefficients),
         split,
         rest_counts(data, split.train),
         untouched=code.project(np.zeros((1, len(code.mean)), np.float32)),
@@ -176,7 +159,7 @@ def fit_coefficients(
     members = []
     for member in range(config.members):
         torch.manual_seed(1000 * seed + member)
-        layers = config.layers(2 * given.shape[1], wanted.shape[1])
+        layers = config.member(2 * given.shape[1], wanted.shape[1])
         net = ElectrodeNet([layers], rest, signs)
         inputs = net.inputs.of(given)
         layers.normalise_from(inputs[: len(inputs) - still], wanted[: len(wanted) - still])

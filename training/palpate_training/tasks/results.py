@@ -154,11 +154,8 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-FloatArray = npt.NDArray[np.float32]
 Errors = dict[str, Rows64]
 OnNetwork = Callable[[], None]
-
-ZERO, MEAN, RIDGE, OWN, ALL = "zero", "training mean", "ridge", "network", "network, all units"
 
 
 def stack_seeds(errors: Sequence[Errors], names: Sequence[str]) -> dict[str, Rows64]:

@@ -90,14 +90,13 @@ def fit_synthesis(
     data: MixedDataset,
     split: RowSplit,
     *,
-    code: FieldCode | None = None,
     config: FieldFitConfig | None = None,
     seed: int = 0,
     on_epoch: OnEpoch | None = None,
 ) -> SynthesisModel:
     """Train field -> electrodes; the arguments are those of ``fit_field``."""
     config = config or FieldFitConfig()
-    code = code or fit_code(data, split.train, split.validation, mode_counts=MODE_COUNTS)
+    code = fit_code(data, split.train, split.validation, mode_counts=MODE_COUNTS)
     film = pooling(data.mesh)
     x, y = synthesis_features(data, code, film), tared_counts(data)
     rest = rest_counts(data, split.train)
@@ -117,7 +116,7 @@ def fit_synthesis(
     members = []
     for member in range(config.members):
         torch.manual_seed(1000 * seed + member)
-        layers = config.layers(wide.shape[1], ELECTRODES)
+        layers = config.member(wide.shape[1], ELECTRODES)
         layers.normalise_from(wide, falls.numpy())
         modes = layers.input_sd[: code.size]
         modes.clamp_(min=SMALLEST_MODE * float(modes.max()))
