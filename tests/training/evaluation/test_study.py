@@ -204,7 +204,7 @@ def test_workers_do_not_outlive_a_command_that_was_killed(
         "from pathlib import Path\n"
         "from palpate_training.cli.report import train_report\n"
         f"folder = Path({str(tmp_path)!r})\n"
-        "train_report(folder, folder / 'out', systems='mean of five', workers=2)\n"
+        "train_report(folder, folder / 'out', systems='mean of three', workers=2)\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL) as command:
         workers: list[int] = []

@@ -34,6 +34,9 @@ TASK_SPLITS: dict[str, tuple[SplitName, ...]] = {
 }
 """Synthesis has no unseen unit: its network is of one unit."""
 
+OF_EACH_UNIT: tuple[SplitName, ...] = ("trajectory", "unit")
+"""Splits that are made of each unit alone, too; the others of all units together."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExperimentSource:
@@ -78,13 +81,13 @@ class ExperimentSource:
         return TASK_SPLITS[task]
 
     def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
-        """Trainings of a split; ``whole``: only those of all units together."""
+        """Trainings of a split; ``whole``: only those of all units together, in every split."""
         folds = folds_of(self._rows(task), split, seed=seed)
         if task == "synthesis":
             assert self.mixed is not None
             return of_one_unit(folds, self.mixed)
         together = [fold for fold in folds if fold.test == ALL_UNITS or " + " in fold.test]
-        return together if whole and together else folds
+        return together if together and (whole or split not in OF_EACH_UNIT) else folds
 
     def _rows(self, task: str) -> ExperimentDataset:
         if task in ("location", "force"):

@@ -88,7 +88,8 @@ class ElectrodeInputs(nn.Module):
     """Tared counts ``(N, 19)`` and the fall of the logarithm of the impedance, ``(N, 38)``.
 
     Args:
-        rest: Untouched counts that are assumed of every finger [counts], shape ``(19,)``.
+        rest: Untouched counts that are assumed of every finger [counts], shape ``(19,)``. Where
+            those of each row are known, they are given with the rows.
     """
 
     rest: Tensor
@@ -110,21 +111,26 @@ class ElectrodeInputs(nn.Module):
         """Inputs of tared counts."""
         return torch.cat([tared, self.log_rest - log_impedance(self.rest + tared)], dim=1)
 
-    def of(self, tared: FloatArray) -> FloatArray:
-        """Inputs of tared counts, as arrays."""
-        with torch.inference_mode():
-            found: FloatArray = self(torch.from_numpy(tared)).numpy()
-        return found
+    def of(self, tared: FloatArray, rest: FloatArray | None = None) -> FloatArray:
+        """Inputs of tared counts ``(N, 19)``, as arrays; ``rest``: of each row, NaN = not known."""
+        with torch.inference_mode(), torch.device("cpu"):
+            counts = torch.from_numpy(tared)
+            if rest is None:
+                return np.asarray(self(counts), np.float32)
+            known = torch.from_numpy(rest)
+            known = torch.where(torch.isfinite(known), known, self.rest)
+            fall = log_impedance(known) - log_impedance(known + counts)
+            return np.asarray(torch.cat([counts, fall], dim=1), np.float32)
 
     def mirrored(self, inputs: Tensor) -> Tensor:
         """Inputs of the mirror images."""
         return torch.index_select(inputs, 1, self.order)
 
-    def noisy(self, inputs: Tensor) -> Tensor:
+    def noisy(self, inputs: Tensor, drift_counts: float = DRIFT_COUNTS) -> Tensor:
         """Inputs with noise and with a drift common to all electrodes, drawn for each row."""
         half = inputs.shape[1] // 2
         noise = NOISE_COUNTS * torch.randn_like(inputs[:, :half])
-        drift = DRIFT_COUNTS * torch.randn_like(inputs[:, :1])
+        drift = drift_counts * torch.randn_like(inputs[:, :1])
         # The same counts of an electrode in both of its inputs.
         return inputs + self.slope.to(inputs.device) * (noise + drift).repeat(1, 2)
 

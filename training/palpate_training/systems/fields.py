@@ -32,7 +32,7 @@ Errors = dict[str, npt.NDArray[np.float64]]
 
 TREE_MODES = 16
 """Coefficients that boosted trees estimate; the rest stay at the mean. Each is an ensemble."""
-MEMBERS = 5
+MEMBERS = 3
 _CHUNK_ROWS = 256
 
 
@@ -204,6 +204,6 @@ FIELD_SYSTEMS = (
     ),
     FieldSystem("network to modes", "ours", partial(fit_modes, 1), seeded=True),
     FieldSystem(
-        "networks to modes, mean of five", "ours", partial(fit_modes, MEMBERS), seeded=True
+        "networks to modes, mean of three", "ours", partial(fit_modes, MEMBERS), seeded=True
     ),
 )  # fmt: skip

@@ -16,9 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
-from palpate.messages import COUNTS_MAX
-from palpate_training.learning.electrode_nets import ASSUMED_REST, MIRROR_AXES, ResidualLayers
+from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate_training.learning.electrode_nets import (
+    ASSUMED_REST,
+    MIRROR_AXES,
+    ElectrodeInputs,
+    ResidualLayers,
+)
 from palpate_training.learning.fit import FeaturesFitConfig, fit
 from palpate_training.learning.networks import Standardised, predict
 from palpate_training.systems.samples import (
@@ -28,32 +32,17 @@ from palpate_training.systems.samples import (
     Samples,
     System,
     error_of,
-    impedance_ohm,
 )
 
-MEMBERS = 5
-NOISE_COUNTS = 2.0
+MEMBERS = 3
+"""As many as in the bundles that ship."""
+
 MAGNITUDE_FLOOR_N = 0.5
 """Forces count as their error over this plus their magnitude, to the power of a half."""
 
 OURS_CONFIG = FeaturesFitConfig(
-    epochs=120, patience=30, batch_rows=256, learning_rate=2e-3, weight_decay=1e-5, threads=2
+    epochs=120, patience=30, batch_rows=256, learning_rate=2e-3, weight_decay=1e-5
 )
-
-
-def inputs_of(samples: Samples) -> FloatArray:
-    """Tared counts, and the fall of the logarithm of the impedance, (N, 38)."""
-    rest = np.where(np.isfinite(samples.rest), samples.rest, np.float32(ASSUMED_REST))
-    # Where the rest is assumed, it must leave room for the fall.
-    rest = np.clip(np.maximum(rest, 1.0 - samples.tared), 1.0, COUNTS_MAX - 1.0)
-    fall = np.log(impedance_ohm(rest)) - np.log(impedance_ohm(rest + samples.tared))
-    return np.hstack([samples.tared, fall]).astype(np.float32)
-
-
-def mirrored_inputs(inputs: Tensor) -> Tensor:
-    """The inputs (N, 38) of the mirror image."""
-    order = torch.from_numpy(np.concatenate([ELECTRODE_MIRROR, ELECTRODE_MIRROR + 19])).long()
-    return torch.index_select(inputs, 1, order.to(inputs.device))
 
 
 class ElectrodeAttention(nn.Module):
@@ -94,6 +83,15 @@ class ElectrodeAttention(nn.Module):
         return estimate
 
 
+INPUTS = ElectrodeInputs(np.full(len(ELECTRODE_POSITIONS), ASSUMED_REST, np.float32))
+
+
+def inputs_of(samples: Samples) -> tuple[FloatArray, FloatArray]:
+    """Inputs (N, 38) of rows, and those of their mirror images."""
+    inputs = INPUTS.of(samples.tared, samples.rest)
+    return inputs, inputs[:, INPUTS.order.numpy()]
+
+
 @dataclass(frozen=True, slots=True)
 class Members:
     """An ensemble whose estimate is the mean of its members', each of a row and its mirror image.
@@ -108,8 +106,7 @@ class Members:
 
     def estimate(self, samples: Samples) -> FloatArray:
         """Estimates of rows, shape (N, 3)."""
-        inputs = inputs_of(samples)
-        mirrored = mirrored_inputs(torch.from_numpy(inputs)).numpy()
+        inputs, mirrored = inputs_of(samples)
         total = np.zeros((len(inputs), 3), np.float64)
         for net in self.nets:
             total += predict(net, inputs) + predict(net, mirrored) * MIRROR_AXES
@@ -128,14 +125,13 @@ def fit_members(
     seed: int,
 ) -> Estimate:
     """Train an ensemble, each member from other weights and in another order of rows."""
-    inputs, targets = inputs_of(train), train.truth(quantity)
-    mirrored = mirrored_inputs(torch.from_numpy(inputs)).numpy()
-    both = np.vstack([inputs, mirrored])
+    targets = train.truth(quantity)
+    both = np.vstack(inputs_of(train))
     truths = np.vstack([targets, targets * MIRROR_AXES])
     nets = []
     for member in range(members):
         torch.manual_seed(1000 * seed + member)
-        net = Standardised(layers(), inputs.shape[1])
+        net = Standardised(layers(), both.shape[1])
         _fit_member(net, both, truths, validation, quantity)
         nets.append(net)
     return Members(tuple(nets), quantity == "normal").estimate
@@ -149,7 +145,6 @@ def _fit_member(
     quantity: Quantity,
 ) -> None:
     net.normalise_from(inputs, targets)
-    noise = torch.from_numpy(input_noise())
     truth = validation.truth(quantity)
     size = float(np.sqrt(np.square(targets - targets.mean(axis=0)).sum(axis=1).mean()))
 
@@ -162,11 +157,6 @@ def _fit_member(
         magnitude = torch.linalg.vector_norm(wanted, dim=1)
         return (distance * size / torch.sqrt(MAGNITUDE_FLOOR_N + magnitude)).mean()
 
-    def noisy(batch: Tensor, rows: Tensor) -> Tensor:
-        # The same noise of an electrode in both of its inputs.
-        drawn = torch.randn_like(batch[:, : batch.shape[1] // 2]).repeat(1, 2)
-        return batch + noise.to(batch.device) * drawn
-
     fit(
         net,
         inputs,
@@ -174,15 +164,8 @@ def _fit_member(
         loss_of=loss_of,
         score_of=lambda _: error_of(Members((net,), False).estimate(validation), truth),
         config=OURS_CONFIG,
-        augment=noisy,
+        augment=lambda batch, _: INPUTS.noisy(batch, drift_counts=0.0),
     )
-
-
-def input_noise() -> FloatArray:
-    """What noise of the counts does to each input, by the slope at a usual rest, (38,)."""
-    low, high = np.log(impedance_ohm(np.array([ASSUMED_REST - 1.0, ASSUMED_REST + 1.0])))
-    per_input = np.repeat([1.0, (low - high) / 2.0], len(ELECTRODE_MIRROR))
-    return (NOISE_COUNTS * per_input).astype(np.float32)
 
 
 _EVERY: tuple[Quantity, ...] = ("location", "force", "centre", "normal")
@@ -196,7 +179,7 @@ OURS = (
         seeded=True,
     ),
     System(
-        "residual networks, mean of five",
+        "residual networks, mean of three",
         "ours: log impedances, mirror images, ensemble",
         partial(fit_members, partial(ResidualLayers, 38, 3), MEMBERS),
         _EVERY,

@@ -24,9 +24,7 @@ from palpate_training.systems.samples import Estimate, Quantity, Samples, System
 Floats = npt.NDArray[np.float64]
 
 MILLIMETRE = 1e-3
-POINTS_CONFIG = FeaturesFitConfig(
-    epochs=40, patience=10, batch_rows=256, learning_rate=1e-3, threads=2
-)
+POINTS_CONFIG = FeaturesFitConfig(epochs=40, patience=10, batch_rows=256, learning_rate=1e-3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,7 @@ from palpate_training.learning.fit import FitConfig
 from palpate_training.learning.networks import Standardised
 from palpate_training.systems.samples import FloatArray, Samples
 
-CONFIG = FitConfig(
-    epochs=80, patience=20, batch_rows=512, learning_rate=5e-4, weight_decay=0.0, threads=2
-)
+CONFIG = FitConfig(epochs=80, patience=20, batch_rows=512, learning_rate=5e-4, weight_decay=0.0)
 A_WIDTH, A_LAYERS = 1280, 5
 """The article says five layers and more than six million weights."""
 PENALTY = 1e-3

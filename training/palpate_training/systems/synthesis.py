@@ -37,8 +37,8 @@ Rows = npt.NDArray[np.int64]
 CountsOf = Callable[[Rows], FloatArray]
 """Estimates the tared counts of rows of the data set, shape (R, 19)."""
 
-POINTS_CONFIG = FitConfig(epochs=40, patience=10, batch_rows=128, learning_rate=1e-3, threads=2)
-FILM_MEMBERS = 5
+POINTS_CONFIG = FitConfig(epochs=40, patience=10, batch_rows=128, learning_rate=1e-3)
+FILM_MEMBERS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +192,6 @@ SYNTHESIS_SYSTEMS = (
     ),
     SynthesisSystem("film network", "ours", partial(fit_film, 1), seeded=True),
     SynthesisSystem(
-        "film networks, mean of five", "ours", partial(fit_film, FILM_MEMBERS), seeded=True
+        "film networks, mean of three", "ours", partial(fit_film, FILM_MEMBERS), seeded=True
     ),
 )  # fmt: skip

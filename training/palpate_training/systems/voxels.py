@@ -28,12 +28,8 @@ PROJECTED_RADIUS_M = 5.5e-3
 SHARPNESS = 10.0
 """Exponent of the weight of a row by the direction of its force."""
 
-VOXEL_CONFIG = FeaturesFitConfig(
-    epochs=25, patience=8, batch_rows=256, learning_rate=1e-3, threads=2
-)
-PROJECTION_CONFIG = FeaturesFitConfig(
-    epochs=120, patience=20, batch_rows=512, learning_rate=1e-3, threads=2
-)
+VOXEL_CONFIG = FeaturesFitConfig(epochs=25, patience=8, batch_rows=256, learning_rate=1e-3)
+PROJECTION_CONFIG = FeaturesFitConfig(epochs=120, patience=20, batch_rows=512, learning_rate=1e-3)
 
 
 def voxel_of(points: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:

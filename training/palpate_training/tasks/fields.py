@@ -20,13 +20,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.messages import COUNTS_MAX, TrainingRange
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning.electrode_nets import (
     DRIFT_COUNTS,
     NOISE_COUNTS,
+    ElectrodeInputs,
     ElectrodeNet,
     MembersConfig,
     rest_of,
@@ -149,20 +149,21 @@ def fit_coefficients(
         seed: Of weights, order of rows and noise.
         on_epoch: Called after each epoch, for a progress bar.
     """
-    given, wanted = counts[split.train], coefficients[split.train]
+    read = ElectrodeInputs(rest)
+    inputs, wanted = read.of(counts[split.train]), coefficients[split.train]
     if signs is not None:
-        given = np.vstack([given, given[:, ELECTRODE_MIRROR]])
+        inputs = np.vstack([inputs, inputs[:, read.order.numpy()]])
         wanted = np.vstack([wanted, wanted * signs])
-    still = config.rest_rows(len(wanted))
-    given = np.vstack([given, np.zeros((still, given.shape[1]), np.float32)])
+    pressed = len(wanted)
+    still = config.rest_rows(pressed)
+    inputs = np.vstack([inputs, np.zeros((still, inputs.shape[1]), np.float32)])
     wanted = np.vstack([wanted, np.repeat(untouched, still, axis=0)])
     members = []
     for member in range(config.members):
         torch.manual_seed(1000 * seed + member)
-        layers = config.member(2 * given.shape[1], wanted.shape[1])
+        layers = config.member(inputs.shape[1], wanted.shape[1])
         net = ElectrodeNet([layers], rest, signs)
-        inputs = net.inputs.of(given)
-        layers.normalise_from(inputs[: len(inputs) - still], wanted[: len(wanted) - still])
+        layers.normalise_from(inputs[:pressed], wanted[:pressed])
         fit_on_norms(
             net,
             layers,
