@@ -11,7 +11,12 @@ import numpy.typing as npt
 
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
 from palpate_training.evaluation.intervals import drawn_medians, interval
-from palpate_training.learning.metrics import angles, force_errors, location_errors
+from palpate_training.learning.metrics import (
+    FORCE_BINS_N,
+    angles,
+    force_errors,
+    location_errors,
+)
 from palpate_training.learning.splits import RowSplit
 from palpate_training.systems.analytic import ANALYTIC
 from palpate_training.systems.ours import OURS
@@ -36,9 +41,6 @@ OUR_NAMES = tuple(system.name for system in OURS)
 
 PAPER_SYSTEMS = ("MLP (the paper's)", "voxel network (the paper's)", "PointNet++ (the paper's)")
 """Ours are compared with the best of these."""
-
-FORCE_BINS_N = {"below_2n": (0.0, 2.0), "2_to_8n": (2.0, 8.0), "above_8n": (8.0, np.inf)}
-"""The paper's bounds of low and high force; its rows begin at 0.5 N."""
 
 PAPER_SD_N = 4.6
 """Standard deviation of |F| in the paper's data, all units [N]: 0.64 N over 0.14."""

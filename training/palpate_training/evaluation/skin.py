@@ -11,9 +11,9 @@ import numpy.typing as npt
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
-from palpate_training.evaluation.features import FORCE_BINS_N, Scores
+from palpate_training.evaluation.features import Scores
 from palpate_training.evaluation.intervals import drawn_medians, interval
-from palpate_training.learning.metrics import cluster_bootstrap, root_mean
+from palpate_training.learning.metrics import FORCE_BINS_N, cluster_bootstrap, root_mean
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS, FieldSystem
 from palpate_training.systems.synthesis import SYNTHESIS_SYSTEMS, SynthesisSystem

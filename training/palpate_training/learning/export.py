@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -39,6 +40,9 @@ GOLDEN_ROWS = 4
 """Rows of a field that are shipped with their answers: one of 6870 nodes is 82 kB."""
 
 _RANDOM_ROWS = 512
+
+_LARGE = 1024
+"""Values of a constant from which on half the bytes are worth a cast."""
 
 
 def refuse_existing(folder: Path) -> None:
@@ -142,7 +146,7 @@ def export_fields(
     takes, gives = tensors_of(
         task,
         len(mesh.nodes),
-        optional=("displacement_sd", "coefficients"),
+        optional=graph.optional,
         modes=graph.modes.shape[0],
     )
     inputs = np.ascontiguousarray(inputs, np.float32)
@@ -282,6 +286,7 @@ def onnx_bytes(
         raise BundleError("torch exported nothing", remedy="report this with the torch version")
     model = program.model_proto
     _strip(model)
+    _halve(model.graph)
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString(deterministic=True))
 
@@ -298,6 +303,32 @@ def _strip(model: Any) -> None:
     for item in (*graph.node, *graph.input, *graph.output, *graph.initializer):
         item.doc_string = ""
         del item.metadata_props[:]
+
+
+def _halve(graph: Any) -> None:
+    """Store large constants in half precision where it holds their values exactly.
+
+    ONNX Runtime casts them once, when it loads the model.
+    """
+    onnx = require("onnx", extra="training")
+    casts = []
+    for constant in graph.initializer:
+        if constant.data_type != onnx.TensorProto.FLOAT or math.prod(constant.dims) < _LARGE:
+            continue
+        values = onnx.numpy_helper.to_array(constant)
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if np.array_equal(half, values):
+            name = constant.name
+            constant.CopyFrom(onnx.numpy_helper.from_array(half, f"{name}.half"))
+            casts.append(
+                onnx.helper.make_node(
+                    "Cast", [constant.name], [name], f"{name}.cast", to=onnx.TensorProto.FLOAT
+                )
+            )
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
 
 
 def check_parity(

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from palpate.files.tasks import TASKS
 from palpate.messages import TensorInfo
+from palpate_training.learning.contact_code import ContactCode
 from palpate_training.learning.field_code import FieldCode
 from palpate_training.learning.film import FilmNet, FilmPooling
 
@@ -78,12 +79,14 @@ class FeaturesGraph(nn.Module):
 
 
 class FieldGraph(nn.Module):
-    """Tared counts ``(N, 19)`` -> nodal displacement ``(N, 3V)`` [m], its spread, coefficients.
+    """Tared counts ``(N, 19)`` -> the ``field`` task; ``optional`` names what it adds to it.
 
     Args:
-        net: Tared counts -> coefficients [m], shape ``(N, K)``.
-        code: What they are coefficients of.
+        net: Tared counts -> coefficients of the displacement [m], then of the contact forces [N],
+            shape ``(N, K + C)``.
+        code: What the first K are coefficients of.
         node_sd: Root mean square length of the nodal error on validation rows [m], shape ``(V,)``.
+        contact: What the last C are coefficients of; None = there are none.
     """
 
     modes: Tensor
@@ -91,17 +94,43 @@ class FieldGraph(nn.Module):
     mean: Tensor
     node_spread: Tensor
 
-    def __init__(self, net: nn.Module, code: FieldCode, node_sd: FloatArray) -> None:
+    def __init__(
+        self,
+        net: nn.Module,
+        code: FieldCode,
+        node_sd: FloatArray,
+        contact: ContactCode | None = None,
+    ) -> None:
         super().__init__()
         self.net = net
         _register(self, modes=code.modes, scale=code.scale, mean=code.mean)
         _register(self, node_spread=node_sd.astype(np.float32))
+        self.optional: tuple[str, ...] = ("displacement_sd", "coefficients")
+        if contact is not None:
+            self.optional = ("displacement_sd", "contact_force", "coefficients")
+            _register(self, contact_modes=contact.modes, contact_scale=contact.scale)
+            # Inner nodes take the zero that follows the forces of the outer ones.
+            place = np.full((contact.nodes, 3), contact.modes.shape[1], np.int64)
+            place[contact.outer] = np.arange(contact.modes.shape[1]).reshape(-1, 3)
+            _register(self, contact_place=place.ravel())
 
-    def forward(self, electrodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Displacement ``(N, 3V)``, standard deviation ``(N, V)``, coefficients ``(N, K)``, [m]."""
-        coefficients = self.net(electrodes) * self.scale  # (N, K)
+    def forward(self, electrodes: Tensor) -> tuple[Tensor, ...]:
+        """Displacement ``(N, 3V)`` [m], and what ``optional`` names.
+
+        Standard deviation ``(N, V)`` [m], contact force ``(N, 3V)`` [N], coefficients ``(N, K)``
+        [m].
+        """
+        estimate = self.net(electrodes)
+        coefficients = estimate[:, : len(self.scale)] * self.scale  # (N, K)
         field = coefficients @ self.modes.to(torch.float32) + self.mean  # (N, 3V)
-        return field, self.node_spread.expand(electrodes.shape[0], -1), coefficients
+        spread = self.node_spread.expand(electrodes.shape[0], -1)
+        if "contact_force" not in self.optional:
+            return field, spread, coefficients
+        of_contact = estimate[:, len(self.scale) :] * self.get_buffer("contact_scale")
+        outer = of_contact @ self.get_buffer("contact_modes").to(torch.float32)  # (N, 3O)
+        padded = nn.functional.pad(outer, (0, 1))
+        force = torch.index_select(padded, 1, self.get_buffer("contact_place"))
+        return field, spread, force, coefficients
 
 
 class SynthesisGraph(nn.Module):
@@ -113,6 +142,8 @@ class SynthesisGraph(nn.Module):
         pooling: How the film near the electrodes is pooled.
         counts_sd: Root mean square residual on validation rows [counts], shape ``(19,)``.
     """
+
+    optional: tuple[str, ...] = ()
 
     modes: Tensor
     scale: Tensor

@@ -27,6 +27,9 @@ Float = npt.NDArray[np.floating]
 Labels = npt.NDArray[np.int32]
 Statistic = Callable[[npt.NDArray[np.float64]], float]
 
+FORCE_BINS_N = {"below_2n": (0.0, 2.0), "2_to_8n": (2.0, 8.0), "above_8n": (8.0, np.inf)}
+"""The paper's bounds of low and high force; its rows begin at 0.5 N."""
+
 MIN_MAGNITUDE_N = 1e-3
 """Below this true force a direction has no meaning [N]; such rows have no angle."""
 
@@ -224,6 +227,44 @@ def field_summary(errors: dict[str, Rows64], zero: dict[str, Rows64]) -> dict[st
             _mean(errors[name]), _mean(zero[name])
         )
     return summary
+
+
+def by_force(name: str, values: Rows64, force_n: Rows64, statistic: Statistic) -> dict[str, float]:
+    """A statistic of the rows of each of ``FORCE_BINS_N`` that has some.
+
+    Args:
+        name: The key of a bin is this and the bin's name.
+        values: One for each row, shape ``(N,)``.
+        force_n: Magnitude of each row's force [N], shape ``(N,)``.
+        statistic: Of values.
+    """
+    inside = {
+        where: (force_n >= low) & (force_n < high) for where, (low, high) in FORCE_BINS_N.items()
+    }
+    return {
+        f"{name}_{where}": statistic(values[rows]) for where, rows in inside.items() if rows.any()
+    }
+
+
+def contact_errors(estimate: Float, truth: Float) -> dict[str, Rows64]:
+    """Errors of every row's contact forces on nodes.
+
+    Args:
+        estimate: Estimated forces [N], shape ``(N, V, 3)``.
+        truth: True forces [N], shape ``(N, V, 3)``.
+
+    Returns:
+        ``misplaced``: the share of the force that would have to be moved to other nodes or turned:
+        half of the sum of the nodal errors over the sum of the true nodal forces; ``net_n``: error
+        of the net force [N]. Each of shape ``(N,)``.
+    """
+    if estimate.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3:
+        raise ValueError(f"shapes {estimate.shape} and {truth.shape}, expected twice (N, V, 3)")
+    left = np.asarray(estimate - truth, np.float64)
+    total = np.linalg.norm(truth, axis=2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        misplaced = 0.5 * np.linalg.norm(left, axis=2).sum(axis=1) / total
+    return {"misplaced": misplaced, "net_n": np.linalg.norm(left.sum(axis=1), axis=1)}
 
 
 def electrode_errors(estimate: Float, truth: Float) -> dict[str, Rows64]:

@@ -84,6 +84,14 @@ class Mlp(Standardised):
         super().__init__(nn.Sequential(*layers, nn.Linear(widths[-1], outputs)), inputs, outputs)
 
 
+def round_to_half(net: nn.Module) -> None:
+    """Round the weights of all layers to half precision, in place, as bundles store them."""
+    with torch.no_grad():
+        for layer in net.modules():
+            if isinstance(layer, nn.Linear):
+                layer.weight.copy_(layer.weight.half())
+
+
 def predict(
     net: nn.Module, inputs: npt.NDArray[np.float32], *, batch_rows: int = 8192
 ) -> npt.NDArray[np.float32]:

@@ -44,7 +44,7 @@ from palpate_training.learning.metrics import (
     location_metrics,
     rms,
 )
-from palpate_training.learning.networks import predict
+from palpate_training.learning.networks import predict, round_to_half
 from palpate_training.learning.ranges import ends_of, known_inputs
 from palpate_training.learning.splits import Rows, RowSplit, by_group
 
@@ -143,6 +143,7 @@ def train_features(
     net = best
     if config.members > 1:
         net = fit("features, other members", config.members, best, symmetric=best.symmetric)
+    round_to_half(net)
 
     validated, tested = (predict(net, x[rows]) for rows in (split.validation, split.test))
     threshold = _contact_threshold(data, validated[:, :3], split)

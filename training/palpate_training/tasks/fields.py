@@ -1,4 +1,4 @@
-"""Electrodes -> displacement field of the skin: train, test on held-out trajectories, ship.
+"""Electrodes -> displacement and contact forces of the skin: train, test on held-out presses, ship.
 
 The network that ships is by default one for all specimens, since the finger of a robot is none of
 the training specimens. What is reported was measured with exactly the weights that are shipped.
@@ -23,6 +23,13 @@ from torch import Tensor, nn
 from palpate.messages import COUNTS_MAX, TrainingRange
 from palpate_training.datasets.experiment import MixedDataset, content_sha256
 from palpate_training.datasets.features import ELECTRODES
+from palpate_training.learning.contact_code import (
+    SPREAD_M,
+    ContactCode,
+    contact_coefficients,
+    fit_contact_code,
+    spread_forces,
+)
 from palpate_training.learning.electrode_nets import (
     DRIFT_COUNTS,
     NOISE_COUNTS,
@@ -35,14 +42,28 @@ from palpate_training.learning.export import export_fields, refuse_existing
 from palpate_training.learning.field_code import FieldCode, fit_code
 from palpate_training.learning.fit import OnEpoch, fit
 from palpate_training.learning.graphs import FieldGraph
-from palpate_training.learning.metrics import field_errors, field_summary, join
-from palpate_training.learning.networks import Standardised, device_of, predict
+from palpate_training.learning.metrics import (
+    by_force,
+    contact_errors,
+    field_errors,
+    field_summary,
+    join,
+)
+from palpate_training.learning.networks import (
+    Standardised,
+    device_of,
+    predict,
+    round_to_half,
+)
 from palpate_training.learning.ranges import ends_of, known_inputs, longest_of
 from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
 from palpate_training.tasks.results import Errors
 
 FloatArray = npt.NDArray[np.float32]
 Estimate = Callable[[Rows], FloatArray]
+
+CONTACT_WEIGHT = 0.3
+"""Of an error of contact forces [1/N], beside one of the mean displacement [1/mm], in the loss."""
 
 PARITY_ROWS = 24
 """Held-out rows of the parity check, spread over the test trajectories."""
@@ -68,19 +89,27 @@ class FieldFitConfig(MembersConfig):
 
 @dataclass(frozen=True, slots=True)
 class FieldModel:
-    """Electrodes -> field.
+    """Electrodes -> displacement and contact forces.
 
     Attributes:
-        net: Tared counts (N, 19) -> coefficients (N, K) [m].
-        code: What they are coefficients of.
+        net: Tared counts (N, 19) -> coefficients of the displacement [m], then of the contact
+            forces [N], shape (N, K + C).
+        code: What the first K are coefficients of.
+        contact: What the last C are coefficients of; None if the data set has no contact forces.
     """
 
     net: ElectrodeNet
     code: FieldCode
+    contact: ContactCode | None
 
     def coefficients(self, tared_counts: FloatArray) -> FloatArray:
-        """Coefficients [m], shape (N, K), of tared counts (N, 19)."""
-        return predict(self.net, tared_counts)
+        """Coefficients of the displacement [m], shape (N, K), of tared counts (N, 19)."""
+        return predict(self.net, tared_counts)[:, : self.code.size]
+
+    def contact_forces(self, tared_counts: FloatArray) -> FloatArray:
+        """Spread forces on the outer nodes [N], shape (N, O, 3), of tared counts (N, 19)."""
+        assert self.contact is not None, "the data set had no contact forces"
+        return self.contact.decode(predict(self.net, tared_counts)[:, self.code.size :])
 
 
 def tared_counts(data: MixedDataset) -> FloatArray:
@@ -103,23 +132,36 @@ def fit_field(
 ) -> FieldModel:
     """Train electrodes -> field on the training rows of a split, in modes of these rows.
 
-    The seed decides weights, order of rows and noise.
+    Contact forces are learned by the same network if the data set has them. The seed decides
+    weights, order of rows and noise.
     """
     config = config or FieldFitConfig()
     code = fit_code(data, split.train, split.validation)
+    wanted = code.encode(data.coefficients)
+    untouched = code.project(np.zeros((1, len(code.mean)), np.float32))
+    signs, scale = code.signs, np.full(code.size, 1e3 / math.sqrt(code.nodes))
+    contact = None
+    if data.contact is not None:
+        contact = fit_contact_code(data, split.train)
+        wanted = np.hstack([wanted, contact_coefficients(data, contact)])
+        untouched = np.hstack([untouched, np.zeros((1, contact.size), np.float32)])
+        scale = np.concatenate([scale, np.full(contact.size, CONTACT_WEIGHT)])
+        if signs is not None:
+            assert contact.signs is not None, "one mesh is its own mirror image or it is not"
+            signs = np.concatenate([signs, contact.signs])
     net = fit_coefficients(
         tared_counts(data),
-        code.encode(data.coefficients),
+        wanted,
         split,
         rest_counts(data, split.train),
-        untouched=code.project(np.zeros((1, len(code.mean)), np.float32)),
-        signs=code.signs,
-        scale=1e3 / math.sqrt(code.nodes),
+        untouched=untouched,
+        signs=signs,
+        scale=scale.astype(np.float32),
         config=config,
         seed=seed,
         on_epoch=on_epoch,
     )
-    return FieldModel(net, code)
+    return FieldModel(net, code, contact)
 
 
 def fit_coefficients(
@@ -130,7 +172,7 @@ def fit_coefficients(
     *,
     untouched: FloatArray,
     signs: FloatArray | None,
-    scale: float,
+    scale: FloatArray,
     config: FieldFitConfig,
     seed: int,
     on_epoch: OnEpoch | None,
@@ -144,7 +186,7 @@ def fit_coefficients(
         rest: Untouched counts that are assumed of every finger, shape (19,).
         untouched: Coefficients of an untouched finger, shape (1, K).
         signs: What a mirror image makes of each coefficient, shape (K,); None = there is none.
-        scale: Makes an error of coefficients one of about 1.
+        scale: Of the error of each coefficient in the loss, shape (K,).
         config: Settings.
         seed: Of weights, order of rows and noise.
         on_epoch: Called after each epoch, for a progress bar.
@@ -187,7 +229,7 @@ def fit_on_norms(
     targets: FloatArray,
     validation: tuple[FloatArray, FloatArray],
     *,
-    scale: float,
+    scale: float | FloatArray,
     floor: float,
     config: FieldFitConfig,
     augment: Callable[[Tensor], Tensor] = lambda batch: batch,
@@ -205,7 +247,7 @@ def fit_on_norms(
         inputs: Of the member, shape (N, I).
         targets: Of the network, shape (N, O).
         validation: Inputs and targets of the network.
-        scale: Of an error.
+        scale: Of an error, or of the error of each target, shape (O,).
         floor: Scaled error below which the loss is no longer straight.
         config: Settings.
         augment: Inputs of the member -> inputs that it sees.
@@ -215,9 +257,10 @@ def fit_on_norms(
     device = torch.get_default_device()
     net.to(device)
     seen, truth = (torch.from_numpy(part).to(device) for part in validation)
+    weight = torch.as_tensor(scale, dtype=torch.float32, device=device)
 
     def distance(estimate: Tensor, wanted: Tensor) -> Tensor:
-        squares = torch.sum(torch.square(scale * (estimate - wanted)), dim=1)
+        squares = torch.sum(torch.square(weight * (estimate - wanted)), dim=1)
         return torch.sqrt(squares + floor**2).mean()
 
     def score_of(_: nn.Module) -> float:
@@ -285,19 +328,25 @@ def field_bundle(
     units = units or unit_sets(data.experiment)[-1]
     split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), units)
     model = fit_field(data, split, config=config, seed=seed, on_epoch=on_epoch)
+    round_to_half(model.net)
     code, counts = model.code, tared_counts(data)
+    force_n = np.linalg.norm(data.experiment.force[split.test].astype(np.float64), axis=1)
 
     estimate = _estimate(model.coefficients, code, counts)
     errors = field_row_errors(data, split.test, {"zero": [_still(data)], "net": [estimate]})
     metrics = field_summary(errors["net"][0], errors["zero"][0])
+    metrics |= by_force("nodal_all_m", errors["net"][0]["all_m"], force_n, _mean)
     metrics["zero_nodal_subset_m"] = float(errors["zero"][0]["subset_m"].mean())
     untouched = code.decode(model.coefficients(np.zeros((1, counts.shape[1]), np.float32)))
     metrics["untouched_nodal_all_m"] = float(np.linalg.norm(untouched, axis=2).mean())
     metrics |= truncation_metrics(code)
+    if model.contact is not None:
+        metrics |= _contact_metrics(data, model, split.test, force_n)
+    node_sd = _node_sd(data, split.validation, estimate)
     seen, presses = seen_rows(data, split.train, config or FieldFitConfig(), seed)
     export_fields(
         folder,
-        FieldGraph(model.net, code, _node_sd(data, split.validation, estimate)),
+        FieldGraph(model.net, code, node_sd, model.contact),
         counts[spread_rows(split.test)],
         data.mesh,
         name=name,
@@ -309,12 +358,44 @@ def field_bundle(
             "electrodes": "tared counts and logarithms of impedances for an assumed rest,"
             " standardised by the training rows, inside the graph",
             "displacement": f"{code.size} modes of the training rows, half precision in the graph",
+            "contact_force": f"each node's force spread by a Gaussian of {1e3 * SPREAD_M} mm, in"
+            " modes of the training rows, half precision in the graph",
             "displacement_sd": "constant per node: rms length of the error on validation rows",
         },
         training_range=field_range(data, split.train, seen),
         known_inputs=known_inputs(seen, presses),
     )
     return metrics
+
+
+def _contact_metrics(
+    data: MixedDataset, model: FieldModel, rows: Rows, force_n: npt.NDArray[np.float64]
+) -> dict[str, float]:
+    """How well contact forces are estimated, medians over rows, for a manifest."""
+    assert model.contact is not None
+    parts = []
+    for start in range(0, len(rows), _CHUNK_ROWS):
+        part = rows[start : start + _CHUNK_ROWS]
+        estimate = model.contact_forces(tared_counts(data)[part])
+        parts.append(contact_errors(estimate, spread_forces(data, part)))
+    errors = join(parts)
+    net = errors["net_n"] / np.linalg.norm(data.simulated_force[rows].astype(np.float64), axis=1)
+    return {
+        "contact_modes": float(model.contact.size),
+        "contact_spread_m": SPREAD_M,
+        "contact_misplaced": _median(errors["misplaced"]),
+        "contact_net_over_norm": _median(net),
+        **by_force("contact_misplaced", errors["misplaced"], force_n, _median),
+        **by_force("contact_net_over_norm", net, force_n, _median),
+    }
+
+
+def _mean(values: npt.NDArray[np.float64]) -> float:
+    return float(np.mean(values))
+
+
+def _median(values: npt.NDArray[np.float64]) -> float:
+    return float(np.median(values))
 
 
 def seen_rows(

@@ -30,8 +30,14 @@ from palpate_training.learning.film import (
 )
 from palpate_training.learning.fit import OnEpoch
 from palpate_training.learning.graphs import SynthesisGraph
-from palpate_training.learning.metrics import electrode_errors, electrode_summary, rms
-from palpate_training.learning.networks import device_of, predict
+from palpate_training.learning.metrics import (
+    by_force,
+    electrode_errors,
+    electrode_summary,
+    rms,
+    root_mean,
+)
+from palpate_training.learning.networks import device_of, predict, round_to_half
 from palpate_training.learning.ranges import ends_of, longest_of
 from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units
 from palpate_training.tasks.fields import (
@@ -153,11 +159,15 @@ def synthesis_bundle(
     refuse_existing(folder)
     split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), [unit])
     model = fit_synthesis(data, split, config=config, seed=seed, on_epoch=on_epoch)
+    round_to_half(model.net)
     counts = tared_counts(data)
     features = synthesis_features(data, model.code, model.pooling)
     test, validation = split.test, split.validation
     zero = electrode_errors(np.zeros_like(counts[test]), counts[test])
-    metrics = electrode_summary(electrode_errors(model.counts(features[test]), counts[test]), zero)
+    errors = electrode_errors(model.counts(features[test]), counts[test])
+    metrics = electrode_summary(errors, zero)
+    force_n = np.linalg.norm(data.experiment.force[test].astype(np.float64), axis=1)
+    metrics |= by_force("electrode_rmse_counts", errors["mean_square"], force_n, root_mean)
     residual = model.counts(features[validation]) - counts[validation]
     sd = np.asarray(rms(residual), np.float32)
     graph = SynthesisGraph(model.net, model.code, model.pooling, sd)
