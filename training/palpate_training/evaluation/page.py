@@ -15,7 +15,7 @@ from typing import Any
 
 from palpate.files.atomic import written_whole
 from palpate_training.figures.style import markdown_table
-from palpate_training.learning.splits import ALL_UNITS
+from palpate_training.learning.splits import ALL_UNITS, SplitName
 
 Row = Mapping[str, Any]
 
@@ -31,6 +31,9 @@ SPLIT_WORDS = {
     "unit": "Unseen BioTac, nothing calibrated",
     "neighbour": "Not a result: neighbouring rows in training, which shows what is left to gain",
 }
+
+FLOOR: SplitName = "neighbour"
+FLOOR_WORDS = "*not a result*, neighbouring rows in training"
 
 TASK_WORDS = {
     "location": "Contact location",
@@ -115,7 +118,12 @@ DETAILS: dict[str, tuple[Column, ...]] = {
         Column("all_m_mean_2_to_8n", "mm", 1e3, 3, "all, 2-8 N"),
         Column("all_m_mean_above_8n", "mm", 1e3, 3, "all, above 8 N"),
     ),
-    "synthesis": (Column("rmse", "-", 1.0, 4, "of full scale"),),
+    "synthesis": (
+        Column("rmse", "-", 1.0, 4, "of full scale"),
+        Column("rmse_counts_below_2n", "counts", 1.0, 1, "below 2 N"),
+        Column("rmse_counts_2_to_8n", "counts", 1.0, 1, "2-8 N"),
+        Column("rmse_counts_above_8n", "counts", 1.0, 1, "above 8 N"),
+    ),
 }
 DETAILS["centre"] = DETAILS["location"]
 DETAILS["normal"] = tuple(
@@ -195,7 +203,12 @@ def tables_of(values: Mapping[str, Any]) -> Iterator[Table]:
         yield Table(2, TASK_WORDS[task], pictures=pictures(task))
         for split in dict.fromkeys(row["split"] for row in scores if row["task"] == task):
             mine = [row for row in scores if row["task"] == task and row["split"] == split]
-            yield from _of_split(task, split, mine)
+            floor = [
+                row
+                for row in scores
+                if row["task"] == task and row["split"] == FLOOR and split != FLOOR
+            ]
+            yield from _of_split(task, split, mine, floor)
     ratios = values.get("ratios", [])
     if ratios:
         yield Table(
@@ -224,27 +237,32 @@ def _force_range(least_n: float, most_n: float | None) -> str:
     return f"from {least_n:g} N" if least_n else "all"
 
 
-def _of_split(task: str, split: str, rows: Sequence[Row]) -> Iterator[Table]:
+def _of_split(task: str, split: str, rows: Sequence[Row], floor: Sequence[Row]) -> Iterator[Table]:
     tests = tuple(dict.fromkeys(row["test"] for row in rows))
     systems = tuple(dict.fromkeys(row["system"] for row in rows))
     found = {(row["system"], row["test"]): row for row in rows}
+    left = {(row["system"], row["test"]): row for row in floor}
+    floors = tuple(dict.fromkeys(row["test"] for row in floor))
     for number, column in enumerate(HEADLINES[task]):
         lines = [
             (
                 system,
                 *(column.cell(found[system, test]) if (system, test) in found else "-"
                   for test in tests),
+                *(column.cell(left[system, test]) if (system, test) in left else "-"
+                  for test in floors),
             )
             for system in systems
         ]  # fmt: skip
         known = PAPER.get((task, split, column.metric))
         if known:
-            lines.append((PAPER_LABEL, *(known.get(test, "-") for test in tests)))
+            shown = (known.get(test, "-") for test in tests)
+            lines.append((PAPER_LABEL, *shown, *("-" for _ in floors)))
         yield Table(
             3,
             SPLIT_WORDS[split] if number == 0 else f"{SPLIT_WORDS[split]}: {column.title}",
             f"{column.title[0].upper()}{column.title[1:]} [{column.unit}].",
-            ("system", *tests),
+            ("system", *tests, *(f"{FLOOR_WORDS}: {test}" for test in floors)),
             tuple(lines),
         )
     widest = ALL_UNITS if ALL_UNITS in tests else tests[-1]

@@ -105,6 +105,7 @@ def score_fields(task: FieldTask, results: Mapping[Cell, CellResult]) -> list[Sc
 def score_synthesis(task: SynthesisTask, results: Mapping[Cell, CellResult]) -> list[Scores]:
     """The table of synthesis: root mean square [counts], median norm, and of each electrode."""
     counts = tared_counts(task.data)
+    force_n = np.linalg.norm(task.data.experiment.force.astype(np.float64), axis=1)
     found = []
     for key, by_seed in grouped(results):
         rows = np.concatenate([cell.fold.rows.test for cell in by_seed[0]])
@@ -125,6 +126,11 @@ def score_synthesis(task: SynthesisTask, results: Mapping[Cell, CellResult]) -> 
             each = [root_mean(one[:, electrode]) for one in squares]
             metrics[f"rmse_e{electrode + 1:02d}_counts"] = float(np.mean(each))
         mean_squares = np.stack([one.mean(axis=1) for one in squares], axis=1)
+        for where, (low, high) in FORCE_BINS_N.items():
+            inside = (force_n[rows] >= low) & (force_n[rows] < high)
+            if inside.any():
+                each = [root_mean(one[inside]) for one in squares]
+                metrics[f"rmse_counts_{where}"] = float(np.mean(each))
         ends = cluster_bootstrap(
             {"rmse_counts": mean_squares}, cluster, statistic=root_mean, draws=BOOTSTRAP_DRAWS
         )
