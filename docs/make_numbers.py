@@ -145,6 +145,16 @@ def _twin() -> Iterator[Claim]:
         "force": f"{features['force_magnitude_median_n']:.2f}",
         "counts": f"{synthesis['electrode_rmse_counts']:.0f}",
     }
+    for name, where in (("light", "below_2n"), ("middle", "2_to_8n"), ("hard", "above_8n")):
+        figures[name] = f"{fields[f'nodal_all_m_{where}'] * 1e3:.3f}"
+        figures[f"{name}_counts"] = f"{synthesis[f'electrode_rmse_counts_{where}']:.0f}"
+    for name, metric in (
+        ("misplaced", "contact_misplaced"),
+        ("misplaced2", "contact_misplaced_2_to_8n"),
+        ("net", "contact_net_over_norm"),
+        ("net2", "contact_net_over_norm_2_to_8n"),
+    ):
+        figures[name] = f"{fields[metric] * 100:.0f}"
     yield Claim(
         "README.md",
         "displacement of the skin {field} mm a node (0.22; predicting no displacement {zero}),"
@@ -154,7 +164,20 @@ def _twin() -> Iterator[Claim]:
     )
     yield Claim(
         "docs/results/twin.md",
-        "{field} mm a node, mean over the 128 nodes; {all} over all",
+        "{field} mm a node, mean over the 128 nodes; {all} over all, {light} below 2 N, {middle}"
+        " from 2 N, {hard} above 8 N",
+        figures,
+    )
+    yield Claim(
+        "docs/results/twin.md",
+        "{misplaced} % of a force on other nodes than it is or in another direction, {misplaced2} %"
+        " from 2 N; net force {net} % off, {net2} % from 2 N",
+        figures,
+    )
+    yield Claim(
+        "docs/results/twin.md",
+        "({counts} counts; {light_counts} below 2 N, {middle_counts} from 2 N, {hard_counts} above"
+        " 8 N)",
         figures,
     )
 

@@ -134,7 +134,9 @@ class FieldEstimate:
         displacement: Nodal displacement from the pressurised state [m], shape ``(V, 3)``; of a
             reduced reply ``(0, 3)``.
         displacement_sd: One standard deviation of its magnitude [m], shape ``(V,)``, or None.
-        contact_force: Nodal contact force on the skin [N], shape ``(V, 3)``, or None.
+        contact_force: Contact force on each node of the skin [N], shape ``(V, 3)``, or None. The
+            bundles that ship spread it over 1.5 mm: sums over an area are forces, those of single
+            nodes are not.
         coefficients: The same displacement in the bundle's basis [m], shape ``(K,)``, or None:
             see ``ModeBasis``.
         basis_sha256: Content hash of that basis, 32 bytes; empty without coefficients.
