@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "training" / "palpate_training" / "samples" / "twin.h5"
 PICTURE = ROOT / "docs" / "pictures" / "field.png"
 
-Floats = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating]
 
 
 def main() -> None:
@@ -36,7 +36,7 @@ def main() -> None:
     runtime = load(bundle, "field")
     trial = data.experiment.trial
     rows = np.flatnonzero(np.append(trial[1:] != trial[:-1], True))
-    outputs = [runtime.run(counts) for counts in tared_counts(data)[rows]]
+    outputs = [runtime.run(counts) or {} for counts in tared_counts(data)[rows]]
     moved = np.stack([one["displacement"].reshape(-1, 3) for one in outputs])
     errors = np.linalg.norm(moved - data.displacement(rows), axis=2).mean(axis=1)
     middle = int(np.argsort(errors)[len(errors) // 2])
@@ -117,7 +117,8 @@ def _areas(mesh: SkinMesh) -> Floats:
     corners = mesh.nodes[mesh.outer_faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     third = np.linalg.norm(across, axis=1) / 6.0
-    return np.bincount(mesh.outer_faces.ravel(), np.repeat(third, 3), minlength=len(mesh.nodes))
+    area = np.bincount(mesh.outer_faces.ravel(), np.repeat(third, 3), minlength=len(mesh.nodes))
+    return np.asarray(area)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from palpate_training.learning.electrode_nets import (
 )
 from palpate_training.learning.export import onnx_bytes
 from palpate_training.learning.networks import Mlp, Standardised
-from palpate_training.systems import latent, ours, perceptrons, points, ruppel, synthesis, voxels
+from palpate_training.systems import latent, ours, perceptrons, points, ruppel, voxels
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results" / "networks.md"
@@ -128,7 +128,7 @@ def of_fields(nodes: int, modes: int) -> Iterator[tuple[str, nn.Module, int]]:
 def of_synthesis(places: np.ndarray, modes: int) -> Iterator[tuple[str, nn.Module, int]]:
     """Networks from the 128 nodes, from features or from modes to electrodes."""
     width = 3 * len(places)
-    net = points.PointNetPlus(places, 3, ELECTRODES, synthesis.FITTED_NODES)
+    net = points.PointNetPlus(places, 3, ELECTRODES, points.FITTED_NODES)
     yield "PointNet++ (the paper's)", Standardised(net, width, ELECTRODES), width
     yield "Ruppel 2019: network A", ruppel.network_a(ELECTRODES), 0
     yield "Ruppel 2019: network B", ruppel.network_b(ELECTRODES), 0

@@ -69,6 +69,18 @@ def verify(
     verify_model(bundle, load_profile(profile).models.repository_folder)
 
 
+@model_app.command(epilog=example("palpate model card field-twin"))
+def card(
+    bundle: Annotated[str, typer.Argument(help="Name, name:version or folder.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+) -> None:
+    """What a bundle estimates, from what it learned and how good it was, as Markdown."""
+    from palpate_deploy.station.models import print_card
+    from palpate_deploy.station.profile import load_profile
+
+    print_card(bundle, load_profile(profile).models.repository_folder)
+
+
 @model_app.command("import", epilog=example("palpate model import runs/bundle/2"))
 def import_(
     folder: Annotated[Path, typer.Argument(help="Folder of the bundle.")],

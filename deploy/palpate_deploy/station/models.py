@@ -16,6 +16,7 @@ from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
 from palpate.errors import LinkError, PalpateError, printable
 from palpate.files.bundle import Bundle, read_bundle, read_manifest
+from palpate.files.card import model_card
 from palpate.messages import ModelAction, ModelInventory, ServedModel
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.profile import Profile
@@ -98,6 +99,17 @@ def verify_model(name: str, folder: Path) -> None:
     print(f"ok  {manifest.name}:{manifest.version}  task {manifest.task}  {where}")
     print(f"    digest {bundle.sha256.hex()}")
     print(f"    {rows} golden rows reproduced; trained on {manifest.trained_on}")
+
+
+def print_card(name: str, folder: Path) -> None:
+    """Print the model card of a bundle.
+
+    Raises:
+        ConfigError: There is no such bundle.
+        BundleError: It is damaged.
+    """
+    bundle = read_bundle(Repository(folder).resolve(name))
+    print(model_card(bundle.manifest, bundle.sha256), end="")
 
 
 def import_model(source: Path, folder: Path) -> None:

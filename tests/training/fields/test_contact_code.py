@@ -175,6 +175,7 @@ def test_a_bundle_carries_them_and_says_how_good_they_are(
     assert 0.0 < metrics["contact_misplaced"] < 1.0
     assert metrics["contact_misplaced_2_to_8n"] <= 1.0
     outputs = load(bundle, "field").run(tared_counts(pressed)[0])
+    assert outputs is not None
     assert outputs["contact_force"].shape[-1] == 3 * len(pressed.mesh.nodes)
 
 

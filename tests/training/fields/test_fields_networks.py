@@ -21,6 +21,7 @@ from palpate_training.learning import export
 from palpate_training.learning.export import onnx_bytes
 from palpate_training.learning.graphs import FieldGraph, SynthesisGraph
 from palpate_training.learning.splits import RowSplit, by_trajectory, of_units
+from palpate_training.tasks.features import FEATURES_CONFIG
 from palpate_training.tasks.fields import (
     FieldFitConfig,
     FieldModel,
@@ -299,3 +300,4 @@ def test_unknown_untouched_counts_are_assumed(
 
 def test_the_command_has_the_epochs_of_the_configuration() -> None:
     assert FieldFitConfig().epochs == EPOCHS
+    assert FEATURES_CONFIG.epochs == EPOCHS

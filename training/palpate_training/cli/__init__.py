@@ -13,6 +13,7 @@ train_app.command("force-real")(train.train_force_real)
 train_app.command("features")(train.train_features_command)
 train_app.command("field")(train.train_field)
 train_app.command("synthesis")(train.train_synthesis)
+train_app.command("all")(train.train_all)
 train_app.command("report")(report.train_report)
 train_app.command("upgrade")(train.train_upgrade)
 

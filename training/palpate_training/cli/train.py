@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from palpate.files.atomic import written_whole
+from palpate.files.bundle import read_bundle
+from palpate.files.card import model_card
 from palpate.process import typed_command
 from palpate_training.datasets.features import open_dataset
 
@@ -21,7 +26,7 @@ Epochs = Annotated[int, typer.Option(min=1, help="Passes over the rows at most, 
 Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
 
 EPOCHS = 80
-"""The default of ``FieldFitConfig``, whose module needs torch."""
+"""The default of ``MembersConfig``, whose module needs torch."""
 
 console = Console()
 
@@ -80,6 +85,60 @@ def train_synthesis(
     _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
 
 
+def train_all(
+    data: Annotated[
+        Path,
+        typer.Argument(help="Mixed data set (.h5), or folder of published files (biotac1.hdf5)."),
+    ],
+    out: Annotated[Path, typer.Argument(help="Folder of the bundles, and of cards.md.")],
+    unit: Annotated[
+        str, typer.Option(help="Specimen whose electrodes are synthesised; empty = the first.")
+    ] = "",
+    name: Annotated[str, typer.Option(help="Bundles are called features-NAME, ...")] = "twin",
+    version: Version = 1,
+    seed: Seed = 0,
+    epochs: Epochs = EPOCHS,
+    assumed_rest: Annotated[
+        int | None,
+        typer.Option(min=0, max=4095, help="Rest [counts] of trials whose file has none."),
+    ] = None,
+) -> None:
+    """Bundles of all tasks from one data set: features, field, synthesis, and their model cards.
+
+    palpate train all runs/rest/mixed.h5 models --unit biotac-2 --version 5
+    """
+    from palpate_training.datasets.experiment import MixedDataset
+    from palpate_training.datasets.export import features
+    from palpate_training.datasets.features import write_dataset
+    from palpate_training.datasets.inspect import load
+    from palpate_training.learning.export import refuse_existing
+
+    _, experiment = load(data)
+    tasks = (
+        ("features", "field", "synthesis")
+        if isinstance(experiment, MixedDataset)
+        else ("features",)
+    )
+    folders = {task: out / f"{task}-{name}" / str(version) for task in tasks}
+    for folder in folders.values():
+        refuse_existing(folder)
+    with tempfile.TemporaryDirectory() as scratch:
+        rows = Path(scratch) / "features.h5"
+        write_dataset(rows, features(experiment, assumed_rest=assumed_rest))
+        train_features_command(rows, folders["features"], f"features-{name}", version, seed, epochs)
+    if isinstance(experiment, MixedDataset):
+        chosen = unit or experiment.experiment.unit_names[0]
+        train_field(data, folders["field"], "", f"field-{name}", version, seed, epochs)
+        synthesis = f"synthesis-{name}"
+        train_synthesis(data, folders["synthesis"], chosen, synthesis, version, seed, epochs)
+    else:
+        console.print("no field and no synthesis: the data set has no displacements")
+    cards = [read_bundle(folder) for folder in folders.values()]
+    with written_whole(out / "cards.md") as part:
+        part.write_text("\n".join(model_card(one.manifest, one.sha256) for one in cards), "utf-8")
+    console.print(f"wrote {out / 'cards.md'}")
+
+
 def train_force_real(
     data: Annotated[Path, typer.Option(help="Data set from `palpate data ingest-lasa`.")],
     out: Annotated[Path, typer.Option(help="Folder for force-real.md, .json and .png.")],
@@ -105,14 +164,15 @@ def train_features_command(
     data: Annotated[Path, typer.Option(help="Data set (.h5).")],
     out: Annotated[Path, typer.Option(help="Folder of the bundle; must not exist.")],
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "features",
-    version: Annotated[int, typer.Option(min=1, help="Its version.")] = 1,
-    seed: Annotated[int, typer.Option(help="Seed of split and weights.")] = 0,
+    version: Version = 1,
+    seed: Seed = 0,
+    epochs: Epochs = EPOCHS,
 ) -> None:
     """Train force and contact location, test on unseen presses, write the bundle.
 
     palpate train features --data presses.h5 --out models/features-virtual/1 --name features-virtual
     """
-    from palpate_training.tasks.features import train_features
+    from palpate_training.tasks.features import FEATURES_CONFIG, train_features
 
     with _progress() as progress:
         tasks = {}
@@ -122,7 +182,15 @@ def train_features_command(
                 tasks[quantity] = progress.add_task(quantity, total=total)
             progress.update(tasks[quantity], completed=done)
 
-        report = train_features(data, out, name=name, version=version, seed=seed, on_epoch=on_epoch)
+        report = train_features(
+            data,
+            out,
+            name=name,
+            version=version,
+            config=replace(FEATURES_CONFIG, epochs=epochs),
+            seed=seed,
+            on_epoch=on_epoch,
+        )
     _show(report.metrics, f"{name} {version}: unseen presses", out)
 
 

@@ -1,0 +1,52 @@
+"""Write docs/models.md: the cards of the bundles that ship (``make docs``).
+
+``python docs/make_models.py``          writes the page
+``python docs/make_models.py --check``  exits 1 if the committed page is not what it would write
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from palpate.files.bundle import read_bundle
+from palpate.files.card import model_card
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "models.md"
+MODELS = ROOT / "services" / "palpate_services" / "models"
+HEAD = """\
+<!-- Written by docs/make_models.py from the bundles that ship; do not edit. -->
+# Models that ship
+
+Their cards, as `palpate model card` shows them for any bundle. What each costs per frame:
+[results/networks.md](results/networks.md). How they are trained again: [twin.md](twin.md).
+They were trained on simulated fingers alone: on a real sensor their numbers mean nothing until you
+train your own.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for folder in sorted(path.parent for path in MODELS.glob("*/*/manifest.json")):
+        bundle = read_bundle(folder)
+        card = model_card(bundle.manifest, bundle.sha256)
+        parts.append(
+            "\n".join(f"#{line}" if line[:1] == "#" else line for line in card.split("\n"))
+        )
+    return "\n".join(parts)
+
+
+def main() -> None:
+    """Write or check."""
+    fresh = page()
+    if "--check" in sys.argv:
+        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != fresh:
+            raise SystemExit(f"{PAGE} is not what {sys.argv[0]} would write: run make docs")
+        return
+    PAGE.write_text(fresh, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

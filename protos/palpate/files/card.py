@@ -1,0 +1,136 @@
+"""The model card of a bundle: what it estimates, what it learned from, how good it was.
+
+Markdown, from the manifest alone, so a card never says what the bundle does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from palpate.files.bundle import Manifest
+from palpate.messages import TrainingRange, ValueRange
+
+TASK_WORDS = {
+    "features": "Tared electrodes of one BioTac to net force and, where it touches, to where.",
+    "field": "Tared electrodes of one BioTac to fields on the skin.",
+    "synthesis": "Displacement of the skin to the tared electrodes of one BioTac.",
+}
+
+OUTPUT_WORDS = {
+    "electrodes": "counts less those of the tare",
+    "tared_counts": "counts less those of the tare",
+    "force": "net force on the finger",
+    "contact_location": "centre of the indenter's tip, as the paper labels it",
+    "centre_of_pressure": "where the net force goes through the deformed skin",
+    "contact_normal": "mean direction of contact forces, out of the skin",
+    "displacement": "of each node from the pressurised, untouched state",
+    "contact_force": "on each node; see the normalisation for how far it is spread",
+    "coefficients": "of the displacement in the bundle's own basis",
+}
+
+_UNITS = {"_m": ("mm", 1e3), "_n": ("N", 1.0), "_rad": ("rad", 1.0), "_counts": ("counts", 1.0)}
+
+
+def model_card(manifest: Manifest, digest: bytes) -> str:
+    """A page for people about a bundle.
+
+    Args:
+        manifest: Of the bundle.
+        digest: SHA-256 of the manifest's file, 32 bytes: what estimates carry.
+    """
+    threshold = manifest.contact_threshold_n
+    facts = [
+        ("task", f"`{manifest.task}`: {TASK_WORDS[manifest.task]}"),
+        ("sensor", manifest.sensor_type),
+        ("frame", "finger, as in docs/conventions.md; SI units"),
+        ("digest", f"`{digest.hex()}`"),
+        ("made", f"{manifest.created[:10]} with palpate {manifest.palpate_version}"),
+        ("trained on", manifest.trained_on),
+        ("training data", f"content sha256 `{manifest.training_data_sha256}`"),
+        ("ONNX operator set", str(manifest.opset)),
+    ]
+    if threshold:
+        facts.append(("in contact", f"from an estimated force of {threshold:g} N"))
+    tensors = [
+        (
+            side,
+            f"`{tensor.name}`",
+            " x ".join("any" if width < 0 else str(width) for width in tensor.shape),
+            tensor.unit,
+            _words_of(tensor.name),
+        )
+        for side, some in (("in", manifest.inputs), ("out", manifest.outputs))
+        for tensor in some
+    ]
+    return "\n".join(
+        [
+            f"# {manifest.name} {manifest.version}",
+            "",
+            *_table(("", ""), facts),
+            "",
+            "## Inputs and outputs",
+            "",
+            *_table(("", "tensor", "shape", "unit", "what it is"), tensors),
+            "",
+            *(f"* {name}: {how}" for name, how in manifest.normalisation.items()),
+            "",
+            "## How good it was on rows that it was not trained on",
+            "",
+            "Rows of the data named above. On another finger, with another indenter or at another"
+            " temperature it may be worse; estimates carry flags where the input is unlike the"
+            " training rows.",
+            "",
+            *_table(("metric", "value", "unit"), map(_metric, sorted(manifest.metrics.items()))),
+            "",
+            "## Where it was trained",
+            "",
+            *_ranges(manifest.training_range),
+            "",
+        ]
+    )
+
+
+def _words_of(name: str) -> str:
+    if name.endswith("_sd"):
+        return f"standard deviation of `{name.removesuffix('_sd')}`"
+    return OUTPUT_WORDS.get(name, "")
+
+
+def _metric(item: tuple[str, float]) -> tuple[str, str, str]:
+    name, value = item
+    for ending, (unit, factor) in _UNITS.items():
+        # A bin of forces stands behind the unit: nodal_all_m_above_8n.
+        bare, _, rest = name.rpartition(ending)
+        if bare and (not rest or rest in ("_below_2n", "_2_to_8n", "_above_8n")):
+            return f"`{name}`", f"{factor * value:.4g}", unit
+    return f"`{name}`", f"{value:.4g}", ""
+
+
+def _ranges(known: TrainingRange | None) -> list[str]:
+    if known is None:
+        return ["Not known: the bundle was made before bundles said so."]
+    lines = [f"{known.source}.", ""]
+    rows = [
+        (f"`{one.name}`", one.unit, _ends(one), f"{one.length_max:.4g}" if one.length_max else "-")
+        for one in (*known.inputs, *known.outputs)
+    ]
+    lines += _table(("tensor", "unit", "smallest and largest of each value", "longest"), rows)
+    if known.combinations:
+        lines += ["", "It also knows which inputs occur together, and flags those that do not."]
+    return lines
+
+
+def _ends(values: ValueRange) -> str:
+    if not values.low:
+        return "-"
+    return ", ".join(
+        f"{low:.4g} to {high:.4g}" for low, high in zip(values.low, values.high, strict=True)
+    )
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [
+        f"| {' | '.join(head)} |",
+        f"|{'---|' * len(head)}",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]

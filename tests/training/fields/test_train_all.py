@@ -1,0 +1,49 @@
+"""``palpate train all``: every bundle of a data set by one command, or none of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from palpate.errors import BundleError
+from palpate.files.bundle import read_bundle
+from palpate_training.cli import train_app
+from palpate_training.datasets.experiment import MixedDataset, write_mixed
+from palpate_training.datasets.export import export_published
+
+
+def test_one_command_trains_all_bundles_and_writes_their_cards(
+    mixed: MixedDataset, tmp_path: Path
+) -> None:
+    write_mixed(tmp_path / "mixed.h5", mixed)
+    arguments = ["all", str(tmp_path / "mixed.h5"), str(tmp_path / "models")]
+    arguments += ["--unit", "biotac-2", "--name", "mine", "--version", "7", "--epochs", "2"]
+    result = CliRunner().invoke(train_app, arguments)
+    assert result.exit_code == 0, result.output
+    cards = (tmp_path / "models" / "cards.md").read_text(encoding="utf-8")
+    for task in ("features", "field", "synthesis"):
+        manifest = read_bundle(tmp_path / "models" / f"{task}-mine" / "7").manifest
+        assert (manifest.task, manifest.version) == (task, 7)
+        assert f"# {task}-mine 7" in cards
+    assert (
+        "biotac-2" in read_bundle(tmp_path / "models" / "synthesis-mine" / "7").manifest.trained_on
+    )
+    # One that is there already: refused before anything is trained.
+    (tmp_path / "models" / "field-mine" / "8").mkdir()
+    again = CliRunner().invoke(train_app, [*arguments, "--version", "8"])
+    assert isinstance(again.exception, BundleError)
+    assert not (tmp_path / "models" / "features-mine" / "8").exists()
+
+
+def test_published_files_have_features_alone_and_it_says_so(
+    mixed: MixedDataset, tmp_path: Path
+) -> None:
+    export_published(tmp_path / "published", mixed.experiment)
+    arguments = ["all", str(tmp_path / "published"), str(tmp_path / "models")]
+    result = CliRunner().invoke(train_app, [*arguments, "--assumed-rest", "3200", "--epochs", "2"])
+    assert result.exit_code == 0, result.output
+    assert "no displacements" in result.output
+    assert [each.name for each in (tmp_path / "models").iterdir() if each.is_dir()] == [
+        "features-twin"
+    ]
