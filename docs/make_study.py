@@ -31,45 +31,61 @@ HEAD = """\
 
 Tables, pictures and the numbers behind them; each page names the command that made its folder:
 
-| page | data | what is held out |
-|---|---|---|
-| [twin](study/twin/report.md) | the twin: 450 indentations, three simulated BioTacs | trajectories; a BioTac, nothing calibrated |
-| [twin-points](study/twin-points/report.md) | the same, force and location | points, executions, and neighbouring rows (no result: the floor) |
-| [real](study/real/report.md) | real BioTacs, public recordings | blocks of 18 s of force; touches of a contact normal |
-
-One seed each so far. Five seeds, unseen indenters and the other splits of the remaining tasks are not made yet. What each
-network costs per frame: [networks.md](networks.md). What failed: [training/LOG.md](../../training/LOG.md).
-How it is built: [ADR 22](../adr/0022-one-study.md).
+{pages}
+One seed each so far. Five seeds, unseen indenters, and the other splits of the remaining tasks are
+not made yet. What each network costs per frame: [networks.md](networks.md). What failed:
+[training/LOG.md](../../training/LOG.md). How it is built: [ADR 22](../adr/0022-one-study.md).
 
 ## Goals
 
-Ours are means of three networks. The floor is the same network with neighbouring rows in training: what presses that are alike would
-still give, so no result. Ratios are of median errors, ours over the best of the paper's three networks in the same test, with 95 % intervals.
+Ours are means of three networks. The floor is the same network with neighbouring rows in training:
+what presses that are alike would still give, so no result. Ratios are of median errors, ours over
+the best of the paper's three networks in the same test, with 95 % intervals.
 
 """
+
+PAGES = (
+    (
+        "[twin](study/twin/report.md)",
+        "the twin: 450 indentations, three simulated BioTacs",
+        "trajectories; a BioTac, nothing calibrated",
+    ),
+    (
+        "[twin-points](study/twin-points/report.md)",
+        "the same, force and location",
+        "points, executions, and neighbouring rows (no result: the floor)",
+    ),
+    (
+        "[real](study/real/report.md)",
+        "real BioTacs, public recordings",
+        "blocks of 18 s of force; touches of a contact normal",
+    ),
+)
 
 TAIL = """
 ## What holds back what is not reached
 
-* **Force from 2 N: presses.** With neighbours in training the same networks are at the floor above, far below the goal: noise, labels and
-  the networks themselves would allow it. What is missing are hard presses: {hard} of the rows are above 8 N, of 53 training trajectories.
-* **A BioTac that was not seen: specimens.** Our networks take a sensor's own gains for granted more than the paper's do, and are worse in
-  most of these tests. Two specimens cannot show what varies between them; a population can (to be trained on one next).
-* **Electrodes from the skin: presses**, too: with neighbours in training 10 counts ([training/LOG.md](../../training/LOG.md)).
-* **Location below 2 N** carries the robot's registration error, one constant for each unit and arm, which can only be learned on seen units.
+* **Force from 2 N: presses.** With neighbours in training the same networks are at the floor above,
+  far below the goal: noise, labels and the networks themselves would allow it. What is missing are
+  hard presses: {hard} of the rows are above 8 N.
+* **A BioTac that was not seen: specimens.** Our networks take a sensor's own gains for granted more
+  than the paper's do, and are worse in many of these tests. Two specimens cannot show what varies
+  between them; a population can.
+* **Electrodes from the skin: presses**, too: with neighbours in training 10 counts
+  ([training/LOG.md](../../training/LOG.md)).
+* **Location below 2 N** carries the robot's registration error, one constant for each unit and arm,
+  which can only be learned on seen units.
 """
 
 
 def read(folder: str) -> dict[str, Any]:
-    """A study; empty where it is not there."""
+    """A study, as its command wrote it."""
     path = STUDIES / folder / "study.json"
     values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return values
 
 
-def score(
-    study: dict[str, Any], task: str, split: str, metric: str, test: str = ALL
-) -> float | None:
+def score(study: dict[str, Any], task: str, split: str, metric: str, test: str = ALL) -> float:
     """A metric of ours; NaN where the study does not hold it."""
     for row in study["scores"]:
         key = (row["task"], row["split"], row["test"], row["system"])
@@ -101,7 +117,9 @@ def ratio_words(rows: list[dict[str, Any]]) -> str:
     return f"{found[0]:.2f} to {found[-1]:.2f} in {len(found)} tests"
 
 
-def goals(twin: dict[str, Any], points: dict[str, Any], real: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+def goals(
+    twin: dict[str, Any], points: dict[str, Any], real: dict[str, Any]
+) -> Iterator[tuple[str, ...]]:
     """Rows of the table: what, goal, measured, floor."""
 
     def line(
@@ -126,17 +144,25 @@ def goals(twin: dict[str, Any], points: dict[str, Any], real: dict[str, Any]) ->
         floor = list(ratios(points, task, "neighbour", error, least_n, most_n))
         return (what, goal, ratio_words(found), ratio_words(floor) if floor else "-")
 
-    yield line("force from 2 N, relative", "force", "magnitude_over_norm_median_from_2n", "8 %", 100, "%")
+    yield line(
+        "force from 2 N, relative", "force", "magnitude_over_norm_median_from_2n", "8 %", 100, "%"
+    )
     yield ratio("the same, ratio", "0.5", twin, "force", "trajectory", "magnitude_over_norm", 2.0)
-    yield line("angle of the force from 2 N", "force", "angle_rad_median_from_2n", "0.025 rad", 1, "rad")
+    yield line(
+        "angle of the force from 2 N", "force", "angle_rad_median_from_2n", "0.025 rad", 1, "rad"
+    )
     yield ratio("the same, ratio", "0.6", twin, "force", "trajectory", "angle_rad", 2.0)
-    yield line("contact location below 2 N", "location", "distance_m_median_below_2n", "1.2 mm", 1e3, "mm")
+    yield line(
+        "contact location below 2 N", "location", "distance_m_median_below_2n", "1.2 mm", 1e3, "mm"
+    )
     yield ratio("the same, ratio", "0.6", twin, "location", "trajectory", "distance_m", 0.0, 2.0)
     yield line("centre of pressure", "centre", "distance_m_median", "0.6 mm", 1e3, "mm")
     yield line("skin, all nodes", "field", "all_m_mean", "0.025 mm", 1e3, "mm")
     yield line("skin, above 8 N", "field", "all_m_mean_above_8n", "0.06 mm", 1e3, "mm")
     for unit in ("biotac-1", "biotac-2", "biotac-3"):
-        yield line(f"electrodes of {unit}", "synthesis", "rmse_counts", "12 counts", 1, "counts", unit)
+        yield line(
+            f"electrodes of {unit}", "synthesis", "rmse_counts", "12 counts", 1, "counts", unit
+        )
     yield ratio("unseen point, force, ratio", "0.7", points, "force", "point", "magnitude_n")
     yield ratio("unseen point, location, ratio", "0.7", points, "location", "point", "distance_m")
     yield ratio("unseen BioTac, force, ratio", "0.7", twin, "force", "unit", "magnitude_n")
@@ -155,10 +181,13 @@ def goals(twin: dict[str, Any], points: dict[str, Any], real: dict[str, Any]) ->
 def page() -> str:
     """The whole page."""
     twin, points, real = (read(name) for name in ("twin", "twin-points", "real"))
-    table = markdown_table(("what", "goal at most", "ours", "floor"), list(goals(twin, points, real)))
+    table = markdown_table(
+        ("what", "goal at most", "ours", "floor"), list(goals(twin, points, real))
+    )
     caption = next(one["caption"] for one in twin["pictures"] if one["task"] == "")
     hard = caption.partition("above 8 N ")[2].partition(" of")[0]
-    return HEAD + table + TAIL.format(hard=hard)
+    pages = markdown_table(("page", "data", "what is held out"), PAGES)
+    return HEAD.format(pages=pages) + table + TAIL.format(hard=hard)
 
 
 def main() -> None:

@@ -100,6 +100,34 @@ def test_pages_show_the_json_beside_the_paper(data: ExperimentDataset, tmp_path:
     assert page.count("<table>") == sum(bool(table.rows) for table in tables_of(read))
 
 
+def test_the_floor_stands_beside_each_number(data: ExperimentDataset, tmp_path: Path) -> None:
+    values = made(data, tmp_path, tasks=("force",), splits=("trajectory", "neighbour"))
+    tables = [table for table in tables_of(values) if table.columns[:1] == ("system",)]
+    beside, floor = (
+        next(
+            table
+            for table in tables
+            if table.text.startswith("Median error") and of in table.heading
+        )
+        for of in ("Unseen trajectory", "Not a result")
+    )
+    assert beside.columns[-1] == "*not a result*, neighbouring rows in training: all units"
+    left = {row[0]: row[-1] for row in floor.rows}
+    shown = {row[0]: row[-1] for row in beside.rows if row[0] != PAPER_LABEL}
+    assert shown == left
+    assert all(len(row) == len(beside.columns) for row in beside.rows)
+
+
+def test_what_is_not_known_is_a_dash(data: ExperimentDataset, tmp_path: Path) -> None:
+    values = made(data, tmp_path, tasks=("force",), splits=("trajectory",))
+    for row in values["scores"]:
+        row["metrics"]["magnitude_n_mean"] = float("nan")
+    write_study(tmp_path / "study.json", values)
+    read = json.loads((tmp_path / "study.json").read_text())
+    table = next(table for table in tables_of(read) if "mean [N]" in table.columns)
+    assert {row[table.columns.index("mean [N]")] for row in table.rows} == {"-"}
+
+
 def test_a_study_that_holds_nothing_says_what_there_is(data: ExperimentDataset) -> None:
     with pytest.raises(ConfigError, match="no system of these tasks"):
         Study(ExperimentSource(data, None), StudyPlan(systems=("nobody",)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -107,7 +108,9 @@ def train_report(
     values = study.results(folder)
     values["pictures"] = study.draw(folder, out)
     write_study(out / "study.json", values)
-    for path in (out / "study.json", *write_pages(out, values, command=typed_command())):
+    # Of what the file says: it has no numbers that are none.
+    read = json.loads((out / "study.json").read_text(encoding="utf-8"))
+    for path in (out / "study.json", *write_pages(out, read, command=typed_command())):
         console.print(f"wrote {path}", soft_wrap=True)
 
 

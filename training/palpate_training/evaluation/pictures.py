@@ -78,6 +78,7 @@ class Picture:
 class _Shown:
     """Estimates of one system for the test rows of the widest test, by the first seed."""
 
+    test: str
     system: str
     rows: npt.NDArray[np.int64]
     estimate: Floats
@@ -154,6 +155,7 @@ def _shown(made: Made, shown_split: SplitName) -> list[_Shown]:
         if split == shown_split:
             tests.setdefault(test, []).append(
                 _Shown(
+                    test,
                     system,
                     np.concatenate([cell.fold.rows.test for cell in cells]),
                     np.concatenate([made[cell].arrays["estimate"] for cell in cells]).astype(
@@ -214,7 +216,7 @@ def _draw_errors(path: Path, task: FeatureTask, shown: Sequence[_Shown], split: 
     return finish(
         figure,
         path,
-        f"{task.name.capitalize()}: {_HELD_OUT[split]}",
+        f"{task.name.capitalize()}: {_HELD_OUT[split]}, {shown[0].test}",
         f"{len(shown[0].rows):,} rows. Box: interquartile range (IQR); solid line: median; dashed:"
         " mean; whiskers: 1.5 IQR, rounded down to the nearest value. Green: ours; yellow: the"
         " paper's networks. Boxes may leave the picture on the right.",
