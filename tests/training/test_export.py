@@ -24,7 +24,7 @@ from palpate_training.learning.export import (
 )
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.graphs import FeaturesGraph
-from palpate_training.learning.networks import Mlp
+from palpate_training.learning.networks import Mlp, round_to_half
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
@@ -94,6 +94,20 @@ def test_bundle_round_trip(tmp_path: Path, *, contact: bool) -> None:
         assert values.dtype == np.float32
         np.testing.assert_allclose(values, bundle.golden[name], atol=1e-5)
     assert bundle.golden["force_sd"].shape == (16, 3)
+
+
+def test_weights_that_half_precision_holds_are_stored_in_it() -> None:
+    """And are what torch computes with; others are not rounded behind its back."""
+    plain, rounded = make_graph(), make_graph()
+    round_to_half(rounded.net)
+    whole, half = to_onnx(plain), to_onnx(rounded)
+    assert len(half) < 0.6 * len(whole)
+    assert parity(rounded, half, rows()) < export.PARITY_MAX
+    assert parity(plain, whole, rows()) < export.PARITY_MAX
+    with torch.inference_mode():
+        given = torch.from_numpy(rows())
+        change = (plain(given)[0] - rounded(given)[0]).abs().max()
+    assert 0 < change < 0.01 * plain(given)[0].abs().max()
 
 
 def test_export_is_deterministic_and_names_no_machine() -> None:
