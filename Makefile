@@ -93,6 +93,7 @@ docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links 
 	$(BIN)/python docs/make_indenters.py
 	$(BIN)/python docs/make_house.py
 	$(BIN)/python docs/make_models.py
+	$(BIN)/python docs/make_study.py
 	$(BIN)/python docs/make_numbers.py
 	$(BIN)/towncrier build --draft >/dev/null
 	$(BIN)/pytest -q tests/house/test_docs.py

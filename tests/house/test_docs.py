@@ -140,6 +140,7 @@ def test_palpate_commands_exist(
         "make_models.py",
         "make_numbers.py",
         "make_serving.py",
+        "make_study.py",
     ],
 )
 def test_generated_documents_are_fresh(program: str) -> None:
