@@ -118,6 +118,19 @@ def test_the_floor_stands_beside_each_number(data: ExperimentDataset, tmp_path: 
     assert all(len(row) == len(beside.columns) for row in beside.rows)
 
 
+def test_seeds_are_spent_where_all_units_are_trained_together(data: ExperimentDataset) -> None:
+    plan = StudyPlan(
+        tasks=("force",), splits=("trajectory", "unit"), systems=("MLP (the",), seeds=(0, 1, 2)
+    )
+    cells = Study(ExperimentSource(data, None), plan).cells
+    seeds: dict[tuple[str, str], list[int]] = {}
+    for cell in cells:
+        seeds.setdefault((cell.fold.split, cell.fold.test), []).append(cell.seed)
+    assert seeds.pop(("trajectory", "all units")) == [0, 1, 2]
+    assert set(map(tuple, seeds.values())) == {(0,)}
+    assert len(seeds) == 4
+
+
 def test_what_is_not_known_is_a_dash(data: ExperimentDataset, tmp_path: Path) -> None:
     values = made(data, tmp_path, tasks=("force",), splits=("trajectory",))
     for row in values["scores"]:

@@ -49,7 +49,10 @@ def train_report(
         str, typer.Option(help="Words of which a system's name has one; empty = all.")
     ] = "",
     seeds: Annotated[
-        int, typer.Option(min=1, help="Seeds of the first split of a task; others have one.")
+        int,
+        typer.Option(
+            min=1, help="Seeds of all units together in a task's first split; the rest: 1."
+        ),
     ] = 5,
     whole: Annotated[
         bool, typer.Option("--whole", help="Only tests of all units together.")

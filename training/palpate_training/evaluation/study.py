@@ -38,7 +38,7 @@ from palpate_training.evaluation.skin import (
     score_fields,
     score_synthesis,
 )
-from palpate_training.learning.splits import Fold, SplitName
+from palpate_training.learning.splits import ALL_UNITS, Fold, SplitName
 
 
 class StudySource(Protocol):
@@ -48,7 +48,7 @@ class StudySource(Protocol):
         """A task by name; None if the data does not hold it."""
 
     def splits(self, task: str) -> tuple[SplitName, ...]:
-        """Splits of a task; of the first all seeds are trained."""
+        """Splits of a task; of the first more seeds than one are trained."""
 
     def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
         """Trainings of a split; ``whole``: only those of all units together."""
@@ -73,7 +73,8 @@ class StudyPlan:
         tasks: Names of tasks.
         splits: Names of splits; a task leaves out those that it does not have.
         systems: Words of which a system's name must contain one; empty = all.
-        seeds: Seeds of the first split of a task; of the other splits the first alone.
+        seeds: Of the first split of a task, where all units are trained together (of recordings:
+            all of it); every other test has the first alone.
         split_seed: Deals trajectories and points to the sides.
         whole: Only the folds of all units together; for a first look.
     """
@@ -122,10 +123,12 @@ class Study:
             if split not in plan.splits:
                 continue
             folds = self.source.folds(name, split, seed=plan.split_seed, whole=plan.whole)
-            seeds = plan.seeds if number == 0 else plan.seeds[:1]
-            self.cells += [
-                cell for cell in cells_of(task, folds, seeds) if self._wanted(cell.system)
-            ]
+            together = [fold for fold in folds if fold.test == ALL_UNITS] or folds
+            for fold in folds:
+                seeds = plan.seeds if number == 0 and fold in together else plan.seeds[:1]
+                self.cells += [
+                    cell for cell in cells_of(task, [fold], seeds) if self._wanted(cell.system)
+                ]
 
     def _wanted(self, system: str) -> bool:
         words = self.plan.systems
