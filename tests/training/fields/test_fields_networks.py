@@ -18,7 +18,7 @@ from palpate.files.bundle import read_bundle
 from palpate_training.cli.train import EPOCHS
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import export
-from palpate_training.learning.export import onnx_bytes
+from palpate_training.learning.export import onnx_bytes, run_onnx
 from palpate_training.learning.graphs import FieldGraph, SynthesisGraph
 from palpate_training.learning.splits import RowSplit, by_trajectory, of_units
 from palpate_training.tasks.features import FEATURES_CONFIG
@@ -301,3 +301,16 @@ def test_unknown_untouched_counts_are_assumed(
 def test_the_command_has_the_epochs_of_the_configuration() -> None:
     assert FieldFitConfig().epochs == EPOCHS
     assert FEATURES_CONFIG.epochs == EPOCHS
+
+
+def test_synthesis_in_a_batch_has_the_bits_of_single_rows(
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig
+) -> None:
+    """Exponentials of rows of 19 would not have them."""
+    fitted = fit_synthesis(mixed, held, config=replace(quick, epochs=1))
+    graph = SynthesisGraph(fitted.net, fitted.code, fitted.pooling, np.ones(19, np.float32))
+    width = 3 * fitted.code.nodes
+    model = onnx_bytes(graph, "displacement", torch.zeros(4, width), ["tared_counts", "sd"])
+    rows = mixed.displacement(np.arange(200)).reshape(200, -1)
+    together, alone = run_onnx(model, "displacement", rows)
+    assert together[0].tobytes() == alone[0].tobytes()

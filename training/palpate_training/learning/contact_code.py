@@ -119,18 +119,25 @@ def fit_contact_code(data: MixedDataset, train: Rows, *, modes: int = CONTACT_MO
 
 def contact_coefficients(data: MixedDataset, code: ContactCode) -> FloatArray:
     """Coefficients of the spread forces of all rows [N], shape (N, K)."""
+    weights = spreading(data.mesh)
+    every = np.arange(len(data))
     parts = [
-        code.encode(spread_forces(data, np.arange(start, min(start + _CHUNK_ROWS, len(data)))))
+        code.encode(spread_forces(data, every[start : start + _CHUNK_ROWS], weights))
         for start in range(0, len(data), _CHUNK_ROWS)
     ]
     return np.concatenate(parts)
 
 
-def spread_forces(data: MixedDataset, rows: Rows) -> FloatArray:
+def spread_forces(data: MixedDataset, rows: Rows, weights: Floats | None = None) -> FloatArray:
     """Contact forces of rows on the outer nodes, spread over the skin [N], shape (R, O, 3).
 
     Data sets hold forces as modes, which lose some of the net force; it is put back where the
     forces are, so that each row's sum is the force of the simulation.
+
+    Args:
+        data: The rows.
+        rows: Which of them.
+        weights: Where forces go, from ``spreading``; None = found here.
 
     Raises:
         DatasetError: The data set has no contact forces.
@@ -145,7 +152,8 @@ def spread_forces(data: MixedDataset, rows: Rows) -> FloatArray:
     share = size / np.maximum(size.sum(axis=1, keepdims=True), 1e-12)
     lost = data.simulated_force[rows] - forces.sum(axis=1)
     whole = forces + share[:, :, None] * lost[:, None]
-    spread = np.tensordot(whole, spreading(data.mesh), axes=(1, 1))  # (R, 3, O)
+    weights = spreading(data.mesh) if weights is None else weights
+    spread = np.tensordot(whole, weights, axes=(1, 1))  # (R, 3, O)
     return np.asarray(spread.transpose(0, 2, 1), np.float32)
 
 

@@ -8,7 +8,7 @@ row, and an estimate may be the mean of that of a row and of its mirror image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,11 +126,12 @@ class ElectrodeInputs(nn.Module):
         """Inputs of the mirror images."""
         return torch.index_select(inputs, 1, self.order)
 
-    def noisy(self, inputs: Tensor, drift_counts: float = DRIFT_COUNTS) -> Tensor:
+    def noisy(self, inputs: Tensor, drift_counts: float | None = None) -> Tensor:
         """Inputs with noise and with a drift common to all electrodes, drawn for each row."""
         half = inputs.shape[1] // 2
         noise = NOISE_COUNTS * torch.randn_like(inputs[:, :half])
-        drift = drift_counts * torch.randn_like(inputs[:, :1])
+        spread = DRIFT_COUNTS if drift_counts is None else drift_counts
+        drift = spread * torch.randn_like(inputs[:, :1])
         # The same counts of an electrode in both of its inputs.
         return inputs + self.slope.to(inputs.device) * (noise + drift).repeat(1, 2)
 
@@ -177,13 +178,23 @@ class ElectrodeNet(nn.Module):
         return torch.stack(estimates).sum(dim=0) / len(estimates)
 
 
+def in_lanes(function: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
+    """A function of each value (N, W), with the same bits in a batch as alone.
+
+    Processors take 16 logarithms or exponentials at once and the rest one by one, in other bits.
+    Rows of 19 would have other bits in a batch than alone; rows of a whole number of sixteens do
+    not.
+    """
+    width = values.shape[-1]
+    whole = nn.functional.pad(values, (0, -width % _LANES), value=1.0)
+    return function(whole)[..., :width]
+
+
 def log_impedance(counts: Tensor) -> Tensor:
     """Logarithm of the impedance, but for a constant; counts are kept one inside of their range."""
-    # Processors take 16 logarithms at once and the rest one by one, in other bits. Rows of 19 would
-    # have other bits in a batch than alone; rows of a whole number of sixteens do not.
-    width = counts.shape[-1]
-    whole = nn.functional.pad(counts, (0, -width % _LANES), value=1.0)
-    return torch.log(COUNTS_MAX / whole.clamp(1.0, COUNTS_MAX - 1.0) - 1.0)[..., :width]
+    return in_lanes(
+        lambda whole: torch.log(COUNTS_MAX / whole.clamp(1.0, COUNTS_MAX - 1.0) - 1.0), counts
+    )
 
 
 def rest_of(trial_rest: FloatArray) -> FloatArray:

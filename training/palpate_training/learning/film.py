@@ -19,7 +19,7 @@ from palpate.anatomy import CORE_RADIUS_M, ELECTRODE_POSITIONS, EXCITATION_POSIT
 from palpate.errors import DatasetError
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import SkinMesh
-from palpate_training.learning.electrode_nets import MIRROR_AXES, log_impedance
+from palpate_training.learning.electrode_nets import MIRROR_AXES, in_lanes, log_impedance
 from palpate_training.learning.networks import Standardised
 
 FloatArray = npt.NDArray[np.float32]
@@ -152,7 +152,8 @@ class FilmNet(nn.Module):
     def widen(self, features: Tensor) -> Tensor:
         """Features ``(N, K + P)`` [m] with the logarithms behind them, ``(N, K + 2P)``."""
         thickness = 1.0 + features[:, self.modes :] / self.rest_m
-        return torch.cat([features, torch.log(torch.clamp(thickness, min=THINNEST_FILM))], dim=1)
+        logarithm = in_lanes(torch.log, torch.clamp(thickness, min=THINNEST_FILM))
+        return torch.cat([features, logarithm], dim=1)
 
     def fall_of(self, tared: Tensor) -> Tensor:
         """Fall of the logarithm of the impedance that tared counts ``(N, 19)`` mean."""
@@ -160,7 +161,7 @@ class FilmNet(nn.Module):
 
     def counts_of(self, fall: Tensor) -> Tensor:
         """Tared counts of a fall of the logarithm of the impedance, ``(N, 19)``."""
-        return COUNTS_MAX / (1.0 + torch.exp(self.log_rest - fall)) - self.rest
+        return COUNTS_MAX / (1.0 + in_lanes(torch.exp, self.log_rest - fall)) - self.rest
 
     def forward(self, features: Tensor) -> Tensor:
         """Tared counts ``(N, 19)`` of features ``(N, K + P)`` [m]."""
