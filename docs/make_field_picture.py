@@ -17,7 +17,8 @@ import numpy.typing as npt
 from palpate.files.bundle import read_bundle
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import resolve
-from palpate_training.datasets.experiment import MixedDataset, SkinMesh, read_mixed
+from palpate_training.datasets.experiment import MixedDataset, read_mixed
+from palpate_training.figures.skin import paint_outer
 from palpate_training.figures.style import INK, MM, finish, label, new_figure
 from palpate_training.learning.contact_code import spread_forces
 from palpate_training.tasks.fields import tared_counts
@@ -55,7 +56,7 @@ def draw(
     truth = data.displacement(np.array([row]))[0]
     pressing = np.zeros_like(truth)
     pressing[outer] = spread_forces(data, np.array([row]))[0]
-    area = _areas(mesh)
+    area = mesh.areas(mesh.outer_faces)
     kilopascal = 1e-3 / np.where(area > 0, area, np.inf)
     panels = {
         "displacement [mm]": [
@@ -82,7 +83,8 @@ def draw(
         top = max(float(values[outer].max()) for values in each)
         drawn = None
         for panel, values, what in zip(line, each, ("truth", "estimate", "error"), strict=True):
-            drawn = _from_below(panel, mesh, values, top)
+            drawn = paint_outer(panel, mesh, values, top)
+            panel.invert_yaxis()
             x_name = "x, distal [mm]" if line[0] is axes[-1, 0] else ""
             y_name = "y, lateral [mm]" if panel is line[0] else ""
             label(panel, x_name, y_name, f"{title.partition(' [')[0]}: {what}")
@@ -90,35 +92,6 @@ def draw(
         bar.set_label(title, color=INK, fontsize=9)
         bar.ax.tick_params(colors=INK, labelsize=8)
     finish(figure, PICTURE, "A press from 19 electrodes", text)
-
-
-def _from_below(panel: object, mesh: SkinMesh, values: Floats, top: float) -> object:
-    corners = mesh.nodes[mesh.outer_faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    seen = normal[:, 2] < 0
-    far_first = np.argsort(-corners[seen, :, 2].mean(axis=1))
-    drawn = panel.tripcolor(  # type: ignore[attr-defined]
-        MM * mesh.nodes[:, 0],
-        MM * mesh.nodes[:, 1],
-        values,
-        triangles=mesh.outer_faces[seen][far_first],
-        shading="gouraud",
-        cmap="viridis",
-        vmin=0,
-        vmax=top,
-    )
-    panel.set_aspect("equal")  # type: ignore[attr-defined]
-    panel.invert_yaxis()  # type: ignore[attr-defined]
-    return drawn
-
-
-def _areas(mesh: SkinMesh) -> Floats:
-    """Share of each node in the area of the outer surface [m2], shape (V,)."""
-    corners = mesh.nodes[mesh.outer_faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    third = np.linalg.norm(across, axis=1) / 6.0
-    area = np.bincount(mesh.outer_faces.ravel(), np.repeat(third, 3), minlength=len(mesh.nodes))
-    return np.asarray(area)
 
 
 if __name__ == "__main__":

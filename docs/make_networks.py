@@ -48,7 +48,6 @@ SAMPLE = ROOT / "training" / "palpate_training" / "samples" / "twin.h5"
 RUNS = 500
 GOAL_MS = {"features": 0.2, "field": 3.0, "synthesis": 3.0}
 REST = np.full(ELECTRODES, ASSUMED_REST, np.float32)
-SIGNS = MIRROR_AXES
 
 
 class Projected(nn.Module):
@@ -105,9 +104,9 @@ def of_features() -> Iterator[tuple[str, nn.Module, int]]:
         yield name, Standardised(net), ELECTRODES
     for name, members in (("residual network", 1), ("residual networks, mean of three", 3)):
         nets = [Standardised(ResidualLayers(38, 3), 38, 3) for _ in range(members)]
-        yield name, ElectrodeNet(nets, REST, SIGNS), ELECTRODES
+        yield name, ElectrodeNet(nets, REST, MIRROR_AXES), ELECTRODES
     attention = Standardised(Flat(ours.ElectrodeAttention(3)), 38, 3)
-    yield "attention over electrodes", ElectrodeNet([attention], REST, SIGNS), ELECTRODES
+    yield "attention over electrodes", ElectrodeNet([attention], REST, MIRROR_AXES), ELECTRODES
 
 
 def of_fields(nodes: int, modes: int) -> Iterator[tuple[str, nn.Module, int]]:
@@ -187,7 +186,7 @@ def main() -> None:
     """Measure and write both files."""
     data = read_mixed(SAMPLE)
     places = data.mesh.nodes[data.mesh.subset]
-    shapes = {one["name"]: one for one in shipped()}
+    bundles = list(shipped())
     modes = int(
         json.loads(
             next((MODELS / "field-twin").glob("*/manifest.json")).read_text(encoding="utf-8")
@@ -207,7 +206,7 @@ def main() -> None:
         "cpu": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "onnxruntime": onnxruntime.__version__,
-        "bundles": list(shapes.values()),
+        "bundles": bundles,
         "networks": networks,
     }
     RESULTS.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")

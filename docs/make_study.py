@@ -38,9 +38,9 @@ not made yet. What each network costs per frame: [networks.md](networks.md). Wha
 
 ## Goals
 
-Ours are means of three networks. The floor is the same network with neighbouring rows in training:
-what presses that are alike would still give, so no result. Ratios are of median errors, ours over
-the best of the paper's three networks in the same test, with 95 % intervals.
+Ours are means of three networks. The floor is the same network tested on rows whose neighbours it
+was trained on: it is no result, and shows what more presses could give. A ratio is our median error
+over that of the best of the paper's three networks in the same test, with its 95 % interval.
 
 """
 
@@ -65,9 +65,8 @@ PAGES = (
 TAIL = """
 ## What holds back what is not reached
 
-* **Force from 2 N: presses.** With neighbours in training the same networks are at the floor above,
-  far below the goal: noise, labels and the networks themselves would allow it. What is missing are
-  hard presses: {hard} of the rows are above 8 N.
+* **Force from 2 N: presses.** The floor is far below the goal, so noise, labels and networks would
+  allow it. What is missing are hard presses: {hard} of the rows are above 8 N.
 * **A BioTac that was not seen: our training.** Our networks take a sensor's own gains for granted
   more than the paper's do, and are worse in many of these tests. Random gains of electrodes in
   training cure most of that (one network, 0.232 to 0.088 N from the third unit to the first) and

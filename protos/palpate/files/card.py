@@ -11,7 +11,7 @@ from palpate.files.bundle import Manifest
 from palpate.messages import TrainingRange, ValueRange
 
 TASK_WORDS = {
-    "features": "Tared electrodes of one BioTac to net force and, where it touches, to where.",
+    "features": "Tared electrodes of one BioTac to the net force and the place of contact.",
     "field": "Tared electrodes of one BioTac to fields on the skin.",
     "synthesis": "Displacement of the skin to the tared electrodes of one BioTac.",
 }
@@ -108,7 +108,7 @@ def _metric(item: tuple[str, float]) -> tuple[str, str, str]:
 
 def _ranges(known: TrainingRange | None) -> list[str]:
     if known is None:
-        return ["Not known: the bundle was made before bundles said so."]
+        return ["Not known: the bundle is older than this part of the manifest."]
     lines = [f"{known.source}.", ""]
     rows = [
         (f"`{one.name}`", one.unit, _ends(one), f"{one.length_max:.4g}" if one.length_max else "-")

@@ -51,7 +51,7 @@ def train_report(
     seeds: Annotated[
         int,
         typer.Option(
-            min=1, help="Seeds of all units together in a task's first split; the rest: 1."
+            min=1, help="Seeds of tests of all units in a task's first split; others have 1."
         ),
     ] = 5,
     whole: Annotated[
@@ -111,7 +111,7 @@ def train_report(
     values = study.results(folder)
     values["pictures"] = study.draw(folder, out)
     write_study(out / "study.json", values)
-    # Of what the file says: it has no numbers that are none.
+    # The file has null where a metric is not known; the pages are made from it.
     read = json.loads((out / "study.json").read_text(encoding="utf-8"))
     for path in (out / "study.json", *write_pages(out, read, command=typed_command())):
         console.print(f"wrote {path}", soft_wrap=True)

@@ -127,6 +127,14 @@ class SkinMesh:
         """Nodes of the outer surface, ascending, shape (O,)."""
         return np.unique(self.outer_faces)
 
+    def areas(self, faces: IndexArray) -> npt.NDArray[np.float64]:
+        """Each node's share of the area of some triangles [m2], shape (V,)."""
+        corners = self.nodes[faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        third = np.linalg.norm(cross, axis=1) / 6.0
+        shares = np.bincount(faces.ravel(), np.repeat(third, 3), minlength=len(self.nodes))
+        return np.asarray(shares, np.float64)
+
 
 @dataclass(frozen=True, slots=True)
 class FieldBasis:

@@ -77,7 +77,7 @@ class ExperimentSource:
         )
 
     def splits(self, task: str) -> tuple[SplitName, ...]:
-        """Splits of a task; of the first more seeds than one are trained."""
+        """Splits of a task; the first is trained with several seeds."""
         return TASK_SPLITS[task]
 
     def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:

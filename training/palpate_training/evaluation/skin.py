@@ -13,7 +13,7 @@ from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
 from palpate_training.evaluation.features import Scores
 from palpate_training.evaluation.intervals import drawn_medians, interval
-from palpate_training.learning.metrics import FORCE_BINS_N, cluster_bootstrap, root_mean
+from palpate_training.learning.metrics import by_force, cluster_bootstrap, root_mean
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS, FieldSystem
 from palpate_training.systems.synthesis import SYNTHESIS_SYSTEMS, SynthesisSystem
@@ -84,10 +84,9 @@ def score_fields(task: FieldTask, results: Mapping[Cell, CellResult]) -> list[Sc
         for name in errors[0]:
             stacked = np.stack([one[name] for one in errors]).astype(np.float64)
             metrics[f"{name}_mean"] = float(np.nanmean(stacked))
-            for where, (low, high) in FORCE_BINS_N.items():
-                inside = (force_n >= low) & (force_n < high)
-                if inside.any():
-                    metrics[f"{name}_mean_{where}"] = float(np.nanmean(stacked[:, inside]))
+            metrics |= by_force(
+                f"{name}_mean", stacked.T, force_n, lambda some: float(np.nanmean(some))
+            )
         ends = cluster_bootstrap(
             {
                 f"{name}_mean": np.stack([one[name] for one in errors], axis=1).astype(np.float64)
@@ -126,11 +125,12 @@ def score_synthesis(task: SynthesisTask, results: Mapping[Cell, CellResult]) -> 
             each = [root_mean(one[:, electrode]) for one in squares]
             metrics[f"rmse_e{electrode + 1:02d}_counts"] = float(np.mean(each))
         mean_squares = np.stack([one.mean(axis=1) for one in squares], axis=1)
-        for where, (low, high) in FORCE_BINS_N.items():
-            inside = (force_n[rows] >= low) & (force_n[rows] < high)
-            if inside.any():
-                each = [root_mean(one[inside]) for one in squares]
-                metrics[f"rmse_counts_{where}"] = float(np.mean(each))
+        metrics |= by_force(
+            "rmse_counts",
+            mean_squares,
+            force_n[rows],
+            lambda some: float(np.mean([root_mean(one) for one in some.T])),
+        )
         ends = cluster_bootstrap(
             {"rmse_counts": mean_squares}, cluster, statistic=root_mean, draws=BOOTSTRAP_DRAWS
         )

@@ -48,7 +48,7 @@ class StudySource(Protocol):
         """A task by name; None if the data does not hold it."""
 
     def splits(self, task: str) -> tuple[SplitName, ...]:
-        """Splits of a task; of the first more seeds than one are trained."""
+        """Splits of a task; the first is trained with several seeds."""
 
     def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
         """Trainings of a split; ``whole``: only those of all units together."""

@@ -189,25 +189,47 @@ def draw_motion(path: Path, mesh: SkinMesh, share: Floats, rows: int) -> str:
     top = max(100 * float(outer.max()), 1e-9)
     drawn: Any = None
     for axes, (title, across, up, towards, sign) in zip(panels, _MOTION_VIEWS, strict=True):
-        corners = mesh.nodes[mesh.outer_faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        seen = sign * normal[:, towards] > 0
-        # Far triangles first: those behind are painted over.
-        depth = sign * corners[seen, :, towards].mean(axis=1)
-        drawn = axes.tripcolor(
-            MM * mesh.nodes[:, across],
-            MM * mesh.nodes[:, up],
-            100 * share,
-            triangles=mesh.outer_faces[seen][np.argsort(depth)],
-            shading="gouraud",
-            cmap="viridis",
-            vmin=0,
-            vmax=top,
-        )
+        drawn = paint_outer(axes, mesh, 100 * share, top, (across, up, towards), sign)
         label(axes, _AXES[across], _AXES[up], title)
-        axes.set_aspect("equal")
     panels[1].invert_yaxis()
     bar = figure.colorbar(drawn, ax=panels, shrink=0.8, pad=0.02)
     bar.set_label("rows with motion > 0.1 mm [%]", color=INK, fontsize=9)
     bar.ax.tick_params(colors=INK, labelsize=8)
     return finish(figure, path, "Frequency of skin motion", text)
+
+
+def paint_outer(
+    axes: Any,
+    mesh: SkinMesh,
+    values: npt.NDArray[np.floating],
+    top: float,
+    view: tuple[int, int, int] = (0, 1, 2),
+    sign: float = -1.0,
+) -> Any:
+    """Colour the outer skin by values of its nodes, 0 to ``top``; returns what a colour bar needs.
+
+    Args:
+        axes: Where to draw; in mm.
+        mesh: The skin.
+        values: Of all nodes, shape (V,).
+        top: Value of the last colour.
+        view: Coordinates that point across, up and towards the viewer; by default from below.
+        sign: Of the coordinate towards the viewer.
+    """
+    across, up, towards = view
+    corners = mesh.nodes[mesh.outer_faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    seen = sign * normal[:, towards] > 0
+    # Far triangles first: those behind are painted over.
+    depth = sign * corners[seen, :, towards].mean(axis=1)
+    axes.set_aspect("equal")
+    return axes.tripcolor(
+        MM * mesh.nodes[:, across],
+        MM * mesh.nodes[:, up],
+        values,
+        triangles=mesh.outer_faces[seen][np.argsort(depth)],
+        shading="gouraud",
+        cmap="viridis",
+        vmin=0,
+        vmax=top,
+    )

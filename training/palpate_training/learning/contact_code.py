@@ -163,10 +163,7 @@ def spreading(mesh: SkinMesh) -> Floats:
     A Gaussian of ``SPREAD_M`` of the distance, weighted by each node's share of the skin's area.
     """
     outer = mesh.outer_nodes
-    faces = np.searchsorted(outer, mesh.outer_faces)
     place = mesh.nodes[outer]
-    first, second, third = (place[faces[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 6.0
-    of_node = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(outer))
-    weights = of_node[:, None] * np.exp(-0.5 * np.square(cdist(place, place) / SPREAD_M))
+    area = mesh.areas(mesh.outer_faces)[outer]
+    weights = area[:, None] * np.exp(-0.5 * np.square(cdist(place, place) / SPREAD_M))
     return np.asarray(weights / weights.sum(axis=0), np.float64)

@@ -86,7 +86,7 @@ def pooling(mesh: SkinMesh) -> FilmPooling:
     axis = np.minimum(points[:, :1], 0.0) * [[1.0, 0.0, 0.0]]
     film = np.sum((points - axis) * normals, axis=1) - CORE_RADIUS_M
     foot = axis + CORE_RADIUS_M * normals
-    area = _nodal_area(mesh, inner)
+    area = mesh.areas(mesh.inner_faces)[inner]
     distance = np.linalg.norm(foot[:, None] - SITES[None], axis=2)  # (I, 23)
     columns = []
     for site in range(len(SITES)):
@@ -103,14 +103,6 @@ def pooling(mesh: SkinMesh) -> FilmPooling:
         weights=weights[used].astype(np.float32),
         rest_m=np.maximum(film @ weights, _THINNEST_REST_M).astype(np.float32),
     )
-
-
-def _nodal_area(mesh: SkinMesh, inner: npt.NDArray[np.int64]) -> Floats:
-    corners = mesh.nodes[mesh.inner_faces]  # (G, 3, 3)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    third = np.linalg.norm(cross, axis=1) / 6.0
-    area = np.bincount(mesh.inner_faces.ravel(), np.repeat(third, 3), minlength=len(mesh.nodes))
-    return np.asarray(area[inner], np.float64)
 
 
 THINNEST_FILM = 0.02

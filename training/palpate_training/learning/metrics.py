@@ -234,7 +234,7 @@ def by_force(name: str, values: Rows64, force_n: Rows64, statistic: Statistic) -
 
     Args:
         name: The key of a bin is this and the bin's name.
-        values: One for each row, shape ``(N,)``.
+        values: Of each row, shape ``(N, ...)``.
         force_n: Magnitude of each row's force [N], shape ``(N,)``.
         statistic: Of values.
     """
