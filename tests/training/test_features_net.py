@@ -55,6 +55,25 @@ def test_inputs_are_counts_and_the_fall_of_the_log_impedance() -> None:
     assert torch.isfinite(net(at_the_ends)).all()
 
 
+def test_training_inputs_have_gains_of_their_own() -> None:
+    """Another finger's electrodes are stronger or weaker: both inputs of an electrode alike."""
+    read = electrode_nets.ElectrodeInputs(REST)
+    tared = np.full((4000, 19), 300.0, np.float32)
+    inputs = torch.from_numpy(read.of(tared))
+    torch.manual_seed(0)
+    counts, fall = (
+        (read.noisy(inputs, drift_counts=0.0) / inputs).numpy().reshape(-1, 2, 19).swapaxes(0, 1)
+    )
+    np.testing.assert_allclose(counts, fall, atol=0.05)
+    gains = np.log(counts)
+    np.testing.assert_allclose(gains.std(axis=0), electrode_nets.GAIN_SPREAD, rtol=0.06)
+    np.testing.assert_allclose(gains.mean(axis=0), 0.0, atol=0.02)
+    assert np.abs(np.corrcoef(gains.T) - np.eye(19)).max() < 0.1
+    # An untouched finger stays untouched, whatever its gains are.
+    still = read.noisy(torch.zeros(500, 38), drift_counts=0.0)[:, :19]
+    assert still.std() < 1.5 * electrode_nets.NOISE_COUNTS
+
+
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_it_learns_and_a_mirror_image_has_the_mirrored_estimate(*, symmetric: bool) -> None:
     train, test = rows_of(800, 1), rows_of(200, 2)

@@ -174,6 +174,12 @@ def test_a_bundle_carries_them_and_says_how_good_they_are(
     assert names == ["displacement", "displacement_sd", "contact_force", "coefficients"]
     assert 0.0 < metrics["contact_misplaced"] < 1.0
     assert metrics["contact_misplaced_2_to_8n"] <= 1.0
+    assert bundle.manifest.training_range is not None
+    displacement, contact = bundle.manifest.training_range.outputs
+    assert (displacement.name, contact.name, contact.unit) == ("displacement", "contact_force", "N")
+    rows = of_units(pressed.experiment, by_trajectory(pressed.experiment), ["biotac-1"]).train
+    longest = np.linalg.norm(spread_forces(pressed, rows), axis=2).max()
+    assert contact.length_max == pytest.approx(longest, rel=1e-5)
     outputs = load(bundle, "field").run(tared_counts(pressed)[0])
     assert outputs is not None
     assert outputs["contact_force"].shape[-1] == 3 * len(pressed.mesh.nodes)

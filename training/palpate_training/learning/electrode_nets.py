@@ -31,6 +31,11 @@ DRIFT_COUNTS = 10.0
 """Standard deviation of what all electrodes of a training row have drifted alike since the tare:
 half a kelvin. A network that never saw it takes 20 counts for 0.85 N (training/LOG.md)."""
 
+GAIN_SPREAD = 0.1
+"""Standard deviation of the logarithm of a gain that each electrode of a training row gets: what
+the electrodes of a finger that nobody trained on differ by. Without it a network takes the gains of
+the fingers it saw for granted (training/LOG.md)."""
+
 _LANES = 16
 
 
@@ -127,13 +132,15 @@ class ElectrodeInputs(nn.Module):
         return torch.index_select(inputs, 1, self.order)
 
     def noisy(self, inputs: Tensor, drift_counts: float | None = None) -> Tensor:
-        """Inputs with noise and with a drift common to all electrodes, drawn for each row."""
+        """Inputs with noise, a common drift and gains of the electrodes, drawn for each row."""
         half = inputs.shape[1] // 2
         noise = NOISE_COUNTS * torch.randn_like(inputs[:, :half])
         spread = DRIFT_COUNTS if drift_counts is None else drift_counts
         drift = spread * torch.randn_like(inputs[:, :1])
-        # The same counts of an electrode in both of its inputs.
-        return inputs + self.slope.to(inputs.device) * (noise + drift).repeat(1, 2)
+        gain = torch.exp(GAIN_SPREAD * torch.randn_like(inputs[:, :half]))
+        # The same counts and gain of an electrode in both of its inputs.
+        moved = inputs + self.slope.to(inputs.device) * (noise + drift).repeat(1, 2)
+        return moved * gain.repeat(1, 2)
 
 
 class ElectrodeNet(nn.Module):

@@ -110,9 +110,9 @@ class FieldGraph(nn.Module):
             self.optional = ("displacement_sd", "contact_force", "coefficients")
             _register(self, contact_modes=contact.modes, contact_scale=contact.scale)
             # Inner nodes take the zero that follows the forces of the outer ones.
-            place = np.full((contact.nodes, 3), contact.modes.shape[1], np.int64)
-            place[contact.outer] = np.arange(contact.modes.shape[1]).reshape(-1, 3)
-            _register(self, contact_place=place.ravel())
+            place = np.full(contact.nodes, len(contact.outer), np.int64)
+            place[contact.outer] = np.arange(len(contact.outer))
+            _register(self, contact_place=place)
 
     def forward(self, electrodes: Tensor) -> tuple[Tensor, ...]:
         """Displacement ``(N, 3V)`` [m], and what ``optional`` names.
@@ -128,8 +128,8 @@ class FieldGraph(nn.Module):
             return field, spread, coefficients
         of_contact = estimate[:, len(self.scale) :] * self.get_buffer("contact_scale")
         outer = of_contact @ self.get_buffer("contact_modes").to(torch.float32)  # (N, 3O)
-        padded = nn.functional.pad(outer, (0, 1))
-        force = torch.index_select(padded, 1, self.get_buffer("contact_place"))
+        vectors = nn.functional.pad(outer, (0, 3)).reshape(outer.shape[0], -1, 3)  # (N, O + 1, 3)
+        force = torch.index_select(vectors, 1, self.get_buffer("contact_place")).flatten(1)
         return field, spread, force, coefficients
 
 

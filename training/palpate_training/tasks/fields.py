@@ -29,6 +29,7 @@ from palpate_training.learning.contact_code import (
     contact_coefficients,
     fit_contact_code,
     spread_forces,
+    spreading,
 )
 from palpate_training.learning.electrode_nets import (
     DRIFT_COUNTS,
@@ -286,8 +287,7 @@ def field_row_errors(
     parts: dict[str, list[list[Errors]]] = {
         name: [[] for _ in each] for name, each in models.items()
     }
-    for start in range(0, len(rows), _CHUNK_ROWS):
-        part = rows[start : start + _CHUNK_ROWS]
+    for part in _in_parts(rows):
         truth = data.displacement(part)
         for name, each in models.items():
             for i, estimate in enumerate(each):
@@ -362,7 +362,7 @@ def field_bundle(
             " modes of the training rows, half precision in the graph",
             "displacement_sd": "constant per node: rms length of the error on validation rows",
         },
-        training_range=field_range(data, split.train, seen),
+        training_range=field_range(data, split.train, seen, contact=model.contact is not None),
         known_inputs=known_inputs(seen, presses),
     )
     return metrics
@@ -374,8 +374,7 @@ def _contact_metrics(
     """How well contact forces are estimated, medians over rows, for a manifest."""
     assert model.contact is not None
     parts = []
-    for start in range(0, len(rows), _CHUNK_ROWS):
-        part = rows[start : start + _CHUNK_ROWS]
+    for part in _in_parts(rows):
         estimate = model.contact_forces(tared_counts(data)[part])
         parts.append(contact_errors(estimate, spread_forces(data, part)))
     errors = join(parts)
@@ -411,23 +410,47 @@ def seen_rows(
     return np.vstack([tared_counts(data)[rows], untouched]), presses
 
 
-def field_range(data: MixedDataset, rows: Rows, seen: FloatArray) -> TrainingRange:
-    """Range of a field network that was trained on rows; ``seen`` are its inputs, all of them."""
+def field_range(
+    data: MixedDataset, rows: Rows, seen: FloatArray, *, contact: bool
+) -> TrainingRange:
+    """Range of a field network that was trained on rows.
+
+    Args:
+        data: The rows.
+        rows: Which of them.
+        seen: Its inputs, all of them.
+        contact: Whether the network estimates contact forces.
+    """
+    outputs = [longest_of("displacement", "m", fields_of(data, rows))]
+    if contact:
+        outputs.append(longest_of("contact_force", "N", _contact_forces_of(data, rows)))
     return TrainingRange(
         source=f"{len(seen)} training rows, untouched ones included, of"
         f" {data.experiment.provenance.source}",
         data_sha256=content_sha256(data),
         rows=len(seen),
         inputs=(ends_of("electrodes", "tared counts", seen),),
-        outputs=(longest_of("displacement", "m", fields_of(data, rows)),),
+        outputs=tuple(outputs),
         combinations=True,
     )
 
 
+def _in_parts(rows: Rows) -> list[Rows]:
+    """So few rows at a time that their fields fit into memory."""
+    return np.split(rows, range(_CHUNK_ROWS, len(rows), _CHUNK_ROWS))
+
+
 def fields_of(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:
     """Fields of rows in small parts, each of shape (N, V, 3)."""
-    for start in range(0, len(rows), _CHUNK_ROWS):
-        yield data.displacement(rows[start : start + _CHUNK_ROWS])
+    for part in _in_parts(rows):
+        yield data.displacement(part)
+
+
+def _contact_forces_of(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:
+    """Spread contact forces of rows in small parts, each of shape (N, O, 3)."""
+    weights = spreading(data.mesh)
+    for part in _in_parts(rows):
+        yield spread_forces(data, part, weights)
 
 
 def truncation_metrics(code: FieldCode) -> dict[str, float]:
@@ -443,8 +466,7 @@ def spread_rows(rows: Rows) -> Rows:
 
 def _node_sd(data: MixedDataset, rows: Rows, estimate: Callable[[Rows], FloatArray]) -> FloatArray:
     total = np.zeros(len(data.mesh.nodes))
-    for start in range(0, len(rows), _CHUNK_ROWS):
-        part = rows[start : start + _CHUNK_ROWS]
+    for part in _in_parts(rows):
         total += np.square(estimate(part) - data.displacement(part)).sum(axis=(0, 2))
     return np.asarray(np.sqrt(total / len(rows)), np.float32)
 

@@ -58,7 +58,8 @@ def upgrade_bundle(old: Path, data: Path, out: Path, *, units: Sequence[str] = (
             bundle = with_coefficients(bundle)
             seen, groups = seen_rows(mixed, rows, FieldFitConfig(), seed=0)
             known = known_inputs(seen, groups)
-            found = field_range(mixed, rows, seen)
+            contact = any(one.name == "contact_force" for one in bundle.manifest.outputs)
+            found = field_range(mixed, rows, seen, contact=contact)
         else:
             found = synthesis_range(mixed, rows)
     if found.data_sha256 != bundle.manifest.training_data_sha256:
