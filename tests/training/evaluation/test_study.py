@@ -79,6 +79,9 @@ def test_scores_are_those_of_the_estimates(data: ExperimentDataset, tmp_path: Pa
     assert zero["metrics"]["magnitude_over_norm_median_below_2n"] == pytest.approx(1.0)
     low, high = zero["intervals"]["magnitude_n_median"]
     assert low <= np.percentile(force, 50, method="lower") <= high
+    every = np.linalg.norm(data.force.astype(np.float64), axis=1)
+    assert values["forces"]["median_n"] == pytest.approx(np.median(every))
+    assert values["forces"]["below_2n"] == pytest.approx((every < 2).sum() / len(every))
 
 
 def test_pages_show_the_json_beside_the_paper(data: ExperimentDataset, tmp_path: Path) -> None:

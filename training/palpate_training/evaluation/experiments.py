@@ -17,7 +17,13 @@ from palpate_training.datasets.experiment import (
 )
 from palpate_training.evaluation.cells import Task
 from palpate_training.evaluation.features import FeatureTask, systems_of
-from palpate_training.evaluation.pictures import Made, Picture, draw_forces, draw_task
+from palpate_training.evaluation.pictures import (
+    Made,
+    Picture,
+    draw_forces,
+    draw_task,
+    force_shares,
+)
 from palpate_training.evaluation.skin import FieldTask, SynthesisTask, of_one_unit
 from palpate_training.learning.splits import ALL_UNITS, Fold, SplitName, folds_of
 from palpate_training.systems.samples import Quantity, samples_of
@@ -106,6 +112,11 @@ class ExperimentSource:
         """Rows of each data set."""
         mixed = {} if self.mixed is None else {"mixed rows with fields": len(self.mixed)}
         return {"rows of the experiment": len(self.experiment), **mixed}
+
+    @property
+    def forces(self) -> dict[str, float]:
+        """How strong the presses are; see ``force_shares``."""
+        return force_shares(self.experiment)
 
     def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
         """Draw what there is to show of each task into ``out``."""

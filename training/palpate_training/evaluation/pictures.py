@@ -122,6 +122,17 @@ def draw_task(
     ]
 
 
+def force_shares(data: ExperimentDataset) -> dict[str, float]:
+    """How strong the presses are: median and standard deviation [N], shares of light and hard."""
+    force_n = np.linalg.norm(data.force.astype(np.float64), axis=1)
+    return {
+        "median_n": float(np.median(force_n)),
+        "sd_n": float(force_n.std()),
+        "below_2n": float(np.mean(force_n < 2)),
+        "above_8n": float(np.mean(force_n > 8)),
+    }
+
+
 def draw_forces(folder: Path, data: ExperimentDataset) -> Picture:
     """Draw how strong the presses are, beside the spread of the paper's.
 
@@ -136,13 +147,14 @@ def draw_forces(folder: Path, data: ExperimentDataset) -> Picture:
         axes.axvline(bound, color=INK, lw=0.8, ls="--")
     label(axes, "magnitude of the force [N]", "rows")
     grid(axes, "y")
+    of = force_shares(data)
     caption = finish(
         figure,
         folder / "forces.png",
         "How strong the presses are",
-        f"Median {np.median(force_n):.2f} N, standard deviation {force_n.std():.2f} N (the paper's "
-        f"rows: about {PAPER_SD_N:g} N), below 2 N {100 * np.mean(force_n < 2):.0f} %, above 8 N "
-        f"{100 * np.mean(force_n > 8):.0f} % of {len(force_n):,} rows.",
+        f"Median {of['median_n']:.2f} N, standard deviation {of['sd_n']:.2f} N (the paper's "
+        f"rows: about {PAPER_SD_N:g} N), below 2 N {100 * of['below_2n']:.0f} %, above 8 N "
+        f"{100 * of['above_8n']:.0f} % of {len(force_n):,} rows.",
     )
     return Picture("", "forces.png", caption)
 

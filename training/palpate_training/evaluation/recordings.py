@@ -118,6 +118,11 @@ class RecordingSource:
         """Rows for each task."""
         return {f"rows for {name}": len(rows.samples) for name, rows in self.recorded.items()}
 
+    @property
+    def forces(self) -> dict[str, float]:
+        """Nothing: what was pressed here is nobody's plan."""
+        return {}
+
     def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
         """Draw the boxes of each task into ``out``."""
         return [

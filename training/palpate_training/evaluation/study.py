@@ -61,6 +61,10 @@ class StudySource(Protocol):
     def row_counts(self) -> dict[str, int]:
         """Rows of each data set."""
 
+    @property
+    def forces(self) -> dict[str, float]:
+        """How strong the presses are; empty if they are not a designed experiment's."""
+
     def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
         """Draw what there is to show of each task into ``out``."""
 
@@ -170,6 +174,7 @@ class Study:
             "palpate": __version__,
             "sources": [asdict(one) for one in self.source.provenance],
             "rows": self.source.row_counts,
+            "forces": self.source.forces,
             "plan": asdict(self.plan),
             "scores": [asdict(one) for one in scores],
             "ratios": ratios,
