@@ -148,6 +148,13 @@ def _twin() -> Iterator[Claim]:
     for name, where in (("light", "below_2n"), ("middle", "2_to_8n"), ("hard", "above_8n")):
         figures[name] = f"{fields[f'nodal_all_m_{where}'] * 1e3:.3f}"
         figures[f"{name}_counts"] = f"{synthesis[f'electrode_rmse_counts_{where}']:.0f}"
+    for name, metric, factor, digits in (
+        ("relative", "force_magnitude_over_norm_median", 100, 1),
+        ("angle", "force_angle_median_rad", 1, 3),
+        ("centre", "centre_of_pressure_distance_median_m", 1e3, 2),
+        ("normal", "normal_angle_median_rad", 1, 3),
+    ):
+        figures[name] = f"{features[metric] * factor:.{digits}f}"
     for name, metric in (
         ("misplaced", "contact_misplaced"),
         ("misplaced2", "contact_misplaced_2_to_8n"),
@@ -160,6 +167,12 @@ def _twin() -> Iterator[Claim]:
         "displacement of the skin {field} mm a node (0.22; predicting no displacement {zero}),"
         " contact location {location} mm (2.0), force {force} N (0.64), electrodes of one simulated"
         " BioTac from the field {counts} counts (66 to 80): the networks that ship",
+        figures,
+    )
+    yield Claim(
+        "docs/results/twin.md",
+        "force {force} N ({relative} %) and {angle} rad, location {location} mm, centre of pressure"
+        " {centre} mm, contact normal {normal} rad (medians)",
         figures,
     )
     yield Claim(
