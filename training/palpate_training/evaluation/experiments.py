@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
@@ -16,14 +17,8 @@ from palpate_training.datasets.experiment import (
     content_sha256,
 )
 from palpate_training.evaluation.cells import Task
-from palpate_training.evaluation.features import FeatureTask, systems_of
-from palpate_training.evaluation.pictures import (
-    Made,
-    Picture,
-    draw_forces,
-    draw_task,
-    force_shares,
-)
+from palpate_training.evaluation.features import FeatureTask, force_shares, systems_of
+from palpate_training.evaluation.pictures import Made, Picture, draw_forces, draw_task
 from palpate_training.evaluation.skin import FieldTask, SynthesisTask, of_one_unit
 from palpate_training.learning.splits import ALL_UNITS, Fold, SplitName, folds_of
 from palpate_training.systems.samples import Quantity, samples_of
@@ -114,13 +109,18 @@ class ExperimentSource:
         return {"rows of the experiment": len(self.experiment), **mixed}
 
     @property
+    def _force_n(self) -> npt.NDArray[np.float64]:
+        """Magnitude of the force of each row [N]."""
+        return np.asarray(np.linalg.norm(self.experiment.force.astype(np.float64), axis=1))
+
+    @property
     def forces(self) -> dict[str, float]:
-        """How strong the presses are; see ``force_shares``."""
-        return force_shares(self.experiment)
+        """How strong the presses are."""
+        return force_shares(self._force_n)
 
     def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
         """Draw what there is to show of each task into ``out``."""
-        pictures = [draw_forces(out, self.experiment)]
+        pictures = [draw_forces(out, self._force_n)]
         for name, (task, results) in made.items():
             pictures += draw_task(out, task, self._rows(name), results)
         return pictures

@@ -280,6 +280,16 @@ def paper_weights(force_n: Floats) -> Floats:
     return spread(float(tilts[(spreads >= PAPER_SD_N).argmax()]))[1]
 
 
+def force_shares(force_n: Floats) -> dict[str, float]:
+    """How strong presses are: median and standard deviation [N], shares of light and hard rows."""
+    return {
+        "median_n": float(np.median(force_n)),
+        "sd_n": float(force_n.std()),
+        "below_2n": float(np.mean(force_n < 2)),
+        "above_8n": float(np.mean(force_n > 8)),
+    }
+
+
 def weighted_median(values: Floats, weights: Floats) -> float:
     """The value below which half of the weight lies; NaN rows do not count."""
     kept = ~np.isnan(values)

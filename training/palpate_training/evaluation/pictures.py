@@ -25,6 +25,7 @@ from palpate_training.evaluation.features import (
     PAPER_SD_N,
     PAPER_SYSTEMS,
     FeatureTask,
+    force_shares,
     row_errors,
 )
 from palpate_training.evaluation.skin import SynthesisTask
@@ -122,24 +123,16 @@ def draw_task(
     ]
 
 
-def force_shares(data: ExperimentDataset) -> dict[str, float]:
-    """How strong the presses are: median and standard deviation [N], shares of light and hard."""
-    force_n = np.linalg.norm(data.force.astype(np.float64), axis=1)
-    return {
-        "median_n": float(np.median(force_n)),
-        "sd_n": float(force_n.std()),
-        "below_2n": float(np.mean(force_n < 2)),
-        "above_8n": float(np.mean(force_n > 8)),
-    }
-
-
-def draw_forces(folder: Path, data: ExperimentDataset) -> Picture:
+def draw_forces(folder: Path, force_n: Floats) -> Picture:
     """Draw how strong the presses are, beside the spread of the paper's.
+
+    Args:
+        folder: Where to.
+        force_n: Magnitude of the force of each row [N], shape (N,).
 
     Raises:
         DatasetError: The disk refused.
     """
-    force_n = np.linalg.norm(data.force.astype(np.float64), axis=1)
     figure = new_figure(7.0, 3.2)
     axes = figure.subplots()
     axes.hist(force_n, bins=60, color=unit_colour(0), alpha=0.8)
@@ -147,7 +140,7 @@ def draw_forces(folder: Path, data: ExperimentDataset) -> Picture:
         axes.axvline(bound, color=INK, lw=0.8, ls="--")
     label(axes, "magnitude of the force [N]", "rows")
     grid(axes, "y")
-    of = force_shares(data)
+    of = force_shares(force_n)
     caption = finish(
         figure,
         folder / "forces.png",

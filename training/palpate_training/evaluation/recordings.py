@@ -120,7 +120,7 @@ class RecordingSource:
 
     @property
     def forces(self) -> dict[str, float]:
-        """Nothing: what was pressed here is nobody's plan."""
+        """Empty: only an experiment is compared with the paper's forces."""
         return {}
 
     def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:

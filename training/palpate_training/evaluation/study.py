@@ -63,7 +63,7 @@ class StudySource(Protocol):
 
     @property
     def forces(self) -> dict[str, float]:
-        """How strong the presses are; empty if they are not a designed experiment's."""
+        """How strong the presses of an experiment are; empty for recordings."""
 
     def draw(self, out: Path, made: Mapping[str, tuple[Task, Made]]) -> list[Picture]:
         """Draw what there is to show of each task into ``out``."""

@@ -9,6 +9,7 @@ of the press. Then the forces have a few modes, each even or odd if the mesh is 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.spatial.distance import cdist
 from palpate.errors import DatasetError
 from palpate_training.datasets.experiment import MixedDataset, SkinMesh
 from palpate_training.learning.electrode_nets import MIRROR_AXES
-from palpate_training.learning.field_code import mirror_nodes
+from palpate_training.learning.field_code import in_parts, mirror_nodes
 from palpate_training.learning.splits import Rows
 
 FloatArray = npt.NDArray[np.float32]
@@ -34,7 +35,6 @@ FLOOR_N = 0.5
 """Modes are those of forces over this plus the net force [N]."""
 
 _FIT_ROWS = 2000
-_CHUNK_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +119,15 @@ def fit_contact_code(data: MixedDataset, train: Rows, *, modes: int = CONTACT_MO
 
 def contact_coefficients(data: MixedDataset, code: ContactCode) -> FloatArray:
     """Coefficients of the spread forces of all rows [N], shape (N, K)."""
+    parts = spread_forces_in_parts(data, np.arange(len(data)))
+    return np.concatenate([code.encode(part) for part in parts])
+
+
+def spread_forces_in_parts(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:
+    """``spread_forces`` of each part of the rows (``in_parts``), one after the other."""
     weights = spreading(data.mesh)
-    every = np.arange(len(data))
-    parts = [
-        code.encode(spread_forces(data, every[start : start + _CHUNK_ROWS], weights))
-        for start in range(0, len(data), _CHUNK_ROWS)
-    ]
-    return np.concatenate(parts)
+    for part in in_parts(rows):
+        yield spread_forces(data, part, weights)
 
 
 def spread_forces(data: MixedDataset, rows: Rows, weights: Floats | None = None) -> FloatArray:

@@ -32,9 +32,9 @@ DRIFT_COUNTS = 10.0
 half a kelvin. A network that never saw it takes 20 counts for 0.85 N (training/LOG.md)."""
 
 GAIN_SPREAD = 0.1
-"""Standard deviation of the logarithm of a gain that each electrode of a training row gets: what
-the electrodes of a finger that nobody trained on differ by. Without it a network takes the gains of
-the fingers it saw for granted (training/LOG.md)."""
+"""Standard deviation of the logarithm of the gain that each electrode of a training row gets. It
+stands for the electrodes of other fingers, which are stronger or weaker; without it errors on them
+are larger (training/LOG.md)."""
 
 _LANES = 16
 

@@ -195,6 +195,11 @@ def mirrored(fields: Floats, order: Rows) -> Floats:
     return np.asarray((vectors[:, order] * MIRROR_AXES).reshape(fields.shape), np.float64)
 
 
+def in_parts(rows: Rows) -> list[Rows]:
+    """Rows in parts that are so small that the fields of one fit into memory."""
+    return np.split(rows, range(_CHUNK_ROWS, len(rows), _CHUNK_ROWS))
+
+
 def _first(code: FieldCode, count: int, lost: dict[int, float]) -> FieldCode:
     return replace(
         code,
@@ -208,8 +213,7 @@ def _first(code: FieldCode, count: int, lost: dict[int, float]) -> FieldCode:
 
 def _truncation(data: MixedDataset, code: FieldCode, rows: Rows) -> float:
     total = 0.0
-    for start in range(0, len(rows), _CHUNK_ROWS):
-        part = rows[start : start + _CHUNK_ROWS]
+    for part in in_parts(rows):
         lost = code.decode(code.encode(data.coefficients[part])) - data.displacement(part)
         total += float(np.linalg.norm(lost, axis=2).mean(axis=1).sum())
     return total / len(rows)

@@ -15,7 +15,7 @@ from torch import Tensor
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import baselines
-from palpate_training.learning.field_code import FieldCode, fit_code
+from palpate_training.learning.field_code import FieldCode, fit_code, in_parts
 from palpate_training.learning.fit import fit
 from palpate_training.learning.metrics import field_errors
 from palpate_training.learning.networks import Standardised, predict
@@ -33,7 +33,6 @@ Errors = dict[str, npt.NDArray[np.float64]]
 TREE_MODES = 16
 """Coefficients that boosted trees estimate; the rest stay at the mean. Each is an ensemble."""
 MEMBERS = 3
-_CHUNK_ROWS = 256
 
 
 class WholeSkinEstimate:
@@ -46,8 +45,7 @@ class WholeSkinEstimate:
     def errors(self, rows: Rows) -> Errors:
         """Errors of rows by name (``metrics.field_errors``); fields are made in small parts."""
         parts = []
-        for start in range(0, len(rows), _CHUNK_ROWS):
-            some = rows[start : start + _CHUNK_ROWS]
+        for some in in_parts(rows):
             truth = self._data.displacement(some)
             parts.append(field_errors(self._fields(some), truth, self._data.mesh.subset))
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -28,8 +28,7 @@ from palpate_training.learning.contact_code import (
     ContactCode,
     contact_coefficients,
     fit_contact_code,
-    spread_forces,
-    spreading,
+    spread_forces_in_parts,
 )
 from palpate_training.learning.electrode_nets import (
     DRIFT_COUNTS,
@@ -40,7 +39,7 @@ from palpate_training.learning.electrode_nets import (
     rest_of,
 )
 from palpate_training.learning.export import export_fields, refuse_existing
-from palpate_training.learning.field_code import FieldCode, fit_code
+from palpate_training.learning.field_code import FieldCode, fit_code, in_parts
 from palpate_training.learning.fit import OnEpoch, fit
 from palpate_training.learning.graphs import FieldGraph
 from palpate_training.learning.metrics import (
@@ -68,8 +67,6 @@ CONTACT_WEIGHT = 0.3
 
 PARITY_ROWS = 24
 """Held-out rows of the parity check, spread over the test trajectories."""
-
-_CHUNK_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -287,7 +284,7 @@ def field_row_errors(
     parts: dict[str, list[list[Errors]]] = {
         name: [[] for _ in each] for name, each in models.items()
     }
-    for part in _in_parts(rows):
+    for part in in_parts(rows):
         truth = data.displacement(part)
         for name, each in models.items():
             for i, estimate in enumerate(each):
@@ -373,11 +370,13 @@ def _contact_metrics(
 ) -> dict[str, float]:
     """How well contact forces are estimated, medians over rows, for a manifest."""
     assert model.contact is not None
-    parts = []
-    for part in _in_parts(rows):
-        estimate = model.contact_forces(tared_counts(data)[part])
-        parts.append(contact_errors(estimate, spread_forces(data, part)))
-    errors = join(parts)
+    counts = tared_counts(data)
+    errors = join(
+        [
+            contact_errors(model.contact_forces(counts[part]), truth)
+            for part, truth in zip(in_parts(rows), spread_forces_in_parts(data, rows), strict=True)
+        ]
+    )
     net = errors["net_n"] / np.linalg.norm(data.simulated_force[rows].astype(np.float64), axis=1)
     return {
         "contact_modes": float(model.contact.size),
@@ -423,7 +422,7 @@ def field_range(
     """
     outputs = [longest_of("displacement", "m", fields_of(data, rows))]
     if contact:
-        outputs.append(longest_of("contact_force", "N", _contact_forces_of(data, rows)))
+        outputs.append(longest_of("contact_force", "N", spread_forces_in_parts(data, rows)))
     return TrainingRange(
         source=f"{len(seen)} training rows, untouched ones included, of"
         f" {data.experiment.provenance.source}",
@@ -435,22 +434,10 @@ def field_range(
     )
 
 
-def _in_parts(rows: Rows) -> list[Rows]:
-    """So few rows at a time that their fields fit into memory."""
-    return np.split(rows, range(_CHUNK_ROWS, len(rows), _CHUNK_ROWS))
-
-
 def fields_of(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:
     """Fields of rows in small parts, each of shape (N, V, 3)."""
-    for part in _in_parts(rows):
+    for part in in_parts(rows):
         yield data.displacement(part)
-
-
-def _contact_forces_of(data: MixedDataset, rows: Rows) -> Iterator[FloatArray]:
-    """Spread contact forces of rows in small parts, each of shape (N, O, 3)."""
-    weights = spreading(data.mesh)
-    for part in _in_parts(rows):
-        yield spread_forces(data, part, weights)
 
 
 def truncation_metrics(code: FieldCode) -> dict[str, float]:
@@ -466,7 +453,7 @@ def spread_rows(rows: Rows) -> Rows:
 
 def _node_sd(data: MixedDataset, rows: Rows, estimate: Callable[[Rows], FloatArray]) -> FloatArray:
     total = np.zeros(len(data.mesh.nodes))
-    for part in _in_parts(rows):
+    for part in in_parts(rows):
         total += np.square(estimate(part) - data.displacement(part)).sum(axis=(0, 2))
     return np.asarray(np.sqrt(total / len(rows)), np.float32)
 
