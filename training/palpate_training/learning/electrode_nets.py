@@ -139,7 +139,7 @@ class ElectrodeInputs(nn.Module):
         drift = spread * torch.randn_like(inputs[:, :1])
         gain = torch.exp(GAIN_SPREAD * torch.randn_like(inputs[:, :half]))
         # The same counts and gain of an electrode in both of its inputs.
-        moved = inputs + self.slope.to(inputs.device) * (noise + drift).repeat(1, 2)
+        moved = inputs + self.slope * (noise + drift).repeat(1, 2)
         return moved * gain.repeat(1, 2)
 
 

@@ -17,8 +17,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from palpate.messages import COUNTS_MAX
+from palpate_training.learning.gpu_steps import CosineRate, recorded
 from palpate_training.learning.networks import (
     PAPER_WIDTHS,
     Activation,
@@ -78,7 +80,8 @@ def fit(
         net: With its constants set from the training rows.
         inputs: Training rows, shape ``(N, I)``.
         targets: Their truth, shape ``(N, O)``.
-        loss_of: Estimates ``(B, O)`` and truth ``(B, O)`` -> loss.
+        loss_of: Estimates ``(B, O)`` and truth ``(B, O)`` -> loss, by tensors alone: on a GPU it is
+            recorded.
         score_of: Validation score of the network, smaller is better; None = all epochs are run and
             the last weights are kept.
         config: Settings.
@@ -89,23 +92,37 @@ def fit(
     device = torch.get_default_device()
     net.to(device)
     x, y = torch.from_numpy(inputs).to(device), torch.from_numpy(targets).to(device)
+    steps = config.epochs * math.ceil(len(x) / config.batch_rows)
+    on_gpu = device.type == "cuda"
+    # A recorded step reads the rate where it lies.
+    rate = torch.tensor(config.learning_rate) if on_gpu else config.learning_rate
     optimiser = torch.optim.Adam(
-        net.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        net.parameters(),
+        lr=rate,
+        weight_decay=config.weight_decay,
+        capturable=on_gpu,
+        fused=on_gpu or None,
     )
-    steps_per_epoch = math.ceil(len(x) / config.batch_rows)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimiser, T_max=config.epochs * steps_per_epoch, eta_min=config.learning_rate_end
-    )
+    schedule: CosineRate | CosineAnnealingLR
+    if isinstance(rate, Tensor):
+        schedule = CosineRate(rate, steps, config.learning_rate_end)
+    else:
+        schedule = CosineAnnealingLR(optimiser, T_max=steps, eta_min=config.learning_rate_end)
+
+    def step(rows: Tensor) -> None:
+        loss = loss_of(net(augment(x[rows], rows)), y[rows])
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+
+    take = recorded(step, min(config.batch_rows, len(x))) if on_gpu else step
     best_score, best_epoch, weights = math.inf, 0, copy.deepcopy(net.state_dict())
     for epoch in range(1, config.epochs + 1):
         net.train()
         # Dealt on the CPU, so that the order is the same on every device.
         order = torch.randperm(len(x), device="cpu").to(device)
         for rows in torch.split(order, config.batch_rows):
-            loss = loss_of(net(augment(x[rows], rows)), y[rows])
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimiser.step()
+            take(rows)
             schedule.step()
         if on_epoch is not None:
             on_epoch()

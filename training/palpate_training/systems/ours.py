@@ -8,6 +8,7 @@ and its mirror image are both true; an estimate is the mean of both.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -147,6 +148,7 @@ def _fit_member(
     net.normalise_from(inputs, targets)
     truth = validation.truth(quantity)
     size = float(np.sqrt(np.square(targets - targets.mean(axis=0)).sum(axis=1).mean()))
+    noisy = copy.deepcopy(INPUTS).to(torch.get_default_device()).noisy
 
     def loss_of(estimate: Tensor, wanted: Tensor) -> Tensor:
         squares = torch.square((estimate - wanted) / size).sum(dim=1)
@@ -164,7 +166,7 @@ def _fit_member(
         loss_of=loss_of,
         score_of=lambda _: error_of(Members((net,), False).estimate(validation), truth),
         config=OURS_CONFIG,
-        augment=lambda batch, _: INPUTS.noisy(batch, drift_counts=0.0),
+        augment=lambda batch, _: noisy(batch, drift_counts=0.0),
     )
 
 

@@ -116,6 +116,7 @@ class ProjectionNet(nn.Module):
     extent: Tensor
     last: Tensor
     voxels: Tensor
+    axis: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -127,6 +128,7 @@ class ProjectionNet(nn.Module):
             ("extent", span),
             ("last", np.array(GRID, np.float32) - 1.0),
             ("voxels", np.arange(math.prod(GRID), dtype=np.float32)),
+            ("axis", np.array([1.0, 0.0, 0.0], np.float32)),
         ):
             self.register_buffer(name, torch.from_numpy(values))
         self.grid = ElectrodeGrid()
@@ -149,7 +151,7 @@ class ProjectionNet(nn.Module):
         weight = weight / torch.clamp(weight.sum(dim=1, keepdim=True), min=1e-12)
         centroid = weight @ self.positions
         on_cylinder = (centroid[:, :1] <= 0.0).to(centroid.dtype)
-        along = centroid * torch.tensor([1.0, 0.0, 0.0], device=centroid.device) * on_cylinder
+        along = centroid * self.axis * on_cylinder
         radial = centroid - along
         length = torch.clamp(torch.linalg.vector_norm(radial, dim=1, keepdim=True), min=1e-9)
         return along + radial * PROJECTED_RADIUS_M / length
@@ -158,8 +160,7 @@ class ProjectionNet(nn.Module):
         """Unit normal into the finger at the contact estimate, shape (N, 3)."""
         contact = self.contact(tared_counts)
         on_cylinder = (contact[:, :1] <= 0.0).to(contact.dtype)
-        mask = torch.tensor([1.0, 0.0, 0.0], device=contact.device) * on_cylinder
-        return -nn.functional.normalize(contact - contact * mask, dim=1)
+        return -nn.functional.normalize(contact - contact * self.axis * on_cylinder, dim=1)
 
     def contact_grid(self, tared_counts: Tensor) -> Tensor:
         """The contact estimate as a grid (N, 1, 16, 16, 8), by the same edges as the electrodes."""
@@ -233,13 +234,11 @@ def fit_projection(quantity: Quantity, train: Samples, validation: Samples, seed
     """Sundaralingam 2019: its network and loss; the optimiser is that of all networks here."""
     torch.manual_seed(seed)
     net = ProjectionNet()
-    counts = torch.from_numpy(train.tared)
+    counts = torch.from_numpy(train.tared).to(torch.get_default_device())
 
     def loss_of(estimate: Tensor, truth_and_row: Tensor) -> Tensor:
-        rows = truth_and_row[:, 3].to(torch.int64).cpu()
-        return projection_loss(
-            net, estimate, truth_and_row[:, :3], counts[rows].to(estimate.device)
-        )
+        rows = truth_and_row[:, 3].to(torch.int64)
+        return projection_loss(net, estimate, truth_and_row[:, :3], counts[rows])
 
     rows = np.arange(len(train), dtype=np.float32)[:, None]
     fit(
