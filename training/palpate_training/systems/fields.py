@@ -118,7 +118,7 @@ def fit_trees(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimat
     code = fit_code(data, rows.train, rows.validation)
     y = code.encode(data.coefficients)[rows.train]
     kept = min(TREE_MODES, code.size)
-    predicted = boosted_trees(tared_counts(data)[rows.train], y[:, :kept], seed)
+    predicted = boosted_trees(tared_counts(data)[rows.train], y[:, :kept])
 
     def estimate(counts: FloatArray) -> FloatArray:
         found = np.zeros((len(counts), code.size), np.float32)
@@ -198,7 +198,7 @@ FIELD_SYSTEMS = (
     ),
     FieldSystem(
         "Zai El Amri 2024: boosted trees", "Zai El Amri and Navarro-Guerrero, IJCNN 2024",
-        fit_trees, seeded=True,
+        fit_trees,
     ),
     FieldSystem("network to modes", "ours", partial(fit_modes, 1), seeded=True),
     FieldSystem(
