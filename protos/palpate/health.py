@@ -81,6 +81,7 @@ class Health:
         self._version = __version__
         self.changed = threading.Event()
         """Set when the state changed, so that the reporter publishes it at once."""
+        self._stirred = threading.Event()  # a change, or a trouble that begins to end
         self._worked = threading.Event()
 
     def worked(self) -> None:
@@ -93,6 +94,22 @@ class Health:
         self._worked.clear()
         if self._worked.wait(_LULL_MOST_S):
             time.sleep(_AFTERWARDS_S)
+
+    def tell(self) -> None:
+        """Have the reporter publish at once."""
+        self.changed.set()
+        self._stirred.set()
+
+    def await_change(self, timeout_s: float) -> bool:
+        """Wait until something changed, the end of a trouble included; False = nothing did."""
+        until_s = time.monotonic() + timeout_s
+        while True:
+            self._stirred.clear()
+            due_s = self.settle()
+            left_s = until_s - time.monotonic()
+            if self.changed.is_set() or left_s <= 0.0:
+                return self.changed.is_set()
+            self._stirred.wait(left_s if due_s is None else min(left_s, due_s))
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a counter."""
@@ -120,19 +137,21 @@ class Health:
                 new = new or self._state is not ServiceState.DEGRADED
                 self._state, self._recovery = ServiceState.DEGRADED, None
         if new:
-            self.changed.set()
+            self.tell()
 
     def set_state(self, state: ServiceState, message: str = "") -> None:
         """Set the state of this process; from DEGRADED it is READY after ``RECOVERY_S`` only."""
         with self._lock:
             if state is ServiceState.READY and self._state is ServiceState.DEGRADED:
+                if self._recovery is None:
+                    self._stirred.set()
                 since_s = time.monotonic() if self._recovery is None else self._recovery[0]
                 self._recovery = since_s, message
                 return
             different = state is not self._state
             self._state, self._message, self._recovery = state, message, None
         if different:
-            self.changed.set()
+            self.tell()
 
     @property
     def state(self) -> ServiceState:
@@ -154,7 +173,7 @@ class Health:
                 if now_s >= since_s + RECOVERY_S:
                     self._state, self._message = ServiceState.READY, message
                     self._recovery = None
-                    self.changed.set()
+                    self.tell()
                 else:
                     left.append(since_s + RECOVERY_S - now_s)
             for name, waiting in list(self._sensor_recovery.items()):
@@ -196,7 +215,9 @@ class Health:
             if shown is None or shown.state is not SensorState.LOST or state not in _DELIVERING:
                 self._show(status)
             else:
-                if waiting is not None:
+                if waiting is None:
+                    self._stirred.set()
+                else:
                     status = replace(status, since_monotonic_ns=waiting.since_monotonic_ns)
                 self._sensor_recovery[name] = status
 
@@ -204,11 +225,11 @@ class Health:
         """Take over the state of a sensor; the caller holds the lock."""
         before = self._sensor_states.get(status.name)
         if before is None or before.state is not status.state:
-            self.changed.set()
+            self.tell()
         else:
             status = replace(status, since_monotonic_ns=before.since_monotonic_ns)
             if before.faults != status.faults:
-                self.changed.set()
+                self.tell()
         self._sensor_states[status.name] = status
 
     def set_processes(self, processes: Sequence[SupervisedProcess]) -> None:
@@ -302,16 +323,13 @@ class HealthReporter(Closing):
             allowance = min(_BURST, allowance + _CHANGES_HZ * (now_s - earned_s)) - 1.0
             earned_s = now_s
             self._stop.wait(max(_APART_S, -allowance / _CHANGES_HZ))
-            due_s = self._health.settle()
-            if not self._health.changed.wait(
-                self._period_s if due_s is None else min(self._period_s, due_s + _APART_S)
-            ):
+            if not self._health.await_change(self._period_s):
                 self._health.await_lull()
 
     def close(self) -> None:
         """Report a last time and stop."""
         self._stop.set()
-        self._health.changed.set()
+        self._health.tell()
         self._thread.join(timeout=2)
         try:
             self._publisher.put(self._status())

@@ -115,6 +115,26 @@ def test_a_lost_sensor_is_live_when_it_has_delivered_for_a_while(clock: Time) ->
     assert shown() is SensorState.ENDED
 
 
+def test_the_end_of_a_trouble_is_told_though_the_reporter_waits(link: LinkConfig) -> None:
+    """Reports come once an hour here; the troubles begin to end long after the last one."""
+    health = Health("gateway", "gateway")
+    with Session.open(link) as session:
+        states = session.subscriber(STATUS, delivery=Delivery.QUEUE)
+        with HealthReporter(session, health, period_s=3600.0):
+            health.set_sensor_state("finger", SensorState.LOST)
+            health.fail(SILENT)
+            while states.next(PATIENCE_S).message.last_error is None:
+                pass
+            time.sleep(0.3)
+            health.set_sensor_state("finger", SensorState.LIVE)
+            while states.next(PATIENCE_S).message.sensor_states[0].state is SensorState.LOST:
+                pass
+            time.sleep(0.3)
+            health.set_state(ServiceState.READY)
+            while states.next(PATIENCE_S).message.state is not ServiceState.READY:
+                pass
+
+
 def test_a_station_that_flaps_does_not_flood_the_bus(link: LinkConfig) -> None:
     """A sensor with 40 ms of jitter: its state changed 36 times a second."""
     health = Health("gateway", "gateway")
