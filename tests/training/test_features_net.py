@@ -62,16 +62,22 @@ def test_training_inputs_have_gains_of_their_own() -> None:
     inputs = torch.from_numpy(read.of(tared))
     torch.manual_seed(0)
     counts, fall = (
-        (read.noisy(inputs, drift_counts=0.0) / inputs).numpy().reshape(-1, 2, 19).swapaxes(0, 1)
+        (read.noisy(inputs, gain_spread=0.1, drift_counts=0.0) / inputs)
+        .numpy()
+        .reshape(-1, 2, 19)
+        .swapaxes(0, 1)
     )
     np.testing.assert_allclose(counts, fall, atol=0.05)
     gains = np.log(counts)
-    np.testing.assert_allclose(gains.std(axis=0), electrode_nets.GAIN_SPREAD, rtol=0.06)
+    np.testing.assert_allclose(gains.std(axis=0), 0.1, rtol=0.06)
     np.testing.assert_allclose(gains.mean(axis=0), 0.0, atol=0.02)
     assert np.abs(np.corrcoef(gains.T) - np.eye(19)).max() < 0.1
     # An untouched finger stays untouched, whatever its gains are.
-    still = read.noisy(torch.zeros(500, 38), drift_counts=0.0)[:, :19]
+    still = read.noisy(torch.zeros(500, 38), gain_spread=0.1, drift_counts=0.0)[:, :19]
     assert still.std() < 1.5 * electrode_nets.NOISE_COUNTS
+    # A network for the fingers of its training gets no gains.
+    own = read.noisy(inputs, gain_spread=0.0, drift_counts=0.0)[:, :19] - inputs[:, :19]
+    assert own.std() < 1.5 * electrode_nets.NOISE_COUNTS
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
@@ -109,18 +115,16 @@ def test_the_same_seed_gives_the_same_network() -> None:
     assert np.abs(first - other).max() > 1e-3
 
 
-def test_a_common_drift_since_the_tare_is_hardly_a_force(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_common_drift_since_the_tare_is_hardly_a_force() -> None:
     train, test = rows_of(800, 1), rows_of(200, 2)
     one = replace(QUICK, members=1)
     drifted = np.array([[-20.0], [20.0]], np.float32).repeat(19, axis=1)
 
-    def force_of_drift() -> float:
-        net = fit_features_net(train, test, REST, symmetric=False, config=one)
+    def force_of_drift(config: FeaturesNetConfig) -> float:
+        net = fit_features_net(train, test, REST, symmetric=False, config=config)
         return float(np.linalg.norm(predict(net, drifted)[:, :3], axis=1).mean())
 
-    seen = force_of_drift()
-    monkeypatch.setattr(electrode_nets, "DRIFT_COUNTS", 0.0)
-    assert seen < 0.5 * force_of_drift()
+    assert force_of_drift(one) < 0.5 * force_of_drift(replace(one, drift_counts=0.0))
 
 
 def test_a_batch_has_the_bits_of_single_rows_in_onnx() -> None:

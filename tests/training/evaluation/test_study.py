@@ -193,7 +193,7 @@ def test_the_published_layout_goes_through_the_same_command(
     export_published(tmp_path / "published", assemble_experiment(trials, provenance))
     train_report(
         data=tmp_path / "published", out=tmp_path / "out", tasks="location, force",
-        splits="trajectory", systems="ridge, residual networks", seeds=1, whole=True, workers=0,
+        splits="trajectory", systems="ridge, mean of three", seeds=1, whole=True, workers=0,
         device="cpu", cells=None,
     )  # fmt: skip
     values = json.loads((tmp_path / "out" / "study.json").read_text())

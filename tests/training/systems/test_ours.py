@@ -78,7 +78,7 @@ def test_normals_are_unit_vectors_and_it_learns(
 def test_noise_of_both_inputs_is_that_of_the_counts() -> None:
     """The same draw, in counts and, by the slope of the logarithm, in the fall of impedance."""
     torch.manual_seed(0)
-    noise = ours.INPUTS.noisy(torch.zeros(20_000, 38), drift_counts=0.0).numpy()
+    noise = ours.INPUTS.noisy(torch.zeros(20_000, 38), gain_spread=0.1, drift_counts=0.0).numpy()
     np.testing.assert_allclose(noise[:, :19].std(axis=0), NOISE_COUNTS, rtol=0.03)
     steps = np.log(impedance_ohm(np.array([ASSUMED_REST, ASSUMED_REST + 1.0])))
     np.testing.assert_allclose(noise[:, 19:], noise[:, :19] * (steps[0] - steps[1]), rtol=0.01)

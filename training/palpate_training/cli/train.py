@@ -25,8 +25,19 @@ Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes over the rows at most, each network.")]
 Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
 
+GainSpread = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        help="Spread of the random gains that electrodes get in training, which stand for other "
+        "fingers; 0 for a network that will only read the fingers it is trained on.",
+    ),
+]
+
 EPOCHS = 80
-"""The default of ``MembersConfig``, whose module needs torch."""
+GAIN_SPREAD = 0.1
+"""The defaults of ``MembersConfig``, whose module needs torch."""
 
 console = Console()
 
@@ -41,6 +52,7 @@ def train_field(
     version: Version = 1,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
+    gain_spread: GainSpread = GAIN_SPREAD,
 ) -> None:
     """Electrodes -> displacement of the whole skin: train, test on unseen trajectories, write.
 
@@ -55,6 +67,7 @@ def train_field(
         data,
         out,
         epochs,
+        gain_spread,
         units=chosen,
         name=name,
         version=version,
@@ -79,7 +92,7 @@ def train_synthesis(
     from palpate_training.tasks.synthesis import synthesis_bundle
 
     metrics = _bundle(
-        synthesis_bundle, "synthesis", data, out, epochs,
+        synthesis_bundle, "synthesis", data, out, epochs, 0.0,
         unit=unit, name=name, version=version, seed=seed,
     )  # fmt: skip
     _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
@@ -98,6 +111,7 @@ def train_all(
     version: Version = 1,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
+    gain_spread: GainSpread = GAIN_SPREAD,
     assumed_rest: Annotated[
         int | None,
         typer.Option(min=0, max=4095, help="Rest [counts] of trials whose file has none."),
@@ -125,10 +139,12 @@ def train_all(
     with tempfile.TemporaryDirectory() as scratch:
         rows = Path(scratch) / "features.h5"
         write_dataset(rows, features(experiment, assumed_rest=assumed_rest))
-        train_features_command(rows, folders["features"], f"features-{name}", version, seed, epochs)
+        train_features_command(
+            rows, folders["features"], f"features-{name}", version, seed, epochs, gain_spread
+        )
     if isinstance(experiment, MixedDataset):
         chosen = unit or experiment.experiment.unit_names[0]
-        train_field(data, folders["field"], "", f"field-{name}", version, seed, epochs)
+        train_field(data, folders["field"], "", f"field-{name}", version, seed, epochs, gain_spread)
         synthesis = f"synthesis-{name}"
         train_synthesis(data, folders["synthesis"], chosen, synthesis, version, seed, epochs)
     else:
@@ -167,6 +183,7 @@ def train_features_command(
     version: Version = 1,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
+    gain_spread: GainSpread = GAIN_SPREAD,
 ) -> None:
     """Train force and contact location, test on unseen presses, write the bundle.
 
@@ -187,7 +204,7 @@ def train_features_command(
             out,
             name=name,
             version=version,
-            config=replace(FEATURES_CONFIG, epochs=epochs),
+            config=replace(FEATURES_CONFIG, epochs=epochs, gain_spread=gain_spread),
             seed=seed,
             on_epoch=on_epoch,
         )
@@ -219,6 +236,7 @@ def _bundle(
     data: Path,
     out: Path,
     epochs: int,
+    gain_spread: float,
     **options: Any,
 ) -> dict[str, float]:
     """Train a field or synthesis bundle; its held-out metrics."""
@@ -226,7 +244,7 @@ def _bundle(
     from palpate_training.tasks.fields import FieldFitConfig
 
     with _progress() as progress:
-        config = FieldFitConfig(epochs=epochs)
+        config = FieldFitConfig(epochs=epochs, gain_spread=gain_spread)
         bar = progress.add_task(task, total=epochs * config.members)
         return train(
             read_mixed(data), out, config=config, on_epoch=lambda: progress.advance(bar), **options

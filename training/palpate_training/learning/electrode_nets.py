@@ -33,8 +33,8 @@ half a kelvin. A network that never saw it takes 20 counts for 0.85 N (training/
 
 GAIN_SPREAD = 0.1
 """Standard deviation of the logarithm of the gain that each electrode of a training row gets. It
-stands for the electrodes of other fingers, which are stronger or weaker; without it errors on them
-are larger (training/LOG.md)."""
+stands for the electrodes of other fingers, which are stronger or weaker: without it errors on them
+are larger, and on the fingers of the training smaller (training/LOG.md)."""
 
 _LANES = 16
 
@@ -73,6 +73,9 @@ class MembersConfig(FitConfig):
         members: Networks whose estimates are averaged; each has weights and an order of its own.
         width: Of the residual layers.
         blocks: Number of residual blocks, of two layers each.
+        gain_spread: Of the electrodes that are read in training, standard deviation of the gain's
+            logarithm; 0 for a network that is to read the fingers of its training and no others.
+        drift_counts: What they have drifted alike since the tare, standard deviation [counts].
     """
 
     epochs: int = 80
@@ -81,6 +84,8 @@ class MembersConfig(FitConfig):
     members: int = 3
     width: int = 256
     blocks: int = 3
+    gain_spread: float = GAIN_SPREAD
+    drift_counts: float = DRIFT_COUNTS
 
     def member(self, inputs: int, outputs: int) -> Standardised:
         """A member before its training."""
@@ -131,13 +136,12 @@ class ElectrodeInputs(nn.Module):
         """Inputs of the mirror images."""
         return torch.index_select(inputs, 1, self.order)
 
-    def noisy(self, inputs: Tensor, drift_counts: float | None = None) -> Tensor:
+    def noisy(self, inputs: Tensor, *, gain_spread: float, drift_counts: float) -> Tensor:
         """Inputs with noise, a common drift and gains of the electrodes, drawn for each row."""
         half = inputs.shape[1] // 2
         noise = NOISE_COUNTS * torch.randn_like(inputs[:, :half])
-        spread = DRIFT_COUNTS if drift_counts is None else drift_counts
-        drift = spread * torch.randn_like(inputs[:, :1])
-        gain = torch.exp(GAIN_SPREAD * torch.randn_like(inputs[:, :half]))
+        drift = drift_counts * torch.randn_like(inputs[:, :1])
+        gain = torch.exp(gain_spread * torch.randn_like(inputs[:, :half]))
         # The same counts and gain of an electrode in both of its inputs.
         moved = inputs + self.slope * (noise + drift).repeat(1, 2)
         return moved * gain.repeat(1, 2)

@@ -123,7 +123,9 @@ def _fit_member(
         loss_of=partial(_loss, sizes_of(train.targets)),
         score_of=lambda _: score_of(net, validation),
         config=config,
-        augment=lambda batch, _: net.inputs.noisy(batch),
+        augment=lambda batch, _: net.inputs.noisy(
+            batch, gain_spread=config.gain_spread, drift_counts=config.drift_counts
+        ),
         on_epoch=on_epoch,
     )
     return member

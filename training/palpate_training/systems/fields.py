@@ -15,6 +15,7 @@ from torch import Tensor
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import baselines
+from palpate_training.learning.electrode_nets import GAIN_SPREAD
 from palpate_training.learning.field_code import FieldCode, fit_code, in_parts
 from palpate_training.learning.fit import fit
 from palpate_training.learning.metrics import field_errors
@@ -173,9 +174,12 @@ def fit_narang(data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstima
     )
 
 
-def fit_modes(members: int, data: MixedDataset, rows: RowSplit, seed: int) -> WholeSkinEstimate:
+def fit_modes(
+    members: int, gain_spread: float, data: MixedDataset, rows: RowSplit, seed: int
+) -> WholeSkinEstimate:
     """Ours: networks to the coefficients of the skin's modes; the mean of some."""
-    model = fit_field(data, rows, config=FieldFitConfig(members=members), seed=seed)
+    config = FieldFitConfig(members=members, gain_spread=gain_spread)
+    model = fit_field(data, rows, config=config, seed=seed)
     return _of_code(data, model.code, model.coefficients)
 
 
@@ -200,8 +204,13 @@ FIELD_SYSTEMS = (
         "Zai El Amri 2024: boosted trees", "Zai El Amri and Navarro-Guerrero, IJCNN 2024",
         fit_trees,
     ),
-    FieldSystem("network to modes", "ours", partial(fit_modes, 1), seeded=True),
+    FieldSystem("network to modes", "ours", partial(fit_modes, 1, 0.0), seeded=True),
     FieldSystem(
-        "networks to modes, mean of three", "ours", partial(fit_modes, MEMBERS), seeded=True
+        "networks to modes, mean of three", "ours", partial(fit_modes, MEMBERS, 0.0), seeded=True
+    ),
+    FieldSystem(
+        "networks to modes, gains in training",
+        "ours; electrodes of other fingers stood for by random gains",
+        partial(fit_modes, MEMBERS, GAIN_SPREAD), seeded=True,
     ),
 )  # fmt: skip

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from palpate.anatomy import ELECTRODE_POSITIONS
 from palpate_training.learning.electrode_nets import (
     ASSUMED_REST,
+    GAIN_SPREAD,
     MIRROR_AXES,
     ElectrodeInputs,
     ResidualLayers,
@@ -120,6 +121,7 @@ class Members:
 def fit_members(
     layers: Callable[[], nn.Module],
     members: int,
+    gain_spread: float,
     quantity: Quantity,
     train: Samples,
     validation: Samples,
@@ -133,7 +135,7 @@ def fit_members(
     for member in range(members):
         torch.manual_seed(1000 * seed + member)
         net = Standardised(layers(), both.shape[1])
-        _fit_member(net, both, truths, validation, quantity)
+        _fit_member(net, both, truths, validation, quantity, gain_spread)
         nets.append(net)
     return Members(tuple(nets), quantity == "normal").estimate
 
@@ -144,6 +146,7 @@ def _fit_member(
     targets: FloatArray,
     validation: Samples,
     quantity: Quantity,
+    gain_spread: float,
 ) -> None:
     net.normalise_from(inputs, targets)
     truth = validation.truth(quantity)
@@ -166,31 +169,40 @@ def _fit_member(
         loss_of=loss_of,
         score_of=lambda _: error_of(Members((net,), False).estimate(validation), truth),
         config=OURS_CONFIG,
-        augment=lambda batch, _: noisy(batch, drift_counts=0.0),
+        augment=lambda batch, _: noisy(batch, gain_spread=gain_spread, drift_counts=0.0),
     )
 
 
 _EVERY: tuple[Quantity, ...] = ("location", "force", "centre", "normal")
 
+_SOURCE = "ours: log impedances, mirror images"
+
 OURS = (
     System(
         "residual network",
-        "ours: log impedances, mirror images",
-        partial(fit_members, partial(ResidualLayers, 38, 3), 1),
+        _SOURCE,
+        partial(fit_members, partial(ResidualLayers, 38, 3), 1, 0.0),
         _EVERY,
         seeded=True,
     ),
     System(
         "residual networks, mean of three",
-        "ours: log impedances, mirror images, ensemble",
-        partial(fit_members, partial(ResidualLayers, 38, 3), MEMBERS),
+        f"{_SOURCE}, ensemble",
+        partial(fit_members, partial(ResidualLayers, 38, 3), MEMBERS, 0.0),
+        _EVERY,
+        seeded=True,
+    ),
+    System(
+        "residual networks, gains in training",
+        f"{_SOURCE}, ensemble; electrodes of other fingers stood for by random gains",
+        partial(fit_members, partial(ResidualLayers, 38, 3), MEMBERS, GAIN_SPREAD),
         _EVERY,
         seeded=True,
     ),
     System(
         "attention over electrodes",
-        "ours: log impedances, mirror images",
-        partial(fit_members, partial(ElectrodeAttention, 3), 1),
+        _SOURCE,
+        partial(fit_members, partial(ElectrodeAttention, 3), 1, 0.0),
         _EVERY,
         seeded=True,
     ),

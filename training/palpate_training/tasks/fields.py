@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -213,7 +214,9 @@ def fit_coefficients(
             scale=scale,
             floor=0.01,
             config=config,
-            augment=net.inputs.noisy,
+            augment=partial(
+                net.inputs.noisy, gain_spread=config.gain_spread, drift_counts=config.drift_counts
+            ),
             on_epoch=on_epoch,
         )
         members.append(layers)
