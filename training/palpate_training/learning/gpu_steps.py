@@ -1,7 +1,7 @@
 """Training steps on a GPU: a step is recorded once and then launched as a whole.
 
-A step of a small network is some ninety kernels of a few microseconds. Launching them one by one
-takes several times as long as running them (training/LOG.md).
+A step of a small network is some ninety kernels of a few microseconds, about as long as it takes to
+launch one. What a training takes is in training/LOG.md.
 """
 
 from __future__ import annotations
