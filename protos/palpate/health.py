@@ -7,6 +7,7 @@ a trouble is over only when it has stayed away for a while, so that no state fla
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
@@ -81,7 +82,9 @@ class Health:
         self._version = __version__
         self.changed = threading.Event()
         """Set when the state changed, so that the reporter publishes it at once."""
-        self._stirred = threading.Event()  # a change, or a trouble that begins to end
+        # For the reporter: wakes it, and when it wakes by itself (monotonic).
+        self._stirred = threading.Event()
+        self._wakes_s = math.inf
         self._worked = threading.Event()
 
     def worked(self) -> None:
@@ -106,10 +109,20 @@ class Health:
         while True:
             self._stirred.clear()
             due_s = self.settle()
-            left_s = until_s - time.monotonic()
-            if self.changed.is_set() or left_s <= 0.0:
+            now_s = time.monotonic()
+            if self.changed.is_set() or now_s >= until_s:
                 return self.changed.is_set()
-            self._stirred.wait(left_s if due_s is None else min(left_s, due_s))
+            self._wakes_s = until_s if due_s is None else min(until_s, now_s + due_s)
+            self._stirred.wait(self._wakes_s - now_s)
+            self._wakes_s = math.inf
+
+    def _begin_to_end(self, due_s: float) -> None:
+        """Have the reporter awake when a trouble is over; the caller holds the lock.
+
+        Troubles that begin to end a hundred times a second do not wake it each time.
+        """
+        if due_s < self._wakes_s:
+            self._stirred.set()
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a counter."""
@@ -143,10 +156,9 @@ class Health:
         """Set the state of this process; from DEGRADED it is READY after ``RECOVERY_S`` only."""
         with self._lock:
             if state is ServiceState.READY and self._state is ServiceState.DEGRADED:
-                if self._recovery is None:
-                    self._stirred.set()
                 since_s = time.monotonic() if self._recovery is None else self._recovery[0]
                 self._recovery = since_s, message
+                self._begin_to_end(since_s + RECOVERY_S)
                 return
             different = state is not self._state
             self._state, self._message, self._recovery = state, message, None
@@ -215,11 +227,10 @@ class Health:
             if shown is None or shown.state is not SensorState.LOST or state not in _DELIVERING:
                 self._show(status)
             else:
-                if waiting is None:
-                    self._stirred.set()
-                else:
+                if waiting is not None:
                     status = replace(status, since_monotonic_ns=waiting.since_monotonic_ns)
                 self._sensor_recovery[name] = status
+                self._begin_to_end(1e-9 * status.since_monotonic_ns + SENSOR_RECOVERY_S)
 
     def _show(self, status: SensorStatus) -> None:
         """Take over the state of a sensor; the caller holds the lock."""
