@@ -82,7 +82,7 @@ class Health:
         self._version = __version__
         self.changed = threading.Event()
         """Set when the state changed, so that the reporter publishes it at once."""
-        # For the reporter: wakes it, and when it wakes by itself (monotonic).
+        # What wakes the waiting reporter, and when it will wake by itself [s, monotonic].
         self._stirred = threading.Event()
         self._wakes_s = math.inf
         self._worked = threading.Event()
@@ -116,10 +116,14 @@ class Health:
             self._stirred.wait(self._wakes_s - now_s)
             self._wakes_s = math.inf
 
-    def _begin_to_end(self, due_s: float) -> None:
+    def _wake_by(self, due_s: float) -> None:
         """Have the reporter awake when a trouble is over; the caller holds the lock.
 
-        Troubles that begin to end a hundred times a second do not wake it each time.
+        It is woken only if it would sleep for longer: a trouble may begin to end a hundred times a
+        second.
+
+        Args:
+            due_s: When it is over at the earliest [s, monotonic].
         """
         if due_s < self._wakes_s:
             self._stirred.set()
@@ -158,7 +162,7 @@ class Health:
             if state is ServiceState.READY and self._state is ServiceState.DEGRADED:
                 since_s = time.monotonic() if self._recovery is None else self._recovery[0]
                 self._recovery = since_s, message
-                self._begin_to_end(since_s + RECOVERY_S)
+                self._wake_by(since_s + RECOVERY_S)
                 return
             different = state is not self._state
             self._state, self._message, self._recovery = state, message, None
@@ -230,7 +234,7 @@ class Health:
                 if waiting is not None:
                     status = replace(status, since_monotonic_ns=waiting.since_monotonic_ns)
                 self._sensor_recovery[name] = status
-                self._begin_to_end(1e-9 * status.since_monotonic_ns + SENSOR_RECOVERY_S)
+                self._wake_by(1e-9 * status.since_monotonic_ns + SENSOR_RECOVERY_S)
 
     def _show(self, status: SensorStatus) -> None:
         """Take over the state of a sensor; the caller holds the lock."""

@@ -135,6 +135,33 @@ def test_the_end_of_a_trouble_is_told_though_the_reporter_waits(link: LinkConfig
                 pass
 
 
+def test_a_trouble_that_often_begins_to_end_hardly_wakes_the_reporter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each time it did, a loaded service had no time left for frames."""
+    health, begun = Health("features", "features"), 200
+    health.fail(SILENT)
+    health.changed.clear()
+    settled, settle = [], health.settle
+
+    def counted() -> float | None:
+        settled.append(1)
+        return settle()
+
+    monkeypatch.setattr(health, "settle", counted)
+    waiting = threading.Thread(target=health.await_change, args=(PATIENCE_S,))
+    waiting.start()
+    for _ in range(begun):
+        health.set_state(ServiceState.READY)
+        time.sleep(1e-3)
+        health.fail(SILENT)
+    health.set_state(ServiceState.READY)
+    waiting.join(PATIENCE_S)
+    assert not waiting.is_alive()
+    assert health.status().state is ServiceState.READY
+    assert len(settled) < begun / 10
+
+
 def test_a_station_that_flaps_does_not_flood_the_bus(link: LinkConfig) -> None:
     """A sensor with 40 ms of jitter: its state changed 36 times a second."""
     health = Health("gateway", "gateway")
