@@ -67,7 +67,7 @@ def train_field(
         data,
         out,
         epochs,
-        gain_spread,
+        gain_spread=gain_spread,
         units=chosen,
         name=name,
         version=version,
@@ -92,7 +92,7 @@ def train_synthesis(
     from palpate_training.tasks.synthesis import synthesis_bundle
 
     metrics = _bundle(
-        synthesis_bundle, "synthesis", data, out, epochs, 0.0,
+        synthesis_bundle, "synthesis", data, out, epochs,
         unit=unit, name=name, version=version, seed=seed,
     )  # fmt: skip
     _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
@@ -236,7 +236,8 @@ def _bundle(
     data: Path,
     out: Path,
     epochs: int,
-    gain_spread: float,
+    *,
+    gain_spread: float = GAIN_SPREAD,
     **options: Any,
 ) -> dict[str, float]:
     """Train a field or synthesis bundle; its held-out metrics."""
