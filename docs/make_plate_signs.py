@@ -102,7 +102,7 @@ def main(folder: Path) -> None:
     spec = ExperimentSpec()
     geometry = biotac(edge_m=spec.edge_m, layers=2)
     tip = Fingertip.pressurised(geometry, parameters_of(spec), SolverSettings())
-    members = [member for member in read_population() if member.published.pressed_with("cube")]
+    members = [member for member in read_population() if member.pressed_with("cube")]
     population = Population(BiotacTip(tip).describe(), [member.specimen for member in members])
     found: dict[str, list[Floats]] = {member.specimen.name: [] for member in members}
     for lean in leans:

@@ -1,4 +1,4 @@
-"""Cost of one indentation and its parts (``palpate fem bench``)."""
+"""Cost of one indentation, its parts, and its electrodes (``palpate fem bench``)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.sparse.linalg import splu
 
 from palpate.rigid import unit
+from palpate_fem.arrays import Floats
+from palpate_fem.electrodes.model import ElectrodeModel
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.mesh.solid import FingertipGeometry
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import Multifrontal
 from palpate_fem.trajectory import (
@@ -97,6 +102,10 @@ def run(
                 best, parts = trajectory, dict(spent)
         assert best is not None
         metrics |= _of_trajectory(name, best, parts)
+        deepest = best.steps[-1] if best.steps else None
+        if name == "normal" and deepest is not None:
+            say("electrodes")
+            metrics |= of_electrodes(geometry, tip.nodes, deepest)
     if isinstance(tip.newton.factor, Multifrontal):
         say("one factorisation")
         metrics |= _of_factor(tip, float(metrics["machine.single_peak_gflops"]))
@@ -129,6 +138,74 @@ def _of_factor(tip: Fingertip, peak: float) -> Metrics:
         "solver.factor_gflops": rate,
         "solver.factor_share_of_single_peak": rate / peak,
     }
+
+
+UNITS = 3
+"""Specimens that share the gaps of a state, as in the twin's experiment."""
+
+
+def of_electrodes(
+    geometry: FingertipGeometry, nodes: Floats, step: IndentationStep, *, repeats: int = 30
+) -> Metrics:
+    """Time from the position of the skin to counts and their gradients, on one core.
+
+    Beside it stands a floor: SciPy's factorisation of the same film's matrix, in the same order of
+    elimination. The best of the repeats counts.
+
+    Args:
+        geometry: Skin and core.
+        nodes: Nodal positions of the pressurised, untouched skin [m], shape (V, 3).
+        step: The state, in contact.
+        repeats: Number of repeats.
+
+    Returns:
+        Milliseconds of a state with one specimen, of a state and specimen if ``UNITS`` share the
+        gaps, of gradients in addition, and the last two over the floor.
+    """
+    specimens = [SpecimenParameters(sigma_s_m=0.23 * (1 - 0.1 * i)) for i in range(UNITS)]
+    model = ElectrodeModel(geometry, specimens[0])
+    models = [model.with_specimen(specimen) for specimen in specimens]
+    film = model.of_gap(model.finder.of_step(nodes, step)).film
+    lower = model.conduction.lower_triangle(film, sigma_s_m=specimens[0].sigma_s_m)
+    lower.eliminate_zeros()
+    whole = (lower + lower.T).tocsc()
+    whole.setdiag(lower.diagonal())
+
+    def together() -> None:
+        gap = model.finder.of_step(nodes, step)
+        for one in models:
+            one.of_gap(gap)
+
+    def state() -> None:
+        model.of_gap(model.finder.of_step(nodes, step))
+
+    def with_gradient() -> None:
+        response = model.of_gap(model.finder.of_step(nodes, step))
+        response.to_skin(np.ones(len(response.counts)), len(nodes))
+
+    def floor() -> None:
+        splu(whole, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    with one_thread():
+        one, shared, gradient, least = (
+            1e3 * min(_seconds(work) for _ in range(repeats))
+            for work in (state, together, with_gradient, floor)
+        )
+    return {
+        "film.nodes": float(len(film)),
+        "film.state_ms": one,
+        "film.state_and_unit_ms": shared / UNITS,
+        "film.with_gradient_ms": gradient,
+        "film.scipy_factorisation_ms": least,
+        "film.state_and_unit_over_scipy_factorisation": shared / UNITS / least,
+        "film.with_gradient_over_scipy_factorisation": gradient / least,
+    }
+
+
+def _seconds(work: Callable[[], None]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
 
 
 def _of_trajectory(name: str, trajectory: IndentationResult, parts: dict[str, float]) -> Metrics:

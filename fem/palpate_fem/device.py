@@ -50,6 +50,16 @@ def scalars(array: NDArray[np.float64]) -> wp.array:
     return wp.array(array, dtype=wp.float64, device=DEVICE, copy=False)
 
 
+def indices(array: NDArray[np.int32]) -> wp.array:
+    """An int32 array of any shape."""
+    return wp.array(array, dtype=wp.int32, device=DEVICE, copy=False)
+
+
+def truths(array: NDArray[np.bool_]) -> wp.array:
+    """A bool array of any shape."""
+    return wp.array(array, dtype=wp.bool, device=DEVICE, copy=False)
+
+
 def vec3s(array: NDArray[np.float64]) -> wp.array:
     """An array of 3-vectors; the last axis is the vector."""
     return wp.array(array, dtype=wp.vec3d, device=DEVICE, copy=False)

@@ -77,8 +77,8 @@ class IndentationResult:
         steps: Converged steps, in order of the path; K - 1 of them if the outcome is COMPLETE.
         outcome: How it ended.
         reason: One sentence if it is not complete: what happened, and at which travel.
-        travel_m: Path length of the indenter at the last *converged* increment, which may lie
-            between two poses [m].
+        travel_m: Travel of the indenter, turns included (`path_lengths`), at the last *converged*
+            increment, which may lie between two poses [m].
         seconds: Computing time.
     """
 

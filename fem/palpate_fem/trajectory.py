@@ -1,4 +1,4 @@
-"""The paper's indentations: targets, straight paths, and the whole campaign.
+"""Paths on the skin: the paper's targets, presses and whole campaign, and chains of segments.
 
 At each of 10 points of the pad there is one indentation along the inward normal, 3 mm deep, and
 four at 30 degrees to it, 1.5 mm deep (paper, "Experimental testing procedure"). The paper
@@ -22,11 +22,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palpate.errors import ConfigError
-from palpate.rigid import facing, unit
+from palpate.errors import ConfigError, SimulationError
+from palpate.rigid import LEVER_M, facing, quaternions_of, rotation_matrices, unit
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.approach import OuterSurface, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.path import POSES_MOST, PathSegment, check_path
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mesh.surface import node_normals
 
@@ -37,7 +39,10 @@ ANGLED_DEPTH_M = 1.5e-3
 ANGLE_RAD = math.radians(30.0)
 AZIMUTHS = 4
 _BATCH = 64  # of draws; fixed, so that asking for more points does not change the first ones
-CLEARANCE_M = 0.05e-3  # more than the reach of the softened contact law, which is 40 um
+STEP_M = NORMAL_DEPTH_M / STEPS
+"""Longest step of a path of segments [m], as `path_lengths` counts: that of the paper's presses."""
+
+CLEARANCE_M = 0.05e-3  # gaps that are means over faces close before the skin is touched: by 16 um
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +114,175 @@ def press_path(
         SimulationError: The indenter passes the skin.
     """
     return _straight_path(indenter, target, direction, surface, depth_m, steps, clearance_m)[0]
+
+
+def segment_path(
+    indenter: Indenter,
+    target: ArrayLike,
+    normal: ArrayLike,
+    segments: Sequence[PathSegment],
+    surface: OuterSurface,
+    *,
+    step_m: float = STEP_M,
+    clearance_m: float = CLEARANCE_M,
+) -> Floats:
+    """A path that follows segments one after the other, each in equal steps.
+
+    It begins just clear of the skin, turned to where the first segment, a press, leads. Later
+    presses do not turn the indenter. Directions are those of the target's plane, also where a slide
+    or a roll has left it: they do not follow the curved skin.
+
+    Args:
+        indenter: The indenter.
+        target: Point of the skin [m], shape (3,), sensor frame.
+        normal: Outward normal there, shape (3,).
+        segments: What it does; see `parse_segments`.
+        surface: Outer surface of the pressurised skin.
+        step_m: Longest step [m], turns as `path_lengths` counts them.
+        clearance_m: How far from the skin a path begins, and an unloading ends [m].
+
+    Returns:
+        Poses, shape (K + 1, 7).
+
+    Raises:
+        ConfigError: A value is out of range, the first segment is not a press, or there are too
+            many steps.
+        SimulationError: The first press passes the skin.
+    """
+    if not (math.isfinite(step_m) and step_m > 0.0):
+        raise ConfigError(f"step_m = {step_m} is not a length", remedy="give it in metres, > 0")
+    if not segments or segments[0].kind != "press":
+        raise ConfigError("the path does not begin with a press", remedy="press first")
+    out = unit(normal, "normal")
+    moves: list[Floats] = []
+    clear = True  # whether it is out of the skin, so that a press counts from first contact
+    for segment in segments:
+        if not moves or (clear and segment.kind == "press"):
+            direction = angled_direction(out, segment.angle_rad, segment.azimuth_rad)
+            depth_m = _amount(segment)
+            if not moves:
+                steps = _steps(depth_m, step_m)
+                path, _ = _straight_path(
+                    indenter, target, direction, surface, depth_m, steps, clearance_m
+                )
+                moves.append(path)
+            else:
+                at = moves[-1][-1]
+                way = _first_touch(indenter, at, direction, surface) + depth_m
+                moves.append(_moved(at, way * direction, _steps(way, step_m)))
+            clear = False
+            continue
+        at = moves[-1][-1]
+        moves.append(_segment_poses(indenter, at, out, segment, surface, step_m, clearance_m))
+        clear = segment.kind == "unload" and segment.amount is None
+    return check_path(np.concatenate(moves), source="the path of these segments")
+
+
+def _segment_poses(
+    indenter: Indenter,
+    at: Floats,
+    out: Floats,
+    segment: PathSegment,
+    surface: OuterSurface,
+    step_m: float,
+    clearance_m: float,
+) -> Floats:
+    """Poses of a segment after the first, without the one that it begins at, shape (K, 7)."""
+    along = angled_direction(out, 0.5 * math.pi, segment.azimuth_rad)
+    if segment.kind == "press":
+        amount = _amount(segment)
+        direction = angled_direction(out, segment.angle_rad, segment.azimuth_rad)
+        return _moved(at, amount * direction, _steps(amount, step_m))
+    if segment.kind == "slide":
+        amount = _amount(segment)
+        return _moved(at, amount * along, _steps(amount, step_m))
+    if segment.kind == "unload":
+        if segment.amount is None:  # back to where it would touch if it came along the normal
+            amount = clearance_m - min(0.0, _first_touch(indenter, at, -out, surface))
+        else:
+            amount = _amount(segment)
+        return _moved(at, amount * out, _steps(amount, step_m))
+    angle, turn = _amount(segment), rotation_matrices(at[3:])
+    if segment.kind == "twist":
+        angles = angle * _shares(_steps(LEVER_M * abs(angle), step_m))
+        turned = turn @ _turns((0.0, 0.0, 1.0), angles)
+        return np.hstack([np.tile(at[:3], (len(angles), 1)), quaternions_of(turned)])
+    if segment.kind != "roll":
+        raise ConfigError(f"{segment.kind!r} is no segment of a path", remedy="see parse_segments")
+    # About the middle of the tip's curvature, which moves along by as much as the tip rolls off:
+    # no slip where it touches. The middle of a flat tip is the tip.
+    radius = _tip_radius(indenter, turn.T @ along)
+    angles = angle * _shares(_steps(max(radius, LEVER_M) * abs(angle), step_m))
+    turned = _turns(np.cross(out, along), angles) @ turn
+    middle = at[:3] - radius * turn[:, 2] + (radius * angles)[:, None] * along
+    return np.hstack([middle + radius * turned[:, :, 2], quaternions_of(turned)])
+
+
+def _amount(segment: PathSegment) -> float:
+    turns = segment.kind in ("twist", "roll")
+    value = math.nan if segment.amount is None else segment.amount
+    if not math.isfinite(value) or value == 0.0 or (value < 0.0 and not turns):
+        raise ConfigError(
+            f"{segment.kind} by {segment.amount}",
+            remedy="give an angle [rad], not 0" if turns else "give metres, > 0",
+        )
+    return value
+
+
+def _steps(way_m: float, step_m: float) -> int:
+    """Number of equal steps of at most ``step_m``; a share of a micrometre makes no step more."""
+    count = way_m / step_m
+    if count > POSES_MOST:  # before arrays are made of them
+        raise ConfigError(
+            f"a segment of {1e3 * way_m:.3g} mm in steps of {1e3 * step_m:.3g} mm has {count:.3g} "
+            f"poses, at most {POSES_MOST:,} are simulated",
+            remedy="make the steps longer",
+        )
+    return max(1, math.ceil(count - 1e-6))
+
+
+def _shares(steps: int) -> Floats:
+    return np.arange(1, steps + 1) / steps
+
+
+def _moved(at: Floats, way: Floats, steps: int) -> Floats:
+    """Poses on a straight way from a pose, which is left out, shape (steps, 7)."""
+    poses = np.tile(at, (steps, 1))
+    poses[:, :3] += _shares(steps)[:, None] * way
+    return poses
+
+
+def _turns(axis: ArrayLike, angles: Floats) -> Floats:
+    """Rotations about a unit axis, shape (K, 3, 3)."""
+    half = 0.5 * angles[:, None]
+    return rotation_matrices(np.hstack([np.cos(half), np.sin(half) * np.asarray(axis)]))
+
+
+def _first_touch(indenter: Indenter, at: Floats, direction: Floats, surface: OuterSurface) -> float:
+    """Way from a pose to first contact with the untouched skin [m]; negative from inside it.
+
+    An indenter that has slid beside the finger touches nothing: 0.
+    """
+    try:
+        return first_contact(indenter, at[3:], at[:3], direction, surface)
+    except SimulationError:
+        return 0.0
+
+
+_NEAR_TIP_M = 0.1e-3
+
+
+def _tip_radius(indenter: Indenter, along: Floats) -> float:
+    """Radius of curvature of the tip in a direction of the indenter frame (3,) [m]; 0 = flat.
+
+    A point beside the tip of a ball of radius R is sqrt(R^2 + h^2) - R away from it.
+    """
+    aside = np.array([along[0], along[1], 0.0])
+    aside *= _NEAR_TIP_M / max(float(np.linalg.norm(aside)), 1e-12)
+    tip, gap = signed_distance(indenter, np.stack([np.zeros(3), aside]))
+    if abs(tip) > 1e-9 or gap < 1e-9:  # no surface at the tip, as in a ring's bore; or flat
+        return 0.0
+    return float((_NEAR_TIP_M**2 - gap**2) / (2.0 * gap))
 
 
 def angled_direction(normal: ArrayLike, angle_rad: float, azimuth_rad: float) -> Floats:

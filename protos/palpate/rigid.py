@@ -27,6 +27,10 @@ Quaternion = tuple[float, float, float, float]
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the length of a quaternion of a log may be: it was printed with few digits."""
 
+LEVER_M = 3.5e-3
+"""`path_lengths` counts a turn as the arc of a point this far away: the radius of the 7 mm
+indenters [m]."""
+
 _ORTHONORMAL = 1e-6  # a pose printed with seven digits passes, a scaled or mirrored one does not
 _STRAIGHT = 1.0 - 1e-12
 """Quaternions with a larger product are so near each other that the chord is the arc."""
@@ -126,6 +130,22 @@ def interpolate_pose(first: Floats, second: Floats, share: float) -> Floats:
     """Pose (7,) between two poses: straight line, and the shortest turn."""
     position = first[:3] + share * (second[:3] - first[:3])
     return np.concatenate([position, slerp(first[3:], second[3:], share)])
+
+
+def path_lengths(path: Floats) -> Floats:
+    """Travel up to each pose [m], (K,): the tip's way, and the arc of its turns at `LEVER_M`.
+
+    From pose to pose it is the root of the sum of both squares. So the noise of measured
+    orientations hardly counts beside a move, and a turn on the spot is travel too.
+    """
+    moves = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1)
+    before, after = path[:-1, 3:], path[1:, 3:]
+    # Either sign of a quaternion is the same turn. The chord keeps the digits of small angles.
+    chords = np.minimum(
+        np.linalg.norm(after - before, axis=1), np.linalg.norm(after + before, axis=1)
+    )
+    turns = 4.0 * np.arcsin(np.minimum(0.5 * chords, 1.0))
+    return np.concatenate([[0.0], np.cumsum(np.hypot(moves, LEVER_M * turns))])
 
 
 def to_local(pose: Floats, points: Floats) -> Floats:

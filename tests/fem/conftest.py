@@ -22,6 +22,7 @@ from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.core import DistanceGrid, RigidCore
@@ -290,3 +291,9 @@ def fill(finger_geometry: FingertipGeometry) -> Fill:
 def finger(fill: Fill) -> Fingertip:
     """The small finger for all tests that leave it as it was."""
     return fill()
+
+
+@pytest.fixture(scope="session")
+def settled() -> SolverSettings:
+    """The mortar correction of contact comes to rest, so that a state does not know its way."""
+    return SolverSettings(newton=NewtonSettings(mortar_updates=30))

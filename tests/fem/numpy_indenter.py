@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,7 @@ from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 
 
 def signed_distance(indenter: Indenter, points: Floats) -> Floats:
-    """Gap alone [m], shape (N,), positive outside; faster than `distance`.
+    """Gap alone [m] without fillet, shape (N,), positive outside; faster than `distance`.
 
     Args:
         indenter: The indenter.
@@ -37,9 +39,83 @@ def distance(indenter: Indenter, points: Floats) -> tuple[Floats, Floats, Floats
     for index, primitive in enumerate(indenter.primitives):
         chosen = nearest == index
         if chosen.any():
-            law = _box if primitive.kind == PrimitiveKind.BOX else _revolved
-            normal[chosen], hessian[chosen] = law(primitive, points[chosen])
+            _, normal[chosen], hessian[chosen] = _of_primitive(primitive, points[chosen])
+    if indenter.fillet_m > 0.0:
+        inside = np.flatnonzero(gap < indenter.fillet_m)
+        sharp = gap[inside], normal[inside], hessian[inside]
+        gap[inside], normal[inside], hessian[inside] = _filleted(indenter, points[inside], *sharp)
     return gap, normal, hessian
+
+
+def _of_primitive(primitive: Primitive, points: Floats) -> tuple[Floats, Floats, Floats]:
+    """Gap, normal and hessian of one primitive."""
+    box = primitive.kind == PrimitiveKind.BOX
+    gap = (_box_gap if box else _revolved_gap)(primitive, points)
+    return gap, *(_box if box else _revolved)(primitive, points)
+
+
+def _filleted(
+    indenter: Indenter, points: Floats, gap: Floats, normal: Floats, hessian: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Fillets by the definition, among all pairs and triples of primitives.
+
+    Of all points that have the gap r to one, two or three, and to none a smaller one, the closest.
+    """
+    radius, parts = indenter.fillet_m, indenter.primitives
+    depth = radius - gap
+    start = points + depth[:, None] * normal
+    clear = _nearest(indenter, start)[0] >= radius - 1e-12
+    best = np.where(clear, depth, depth + radius)
+    out = np.where(clear, gap, gap - radius), normal.copy(), hessian.copy()
+    gaps = np.stack([_of_primitive(part, points)[0] for part in parts])
+    candidate = (gaps < radius + best) & ~clear
+    for count in (2, 3):
+        for chosen in combinations(range(len(parts)), count):
+            rows = np.flatnonzero(candidate[list(chosen)].all(axis=0))
+            if not len(rows):
+                continue
+            centre, follow = _centre(
+                [parts[index] for index in chosen], radius, points[rows], start[rows]
+            )
+            away = centre - points[rows]
+            size = np.linalg.norm(away, axis=1)
+            valid = (size < best[rows]) & (size > 0.0)
+            valid[valid] = _nearest(indenter, centre[valid])[0] >= radius - 1e-10
+            rows, size, n = rows[valid], size[valid], away[valid] / size[valid, None]
+            best[rows] = size
+            out[0][rows], out[1][rows] = radius - size, n
+            change = follow[valid] - np.eye(3)
+            across = np.eye(3) - n[:, :, None] * n[:, None, :]
+            out[2][rows] = across @ change / size[:, None, None]
+    return out
+
+
+def _centre(
+    parts: list[Primitive], radius: float, points: Floats, start: Floats
+) -> tuple[Floats, Floats]:
+    """Closest points with the gap ``radius`` to all of the parts, by Newton's method.
+
+    Infinite where there is none, (N, 3); and their derivative, (N, 3, 3).
+    """
+    centre, count = start.copy(), len(parts)
+    share = np.zeros((len(points), count))
+    matrix = np.zeros((len(points), 3 + count, 3 + count))
+    error = np.full(len(points), np.inf)
+    for _ in range(30):
+        values = [_of_primitive(part, centre) for part in parts]
+        gaps = np.stack([value[0] for value in values], axis=1)
+        normals = np.stack([value[1] for value in values], axis=2)
+        bend = sum(share[:, [k], None] * value[2] for k, value in enumerate(values))
+        matrix[:, :3, :3] = np.eye(3) - bend
+        matrix[:, :3, 3:], matrix[:, 3:, :3] = -normals, normals.transpose(0, 2, 1)
+        right = np.concatenate([points - centre, radius - gaps], axis=1)
+        inverse = np.linalg.pinv(matrix, rcond=1e-9)
+        change = np.einsum("nij,nj->ni", inverse, right)
+        error = np.abs(change[:, :3]).max(axis=1) + np.abs(gaps - radius).max(axis=1)
+        centre += change[:, :3] * np.minimum(1.0, 0.5e-3 / np.maximum(error, 1e-30))[:, None]
+        share = change[:, 3:]
+    centre[error > 1e-12] = np.inf
+    return centre, np.asarray(inverse[:, :3, :3], np.float64)
 
 
 def top(primitive: Primitive) -> float:

@@ -5,13 +5,15 @@ Each computes what a kernel of `palpate_fem.mechanics` computes, in the words of
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_fem.mechanics.material import BARRIER_FROM, VOLUME_BARRIER, energy_density
+from palpate_fem.mechanics.element_kernels import BARRIER_FROM, VOLUME_BARRIER
 from palpate_fem.mechanics.reference_element import face_element, rest_gradients
+from palpate_fem.mechanics.skin import energy_density
 from palpate_fem.mesh.solid import SolidMesh
 
 Floats = NDArray[np.float64]
@@ -372,6 +374,46 @@ def contact(
         tangent=there(tangent),
         rest=there(rest),
     )
+
+
+def mortar(
+    nodes: Floats,
+    faces: Ints,
+    position: Floats,
+    pressure: Floats,
+    distance: Callable[[Floats], tuple[Floats, Floats]],
+) -> tuple[Floats, Floats]:
+    """Weighted gaps and nodal forces of frictionless mortar contact, face by face.
+
+    Args:
+        nodes: Undeformed positions [m], (V, 3).
+        faces: Node ids, (F, k).
+        position: Deformed positions [m], (V, 3).
+        pressure: Of each node [Pa], (V,).
+        distance: Gap [m] and its gradient at points (N, 3).
+
+    Returns:
+        Gap of each node [m], NaN off the faces, (V,); force of the other body [N], (V, 3).
+    """
+    element = face_element(faces.shape[1])
+    gap, area, force = np.zeros(len(nodes)), np.zeros(len(nodes)), np.zeros_like(nodes)
+    for face in faces:
+        values, normals = distance(element.shape @ position[face])
+        mass, sizes = np.zeros((len(face), len(face))), []
+        for shape, slope, weight in zip(
+            element.shape, element.gradient, element.weight, strict=True
+        ):
+            by_r, by_s = slope.T @ nodes[face]
+            sizes.append(weight * np.linalg.norm(np.cross(by_r, by_s)))
+            mass += sizes[-1] * np.outer(shape, shape)
+        dual = np.diag(mass.sum(axis=1)) @ np.linalg.inv(mass)
+        for shape, size, value, normal in zip(element.shape, sizes, values, normals, strict=True):
+            phi = dual @ shape
+            gap[face] += size * value * phi
+            force[face] += size * (phi @ pressure[face]) * np.outer(shape, normal)
+        area[face] += mass.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return gap / area, force
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, DatasetError, SimulationError
+from palpate.rigid import path_lengths
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.calibration.recover import recover
 from palpate_fem.calibration.result import Evaluation, read_parameters, write_calibration
-from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
+from palpate_fem.calibration.runs import PlannedPath, RunSlopes, SimulatedRun
 from palpate_fem.calibration.settings import (
     FRICTION,
     MODULUS,
@@ -27,7 +28,6 @@ from palpate_fem.calibration.settings import (
     CalibrationSettings,
 )
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import plot_calibration
 from palpate_fem.result import IndentationOutcome
 
@@ -96,6 +96,35 @@ class Formula:
         return SimulatedRun(force[:count], way[:count], total, volume, outcome, reason)
 
 
+class SlopeFormula(Formula):
+    """The same with its derivatives."""
+
+    def simulate_slopes(
+        self,
+        parameters: FingertipParameters,
+        indenter: str,
+        path: Floats,
+        names: tuple[str, ...],
+    ) -> SimulatedRun:
+        run, columns, step = self.simulate(parameters, indenter, path), [], 1e-5
+        for name in names:
+            value = getattr(parameters, name)
+            more, less = (
+                self.simulate(replace(parameters, **{name: value * (1 + way)}), indenter, path)
+                for way in (step, -step)
+            )
+            count = len(run.forces)
+            both: list[Floats] = [
+                (more.forces[:count] - less.forces[:count]).ravel(),
+                np.array([more.thickness_m, more.fluid_volume_m3])
+                - [less.thickness_m, less.fluid_volume_m3],
+            ]
+            columns.append(np.concatenate(both) / (2 * step * value))
+        table = np.stack(columns, axis=-1)
+        force = table[:-2].reshape(-1, 3, len(names))
+        return replace(run, slopes=RunSlopes(names, force, table[-2], table[-1]))
+
+
 def press(
     angle_deg: float = 0.0, azimuth_deg: float = 0.0, *, depth_m: float = 3e-3, samples: int = 46
 ) -> Floats:
@@ -147,10 +176,11 @@ def measure(
         (FingertipParameters(1.8e-3, 1.5e5, 0.12), 0.03, 1),
     ],
 )
+@pytest.mark.parametrize("simulator", [Formula(), SlopeFormula()], ids=["differences", "slopes"])
 def test_planted_parameters_are_found_in_noise(
-    truth: FingertipParameters, noise_n: float, sensors: int
+    simulator: Formula, truth: FingertipParameters, noise_n: float, sensors: int
 ) -> None:
-    found = recover(Formula(), truth, PLANS, noise_n, seed=1, sensors=sensors)
+    found = recover(simulator, truth, PLANS, noise_n, seed=1, sensors=sensors)
     assert found.passed, found.rows()
     assert found.calibration.converged
     assert found.calibration.self_test
@@ -193,6 +223,35 @@ def test_the_modulus_needs_no_runs() -> None:
     beside = one.calibration.simulations / len(PLANS[:2]) - points
     assert beside == 2 * round(beside / 2)
     assert one.calibration.simulations <= 2 * (points + 2 * (points - 6 + 1))
+
+
+def test_slopes_save_the_scan_and_the_runs_beside() -> None:
+    counts = []
+    for simulator in (Formula(), SlopeFormula()):
+        found = calibrate(simulator, measure())
+        assert found.converged
+        assert found.parameters.skin_thickness_m == pytest.approx(TRUTH.skin_thickness_m, rel=2e-3)
+        assert found.parameters.friction_coefficient == pytest.approx(0.25, rel=2e-3)
+        counts.append(found.simulations)
+        deviations = {estimate.name: estimate.sd for estimate in found.estimates}
+        assert all(math.isfinite(sd) for sd in deviations.values())
+    assert 3 * counts[1] <= counts[0]
+
+
+def test_slopes_of_a_free_volume() -> None:
+    bounds = PAPER_BOUNDS | {VOLUME: (5e-7, 1.2e-6)}
+    found = calibrate(SlopeFormula(), measure(), CalibrationSettings(bounds=bounds))
+    truth = Formula().simulate(TRUTH, "sphere_medium", press())
+    assert found.fluid_volume_m3 == pytest.approx(truth.fluid_volume_m3, rel=1e-2)
+    assert found.thickness_m == pytest.approx(15.1e-3, abs=1e-6)
+
+
+def test_where_the_middle_fails_slopes_begin_with_the_scan() -> None:
+    simulator = SlopeFormula(thicknesses_m=(1.42e-3, 1.9e-3))
+    truth = replace(TRUTH, skin_thickness_m=1.7e-3)
+    found = calibrate(simulator, measure(truth=truth))
+    assert [entry.stage for entry in found.history][:2] == ["start", "scan"]
+    assert found.parameters.skin_thickness_m == pytest.approx(1.7e-3, rel=5e-3)
 
 
 def test_progress_is_told_in_order() -> None:

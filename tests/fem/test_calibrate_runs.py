@@ -10,13 +10,20 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigError, SimulationError
+from palpate.rigid import path_lengths
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.measured import MeasuredIndentation
-from palpate_fem.calibration.runs import SimulatedRun, SimulationRuns
+from palpate_fem.calibration.runs import FingertipSimulator, SimulatedRun, SimulationRuns
 from palpate_fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings
+from palpate_fem.cli.identify import slope_simulator_for
+from palpate_fem.cli.model import FingertipModel
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate_fem.indenter.approach import OuterSurface
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.parametric import biotac
 from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.trajectory import angled_direction, pad_point, press_path
 
 TRUTH = FingertipParameters()
 
@@ -109,3 +116,64 @@ def test_a_dying_process_is_named() -> None:
 def test_impossible_bounds_are_refused(bounds: dict[str, tuple[float, float]], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         CalibrationSettings(bounds=bounds)
+
+
+SIMULATOR = FingertipSimulator(edge_m=1.4e-3, layers=1)
+
+
+@pytest.fixture(scope="module")
+def pad_press() -> MeasuredIndentation:
+    """Into the pad of the coarse finger, aslant, so that the force depends on friction."""
+    tip = Fingertip.pressurised(biotac(edge_m=SIMULATOR.edge_m, layers=SIMULATOR.layers))
+    surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
+    target, normal = pad_point(surface, -4e-3, 0.0)
+    direction = angled_direction(normal, 0.5, 0.0)
+    path = press_path(
+        make_indenter("sphere_medium"), target, direction, surface, depth_m=1e-3, steps=3,
+        clearance_m=0.2e-3,
+    )  # fmt: skip
+    return MeasuredIndentation("pad", "sphere_medium", "-", path, np.zeros((len(path), 3)))
+
+
+@pytest.mark.slow
+def test_a_finger_in_this_process_derives_its_runs(pad_press: MeasuredIndentation) -> None:
+    runs = SimulationRuns(SIMULATOR)
+    assert runs.knows_slopes
+    names, step = (THICKNESS, FRICTION), 1e-3
+    plain, derived = (runs.run([(TRUTH, pad_press)], wanted)[0] for wanted in ((), names))
+    assert plain.slopes is None
+    assert derived.slopes is not None
+    np.testing.assert_array_equal(plain.forces, derived.forces)
+    assert derived.slopes.force.shape == (*derived.forces.shape, 2)
+    assert derived.slopes.thickness_m == pytest.approx([0.0, 0.0], abs=1e-9)
+    more, less = (
+        SIMULATOR.simulate(
+            replace(TRUTH, friction_coefficient=TRUTH.friction_coefficient * (1 + way)),
+            pad_press.indenter,
+            pad_press.pose,
+        )
+        for way in (step, -step)
+    )
+    wanted = (more.forces - less.forces) / (2 * step)
+    found = derived.curve_slopes(np.array([TRUTH.skin_thickness_m, TRUTH.friction_coefficient]))
+    assert found is not None
+    # The tolerances of the solver leave 1e-4 of the forces.
+    np.testing.assert_allclose(found[1], wanted, atol=0.02 * np.abs(wanted).max())
+
+
+@pytest.mark.slow
+def test_runs_in_a_process_of_their_own_are_derived_too(pad_press: MeasuredIndentation) -> None:
+    model = FingertipModel("", {"edge_m": SIMULATOR.edge_m, "layers": SIMULATOR.layers}, TRUTH)
+    with slope_simulator_for(model, 1, 1) as (simulator, executor, _):
+        assert simulator == SIMULATOR
+        (run,) = SimulationRuns(simulator, executor).run([(TRUTH, pad_press)], (FRICTION,))
+    (here,) = SimulationRuns(SIMULATOR).run([(TRUTH, pad_press)], (FRICTION,))
+    np.testing.assert_array_equal(run.forces, here.forces)
+    assert run.slopes is not None
+    assert run.slopes.names == (FRICTION,)
+
+
+def test_slopes_of_another_mesh_are_refused() -> None:
+    model = FingertipModel("", {"layers": 2, "mesh": "somewhere"}, TRUTH)
+    with pytest.raises(ConfigError, match="parametric mesh"), slope_simulator_for(model, 1, 1):
+        pass

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +28,12 @@ from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, wri
 from palpate_fem.calibration.result import read_parameters
 from palpate_fem.cli import model as cli_model
 from palpate_fem.cli.app import fem_app
+from palpate_fem.cli.run import telling_step
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import COLUMNS
 from palpate_fem.store.read import SimulationStore
+from palpate_fem.study import PathRow
 
 fakes: Any = importlib.import_module("fem_fakes")
 
@@ -62,7 +66,7 @@ def test_the_picture_of_a_press_shows_its_indenter(
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(
-        "palpate_fem.plot.step.plot_step", lambda *_, indenter: drawn.append(indenter)
+        "palpate_fem.plot.step.plot_step", lambda *_, step, indenter: drawn.append(indenter)
     )
     fem("run", "--indenter", "cube_14mm", "--steps", 3, "--png", tmp_path / "press.png")
     (outline,) = drawn
@@ -85,13 +89,69 @@ def test_a_path_from_a_file(tmp_path: Path) -> None:
     path = np.zeros((5, 7))
     path[:, 2], path[:, 3] = np.linspace(-0.010, -0.006, 5), 1.0
     np.savetxt(tmp_path / "poses.csv", path, "%.17g", ",", header=",".join(COLUMNS), comments="")
-    done = fem("run", "--path", tmp_path / "poses.csv", "--json")
+    done = fem("run", "--poses", tmp_path / "poses.csv", "--json")
     steps = json.loads(done.stdout)["trajectories"][0]["steps"]
     assert [step["pose"][2] for step in steps] == path[1:, 2].tolist()
     path[:, 2] += 0.005
     np.savetxt(tmp_path / "inside.csv", path, "%.17g", ",", header=",".join(COLUMNS), comments="")
     with pytest.raises(ConfigError, match="inside"):
-        fem("run", "--path", tmp_path / "inside.csv")
+        fem("run", "--poses", tmp_path / "inside.csv")
+
+
+def test_a_path_of_segments_is_run_and_stored_once(tmp_path: Path) -> None:
+    words = "press 1 mm, slide 0.5 mm towards +y, twist 10 deg, unload"
+    common = ("run", "--path", words, "--step-mm", 0.25, "--store", tmp_path / "a.sim")
+    done = fem(*common, "--json")
+    (trajectory,) = json.loads(done.stdout)["trajectories"]
+    poses = np.array([step["pose"] for step in trajectory["steps"]])
+    assert trajectory["outcome"] == "complete"
+    assert poses[5, 1] - poses[3, 1] == pytest.approx(0.5e-3)
+    turned = np.unwrap(2.0 * np.arctan2(poses[:, 6], poses[:, 3]))
+    assert turned[8] - turned[5] == pytest.approx(np.deg2rad(10.0))
+    assert "1 were there already" in fem(*common).stdout
+
+
+def test_a_picture_shows_the_last_touch_or_the_hardest() -> None:
+    force = np.zeros((4, 3))
+    force[1:, 2] = 2.0, 1.0, 0.5
+    assert telling_step(force) == 3
+    force[3] = 0.0
+    assert telling_step(force) == 1
+    assert telling_step(force[:3]) == 2
+
+
+def test_the_fill_is_an_option() -> None:
+    done = fem("run", "--steps", 2, "--fill-ml", 0.6, "--json")
+    parameters = json.loads(done.stdout)["fingertip"]["parameters"]
+    assert parameters["fluid_volume_m3"] == pytest.approx(0.6e-6)
+    with pytest.raises(ConfigError, match="fluid_volume_m3"):
+        fem("run", "--steps", 2, "--fill-ml", 600)
+
+
+def test_a_study_of_paths_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    good = PathRow(
+        "cube", (0.0, 1.0), "press 1 mm, unload", 9, 9, "complete", "", 1.0, 3e-6, 2e-6, 0.0, 1e-9,
+        9, 30, 1.0,
+    )  # fmt: skip
+    rows = [good, replace(good, friction_least_j=-1e-7), replace(good, undone_m=2e-8)]
+    rows.append(replace(good, outcome="diverged", reason="no way", done=4, undone_m=math.nan))
+    asked: list[dict[str, Any]] = []
+
+    def study(*, on_row: Any, **options: Any) -> list[PathRow]:
+        asked.append(options)
+        return rows[: options["count"]]
+
+    monkeypatch.setattr("palpate_fem.study.path_study", study)
+    done = fem("study", "paths", "--count", 4, "--edge-mm", 0.8, "--fill-ml", 0.6)
+    assert asked == [{"count": 4, "seed": 0, "edge_m": 0.8e-3, "fluid_volume_m3": 0.6e-6}]
+    said = " ".join(done.stdout.split())
+    assert done.exit_code == 1
+    assert "3 of 4 complete; friction took work on all but 1; at most 0.0200 um left" in said
+    assert "no way" in said
+    done = fem("study", "paths", "--count", 1, "--json")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["rows"][0]["words"] == "press 1 mm, unload"
+    assert fem("study", "paths", "--png", "a.png").exit_code == 2
 
 
 def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
@@ -139,7 +199,12 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--indenter", "cube", "--indenter", "ring"), "several"),
         (("--shear-modulus-kpa", 280_000), "shear_modulus_pa"),
         (("--mesh", "nowhere"), "nowhere"),
-        (("--path", "nowhere.csv"), "nowhere.csv"),
+        (("--poses", "nowhere.csv"), "nowhere.csv"),
+        (("--path", "nowhere.csv"), "--poses"),
+        (("--path", "pres 1 mm"), "pres 1 mm"),
+        (("--path", "press 1 mm", "--poses", "a.csv"), "exclude"),
+        (("--path", "press 1 mm", "--step-mm", 0), "step_m"),
+        (("--path", "press 1 mm, slide 20 mm towards +y", "--step-mm", 0.001), "poses"),
         (("--parameters", "nowhere.json"), "nowhere.json"),
         (("--at-mm", 40, 0), "no pad"),
         (("--store", "store.h5"), ".sim"),

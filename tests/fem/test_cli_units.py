@@ -40,3 +40,17 @@ def test_what_cannot_be_fitted_or_shown_is_refused(tmp_path: Path) -> None:
         assert result.exit_code != 0
         with pytest.raises(error, match=word):
             raise result.exception or AssertionError(result.output)
+
+
+def test_drawn_units_are_written_shown_and_the_same_for_the_same_seed(tmp_path: Path) -> None:
+    out = tmp_path / "drawn.json"
+    drawn = CliRunner().invoke(
+        fem_app, ["units", "draw", "5", "--seed", "3", "--out", str(out)], env={"COLUMNS": "100"}
+    )
+    assert drawn.exit_code == 0, drawn.output
+    assert "core displaced distally by [mm]" in drawn.output
+    shown = CliRunner().invoke(fem_app, ["units", "show", str(out)], env={"COLUMNS": "160"})
+    assert shown.exit_code == 0, shown.output
+    assert "unit-005" in shown.output
+    again = CliRunner().invoke(fem_app, ["units", "draw", "5", "--seed", "3", "--json"])
+    assert json.loads(again.output) == json.loads(out.read_text())["members"]

@@ -28,7 +28,9 @@ SAME = 1e-12  # relative to the largest entry: kernels and twins differ by round
 MU, BULK_RATIO, OUTER_M = 2.8e5, 10.0, 4e-3
 SKIN = {"shear_modulus_pa": MU, "bulk_ratio": BULK_RATIO}
 # As soft as the skin, so that no part of a tangent hides behind another.
-SOFT = ContactSettings(stiffness=2e9, tangential_stiffness=8e8, complement=1e8, margin_m=0.5e-3)
+SOFT = ContactSettings(
+    stiffness=2e9, tangential_stiffness=8e8, complement=1e8, margin_m=0.5e-3, mortar=False
+)
 
 # Indenter, friction, drag of the anchors [m], and the statuses that come of it.
 CASES: dict[str, tuple[str, float, float, set[int]]] = {
@@ -100,10 +102,10 @@ class Pressed:
         skin = elements(mesh, NeoHooke(MU), bulk, state.position, state.pressure)
         state.pressure = bulk * (skin.volume / skin.rest_volume - 1.0)
         gap = self.core.grid.evaluate(self.points(self.system.inner, mesh.inner_faces))[0]
-        pressure = np.maximum(0.0, -SOFT.stiffness * gap)
+        pressure = np.maximum(0.0, -SOFT.stiffness * (gap + state.on_core.gap.ravel()))
         state.core_pressure = pressure.reshape(state.core_pressure.shape)
         gap, normal, _, arm = self.near()
-        pressure = np.maximum(0.0, -SOFT.stiffness * gap)
+        pressure = np.maximum(0.0, -SOFT.stiffness * (gap + state.on_indenter.gap.ravel()))
         state.indenter_pressure = pressure.reshape(state.indenter_pressure.shape)
         traction = return_map(self.law, pressure, normal, arm)
         state.traction = traction.reshape(state.traction.shape)
@@ -128,14 +130,22 @@ Squeeze = Callable[..., Pressed]
 
 @pytest.fixture
 def squeeze(shell: Make, ball: Make, assembled: Make) -> Squeeze:
-    """Makes a `Pressed`: indenter, friction, drag of the anchors [m], element corners."""
+    """Makes a `Pressed`: indenter, friction, drag of the anchors [m], corners, mortar or nodes."""
 
-    def make(indenter: str, friction: float, *, drag_m: float = 0.0, corners: int = 8) -> Pressed:
+    def make(
+        indenter: str,
+        friction: float,
+        *,
+        drag_m: float = 0.0,
+        corners: int = 8,
+        mortar: bool = False,
+    ) -> Pressed:
         random = np.random.default_rng(1)
         mesh = shell(6, 1, 3e-3, OUTER_M, corners=corners)
         core = ball(3e-3)
         held = np.zeros(mesh.nodes.shape, bool)
-        system = EquilibriumSystem(mesh, core.grid, **SKIN, contact=SOFT, held=held)
+        contact = replace(SOFT, mortar=mortar)
+        system = EquilibriumSystem(mesh, core.grid, **SKIN, contact=contact, held=held)
         state = SolutionState.at_rest(mesh)
         state.position += random.normal(0.0, 2e-5, mesh.nodes.shape)
         state.fluid_pressure = 3e4
@@ -248,15 +258,21 @@ def test_condensed_loads_and_updates_equal_the_twin(squeeze: Squeeze) -> None:
             assert difference(traction.reshape(-1, 3), wanted) < SAME
 
 
+@pytest.mark.parametrize("mortar", [True, False], ids=["mortar", "nodes"])
 @pytest.mark.parametrize("corners", [8, 6])
 @pytest.mark.parametrize("case", CASES)
 def test_assembled_tangent_is_the_derivative_of_the_forces(
-    squeeze: Squeeze, dense: Dense, case: str, corners: int
+    squeeze: Squeeze, dense: Dense, case: str, corners: int, mortar: bool
 ) -> None:
-    """Of skin, fluid, core and indenter together, pressures following their laws."""
+    """Of skin, fluid, core and indenter together, pressures following their laws.
+
+    With the mortar correction of the state, which Newton's method keeps.
+    """
     indenter, friction, drag_m, statuses = CASES[case]
-    pressed = squeeze(indenter, friction, drag_m=drag_m, corners=corners)
+    pressed = squeeze(indenter, friction, drag_m=drag_m, corners=corners, mortar=mortar)
     system, state = pressed.system, pressed.state
+    system.correct_contact(state, pressed.press)
+    assert state.on_core.gap.any() == state.on_indenter.gap.any() == mortar
     pressed.settle()
     system.balance(state, pressed.press)
     assert set(system.outer.status.numpy().ravel()) == statuses

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tests.fem.numpy_mechanics import Elements, NeoHooke, elements
 
 from palpate_fem.mechanics.contact import ContactSettings
-from palpate_fem.mechanics.material import BARRIER_FROM
+from palpate_fem.mechanics.element_kernels import BARRIER_FROM
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh

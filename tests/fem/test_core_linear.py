@@ -15,7 +15,9 @@ from palpate_fem.mechanics.contact import ContactSettings
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
+from palpate_fem.sparse.blas import BLOCK, DEPTH
 from palpate_fem.sparse.factor import Multifrontal, SparseFactor, make_factor
+from palpate_fem.sparse.fronts import FrontalFactor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -248,3 +250,75 @@ def test_directions_of_instability_are_counted(
         right = np.random.default_rng(3).normal(size=len(matrix))
         answer = factor.solve(right)
         assert np.abs(shifted @ answer - right).max() < 1e-3 * np.abs(right).max()
+
+
+def two_bodies(size: int, joint: int, shift: float = 0.0) -> Floats:
+    """Two dense bodies of ``size`` unknowns that are coupled by ``joint`` unknowns only."""
+    random = np.random.default_rng(8)
+    total = 2 * size + joint
+    matrix = random.normal(size=(total, total)) / np.sqrt(total)
+    matrix = matrix @ matrix.T + (0.5 - shift) * np.eye(total)
+    matrix[:size, size : 2 * size] = matrix[size : 2 * size, :size] = 0.0
+    return np.asarray(matrix)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0], ids=["definite", "indefinite"])
+@pytest.mark.parametrize(
+    ("size", "joint"),
+    [(1, 0), (1, 1), (BLOCK - 1, 1), (BLOCK, BLOCK), (BLOCK + 1, 3), (100, 21), (DEPTH + 45, 37)],
+)
+@pytest.mark.parametrize("solver", ["fronts", "fronts-double"])
+def test_fronts_of_any_size(size: int, joint: int, shift: float, solver: str) -> None:
+    """Blocks that are not full, and fronts deeper than the columns that are taken together."""
+    matrix = two_bodies(size, joint, shift)
+    assert joint == 0 or shift or np.linalg.eigvalsh(matrix)[0] > 0.0
+    indptr, indices = pattern_of(matrix)
+    factor = make_factor(indptr, indices, solver=solver)
+    assert isinstance(factor, Multifrontal)
+    right = np.random.default_rng(9).normal(size=(len(matrix), 3))
+    for scale in (1.0, 3.0):  # what an earlier factor has left behind does no harm
+        factor.factorise(scale * values_of(matrix, indptr, indices))
+        wanted = np.linalg.solve(scale * matrix, right)
+        allowed = 1e-10 if factor.negative or solver == "fronts-double" else 1e-4
+        assert np.abs(factor.solve(right) - wanted).max() < allowed * np.abs(wanted).max()
+        assert factor.negative == int((np.linalg.eigvalsh(matrix) < 0.0).sum())
+
+
+def test_an_updated_indefinite_factor_is_a_new_one(
+    grid: tuple[Multifrontal, Floats, Ints, Ints],
+) -> None:
+    """Fronts that were not definite and are again, and the other way round."""
+    _, matrix, indptr, indices = grid
+    right = np.random.default_rng(4).normal(size=len(matrix))
+    factor = make_factor(indptr, indices, solver="fronts-double")
+    counts = []
+    for place, change in ((0, 0.0), (311, -9.0), (311, 0.0), (40, -9.0)):
+        changed = matrix.copy()
+        changed[place, place] += change
+        factor.factorise(values_of(changed, indptr, indices))
+        fresh = make_factor(indptr, indices, solver="fronts-double")
+        fresh.factorise(values_of(changed, indptr, indices))
+        counts.append(factor.negative)
+        assert fresh.negative == factor.negative
+        np.testing.assert_array_equal(factor.solve(right), fresh.solve(right))
+    assert counts == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("solver", ["fronts", "fronts-double"])
+def test_halves_one_after_the_other_give_the_same_bits(
+    grid: tuple[Multifrontal, Floats, Ints, Ints], solver: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, matrix, indptr, indices = grid
+    right = np.random.default_rng(5).normal(size=(len(matrix), 2))
+    answers = []
+    for _ in range(2):
+        factor = make_factor(indptr, indices, solver=solver)
+        factor.factorise(values_of(matrix, indptr, indices))
+        answers.append(factor.solve(right))
+        monkeypatch.setattr(FrontalFactor, "_both", one_by_one)
+    np.testing.assert_array_equal(answers[0], answers[1])
+
+
+def one_by_one(_: FrontalFactor, work: Callable[[int], None]) -> None:
+    for half in (1, 0):
+        work(half)

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate.rigid import interpolate_pose, rotation_matrices
-from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate.rigid import LEVER_M, interpolate_pose, path_lengths, rotation_matrices
 
 Floats = NDArray[np.float64]
 
@@ -69,3 +68,28 @@ def test_lengths_of_a_path_add_up(corners: list[tuple[float, float, float]]) -> 
     for k in range(1, len(path)):
         step = np.linalg.norm(path[k, :3] - path[k - 1, :3])
         assert lengths[k] - lengths[k - 1] == pytest.approx(step, abs=1e-15)
+
+
+@given(first=poses(), second=poses(), sign=st.sampled_from([1.0, -1.0]))
+def test_a_turn_is_as_long_as_its_arc(first: Floats, second: Floats, sign: float) -> None:
+    path = np.array([first, second, [*first[:3], *(sign * second[3:])]])
+    turn, back = angle(first, second), np.linalg.norm(second[:3] - first[:3])
+    lengths = path_lengths(path)
+    assert lengths[1] == pytest.approx(np.hypot(back, LEVER_M * turn), rel=1e-9, abs=1e-12)
+    assert lengths[2] - lengths[1] == pytest.approx(back, rel=1e-9, abs=1e-12)
+    assert path_lengths(path[[0, 2]])[1] == pytest.approx(LEVER_M * turn, rel=1e-7, abs=1e-12)
+
+
+def test_parts_of_a_twist_add_up_to_it() -> None:
+    half = np.deg2rad(np.linspace(0.0, 10.0, 9))
+    path = np.zeros((9, 7))
+    path[:, 3], path[:, 6] = np.cos(half), np.sin(half)
+    np.testing.assert_allclose(path_lengths(path), LEVER_M * 2.0 * half, atol=1e-15)
+
+
+def test_noise_of_an_orientation_hardly_lengthens_a_move() -> None:
+    path = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (31, 1))
+    path[:, 2] = 1e-4 * np.arange(31)
+    path[1::2, 4] = 1e-3  # 0.1 degrees forth and back
+    path[:, 3:] /= np.linalg.norm(path[:, 3:], axis=1, keepdims=True)
+    assert path_lengths(path)[-1] == pytest.approx(3e-3, rel=3e-3)

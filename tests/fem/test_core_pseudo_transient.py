@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.newton import (
     FIRST_VISCOSITY,
     LEAST_VISCOSITY,
@@ -107,7 +108,8 @@ def test_a_column_stays_straight_by_newton_and_buckles_by_continuation(
     assert plain.residual == balance.residual
 
 
-def test_continuation_arrives_where_plain_steps_do(finger: Fingertip) -> None:
+def test_continuation_arrives_where_plain_steps_do(fill: Fill, settled: SolverSettings) -> None:
+    finger = fill(settled)
     low = finger.nodes[:, 2].min()
     answers = []
     for continued in (False, True):
@@ -153,12 +155,53 @@ def test_a_snap_ends_the_trajectory_before_it(fill: Fill) -> None:
     report, balance = run.increment(path[1], 1.0)
     assert report.converged
     force = float(np.linalg.norm(balance.indenter.sum(axis=0)))
-    assert run.at.force == pytest.approx(force)
+    load = run.at.load
+    assert np.linalg.norm(load.sum(axis=0)) == pytest.approx(force)
 
     run = finger.load_stepping(BALL, path)
-    run.at.force, before = 2.0 * force, run.at.state.copy()
+    run.at.load, before = 2.0 * load, run.at.state.copy()
     report, _ = run.increment(path[1], 1.0)
     assert not report.converged
     assert run.outcome is IndentationOutcome.DIVERGED
     assert run.reason == f"the skin snaps: {2 * force:.1f} N fall to {force:.1f} N"
     np.testing.assert_array_equal(run.at.state.position, before.position)
+
+
+@pytest.mark.parametrize(
+    ("move", "inwards"),
+    [
+        ((0.0, 0.0, 0.1e-3), True),
+        ((0.05e-3, 0.0, 0.0866e-3), True),  # 30 degrees to the normal, as the paper presses
+        ((0.0, 0.0, -0.1e-3), False),
+        ((0.1e-3, 0.0, 0.0), False),
+        ((0.0, -0.1e-3, 0.01e-3), False),
+    ],
+)
+def test_less_force_is_a_snap_on_the_way_in_only(
+    fill: Fill, move: tuple[float, float, float], inwards: bool
+) -> None:
+    finger = fill()
+    low = finger.nodes[:, 2].min()
+    path = np.array([[0.0, 0.0, low + depth, 1.0, 0.0, 0.0, 0.0] for depth in (-2e-6, 0.3e-3)])
+    run = finger.load_stepping(BALL, path)
+    assert run.increment(path[1], 1.0)[0].converged
+    finger.newton.settings = NewtonSettings(iterations=1)  # only continuation converges
+    run.at.load = 3.0 * run.at.load
+    there = path[1].copy()
+    there[:3] += move
+    report, _ = run.increment(there, 1.0)
+    assert report.converged is not inwards
+    assert run.reason.startswith("the skin snaps") is inwards
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
+def test_a_turn_on_the_spot_does_not_go_into_the_skin(fill: Fill, axis: tuple[float, ...]) -> None:
+    """Neither a twist about the normal, nor a turn about a tangent through the tip."""
+    finger = fill()
+    low = finger.nodes[:, 2].min()
+    path = np.array([[0.0, 0.0, low + depth, 1.0, 0.0, 0.0, 0.0] for depth in (-2e-6, 0.3e-3)])
+    run = finger.load_stepping(BALL, path)
+    assert run.increment(path[1], 1.0)[0].converged
+    turned = path[1].copy()
+    turned[3:] = np.cos(0.05), *(np.sin(0.05) * np.array(axis))
+    assert not run.at.moves_in(run.at.indenter.at(turned))

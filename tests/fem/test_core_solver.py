@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import Elements, NeoHooke, cavity, elements
+from tests.fem.numpy_mechanics import Elements, NeoHooke, cavity, elements, mortar
 
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.distance import distance
 from palpate_fem.mechanics.load_stepping import VOIGT, LoadStepping, SolverSettings
 from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
@@ -26,7 +26,7 @@ Fill = Callable[..., Fingertip]
 
 BALL = make_indenter("sphere_medium")
 FRICTION = FingertipParameters().friction_coefficient
-BALANCE = 1e-6  # of the force: Newton's tolerance
+BALANCE = 1e-8  # of the force; ten times Newton's tolerance, whose scale are all forces
 COULOMB = 1e-3  # of the limit: a tenth of a micrometre on a sticking point's spring, and some luck
 ACROSS = np.array([1.0, -1.0, 1.0])
 
@@ -103,6 +103,7 @@ def exact_finger(fill: Fill) -> Fingertip:
         gap_tolerance_m=1e-15,
         traction_tolerance=1e-7,
         iterations=40,
+        mortar_updates=30,
         keep_factor=0.0,
         keep_elastic=0.0,
     )
@@ -127,10 +128,10 @@ def test_every_step_comes_in_order(pressed: Pressed) -> None:
     assert (np.diff([s.fluid_pressure_pa for s in trajectory.steps]) > 0.0).all()
 
 
-def test_all_forces_and_moments_on_the_skin_cancel(pressed: Pressed) -> None:
+def test_all_forces_and_moments_on_the_skin_cancel(exact: Pressed) -> None:
     """Indenter, core and supports, whose reactions the twins give."""
-    mesh, state, last = pressed.tip.geometry.mesh, pressed.run.at.state, pressed.last
-    skin = pressed.skin
+    mesh, state, last = exact.tip.geometry.mesh, exact.run.at.state, exact.last
+    skin = exact.skin
     fluid = state.fluid_pressure * cavity(mesh.inner_faces, state.position).gradient
     left = skin.force - fluid - last.indenter_force - last.core_force
     support = np.zeros_like(left)
@@ -165,14 +166,23 @@ def test_the_skin_keeps_its_volume_in_every_element(pressed: Pressed) -> None:
 
 
 def test_nothing_is_deeper_than_micrometres(pressed: Pressed) -> None:
+    """In the mean over the faces around each node."""
     tip, mesh = pressed.tip, pressed.tip.geometry.mesh
+    none = np.zeros(len(mesh.nodes))
     for step in pressed.trajectory.steps:
         position = tip.nodes + step.displacement
-        outside = signed_distance(BALL, position[mesh.outer_nodes] - step.pose[:3])
-        inside = tip.geometry.core.grid.evaluate(position[mesh.inner_nodes])[0]
-        deepest = max(-outside.min(), -inside.min())
+
+        def to_ball(points: Floats, tip_at: Floats = step.pose[:3]) -> tuple[Floats, Floats]:
+            return distance(BALL, points - tip_at)[:2]
+
+        def to_core(points: Floats) -> tuple[Floats, Floats]:
+            return tip.geometry.core.grid.evaluate(points)[:2]
+
+        outside = mortar(mesh.nodes, mesh.outer_faces, position, none, to_ball)[0]
+        inside = mortar(mesh.nodes, mesh.inner_faces, position, none, to_core)[0]
+        deepest = max(-np.nanmin(outside), -np.nanmin(inside))
         assert 0.0 < deepest < 5e-6
-        assert step.convergence.penetration_m == pytest.approx(deepest, rel=1e-6)
+        assert step.convergence.penetration_m == pytest.approx(deepest, abs=0.5e-6)
 
 
 @pytest.mark.parametrize(
@@ -199,16 +209,16 @@ def test_friction_obeys_coulomb_at_every_point(
     assert across.max() < tolerance * traction.max()
 
 
-def test_nodal_forces_are_those_of_pressure_and_friction(pressed: Pressed) -> None:
-    """Normals point out of the ball; friction drags the skin along with it."""
-    state, surface, last = pressed.run.at.state, pressed.tip.system.outer, pressed.last
-    faces = pressed.tip.geometry.mesh.outer_faces
-    away = pressed.position[faces] - pressed.run.at.indenter.tip - (0.0, 0.0, -3.5e-3)
-    normal = away / np.linalg.norm(away, axis=2, keepdims=True)
-    load = state.indenter_pressure[..., None] * normal - state.traction
-    force = np.zeros_like(state.position)
-    np.add.at(force, faces, surface.area_values[..., None] * load)
-    np.testing.assert_allclose(last.indenter_force, force, atol=1e-9 * last.force[2])
+def test_nodal_forces_are_those_of_pressure_and_friction(exact: Pressed) -> None:
+    """Pressure acts on the faces, friction at the nodes and drags the skin along."""
+    state, surface, last = exact.run.at.state, exact.tip.system.outer, exact.last
+    mesh, faces = exact.tip.geometry.mesh, exact.tip.geometry.mesh.outer_faces
+    pressure = np.zeros(len(mesh.nodes))
+    pressure[faces] = state.indenter_pressure
+    np.testing.assert_allclose(pressure[faces], state.indenter_pressure, rtol=1e-6)
+    _, force = mortar(mesh.nodes, faces, state.position, pressure, exact.run.at.indenter.distance)
+    np.add.at(force, faces, -surface.area_values[..., None] * state.traction)
+    np.testing.assert_allclose(last.indenter_force, force, atol=1e-7 * last.force[2])
     dragged = -(surface.area_values[..., None] * state.traction).sum(axis=(0, 1))
     assert dragged[0] > 0.01 * last.force[2]
 
@@ -290,8 +300,8 @@ def test_a_mirrored_press_gives_the_mirror_image(exact_finger: Fingertip) -> Non
 
 def test_a_press_in_the_plane_of_symmetry_stays_in_it(pressed: Pressed) -> None:
     for step in pressed.trajectory.steps:
-        assert abs(step.force[1]) < 2e-7
-        assert np.abs(step.torque[[0, 2]]).max() < 1e-9
+        assert abs(step.force[1]) < 1e-6
+        assert np.abs(step.torque[[0, 2]]).max() < 5e-9
 
 
 def test_forces_scale_with_the_modulus_and_the_shape_does_not_change(
@@ -310,3 +320,37 @@ def test_forces_scale_with_the_modulus_and_the_shape_does_not_change(
         np.testing.assert_allclose(other.indenter_force, 4 * step.indenter_force, atol=1e-12)
         np.testing.assert_allclose(other.core_force, 4 * step.core_force, atol=1e-12)
         np.testing.assert_allclose(other.stress, 4 * step.stress, rtol=1e-9, atol=1e-6)
+
+
+def held_at_rest(finger: Fingertip) -> float:
+    """Fluid that the unpressurised skin holds [m^3], by the twin's volume."""
+    mesh = finger.geometry.mesh
+    return float(cavity(mesh.inner_faces, mesh.nodes).volume.sum()) - finger.core_volume
+
+
+def test_a_fill_that_sucks_the_skin_inwards_is_refused(finger: Fingertip, fill: Fill) -> None:
+    rest = held_at_rest(finger)
+    assert 0.0 <= fill(fluid_volume_m3=rest + 1e-12).fluid_pressure_pa < 50.0
+    for less in (0.5e-9, 3e-9):
+        with pytest.raises(SimulationError, match="suck the skin inwards") as caught:
+            fill(fluid_volume_m3=rest - less)
+        pressure = float(caught.value.problem.split()[-2])
+        assert -20.0 < pressure <= -0.01
+        assert f"{(rest - less) * 1e6:.3f} ml" in caught.value.problem
+        named = float(caught.value.remedy.split()[4])  # fill in at least X ml
+        assert named * 1e-6 == pytest.approx(rest, abs=1e-9)
+        assert named * 1e-6 >= rest
+
+
+def test_a_path_on_which_the_fluid_sucks_ends_there(finger: Fingertip, fill: Fill) -> None:
+    """A light fill, of which more has gone than the untouched skin knows."""
+    tip = fill(fluid_volume_m3=held_at_rest(finger) + 0.2e-9)
+    low = float(tip.nodes[:, 2].min())
+    path = np.array([[0.0, 0.0, low - 2e-6 + k * 1e-6, 1.0, 0.0, 0.0, 0.0] for k in range(3)])
+    assert tip.indent(BALL, path).outcome is IndentationOutcome.COMPLETE
+    tip.cavity_m3 -= 1e-9
+    ended = tip.indent(BALL, path)
+    assert ended.outcome is IndentationOutcome.DIVERGED
+    assert ended.steps == ()
+    assert ended.reason.startswith("the fluid sucks the skin inwards: -")
+    assert f"{tip.fluid_volume_m3 * 1e6:.3f} ml" in ended.reason

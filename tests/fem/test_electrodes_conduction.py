@@ -199,3 +199,32 @@ def test_a_film_in_parts_is_refused() -> None:
     cut = plane(parts.nodes[used], faces.reshape(-1, 3), parts.terminal.astype(np.int64))
     with pytest.raises(SimulationError, match="parts"):
         FilmConduction(cut, 2).solve(np.full(len(used), FILM), sigma_s_m=SIGMA)
+
+
+def test_elimination_leaves_what_dense_algebra_leaves(quilt: tuple[FilmConduction, Floats]) -> None:
+    solver, film = quilt
+    lower = solver.lower_triangle(film, sigma_s_m=SIGMA, contact_ohm_m2=1e-5).toarray()
+    whole = lower + np.tril(lower, -1).T
+    count = len(film)
+    inner, across, outer = whole[:count, :count], whole[:count, count:], whole[count:, count:]
+    left = outer - across.T @ np.linalg.solve(inner, across)
+    solved = solver.solve(film, sigma_s_m=SIGMA, contact_ohm_m2=1e-5)
+    np.testing.assert_allclose(solved.conductance[1:, 1:], left, rtol=1e-9)
+    np.testing.assert_allclose(solved.impedance, np.diag(np.linalg.inv(left)), rtol=1e-9)
+
+
+def test_reading_the_matrix_leaves_the_solver_as_it_was(
+    quilt: tuple[FilmConduction, Floats],
+) -> None:
+    solver, film = quilt
+    before = solver.solve(film, sigma_s_m=SIGMA).impedance
+    solver.lower_triangle(film, sigma_s_m=SIGMA).eliminate_zeros()
+    np.testing.assert_array_equal(solver.solve(film, sigma_s_m=SIGMA).impedance, before)
+
+
+def test_gradient_of_a_scalar_is_that_of_its_parts(quilt: tuple[FilmConduction, Floats]) -> None:
+    solver, film = quilt
+    solved = solver.solve(film, sigma_s_m=SIGMA, contact_ohm_m2=1e-5)
+    weight = np.random.default_rng(4).normal(size=4)
+    whole = weight @ solved.gradient_film()
+    np.testing.assert_allclose(solved.to_film(weight), whole, atol=1e-12 * np.abs(whole).max())

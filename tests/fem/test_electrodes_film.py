@@ -219,21 +219,26 @@ def test_residual_film_falls_to_its_floor(gap: float, pressure: float, exponent:
 
 
 def test_clamp_closes_the_film_behind_its_edge() -> None:
-    specimen = SpecimenParameters(clamp_closing=0.8)
+    specimen = SpecimenParameters(clamp_closing=0.8, core_offset_m=(0.0, 0.0, -0.2e-3))
     points = np.array([[CLAMP_X_M + dx, 0.0, 0.0] for dx in (-4e-3, 0.0, 4e-3)])
-    np.testing.assert_allclose(gap_adjustment(points, specimen)[0], [0.2, 0.6, 1.0], atol=3e-3)
-    np.testing.assert_array_equal(
-        gap_adjustment(points, replace(specimen, clamp_closing=0.0))[0], 1.0
-    )
+    below = np.tile([0.0, 0.0, -1.0], (3, 1))
+    share, nearer = gap_adjustment(points, below, specimen)
+    np.testing.assert_allclose(share, [0.2, 0.6, 1.0], atol=3e-3)
+    np.testing.assert_allclose(nearer, 0.2e-3 * share)  # held there, core and skin move together
+    open_behind = replace(specimen, clamp_closing=0.0)
+    np.testing.assert_array_equal(gap_adjustment(points, below, open_behind)[0], 1.0)
 
 
 def test_sides_stand_nearer_and_the_pad_does_not() -> None:
     specimen = SpecimenParameters(side_closing_m=0.4e-3)
     angle = np.radians([0.0, 44.0, 60.0, 77.0, 95.0])
-    points = 5e-3 * np.stack([np.full(5, -1.0), np.sin(angle), -np.cos(angle)], axis=1)
-    share, nearer = gap_adjustment(points, specimen)
+    normals = np.stack([0 * angle, np.sin(angle), -np.cos(angle)], axis=1)
+    points = 5e-3 * (normals - [1.0, 0.0, 0.0])
+    share, nearer = gap_adjustment(points, normals, specimen)
     np.testing.assert_allclose(nearer[[0, 1, 3, 4]], [0.0, 0.0, 0.4e-3, 0.4e-3], atol=1e-9)
     assert 0.05e-3 < nearer[2] < 0.35e-3
-    np.testing.assert_array_equal(nearer, gap_adjustment(points * [1, -1, 1], specimen)[1])
+    mirror = np.array([1, -1, 1])
+    mirrored = gap_adjustment(points * mirror, normals * mirror, specimen)[1]
+    np.testing.assert_array_equal(nearer, mirrored)
     gap = share * np.full(5, 1e-3) - nearer
     np.testing.assert_allclose(gap, 1e-3 - nearer, rtol=1e-4)  # the clamp is not quite gone

@@ -98,6 +98,39 @@ def test_finer_films_say_the_same(sensor: ElectrodeModel) -> None:
     np.testing.assert_allclose(rest, fine, atol=4.0)  # counts; noise is 0.5, misfits are 70
 
 
+def uniform(sensor: ElectrodeModel, film_m: Floats) -> Floats:
+    """Counts with the same film everywhere, shape (T, 19)."""
+    rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
+    bare = sensor.with_specimen(replace(BARE, clamp_closing=0.0))
+    return np.array(
+        [bare.of_gap(replace(rest, gap=np.full_like(rest.gap, h))).counts for h in film_m]
+    )
+
+
+def test_more_fluid_everywhere_raises_all_counts(sensor: ElectrodeModel) -> None:
+    """To 4 radii of a disc, 5 mm; the skin is 2 mm away."""
+    assert (np.diff(uniform(sensor, np.geomspace(5e-6, 5e-3, 60)), axis=0) > 0).all()
+
+
+def test_counts_of_a_deep_film_are_settled(sensor: ElectrodeModel) -> None:
+    """From 4 to 16 radii; E19 is nearer to an excitation than `access_length` takes it to be."""
+    counts = uniform(sensor, np.geomspace(5e-3, 20e-3, 12))
+    assert np.diff(counts, axis=0).min() > -1.5
+    assert (counts[-1] - counts.max(axis=0)).min() > -6.0
+    assert np.ptp(counts, axis=0).max() < 0.05 * FULL_SCALE
+
+
+def test_skin_that_leaves_an_electrode_never_lowers_its_counts(sensor: ElectrodeModel) -> None:
+    film = sensor.film
+    rest = sensor.finder.measure(sensor.geometry.mesh.nodes)
+    for electrode in (0, 2, 6, 16, 17):
+        away = np.linalg.norm(film.nodes - ELECTRODE_POSITIONS[electrode], axis=1)
+        share = np.exp(-((away / 2e-3) ** 2))
+        films = [rest.gap * (1 - share) + h * share for h in np.geomspace(1e-5, 8e-3, 25)]
+        counts = [sensor.of_gap(replace(rest, gap=gap)).counts[electrode] for gap in films]
+        assert (np.diff(counts) > 0).all()
+
+
 def closed(
     sensor: ElectrodeModel, film_m: float, pressure_pa: float = 0.0
 ) -> tuple[Floats, Floats]:

@@ -109,6 +109,7 @@ def test_the_texture_is_a_fixed_set_of_grains_on_a_plate() -> None:
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2) + np.eye(24)
     assert (apart > (radii[:, None] + radii[None])).mean() > 0.99  # nearly all stand alone
     np.testing.assert_array_equal(centres[:2, 2], -1e-3)
+    assert {n for n in indenter_names() if make_indenter(n).fillet_m > 0.0} == {"texture"}
     make_indenter.cache_clear()
     np.testing.assert_array_equal(
         [p.centre for p in make_indenter("texture").primitives if p.kind == PrimitiveKind.REVOLVED],

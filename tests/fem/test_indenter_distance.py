@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import no_type_check
 
 import numpy as np
@@ -259,8 +260,8 @@ def launch(indenter: Indenter, points: Floats, margin_m: float) -> tuple[Floats,
 
 
 @EVERY
-def test_gap_and_normal_are_those_of_numpy_to_the_bit(name: str) -> None:
-    indenter, points = make_indenter(name), cloud(50_000, seed=6)
+def test_without_fillet_gap_and_normal_are_those_of_numpy_to_the_bit(name: str) -> None:
+    indenter, points = replace(make_indenter(name), fillet_m=0.0), cloud(50_000, seed=6)
     gap, normal, _ = distance(indenter, points)
     same_gap, same_normal, _ = numpy_indenter.distance(indenter, points)
     np.testing.assert_array_equal(gap, same_gap)
@@ -269,19 +270,25 @@ def test_gap_and_normal_are_those_of_numpy_to_the_bit(name: str) -> None:
 
 @EVERY
 def test_the_kernel_is_the_same_function(name: str) -> None:
-    indenter, points = make_indenter(name), cloud(5000, seed=4)
+    indenter = make_indenter(name)
+    filleted = indenter.fillet_m > 0.0  # NumPy then tries all pairs and triples of primitives
+    points = cloud(60 if filleted else 5000, seed=4)
     gap, normal, hessian = numpy_indenter.distance(indenter, points)
     kernel_gap, kernel_normal, kernel_hessian = launch(indenter, points, 1.0)
     np.testing.assert_allclose(kernel_gap, gap, atol=1e-13 * 1e-2)
-    np.testing.assert_allclose(kernel_normal, normal, atol=1e-13)
+    np.testing.assert_allclose(kernel_normal, normal, atol=1e-12 if filleted else 1e-13)
     size = 1.0 + np.abs(hessian).max(axis=(1, 2))
-    assert (np.abs(kernel_hessian - hessian).max(axis=(1, 2)) / size).max() < 1e-13
+    error = (np.abs(kernel_hessian - hessian).max(axis=(1, 2)) / size).max()
+    assert error < (1e-7 if filleted else 1e-13)
 
 
 @EVERY
-def test_beyond_the_margin_the_kernel_gives_a_bound_and_within_it_the_same(name: str) -> None:
-    indenter, points, margin = make_indenter(name), cloud(5000, seed=5), 0.1e-3
-    gap, normal, _ = numpy_indenter.distance(indenter, points)
+@pytest.mark.parametrize("margin", [0.1e-3, 0.5e-3])  # less and more than a fillet
+def test_beyond_the_margin_the_kernel_gives_a_bound_and_within_it_the_same(
+    name: str, margin: float
+) -> None:
+    indenter, points = make_indenter(name), cloud(5000, seed=5)
+    gap, normal, _ = distance(indenter, points)
     kernel_gap, kernel_normal, kernel_hessian = launch(indenter, points, margin)
     near = gap < margin
     assert near.any()

@@ -26,12 +26,19 @@ from palpate.messages import (
     SimulationPhase,
     SimulationProgress,
     SimulationReply,
+    SimulationRequest,
 )
+from palpate.rigid import path_lengths
 from palpate.v1 import simulation_pb2
 from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.indenter.path import parse_segments
 from palpate_fem.service import node
-from palpate_fem.service.config import FemConfig
-from palpate_fem.service.requests import OUTCOMES, as_step, path_of
+from palpate_fem.service.biotac import biotac
+from palpate_fem.service.config import DEFAULT_FACTORY, FemConfig
+from palpate_fem.service.fingertips import skin_of
+from palpate_fem.service.requests import OUTCOMES, as_pose, as_step, path_of
+from palpate_fem.trajectory import pad_point, segment_path
 
 fakes: Any = importlib.import_module("fem_fakes")
 
@@ -75,6 +82,49 @@ def test_the_wire_changes_no_bit(service: Any) -> None:
     assert seen == [0, 1, 2, 3, 4]
     assert told[-1].phase is SimulationPhase.INDENTING
     assert (told[-1].steps_done, told[-1].steps_total) == (5, 5)
+
+
+def test_a_path_that_slides_twists_and_leaves_is_solved_over_the_wire(
+    serving: Callable[..., Any],
+) -> None:
+    """By the solver itself: what comes back is what it gives in process."""
+    parameters = FingertipParameters(fluid_volume_m3=0.6e-6)
+    tip = biotac(edge_m=1.4e-3)(parameters, lambda _: None)
+    skin = skin_of(tip.describe())
+    target, normal = pad_point(skin, -6e-3, 0.0)
+    words = "press 1 mm, slide 0.8 mm towards +y, twist 15 deg, unload"
+    ball, segments = make_indenter("sphere_medium"), parse_segments(words)
+    # Contact on so coarse a mesh closes 0.13 mm early.
+    path = segment_path(ball, target, normal, segments, skin, step_m=0.2e-3, clearance_m=0.2e-3)
+    asked = SimulationRequest(
+        "slide",
+        "sphere_medium",
+        tuple(as_pose(pose) for pose in path),
+        SimulationParameters(fluid_volume_m3=0.6e-6),
+        want_contact_force=True,
+    )
+    real = {
+        "factory": DEFAULT_FACTORY,
+        "options": {"edge_m": 1.4e-3},
+        "workers": 1,
+        "grace_s": 10.0,
+    }
+    with serving(**real, fingertip={"fluid_volume_m3": 0.6e-6}) as service:
+        reply = service.robot.simulate(asked, timeout_s=120)
+        dry = dataclasses.replace(
+            asked, request_id="dry", parameters=SimulationParameters(fluid_volume_m3=0.3e-6)
+        )
+        with pytest.raises(RemoteError, match=r"0.300 ml of fluid suck the skin inwards, at -\d"):
+            service.robot.simulate(dry, timeout_s=120)
+    here = tip.indent("sphere_medium", path, friction_coefficient=parameters.friction_coefficient)
+    assert reply.outcome is SimulationOutcome.COMPLETE
+    forces = np.array([step.force for step in reply.steps])
+    np.testing.assert_allclose(forces, here.forces, atol=1e-6)
+    press, slide = slice(0, 5), slice(5, 9)
+    assert np.abs(forces[press, 1]).max() < 0.05 * forces[4, 2]
+    assert forces[slide, 1].max() > 0.1 * forces[4, 2]  # friction draws the skin along
+    assert not forces[-1].any()
+    assert reply.travel_m == pytest.approx(path_lengths(path)[-1])
 
 
 def test_others_can_follow(service: Any) -> None:
@@ -162,7 +212,7 @@ def test_a_request_that_means_nothing_is_refused(
         sensor_key("lab", "twin", "simulate"),
         payload=message.SerializeToString(),
         encoding=zenoh.Encoding(ENCODING_PREFIX + SIMULATION_REQUEST.schema),
-        timeout=5,
+        timeout=PATIENCE_S,
     )
     assert reply.err is not None
     error = ERROR.decode(reply.err.payload.to_bytes())

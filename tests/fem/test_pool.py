@@ -28,7 +28,7 @@ from palpate_fem.store.content import StoredFingertip
 sample: Any = importlib.import_module("stored_sample")
 sample_fingertip: Callable[..., StoredFingertip] = sample.sample_fingertip
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 WARM, THIN, THICK = (FingertipParameters(skin_thickness_m=m) for m in (1.57e-3, 1.2e-3, 1.9e-3))
 TIP = sample_fingertip(divisions=2)
 

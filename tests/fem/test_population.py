@@ -30,6 +30,7 @@ from palpate_fem.population.members import (
     PAPER,
     Member,
     PublishedRange,
+    draw_members,
     read_population,
     write_population,
 )
@@ -169,3 +170,45 @@ def test_a_trajectory_counts_until_it_bears_on_the_mount() -> None:
     assert clear_steps(trajectory, held) == 2
     clear = cast(IndentationResult, SimpleNamespace(steps=steps[:2]))
     assert clear_steps(clear, held) == 2
+
+
+def test_a_draw_is_reproducible_and_can_be_extended(tmp_path: Path) -> None:
+    few, many = draw_members(3, 7), draw_members(20, 7)
+    assert many[:3] == few
+    assert draw_members(3, 8)[0].specimen != few[0].specimen
+    assert len({member.specimen.name for member in many}) == 20
+    write_population(tmp_path / "drawn.json", many, source="a test")
+    assert read_population(tmp_path / "drawn.json") == many
+    assert all(member.pressed_with("cube") for member in many)
+    with pytest.raises(ConfigError, match="at least one"):
+        draw_members(0, 7)
+
+
+def test_drawn_specimens_differ_where_real_ones_do(
+    sensor: ElectrodeModel, states: tuple[list[Gap], Gap]
+) -> None:
+    """Tips of real sensors differ by 800 counts at rest, mirrored electrodes by 260 (E1 - E11)."""
+    _, rest = states
+    drawn = [sensor.with_specimen(member.specimen) for member in draw_members(40, 1)]
+    counts = np.array([one.of_gap(rest).counts for one in drawn])
+    assert np.ptp(counts[:, 6]) > 800
+    assert np.abs(counts[:, 0] - counts[:, 10]).max() > 260
+    assert np.isfinite(counts).all()
+    assert (counts > 0).all()
+
+
+def test_a_core_that_sits_elsewhere_leaves_less_fluid_there(
+    sensor: ElectrodeModel, states: tuple[list[Gap], Gap]
+) -> None:
+    _, rest = states
+    centred = sensor.of_gap(rest).counts
+
+    def moved(*offset: float) -> Floats:
+        specimen = replace(sensor.specimen, core_offset_m=offset)
+        return np.asarray(sensor.with_specimen(specimen).of_gap(rest).counts - centred)
+
+    distal, left, down = moved(4e-4, 0.0, 0.0), moved(0.0, 1e-4, 0.0), moved(0.0, 0.0, -4e-4)
+    assert (distal[[6, 7, 8]] < -20).all()
+    assert (left[[10, 13, 15]] < -20).all()  # E11, E14, E16 are on the left
+    assert (left[[0, 3, 5]] > 20).all()
+    assert (down[[16, 17]] < -10).all()

@@ -279,6 +279,7 @@ def test_settings_keep_the_names_that_stores_have() -> None:
     assert sorted(tip.settings) == [
         "contact.complement",
         "contact.margin_m",
+        "contact.mortar",
         "contact.stiffness",
         "contact.tangential_stiffness",
         "force_limit_n",
@@ -288,6 +289,9 @@ def test_settings_keep_the_names_that_stores_have() -> None:
         "newton.keep_elastic",
         "newton.keep_factor",
         "newton.largest_move_m",
+        "newton.linear_tolerance",
+        "newton.mortar_updates",
+        "newton.patience",
         "newton.tolerance",
         "newton.traction_tolerance",
         "newton.volume_tolerance",

@@ -157,7 +157,7 @@ def test_a_killed_sweep_leaves_no_process_and_a_good_store(tmp_path: Path) -> No
     script = tmp_path / "script.py"
     script.write_text(KILLED.format(folder=str(Path(__file__).parent), store=str(store)))
     process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while len(list(store.rglob("*normal.h5"))) < 2:
         assert time.monotonic() < deadline, "nothing was written"
         time.sleep(0.02)

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, SimulationError
-from palpate.rigid import rotation_matrices
+from palpate.rigid import path_lengths, rotation_matrices
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.path import check_path
+from palpate_fem.indenter.path import PathSegment, check_path, parse_segments
 from palpate_fem.trajectory import (
     ANGLE_RAD,
     ANGLED_DEPTH_M,
@@ -24,6 +24,7 @@ from palpate_fem.trajectory import (
     angled_direction,
     press_path,
     sample_targets,
+    segment_path,
 )
 
 Floats = NDArray[np.float64]
@@ -201,3 +202,134 @@ def test_an_indenters_points_are_its_own_and_do_not_depend_on_the_others() -> No
     other = next(iter(replace(Campaign(FINGER, indenters=("sphere_medium",)), seed=1)))
     assert np.abs(other.target - alone[0].target).max() > 1e-4
     assert next(iter(Campaign(FINGER, indenters=("sphere_7mm",)))).name == "sphere_medium/00/normal"
+
+
+TARGET = np.array([-7.3e-3, 0.0, -8.3e-3])
+
+
+def path_of(words: str, indenter: str = "sphere_medium", step_m: float = 0.1e-3) -> Floats:
+    segments = parse_segments(words)
+    return segment_path(make_indenter(indenter), TARGET, PAD, segments, FINGER, step_m=step_m)
+
+
+def axis_of(path: Floats) -> Floats:
+    """Where the indenter faces at each pose."""
+    return rotation_matrices(path[:, 3:])[:, :, 2]
+
+
+@pytest.mark.parametrize("angle", [0, 30])
+def test_a_press_in_words_is_the_papers(angle: int) -> None:
+    direction = angled_direction(PAD, math.radians(angle), math.pi / 2)
+    wanted = press_path(make_indenter("ring"), TARGET, direction, FINGER, depth_m=3e-3, steps=20)
+    found = path_of(f"press 3 mm at {angle} deg towards +y", "ring", 0.15e-3)
+    np.testing.assert_allclose(found, wanted, atol=1e-15)
+
+
+def test_steps_are_equal_and_at_most_as_long_as_asked_for() -> None:
+    path = path_of("press 1 mm, slide 0.55 mm towards +y, twist 10 deg, roll 10 deg towards +y")
+    lengths = np.diff(path_lengths(path))
+    assert lengths[1:].max() <= 0.1e-3 + 1e-12
+    counts = 10, 6, 7, 7  # 3.5 mm times 10 degrees are 0.61 mm
+    assert len(lengths) == sum(counts)
+    for part in np.split(lengths, np.cumsum(counts)[:-1]):
+        np.testing.assert_allclose(part[1:], part[1], rtol=0.02)  # a roll's tip speeds up
+
+
+@pytest.mark.parametrize(
+    ("where", "way"),
+    [("distal", (1, 0)), ("+y", (0, 1)), ("proximal", (-1, 0)), ("-y", (0, -1))],
+)
+def test_a_slide_goes_along_the_skin_and_turns_nothing(where: str, way: tuple[int, int]) -> None:
+    path = path_of(f"press 1 mm, slide 0.5 mm towards {where}")
+    np.testing.assert_allclose(
+        path[-1, :3] - path[-6, :3], [*(0.5e-3 * np.array(way)), 0.0], atol=1e-15
+    )
+    np.testing.assert_array_equal(path[:, 3:], np.tile(path[0, 3:], (16, 1)))
+
+
+def test_a_twist_turns_about_the_axis_on_the_spot() -> None:
+    path = path_of("press 1 mm at 30 deg towards +y, twist 20 deg")
+    first, last = path[10], path[-1]
+    np.testing.assert_array_equal(last[:3], first[:3])
+    turn = rotation_matrices(last[3:]) @ rotation_matrices(first[3:]).T
+    axis = axis_of(first[None])[0]
+    np.testing.assert_allclose(turn @ axis, axis, atol=1e-14)
+    across = np.cross(axis, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    assert np.cross(across, turn @ across) @ axis == pytest.approx(math.sin(math.radians(20.0)))
+
+
+@pytest.mark.parametrize(
+    ("indenter", "where", "radius"),
+    [
+        ("sphere_large", (1, 0), 7e-3),
+        ("sphere_small", (0, -1), 1.75e-3),
+        ("cylinder_long", (0, 1), 3.5e-3),
+        ("cylinder_long", (1, 0), 0.0),  # flat that way, so it turns about its tip
+        ("ring", (0, 1), 0.0),  # its tip is in the bore
+        ("cube", (0, 1), 0.0),
+    ],
+)
+def test_a_roll_does_not_slip(indenter: str, where: tuple[int, int], radius: float) -> None:
+    """The middle of the curvature moves by the arc, so the point that touches stands still."""
+    words = {(1, 0): "distal", (0, 1): "+y", (0, -1): "-y"}[where]
+    path = path_of(f"press 1 mm, roll 20 deg towards {words}", indenter)
+    along = np.array([*where, 0.0])
+    middle = path[:, :3] - radius * axis_of(path)
+    moved = middle[-1] - middle[10]
+    np.testing.assert_allclose(moved, radius * math.radians(20.0) * along, atol=1e-9)
+    tilt = axis_of(path)[-1]
+    np.testing.assert_allclose(
+        tilt, math.cos(math.radians(20)) * -PAD - math.sin(math.radians(20)) * along, atol=1e-12
+    )
+    one = path[11]  # a small turn: the velocity of the point below the middle
+    contact = middle[10] - radius * PAD
+    local = (contact - path[10, :3]) @ rotation_matrices(path[10, 3:])
+    slip = rotation_matrices(one[3:]) @ local + one[:3] - contact
+    assert np.linalg.norm(slip) < 0.02 * np.linalg.norm(one[:3] - path[10, :3]) + 0.3e-3 * 0.05
+
+
+@pytest.mark.parametrize("indenter", ["sphere_small", "cube", "ring", "cylinder_long"])
+def test_unloading_ends_just_clear_of_the_skin_wherever_it_went(indenter: str) -> None:
+    path = path_of(
+        "press 1.5 mm at 20 deg towards distal, slide 1 mm towards -y, twist 30 deg, "
+        "roll 10 deg towards +y, unload",
+        indenter,
+    )
+    assert 0.0 < check_clear(make_indenter(indenter), path[-1], FINGER) <= CLEARANCE_M + 15e-6
+    with pytest.raises(SimulationError):
+        check_clear(make_indenter(indenter), path[-2], FINGER)
+
+
+def test_after_unloading_a_press_counts_from_contact_again() -> None:
+    path = path_of("press 1 mm, unload, press 0.5 mm")
+    assert path[-1, 2] == pytest.approx(path[5, 2], abs=1e-9)
+    part = path_of("press 1 mm, unload 0.3 mm, press 0.2 mm")
+    assert part[-1, 2] == pytest.approx(path[9, 2], abs=1e-12)
+
+
+def test_a_slide_off_the_finger_can_unload() -> None:
+    path = path_of("press 0.5 mm, slide 16 mm towards +y, unload, press 1 mm")
+    assert path[-1, 1] == pytest.approx(16e-3)
+
+
+@pytest.mark.parametrize("step_m", [1e-8, 1e-300, 0.0, math.nan, math.inf])
+def test_steps_that_are_too_many_or_none_are_refused(step_m: float) -> None:
+    with pytest.raises(ConfigError, match=r"poses|step_m"):
+        path_of("press 1 mm, slide 20 mm towards +y", step_m=step_m)
+
+
+@pytest.mark.parametrize(
+    ("segments", "problem"),
+    [
+        ([], "begin with a press"),
+        ([PathSegment("slide", 1e-3)], "begin with a press"),
+        ([PathSegment("press")], "press by None"),
+        ([PathSegment("press", 1e-3), PathSegment("slide", -1e-3)], "slide by -0.001"),
+        ([PathSegment("press", 1e-3), PathSegment("twist", math.nan)], "twist by nan"),
+        ([PathSegment("press", 1e-3), PathSegment("jump", 1e-3)], "'jump' is no segment"),
+    ],
+)
+def test_segments_that_make_no_path_are_refused(segments: list[PathSegment], problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        segment_path(make_indenter("cube"), TARGET, PAD, segments, FINGER)

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
+from palpate.rigid import path_lengths
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
 from palpate_fem.calibration.runs import SimulatedRun, simulate_all
 from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.plot.validation import examples, plot_examples, plot_indenters
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import StoredFingertip

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
-from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate.rigid import path_lengths
 
 Floats = NDArray[np.float64]
 

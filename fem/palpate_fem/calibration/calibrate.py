@@ -6,6 +6,9 @@ shape, and the fluid's volume follows from the total thickness. So a coarse scan
 friction finds a starting point. Each step from there runs the simulator near the point, once for
 each parameter, builds a model that is linear in those and exact in the modulus, and minimises the
 cost of that model by SLSQP. The step is accepted only if runs at its end confirm it.
+
+A `SlopeSimulator` knows the derivatives of its runs, so the runs near a point are not needed, nor
+is the scan: the search begins in the middle of the bounds, unless a trajectory fails there.
 """
 
 from __future__ import annotations
@@ -126,7 +129,8 @@ class _Search:
         jobs = [
             (self.settings.parameters(point), case.item) for point in points for case in self.cases
         ]
-        results = self.runs.run(jobs)
+        names = self.settings.simulated[: len(points[0])] if self.runs.knows_slopes else ()
+        results = self.runs.run(jobs, names)
         count = len(self.cases)
         batches = [results[i * count : (i + 1) * count] for i in range(len(points))]
         for batch in batches:
@@ -175,6 +179,11 @@ class _Search:
         A point at which most cases fail says nothing about them: there, e.g., paths begin inside a
         thick skin.
         """
+        if self.runs.knows_slopes:
+            state = self.simulate([self.settings.middle()])[0]
+            fit = self.evaluate(state, "start")
+            if math.isfinite(fit.cost):
+                return state, fit
         states = self.simulate(self.settings.scan_points())
         while True:
             fits = [self.evaluate(state, "scan") for state in states]
@@ -225,6 +234,8 @@ class _Search:
         self, state: SimulatedPoint, fit: ModulusFit
     ) -> tuple[SimulatedPoint, ModulusFit, LocalModel]:
         """Model from runs near a point, with one parameter moved each; drops cases that fail."""
+        if state.curve_slopes:
+            return state, fit, LocalModel(state, (), self.cases, self.settings)
         while True:
             moved, failures = self._moved(state, fit.modulus_pa)
             if not failures:

@@ -40,7 +40,8 @@ class LocalModel:
 
     Args:
         base: Runs at the base point.
-        moved: Runs with one parameter moved each, in the order of ``settings.simulated``.
+        moved: Runs with one parameter moved each, in the order of ``settings.simulated``; none if
+            the base knows its slopes.
         cases: Measurements that they are compared with.
         settings: Settings of the comparison.
     """
@@ -53,6 +54,12 @@ class LocalModel:
         settings: CalibrationSettings,
     ) -> None:
         self.base, self.cases, self.settings = base, cases, settings
+        if base.thickness_slopes is not None and base.volume_slopes is not None and not moved:
+            self._travel = [line.travel_m for line in base.curves]
+            self._force = [line.force_n for line in base.curves]
+            self._slopes = list(base.curve_slopes)
+            self.thickness_slopes, self.volume_slopes = base.thickness_slopes, base.volume_slopes
+            return
         steps = [float(np.log(state.point[i] / base.point[i])) for i, state in enumerate(moved)]
         self._travel, self._force, self._slopes = [], [], []
         for j, line in enumerate(base.curves):

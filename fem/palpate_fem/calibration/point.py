@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -62,26 +62,43 @@ class SimulatedPoint:
         curves: One for each case, at the modulus of the runs.
         thickness_m: Total thickness [m].
         fluid_volume_m3: Fluid [m^3].
+        curve_slopes: Of each curve by the logarithms of the point, shape (P, K, 3); () = unknown.
+        thickness_slopes: Of the total thickness [m], shape (P,).
+        volume_slopes: Of the fluid [m^3], shape (P,).
     """
 
     point: Floats
     curves: tuple[ForceCurve, ...]
     thickness_m: float
     fluid_volume_m3: float
+    curve_slopes: tuple[Floats, ...] = ()
+    thickness_slopes: Floats | None = None
+    volume_slopes: Floats | None = None
 
     @classmethod
     def of(cls, point: Floats, runs: Sequence[SimulatedRun]) -> SimulatedPoint:
         """From the runs of all cases; refused runs have no thickness."""
         known = [run for run in runs if math.isfinite(run.thickness_m)]
         first = known[0] if known else runs[0]
-        return cls(
+        plain = cls(
             point, tuple(run.curve for run in runs), first.thickness_m, first.fluid_volume_m3
+        )
+        slopes = [run.curve_slopes(point) for run in runs]
+        found = tuple(slope for slope in slopes if slope is not None)
+        if first.slopes is None or len(found) < len(runs):
+            return plain
+        return replace(
+            plain,
+            curve_slopes=found,
+            thickness_slopes=first.slopes.thickness_m * point,
+            volume_slopes=first.slopes.fluid_volume_m3 * point,
         )
 
     def only(self, kept: Sequence[int]) -> SimulatedPoint:
         """The same without the cases that are not kept."""
         curves = tuple(self.curves[i] for i in kept)
-        return SimulatedPoint(self.point, curves, self.thickness_m, self.fluid_volume_m3)
+        slopes = tuple(self.curve_slopes[i] for i in kept) if self.curve_slopes else ()
+        return replace(self, curves=curves, curve_slopes=slopes)
 
 
 @dataclass(frozen=True, slots=True)

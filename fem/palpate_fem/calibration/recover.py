@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate.errors import SimulationError
+from palpate.rigid import path_lengths
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.result import Calibration, Evaluation
@@ -29,7 +30,6 @@ from palpate_fem.calibration.settings import (
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.trajectory import angled_direction, pad_point, press_path
 

@@ -6,16 +6,22 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError, Executor, Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from palpate.errors import ConfigError, SimulationError
+from palpate.rigid import path_lengths
 from palpate_fem.calibration.alignment import Floats, ForceCurve, along
 from palpate_fem.calibration.measured import MeasuredIndentation
-from palpate_fem.config import FingertipParameters
-from palpate_fem.mechanics.load_stepping import path_lengths
+from palpate_fem.config import EDGE_M, FingertipParameters
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.adjoint import sensitivities
+from palpate_fem.mechanics.load_stepping import ConvergedIncrement
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.parametric import biotac
 from palpate_fem.result import IndentationOutcome, IndentationResult
 
 Key = tuple[object, ...]
@@ -34,6 +40,23 @@ class PlannedPath:
 
 
 @dataclass(frozen=True, slots=True)
+class RunSlopes:
+    """Derivatives of a run by P parameters, each in its unit.
+
+    Attributes:
+        names: The parameters, as in `FingertipParameters`.
+        force: Of the forces [N], shape (k, 3, P).
+        thickness_m: Of the total thickness, shape (P,).
+        fluid_volume_m3: Of the fluid's volume, shape (P,).
+    """
+
+    names: tuple[str, ...]
+    force: Floats
+    thickness_m: Floats
+    fluid_volume_m3: Floats
+
+
+@dataclass(frozen=True, slots=True)
 class SimulatedRun:
     """One simulated indentation, reduced to what a comparison needs.
 
@@ -45,6 +68,7 @@ class SimulatedRun:
         fluid_volume_m3: Fluid between skin and core [m^3].
         outcome: How it ended.
         reason: Why it did not complete.
+        slopes: Its derivatives, if they were asked for.
     """
 
     forces: Floats
@@ -53,6 +77,7 @@ class SimulatedRun:
     fluid_volume_m3: float
     outcome: IndentationOutcome
     reason: str = ""
+    slopes: RunSlopes | None = None
 
     @classmethod
     def of(
@@ -74,6 +99,17 @@ class SimulatedRun:
         """Force against travel."""
         return along(self.travel, self.forces)
 
+    def curve_slopes(self, values: Floats) -> Floats | None:
+        """Derivatives of the curve by logarithms of the parameters, shape (P, K, 3).
+
+        Args:
+            values: Of the parameters, shape (P,).
+        """
+        if self.slopes is None:
+            return None
+        by_log = self.slopes.force * values
+        return np.stack([along(self.travel, by_log[:, :, i]).force_n for i in range(len(values))])
+
 
 def from_rest(force_n: Floats) -> Floats:
     """Forces at a solver's steps [N], with zero force in front for the untouched first pose."""
@@ -94,6 +130,81 @@ class Simulator(Protocol):
         ...
 
 
+@runtime_checkable
+class SlopeSimulator(Simulator, Protocol):
+    """A simulator that knows the derivatives of its runs, at about the cost of the run."""
+
+    def simulate_slopes(
+        self,
+        parameters: FingertipParameters,
+        indenter: str,
+        path: Floats,
+        names: tuple[str, ...],
+    ) -> SimulatedRun:
+        """As `simulate`, with derivatives by these parameters."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FingertipSimulator:
+    """Simulates the parametric finger in this process, with derivatives if wanted.
+
+    A process keeps one finger, so it runs one simulation at a time: for several, use a
+    ``ProcessPoolExecutor``.
+
+    Attributes:
+        edge_m: Edge of the elements on the pad [m].
+        layers: Elements through the skin.
+    """
+
+    edge_m: float = EDGE_M
+    layers: int = 2
+
+    def simulate(
+        self, parameters: FingertipParameters, indenter: str, path: Floats
+    ) -> SimulatedRun:
+        """See `Simulator.simulate`."""
+        return self.simulate_slopes(parameters, indenter, path, ())
+
+    def simulate_slopes(
+        self,
+        parameters: FingertipParameters,
+        indenter: str,
+        path: Floats,
+        names: tuple[str, ...],
+    ) -> SimulatedRun:
+        """See `SlopeSimulator.simulate_slopes`.
+
+        Raises:
+            SimulationError: The finger cannot be filled, or the indenter begins inside of it.
+        """
+        # Friction has no effect before contact.
+        tip = _filled(replace(parameters, friction_coefficient=0.0), self.edge_m, self.layers)
+        tip.parameters = parameters
+        history: list[ConvergedIncrement] = []
+        result = tip.indent(make_indenter(indenter), path, history=history if names else None)
+        run = SimulatedRun.of(
+            result, thickness_m=tip.total_thickness_m, fluid_volume_m3=tip.fluid_volume_m3
+        )
+        if not names or not result.steps:
+            return run
+        found = sensitivities(tip, history, names)
+        slopes = RunSlopes(
+            names,
+            np.concatenate([np.zeros((1, 3, len(names))), found.force]),
+            found.total_thickness_m,
+            found.fluid_volume_m3,
+        )
+        return replace(run, slopes=slopes)
+
+
+@lru_cache(maxsize=1)
+def _filled(parameters: FingertipParameters, edge_m: float, layers: int) -> Fingertip:
+    """The last finger again if it is the same."""
+    geometry = biotac(thickness_m=parameters.skin_thickness_m, edge_m=edge_m, layers=layers)
+    return Fingertip.pressurised(geometry, parameters)
+
+
 class SimulationRuns:
     """Results of runs, each made only once, through an executor.
 
@@ -104,6 +215,7 @@ class SimulationRuns:
 
     Attributes:
         count: Number of runs so far.
+        knows_slopes: Whether the simulator derives its runs.
     """
 
     def __init__(
@@ -113,24 +225,28 @@ class SimulationRuns:
         on_run: Callable[[int, int], None] | None = None,
     ) -> None:
         self._simulator = simulator
+        self.knows_slopes = isinstance(simulator, SlopeSimulator)
         self._executor = executor
         self._on_run = on_run
         self._memo: dict[Key, SimulatedRun] = {}
         self.count = 0
 
     def run(
-        self, jobs: Iterable[tuple[FingertipParameters, MeasuredIndentation]]
+        self,
+        jobs: Iterable[tuple[FingertipParameters, MeasuredIndentation]],
+        slopes: tuple[str, ...] = (),
     ) -> list[SimulatedRun]:
         """Results in the order of the jobs; what ran before is not run again.
 
-        A run that the simulator refuses gives a result without steps, with the reason.
+        With names of parameters in ``slopes`` a `SlopeSimulator` derives by them. A run that the
+        simulator refuses gives a result without steps, with the reason.
 
         Raises:
             SimulationError: A process of the simulation died.
         """
-        wanted = [(_key(parameters, item), parameters, item) for parameters, item in jobs]
+        wanted = [(_key(parameters, item, slopes), parameters, item) for parameters, item in jobs]
         new = {key: (p, item) for key, p, item in wanted if key not in self._memo}
-        for done, (key, result) in enumerate(self._results(new), start=1):
+        for done, (key, result) in enumerate(self._results(new, slopes), start=1):
             self._memo[key] = result
             self.count += 1
             if self._on_run is not None:
@@ -138,17 +254,19 @@ class SimulationRuns:
         return [self._memo[key] for key, _, _ in wanted]
 
     def _results(
-        self, new: dict[Key, tuple[FingertipParameters, MeasuredIndentation]]
+        self,
+        new: dict[Key, tuple[FingertipParameters, MeasuredIndentation]],
+        slopes: tuple[str, ...],
     ) -> Iterable[tuple[Key, SimulatedRun]]:
         if self._executor is None:
             for key, (parameters, item) in new.items():
-                yield key, _simulate(self._simulator, parameters, item.indenter, item.pose)
+                yield key, _simulate(self._simulator, parameters, item.indenter, item.pose, slopes)
             return
         futures: dict[Future[SimulatedRun], Key] = {}
         try:
             for key, (parameters, item) in new.items():
                 future = self._executor.submit(
-                    _simulate, self._simulator, parameters, item.indenter, item.pose
+                    _simulate, self._simulator, parameters, item.indenter, item.pose, slopes
                 )
                 futures[future] = key
             for future in as_completed(futures):
@@ -164,10 +282,16 @@ class SimulationRuns:
 
 
 def _simulate(
-    simulator: Simulator, parameters: FingertipParameters, indenter: str, path: Floats
+    simulator: Simulator,
+    parameters: FingertipParameters,
+    indenter: str,
+    path: Floats,
+    slopes: tuple[str, ...],
 ) -> SimulatedRun:
     """One run; if it is refused, only this trajectory has no result."""
     try:
+        if slopes and isinstance(simulator, SlopeSimulator):
+            return simulator.simulate_slopes(parameters, indenter, path, slopes)
         return simulator.simulate(parameters, indenter, path)
     except (SimulationError, ConfigError) as error:
         nothing = np.empty(0)
@@ -181,10 +305,12 @@ def _simulate(
         )
 
 
-def _key(parameters: FingertipParameters, item: MeasuredIndentation) -> Key:
+def _key(
+    parameters: FingertipParameters, item: MeasuredIndentation, slopes: tuple[str, ...]
+) -> Key:
     """Key of a run: sensor and measured force have no effect on it."""
     path = np.round(item.pose, _PLACES) + 0.0  # -0.0 and 0.0 are the same place
-    return (parameters, item.indenter, path.tobytes())
+    return (parameters, item.indenter, path.tobytes(), slopes)
 
 
 def simulate_all(

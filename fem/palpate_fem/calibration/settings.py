@@ -125,6 +125,10 @@ class CalibrationSettings:
             fluid_volume_m3=volume,
         )
 
+    def middle(self) -> Floats:
+        """Point in the middle of the bounds of thickness and friction, in the logarithm."""
+        return np.exp([0.5 * sum(self.log_bounds(name)) for name in (THICKNESS, FRICTION)])
+
     def scan_points(self) -> list[Floats]:
         """Points of the coarse scan, even in the logarithm, half a step from the bounds."""
         axes = []

@@ -51,8 +51,19 @@ ModulusOption = Annotated[
 FrictionOption = Annotated[
     float | None, typer.Option("--friction", help="Friction coefficient of indenter and skin.")
 ]
+FillOption = Annotated[
+    float | None,
+    typer.Option("--fill-ml", help="Fluid under the skin [ml]; none = until it is 15.1 mm thick."),
+]
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=0, help="Solver processes; 0 = one for each core.")
+]
+SlopesOption = Annotated[
+    bool,
+    typer.Option(
+        "--slopes",
+        help="Derive each run by the parameters, so that fewer will do. Parametric mesh only.",
+    ),
 ]
 OnlyOption = Annotated[
     list[str] | None, typer.Option("--only", help="Only names with this prefix; repeatable.")
@@ -64,10 +75,11 @@ MeasuredArgument = Annotated[
 
 
 class StudyKind(StrEnum):
-    """What a refinement study refines."""
+    """What a study is of."""
 
     MESH = "mesh"
     STEPS = "steps"
+    PATHS = "paths"
 
 
 fem_app = typer.Typer(
@@ -81,7 +93,7 @@ fem_app = typer.Typer(
 
 units_app = typer.Typer(
     cls=FemGroup,
-    help="Specimens (individual BioTacs) on the simulated finger: fit them, show them.",
+    help="Specimens (individual BioTacs) on the simulated finger: fit, draw, show them.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -95,6 +107,7 @@ def _example(*lines: str) -> str:
 @fem_app.command(
     epilog=_example(
         "palpate fem run --indenter sphere_7mm --depth-mm 2 --png press.png",
+        'palpate fem run --path "press 2 mm, slide 1.5 mm towards +y, twist 20 deg, unload"',
         "palpate fem run --sweep --points 2 --store runs/paper.sim",
     )
 )
@@ -110,10 +123,26 @@ def run(
     azimuth_deg: Annotated[
         float, typer.Option(help="Direction of an angled path: 0 distal, 90 +y [degrees].")
     ] = 0.0,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of a path.")] = 20,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a press.")] = 20,
     path: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SEGMENTS",
+            help="Instead of a press: 'press 2 mm [at 30 deg towards distal], slide 1 mm towards "
+            "+y, twist 20 deg, roll 10 deg towards 45 deg, unload [1 mm]', in any order after a "
+            "press.",
+        ),
+    ] = None,
+    step_mm: Annotated[
+        float, typer.Option(help="--path: longest step [mm]; 2.5 degrees count as 0.15 mm.")
+    ] = 0.15,
+    poses: Annotated[
         Path | None,
-        typer.Option(metavar="POSES.csv", help="Path of poses x_m,y_m,z_m,qw,qx,qy,qz."),
+        typer.Option(
+            metavar="FILE",
+            help="Instead of a press: poses from a .csv, .json or .npz file with the columns "
+            "x_m,y_m,z_m,qw,qx,qy,qz.",
+        ),
     ] = None,
     sweep: Annotated[
         bool, typer.Option("--sweep", help="The paper's set of indentations.")
@@ -140,6 +169,7 @@ def run(
     skin_thickness_mm: ThicknessOption = None,
     shear_modulus_kpa: ModulusOption = None,
     friction: FrictionOption = None,
+    fill_ml: FillOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Simulate one indentation, or the paper's set; Ctrl-C keeps completed trajectories."""
@@ -156,6 +186,8 @@ def run(
                 azimuth_deg=azimuth_deg,
                 steps=steps,
                 path=path,
+                step_m=step_mm * 1e-3,
+                poses=poses,
                 sweep=sweep,
                 points=points,
                 angled=angled,
@@ -174,6 +206,7 @@ def run(
                 skin_thickness_mm=skin_thickness_mm,
                 shear_modulus_kpa=shear_modulus_kpa,
                 friction=friction,
+                fill_ml=fill_ml,
             ),
             workers=workers,
         )
@@ -224,16 +257,42 @@ def bench(
     bench_command(edge_mm=edge_mm, layers=layers, as_json=json_)
 
 
-@fem_app.command(epilog=_example("palpate fem study mesh --png mesh.png"))
+@fem_app.command(
+    epilog=_example("palpate fem study mesh --png mesh.png", "palpate fem study paths --json")
+)
 def study(
-    what: Annotated[StudyKind, typer.Argument(metavar="mesh|steps", help="What to refine.")],
-    png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw it.")] = None,
+    what: Annotated[
+        StudyKind, typer.Argument(metavar="mesh|steps|paths", help="What to refine, or paths.")
+    ],
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="mesh, steps: draw it.")
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="paths: number.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="paths: seed.")] = 0,
+    edge_mm: Annotated[float, typer.Option(help="paths: edge of the mesh [mm].")] = 0.47,
+    fill_ml: FillOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Refine mesh or steps for sphere, cube on its edge and ring, 3 mm deep, and compare."""
-    from palpate_fem.cli.check import study_command
+    """Refine mesh or steps and compare, or check random paths.
 
-    raise typer.Exit(study_command(what.value, png=png, as_json=json_))
+    Mesh and steps: sphere, cube on its edge and ring, 3 mm deep. Paths: presses that slide, twist,
+    roll and go back; do they complete, does friction only take work, is the skin as it was?
+    """
+    from palpate_fem.cli.check import path_study_command, study_command
+
+    if what is StudyKind.PATHS:
+        if png is not None:
+            raise typer.BadParameter("--png draws mesh and steps only")
+        code = path_study_command(
+            count=count,
+            seed=seed,
+            edge_m=edge_mm * 1e-3,
+            fluid_volume_m3=None if fill_ml is None else fill_ml * 1e-6,
+            as_json=json_,
+        )
+    else:
+        code = study_command(what.value, png=png, as_json=json_)
+    raise typer.Exit(code)
 
 
 @fem_app.command(epilog=_example("palpate fem calibrate measured.h5 --out fit.json"))
@@ -248,13 +307,16 @@ def calibrate(
     mesh: MeshOption = "biotac",
     edge_mm: EdgeOption = None,
     layers: LayersOption = 2,
+    slopes: SlopesOption = False,
 ) -> None:
     """Find skin thickness, modulus, friction and fluid volume from measured forces."""
     from palpate_fem.cli.identify import calibrate_command
     from palpate_fem.cli.model import model_of
 
     model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers)
-    raise typer.Exit(calibrate_command(measured, out, only or [], model, png=png, workers=workers))
+    raise typer.Exit(
+        calibrate_command(measured, out, only or [], model, png=png, workers=workers, slopes=slopes)
+    )
 
 
 @fem_app.command(epilog=_example("palpate fem recover", "palpate fem recover --edge-mm 0.9"))
@@ -265,6 +327,7 @@ def recover(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     workers: WorkersOption = 0,
     edge_mm: EdgeOption = None,
+    slopes: SlopesOption = False,
     json_: JsonOption = False,
 ) -> None:
     """Simulate noisy forces with known parameters, and check that calibration finds them."""
@@ -274,7 +337,13 @@ def recover(
     model = model_of(mesh="biotac", edge_mm=edge_mm, layers=2)
     raise typer.Exit(
         recover_command(
-            model, edge_mm=edge_mm, noise_n=noise_n, seed=seed, workers=workers, as_json=json_
+            model,
+            edge_mm=edge_mm,
+            noise_n=noise_n,
+            seed=seed,
+            workers=workers,
+            slopes=slopes,
+            as_json=json_,
         )
     )
 
@@ -341,6 +410,7 @@ def serve(
     skin_thickness_mm: ThicknessOption = None,
     shear_modulus_kpa: ModulusOption = None,
     friction: FrictionOption = None,
+    fill_ml: FillOption = None,
 ) -> None:
     """Answer simulation requests of a running station until Ctrl-C."""
     from palpate_fem.cli.model import model_of
@@ -354,6 +424,7 @@ def serve(
         skin_thickness_mm=skin_thickness_mm,
         shear_modulus_kpa=shear_modulus_kpa,
         friction=friction,
+        fill_ml=fill_ml,
     )
     serve_command(
         model,
@@ -379,6 +450,21 @@ def fit(
     from palpate_fem.cli.identify import fit_units_command
 
     fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3)
+
+
+@units_app.command(epilog="Example: palpate fem units draw 20 --seed 1 --out drawn.json")
+def draw(
+    count: Annotated[int, typer.Argument(metavar="N", help="Number of specimens.")],
+    seed: Annotated[int, typer.Option(help="The same seed draws the same specimens.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.json", help="Where to write them.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw specimens from priors that bracket real sensors."""
+    from palpate_fem.cli.identify import draw_units_command
+
+    draw_units_command(count, seed, out, as_json=as_json)
 
 
 @units_app.command(epilog="Example: palpate fem units show")

@@ -17,10 +17,10 @@ from rich.table import Table
 
 from palpate.errors import ConfigError
 from palpate_fem.calibration.result import without_nan
-from palpate_fem.cli.terminal import print_table, progress_bar
+from palpate_fem.cli.terminal import print_lines, print_table, progress_bar
 
 if TYPE_CHECKING:
-    from palpate_fem.study import StudyRow
+    from palpate_fem.study import PathRow, StudyRow
     from palpate_fem.verify import VerificationCheck
 
 
@@ -127,7 +127,7 @@ def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
         task = bar.add_task(f"{what} study", total=total)
 
         def on_row(row: StudyRow) -> None:
-            bar.update(task, advance=1, info=f"{row.indenter}, {row.seconds:.0f} s")
+            bar.update(task, advance=1, info=f"{row.press}, {row.seconds:.0f} s")
 
         rows = (mesh_study if what == "mesh" else step_study)(on_row=on_row)
     if png is not None:
@@ -143,12 +143,12 @@ def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
 
 def _show_study(rows: list[StudyRow]) -> None:
     headings = (
-        "indenter", "edge [mm]", "unknowns", "steps", "force [N]", "change [%]", "moved [um]",
+        "press", "edge [mm]", "unknowns", "steps", "force [N]", "change [%]", "moved [um]",
         "at most [um]", "iterations", "seconds", "outcome",
     )  # fmt: skip
     cells = [
         (
-            row.indenter,
+            row.press,
             f"{row.edge_m * 1e3:g}",
             f"{row.unknowns:,}",
             str(row.steps),
@@ -163,3 +163,68 @@ def _show_study(rows: list[StudyRow]) -> None:
         for row in rows
     ]
     print_table(headings, cells, title="what refinement changes", numbers_from=1)
+
+
+def path_study_command(
+    *, count: int, seed: int, edge_m: float, fluid_volume_m3: float | None, as_json: bool
+) -> int:
+    """Run random paths, and print those that are not as they should be.
+
+    Returns:
+        0, or 1 if fewer than 97 % complete, friction gave work on one, or one left a trace.
+    """
+    from palpate_fem.study import COMPLETE_SHARE, path_study
+
+    with progress_bar() as bar:
+        task = bar.add_task("paths", total=count)
+
+        def on_row(row: PathRow) -> None:
+            bar.update(task, advance=1, info=f"{row.indenter} {row.outcome}, {row.seconds:.0f} s")
+
+        rows = path_study(
+            edge_m=edge_m, count=count, seed=seed, fluid_volume_m3=fluid_volume_m3, on_row=on_row
+        )
+    complete = sum(row.complete for row in rows)
+    if as_json:
+        content = {
+            "edge_m": edge_m,
+            "seed": seed,
+            "fluid_volume_m3": fluid_volume_m3,
+            "complete": complete,
+            "accepted": sum(row.accepted for row in rows),
+            "rows": [row.plain() for row in rows],
+        }
+        typer.echo(json.dumps(content, indent=1))
+    else:
+        _show_paths(rows)
+    return 0 if complete >= COMPLETE_SHARE * count and all(row.accepted for row in rows) else 1
+
+
+def _show_paths(rows: list[PathRow]) -> None:
+    odd = [row for row in rows if not (row.complete and row.accepted)]
+    if odd:
+        print_table(
+            ("indenter", "at mm", "path", "outcome", "steps", "friction uJ", "left um", "why"),
+            [
+                (
+                    row.indenter,
+                    f"{row.at_mm[0]:g} {row.at_mm[1]:g}",
+                    row.words,
+                    row.outcome,
+                    f"{row.done} of {row.steps}",
+                    f"{1e6 * row.friction_j:.1f}, least {1e6 * row.friction_least_j:.2g}",
+                    f"{1e6 * row.undone_m:.4f}",
+                    row.reason,
+                )
+                for row in odd
+            ],
+            title="not as they should be",
+            numbers_from=4,
+        )
+    whole = [row for row in rows if row.complete]
+    left = max((row.undone_m for row in whole), default=float("nan"))
+    print_lines(
+        f"{len(whole)} of {len(rows)} complete; friction took work on all but "
+        f"{sum(not row.took for row in rows)}; at most {1e6 * left:.4f} um left of "
+        f"{len(whole)}; {sum(row.seconds for row in rows):.0f} s"
+    )

@@ -2,18 +2,20 @@
 
 Calibration finds the fingertip's mechanical parameters from measured forces, ``recover`` checks
 that method on known parameters, ``validate`` compares simulated with measured forces, and
-``units`` fits the electrodes of specimens to published ranges.
+``units`` fits the electrodes of specimens to published ranges, or draws them.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
 import typer
 from rich.markup import escape
 from rich.progress import Progress
@@ -23,16 +25,23 @@ from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
 from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
-from palpate_fem.calibration.runs import simulate_all
+from palpate_fem.calibration.runs import FingertipSimulator, simulate_all
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.electrodes.model import ElectrodeModel
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.plot.validation import plot_calibration, plot_examples, plot_indenters
 from palpate_fem.population.fitting import deep_states, fit_member
-from palpate_fem.population.members import PAPER, Member, read_population, write_population
+from palpate_fem.population.members import (
+    PAPER,
+    Member,
+    draw_members,
+    read_population,
+    write_population,
+)
 from palpate_fem.population.responses import geometry_of
 from palpate_fem.service.batch import PoolSimulator
 from palpate_fem.store.read import SimulationStore
@@ -58,10 +67,12 @@ def calibrate_command(
     *,
     png: Path | None,
     workers: int,
+    slopes: bool,
 ) -> int:
     """Calibrate and write the result; 1 if the search did not converge."""
     chosen = _chosen(measured, only)
-    with simulator_for(model, workers, len(chosen)) as (simulator, executor, bar):
+    runs_with = slope_simulator_for if slopes else simulator_for
+    with runs_with(model, workers, len(chosen)) as (simulator, executor, bar):
         result = calibrate(
             simulator,
             chosen,
@@ -149,6 +160,26 @@ def simulator_for(
             raise
 
 
+@contextmanager
+def slope_simulator_for(
+    model: FingertipModel, workers: int, jobs: int
+) -> Iterator[tuple[FingertipSimulator, ProcessPoolExecutor, _SearchBar]]:
+    """The same for a simulator that derives its runs.
+
+    Raises:
+        ConfigError: The finger is not the parametric one.
+    """
+    options = dict(model.options)
+    if "mesh" in options:
+        raise ConfigError("--slopes is for the parametric mesh", remedy="leave out --mesh")
+    count, _ = workers_for(workers, jobs)
+    with (
+        ProcessPoolExecutor(count, mp_context=get_context("spawn")) as executor,
+        progress_bar() as bar,
+    ):
+        yield FingertipSimulator(**options), executor, _SearchBar(bar)  # type: ignore[arg-type]
+
+
 class _SearchBar:
     """Progress of a calibration."""
 
@@ -192,6 +223,7 @@ def recover_command(
     noise_n: float,
     seed: int,
     workers: int,
+    slopes: bool,
     as_json: bool,
 ) -> int:
     """Simulate with known parameters, add noise, calibrate; 1 if an error exceeds its tolerance.
@@ -202,7 +234,8 @@ def recover_command(
         thickness_m=PLANTED.skin_thickness_m, edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3
     )
     planned = plan_recovery(Fingertip.pressurised(geometry, replace(PLANTED)))
-    with simulator_for(model, workers, len(planned)) as (simulator, executor, bar):
+    runs_with = slope_simulator_for if slopes else simulator_for
+    with runs_with(model, workers, len(planned)) as (simulator, executor, bar):
         recovery = recover(
             simulator,
             PLANTED,
@@ -283,14 +316,55 @@ def show_units_command(file: Path | None, *, as_json: bool) -> None:
         _show_members(members)
 
 
+def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool) -> None:
+    """Draw specimens, write them, and print how their parameters spread."""
+    members = draw_members(count, seed)
+    if out is not None:
+        write_population(out, members, source=f"{count} drawn with seed {seed}")
+    if as_json:
+        typer.echo(json.dumps([member.to_dict() for member in members], indent=2))
+        return
+    rows: list[tuple[str, Callable[[SpecimenParameters], float]]] = [
+        ("conductivity [S/m]", lambda one: one.sigma_s_m),
+        ("series impedance [Ohm]", lambda one: one.series_ohm),
+        ("film closed by the clamp [1]", lambda one: one.clamp_closing),
+        ("sides closer to the core by [mm]", lambda one: one.side_closing_m * 1e3),
+        ("core displaced distally by [mm]", lambda one: one.core_offset_m[0] * 1e3),
+        ("core displaced to the left by [mm]", lambda one: one.core_offset_m[1] * 1e3),
+        ("core displaced upwards by [mm]", lambda one: one.core_offset_m[2] * 1e3),
+        ("film of an unloaded contact [um]", lambda one: one.asperity_m * 1e6),
+        ("film at infinite pressure [um]", lambda one: one.floor_m * 1e6),
+        ("squeeze pressure [kPa]", lambda one: one.squeeze_pa * 1e-3),
+        ("noise [counts]", lambda one: one.noise_counts),
+        ("warms up by [K]", lambda one: one.heating_k),
+        ("with a time constant of [s]", lambda one: one.heating_tau_s),
+    ]
+    print_table(
+        ("", "5 %", "median", "95 %"),
+        [
+            (
+                escape(label),
+                *(
+                    f"{value:.3g}"
+                    for value in np.percentile(
+                        [of(member.specimen) for member in members], [5, 50, 95]
+                    )
+                ),
+            )
+            for label, of in rows
+        ],
+        title=f"{count} specimens drawn with seed {seed}",
+        numbers_from=1,
+    )
+    if out is not None:
+        print_lines(f"wrote {out}")
+
+
 def _show_members(members: Sequence[Member]) -> None:
     rows: list[tuple[str, Callable[[Member], str]]] = [
-        ("lowest tared value", lambda m: f"{m.found['low']:.3f} ({m.published.low})"),
-        ("highest tared value", lambda m: f"{m.found['high']:.3f} ({m.published.high})"),
-        (
-            "largest force [N]",
-            lambda m: f"{m.found['max_force_n']:.1f} ({m.published.max_force_n})",
-        ),
+        ("lowest tared value", lambda m: _against(m, "low")),
+        ("highest tared value", lambda m: _against(m, "high")),
+        ("largest force [N]", lambda m: _against(m, "max_force_n")),
         ("pressed deeper by [mm]", lambda m: f"{m.overtravel_m * 1e3:.1f}"),
         ("conductivity [S/m]", lambda m: f"{m.specimen.sigma_s_m:.3f}"),
         ("sides closer to the core by [mm]", lambda m: f"{m.specimen.side_closing_m * 1e3:.2f}"),
@@ -304,3 +378,11 @@ def _show_members(members: Sequence[Member]) -> None:
         title="specimens: found (published)",
         numbers_from=1,
     )
+
+
+def _against(member: Member, key: str) -> str:
+    """What was found and, in brackets, published; a drawn specimen has neither."""
+    if member.published is None:
+        return "-"
+    found, published = member.found[key], getattr(member.published, key)
+    return f"{found:.1f} ({published})" if key == "max_force_n" else f"{found:.3f} ({published})"

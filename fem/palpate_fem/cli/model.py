@@ -43,6 +43,7 @@ def model_of(
     skin_thickness_mm: float | None = None,
     shear_modulus_kpa: float | None = None,
     friction: float | None = None,
+    fill_ml: float | None = None,
 ) -> FingertipModel:
     """Check the options and convert their units.
 
@@ -72,6 +73,7 @@ def model_of(
         "skin_thickness_m": None if skin_thickness_mm is None else skin_thickness_mm * 1e-3,
         "shear_modulus_pa": None if shear_modulus_kpa is None else shear_modulus_kpa * 1e3,
         "friction_coefficient": friction,
+        "fluid_volume_m3": None if fill_ml is None else fill_ml * 1e-6,
     }
     wanted = {name: value for name, value in given.items() if value is not None}
     return FingertipModel(DEFAULT_FACTORY, options, replace(base, **wanted))

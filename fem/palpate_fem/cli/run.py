@@ -22,6 +22,8 @@ from palpate.config import joining_link, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
 from palpate.process import typed_command
+from palpate.rigid import path_lengths
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.result import without_nan
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
@@ -34,7 +36,7 @@ from palpate_fem.cli.terminal import (
 )
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.outline import outline_of
-from palpate_fem.indenter.path import read_path
+from palpate_fem.indenter.path import parse_segments, read_path
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.batch import (
     FAILED,
@@ -47,7 +49,13 @@ from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import export
-from palpate_fem.trajectory import Campaign, angled_direction, pad_point, press_path
+from palpate_fem.trajectory import (
+    Campaign,
+    angled_direction,
+    pad_point,
+    press_path,
+    segment_path,
+)
 
 DEFAULT_INDENTER = "sphere_medium"
 GOOD = ("complete", "force limit")
@@ -71,7 +79,9 @@ class RunOptions:
     angle_deg: float
     azimuth_deg: float
     steps: int
-    path: Path | None
+    path: str | None
+    step_m: float
+    poses: Path | None
     sweep: bool
     points: int
     angled: int
@@ -90,8 +100,10 @@ class RunOptions:
         """
         for name in self.indenters:
             make_indenter(name)
-        if self.sweep and self.path is not None:
-            raise ConfigError("--sweep and --path exclude each other", remedy="leave one out")
+        ways = {"--sweep": self.sweep, "--path": self.path, "--poses": self.poses}
+        given = [name for name, value in ways.items() if value]
+        if len(given) > 1:
+            raise ConfigError(f"{' and '.join(given)} exclude each other", remedy="give one")
         if self.sweep and self.store is None:
             raise ConfigError(
                 "a sweep takes long and its results must be stored", remedy="give --store NAME.sim"
@@ -111,7 +123,13 @@ class RunOptions:
                 remedy="give 0 to 89 degrees to the inward normal",
             )
         if self.path is not None:
-            read_path(self.path)
+            if Path(self.path).suffix in (".csv", ".json", ".npz"):
+                raise ConfigError(
+                    f"--path {self.path} is a file", remedy="give a file of poses as --poses"
+                )
+            parse_segments(self.path)
+        if self.poses is not None:
+            read_path(self.poses)
 
     def plans(self, fingertip: StoredFingertip) -> Sequence[TrajectoryPlan]:
         """The trajectories to run on a fingertip."""
@@ -122,19 +140,28 @@ class RunOptions:
                 Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
             )
         indenter = make_indenter((self.indenters or (DEFAULT_INDENTER,))[0])
-        if self.path is not None:
-            path = read_path(self.path)
+        if self.poses is not None:
+            path = read_path(self.poses)
             check_start(fingertip, indenter.name, path[0])
+            return [_named("poses", indenter.name, path)]
+        target, normal = pad_point(skin, *self.at_m)
+        if self.path is not None:
+            segments = parse_segments(self.path)
+            path = segment_path(indenter, target, normal, segments, skin, step_m=self.step_m)
         else:
-            target, normal = pad_point(skin, *self.at_m)
             direction = angled_direction(
                 normal, math.radians(self.angle_deg), math.radians(self.azimuth_deg)
             )
             path = press_path(
                 indenter, target, direction, skin, depth_m=self.depth_m, steps=self.steps
             )
-        digest = hashlib.sha256(path.tobytes()).hexdigest()[:10]
-        return [PlannedPath(f"{indenter.name}/press-{digest}", indenter.name, path)]
+        return [_named("press" if self.path is None else "path", indenter.name, path)]
+
+
+def _named(kind: str, indenter: str, path: Floats) -> PlannedPath:
+    """A path with a name of its own, so that a store runs it once."""
+    digest = hashlib.sha256(path.tobytes()).hexdigest()[:10]
+    return PlannedPath(f"{indenter}/{kind}-{digest}", indenter, path)
 
 
 def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> int:
@@ -279,8 +306,8 @@ def serve_command(
 def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -> None:
     """Print the steps of a trajectory, one in a row."""
     ending = trajectory.outcome.value + (f": {trajectory.reason}" if trajectory.reason else "")
-    places = np.array([trajectory.path[0], *(step.pose for step in trajectory.steps)])[:, :3]
-    travel = np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)) * 1e3
+    places = np.array([trajectory.path[0], *(step.pose for step in trajectory.steps)])
+    travel = path_lengths(places)[1:] * 1e3
     print_table(
         ("step", "travel mm", "|F| N", "Fx", "Fy", "Fz", "p kPa", "area mm²", "Newton"),
         [
@@ -412,11 +439,22 @@ def _draw(
     elif done and done[0].steps:
         from palpate_fem.plot.step import plot_step
 
-        plot_step(fingertip, done[0], png, indenter=outline_of(done[0].indenter))
+        step, outline = telling_step(done[0].forces), outline_of(done[0].indenter)
+        plot_step(fingertip, done[0], png, step=step, indenter=outline)
     else:
         print_lines(f"{png} is not drawn: no step converged", to=console)
         return
     print_lines(f"drew {png}", to=console)
+
+
+def telling_step(forces: Floats) -> int:
+    """The step to draw: the last, or where it pressed hardest if it ends off the skin.
+
+    Args:
+        forces: Net force of each step [N], shape (K, 3).
+    """
+    force = np.linalg.norm(forces, axis=1)
+    return len(force) - 1 if force[-1] > 0.0 else int(force.argmax())
 
 
 def _outcomes(report: BatchReport) -> str:

@@ -7,12 +7,15 @@ the film in that gap: where skin and core touch, asperities of the skin hold a r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.errors import SimulationError
+from palpate_fem.device import indices, launch, scalars, truths, vec3s
 from palpate_fem.electrodes.film import FilmMesh
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.solid import SolidMesh
@@ -22,12 +25,125 @@ from palpate_fem.result import IndentationStep
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
+wp.set_module_options({"enable_backward": False})
+
 OUTSIDE = -1e-9  # a barycentric coordinate below this is outside of its triangle
 MOST_STEPS = 60  # of the walk from triangle to triangle; 3 mm of indentation need fewer than 20
 TRIED = 256  # nearest triangles that are tried where the walk does not end
 # Where the core is cut back below the skin's own edge, a normal may meet the surface far away; such
 # a hit is not a film.
 REACH_M = 4.0e-3
+
+
+@wp.kernel
+@no_type_check  # Warp's annotations are not types
+def walk(
+    outside: wp.float64,
+    most_steps: int,
+    # Film: a point and the core's normal for each thread.
+    points: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
+    # Skin: triangles, and those across the edge opposite to each corner.
+    faces: wp.array2d(dtype=wp.int32),
+    beside: wp.array2d(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3d),
+    # In: triangle to start from. Out: triangle that the normal meets, or where the walk gave up.
+    face: wp.array(dtype=wp.int32),
+    arrived_out: wp.array(dtype=wp.bool),
+    weights_out: wp.array(dtype=wp.vec3d),
+    gap_out: wp.array(dtype=wp.float64),
+    slope_out: wp.array(dtype=wp.vec3d),
+) -> None:
+    """Walk from triangle to triangle over the edge with the most negative barycentric coordinate.
+
+    Without a step, the triangles that are given are measured as they are.
+    """
+    i = wp.tid()
+    point, along = points[i], normals[i]
+    at = face[i]
+    arrived = most_steps == 0
+    weights = wp.vec3d()
+    a, b, c = wp.vec3d(), wp.vec3d(), wp.vec3d()
+    for step in range(most_steps + 1):
+        a = position[faces[at, 0]] - point
+        b = position[faces[at, 1]] - point
+        c = position[faces[at, 2]] - point
+        weights = wp.vec3d(
+            wp.dot(along, wp.cross(b, c)),
+            wp.dot(along, wp.cross(c, a)),
+            wp.dot(along, wp.cross(a, b)),
+        )
+        total = weights[0] + weights[1] + weights[2]
+        if wp.abs(total) > wp.float64(1e-30):
+            weights = weights / total
+        else:
+            weights = wp.vec3d()
+        if step < most_steps and not arrived:
+            worst = wp.argmin(weights)
+            if weights[worst] < outside:
+                at = beside[at, int(worst)]
+            else:
+                arrived = True
+        if arrived:
+            break
+    normal = wp.cross(b - a, c - a)
+    face[i] = at
+    arrived_out[i] = arrived
+    weights_out[i] = weights
+    gap_out[i] = wp.dot(weights[0] * a + weights[1] * b + weights[2] * c, along)
+    slope_out[i] = normal / wp.dot(normal, along)
+
+
+@dataclass(frozen=True)
+class CorePressure:
+    """Pressures of the core on the nodes of the skin, and what they were computed from.
+
+    Attributes:
+        position: Nodal positions of the skin [m], shape (V, 3).
+        force: Nodal forces of the core on the skin [N], shape (V, 3).
+        faces: Triangles with a node that carries a force, shape (L, 3).
+        area: Area vectors of the nodes that carry a force [m^2], shape (V, 3).
+        pressure: Force along the area vector over the area [Pa], shape (V,); not negative.
+    """
+
+    position: Floats
+    force: Floats
+    faces: Ints
+    area: Floats
+    pressure: Floats
+
+    @classmethod
+    def of(cls, position: Floats, force: Floats, faces: Ints) -> CorePressure:
+        """Pressures from positions, forces and all triangles of the skin's inner surface."""
+        # Only around nodes that carry a force: elsewhere there is no pressure.
+        loaded = (force[:, 0] != 0) | (force[:, 1] != 0) | (force[:, 2] != 0)
+        one, two, three = loaded[faces].T
+        faces = faces[one | two | three]
+        share = face_vectors(position, faces) / 3
+        area = _summed(faces, np.repeat(share[:, None], 3, axis=1), len(position))
+        square = np.maximum(np.einsum("ni,ni->n", area, area), 1e-24)
+        pressure = np.maximum(np.einsum("ni,ni->n", force, area) / square, 0.0)
+        return cls(position, force, faces, area, pressure)
+
+    def to_force(self, gradient: Floats) -> Floats:
+        """Gradient of a scalar by forces [1/N], (V, 3), from that by pressures [1/Pa], (V,)."""
+        return self._per_square(gradient)[:, None] * self.area
+
+    def to_skin(self, gradient: Floats) -> Floats:
+        """Gradient of a scalar by positions [1/m], (V, 3), from that by pressures [1/Pa], (V,).
+
+        Forces are held, and spread over areas that change.
+        """
+        by_area = self.force - 2 * self.pressure[:, None] * self.area
+        by_area *= self._per_square(gradient)[:, None]
+        by_face = by_area[self.faces].sum(axis=1)[:, None] / 6
+        corner = self.position[self.faces]
+        opposite = np.roll(corner, -1, axis=1) - np.roll(corner, -2, axis=1)
+        return _summed(self.faces, np.cross(opposite, by_face), len(self.position))
+
+    def _per_square(self, gradient: Floats) -> Floats:
+        square = np.maximum(np.einsum("ni,ni->n", self.area, self.area), 1e-24)
+        return np.asarray(np.where(self.pressure > 0, gradient, 0.0) / square)
 
 
 @dataclass(frozen=True)
@@ -41,6 +157,9 @@ class Gap:
         slope: d gap / d (point of the skin), shape (N, 3): the triangle's normal over its part
             along the core's.
         pressure: Of the core on the skin there, above the fluid's [Pa], shape (N,).
+        normals: The core's normals, shape (N, 3).
+        contact: Pressures of the skin's nodes, of which `pressure` is interpolated; None = no
+            contact.
     """
 
     gap: Floats
@@ -48,22 +167,76 @@ class Gap:
     weights: Floats
     slope: Floats
     pressure: Floats
+    normals: Floats
+    contact: CorePressure | None = None
 
-    def to_skin(self, gradient: Floats, count: int) -> Floats:
+    def to_skin(self, by_gap: Floats, count: int, by_pressure: Floats | None = None) -> Floats:
         """Transpose of the derivative: of a scalar by gaps to the same by nodal positions.
 
         Args:
-            gradient: d scalar / d gap [1/m], shape (N,).
+            by_gap: d scalar / d gap [1/m], shape (N,).
+            count: Nodes of the skin V.
+            by_pressure: d scalar / d pressure [1/Pa], shape (N,); None = pressures are held.
+
+        Returns:
+            d scalar / d position [1/m], shape (V, 3), with the core's nodal forces held.
+        """
+        # A point of the skin that moves by u changes the gap by slope . u.
+        by_point = by_gap[:, None] * self.slope
+        contact = self.contact
+        if contact is None or by_pressure is None:
+            return _summed(self.nodes, self.weights[:, :, None] * by_point[:, None], count)
+        # Pressures are linear in a triangle, and the normal meets another point of it: the place
+        # moves by slope . u along the normal, and the triangle by u.
+        pressed = np.flatnonzero(contact.pressure[self.nodes].any(axis=1) & (by_pressure != 0))
+        rise = self._rise(contact, pressed)
+        along = np.einsum("ni,ni->n", rise, self.normals[pressed])
+        by_point[pressed] += by_pressure[pressed, None] * (
+            along[:, None] * self.slope[pressed] - rise
+        )
+        moved = _summed(self.nodes, self.weights[:, :, None] * by_point[:, None], count)
+        return moved + contact.to_skin(self._to_nodes(by_pressure, count))
+
+    def to_core_force(self, by_pressure: Floats, count: int) -> Floats:
+        """Gradient of a scalar by the core's nodal forces, with positions held.
+
+        Args:
+            by_pressure: d scalar / d pressure [1/Pa], shape (N,).
             count: Nodes of the skin V.
 
         Returns:
-            d scalar / d position [1/m], shape (V, 3).
+            d scalar / d force [1/N], shape (V, 3); zero where there is no force, because contact
+            does not begin there.
         """
-        parts = (gradient[:, None] * self.weights)[:, :, None] * self.slope[:, None]
-        total = np.zeros((count, 3))
-        for i in range(3):
-            total[:, i] = np.bincount(self.nodes.ravel(), parts[:, :, i].ravel(), count)
-        return total
+        if self.contact is None:
+            return np.zeros((count, 3))
+        return self.contact.to_force(self._to_nodes(by_pressure, count))
+
+    def _to_nodes(self, by_pressure: Floats, count: int) -> Floats:
+        shares = (self.weights * by_pressure[:, None]).ravel()
+        return np.asarray(np.bincount(self.nodes.ravel(), shares, count), np.float64)
+
+    def _rise(self, contact: CorePressure, some: NDArray[np.int64]) -> Floats:
+        """Gradient of the pressure within the triangles of some film nodes [Pa/m], shape (S, 3)."""
+        corner = contact.position[self.nodes[some]]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        opposite = np.roll(corner, -2, axis=1) - np.roll(corner, -1, axis=1)
+        across = np.einsum("nk,nki->ni", contact.pressure[self.nodes[some]], opposite)
+        return np.asarray(np.cross(normal, across) / (normal**2).sum(axis=1)[:, None])
+
+
+def _summed(nodes: Ints, parts: Floats, count: int) -> Floats:
+    """Sums of vectors by node, shape (V, 3).
+
+    Args:
+        nodes: Node of each vector, shape (N, 3).
+        parts: Vectors, shape (N, 3, 3).
+        count: Nodes V.
+    """
+    total = np.empty((count, 3))
+    for i in range(3):
+        total[:, i] = np.bincount(nodes.ravel(), parts[:, :, i].ravel(), count)
+    return total
 
 
 class GapFinder:
@@ -101,31 +274,28 @@ class GapFinder:
         Raises:
             SimulationError: A normal of the core misses the skin: the skin is folded or torn.
         """
-        position = np.asarray(position, np.float64)
-        face = self._start.copy()
-        # Walk from triangle to triangle over the edge with the most negative barycentric
-        # coordinate.
-        active = np.arange(len(face))
-        for _ in range(MOST_STEPS):
-            weights, _ = self._meet(position, active, face[active])
-            worst = weights.argmin(axis=1)
-            out = weights[np.arange(len(active)), worst] < OUTSIDE
-            active = active[out]
-            if not len(active):
-                break
-            face[active] = self._beside[face[active], worst[out]]
-        if len(active):
-            face[active] = self._search(position, active)
-        weights, normal = self._meet(position, np.arange(len(face)), face)
+        position = np.ascontiguousarray(position, np.float64)
+        face, count = self._start.copy(), len(self._start)
+        arrived = np.empty(count, np.bool_)
+        weights, gap, slope = np.empty((count, 3)), np.empty(count), np.empty((count, 3))
+
+        def measure(most_steps: int) -> None:
+            film = (vec3s(self.film.nodes), vec3s(self.film.normals))
+            skin = (indices(self.faces), indices(self._beside), vec3s(position))
+            out = [indices(face), truths(arrived), vec3s(weights), scalars(gap), vec3s(slope)]
+            launch(walk, count, [OUTSIDE, most_steps, *film, *skin], out)
+
+        measure(MOST_STEPS)
+        if not arrived.all():
+            lost = np.flatnonzero(~arrived)
+            face[lost] = self._search(position, lost)
+            measure(0)
         nodes = self.faces[face]
-        foot = np.einsum("nk,nki->ni", weights, position[nodes])
-        gap = np.einsum("ni,ni->n", foot - self.film.nodes, self.film.normals)
-        along = np.einsum("ni,ni->n", normal, self.film.normals)
-        pressure = np.zeros(len(gap))
-        if core_force is not None:
-            nodal = self._pressure(position, np.asarray(core_force, np.float64))
-            pressure = np.einsum("nk,nk->n", weights, nodal[nodes])
-        return Gap(gap, nodes, weights, normal / along[:, None], pressure)
+        pressure, contact = np.zeros(count), None
+        if core_force is not None and np.any(core_force):
+            contact = CorePressure.of(position, np.asarray(core_force, np.float64), self.faces)
+            pressure = np.einsum("nk,nk->n", weights, contact.pressure[nodes])
+        return Gap(gap, nodes, weights, slope, pressure, self.film.normals, contact)
 
     def of_step(self, rest: Floats, step: IndentationStep) -> Gap:
         """Gaps of a simulated step.
@@ -135,15 +305,6 @@ class GapFinder:
             step: Its displacement and core forces are used.
         """
         return self.measure(rest + step.displacement, step.core_force)
-
-    def _pressure(self, position: Floats, force: Floats) -> Floats:
-        """Nodal force along the surface's normal over the node's area [Pa], shape (V,)."""
-        share = face_vectors(position, self.faces) / 3
-        vector = np.zeros((self.count, 3))
-        for i in range(3):
-            vector[:, i] = np.bincount(self.faces.ravel(), np.repeat(share[:, i], 3), self.count)
-        square = np.maximum(np.einsum("ni,ni->n", vector, vector), 1e-24)
-        return np.asarray(np.maximum(np.einsum("ni,ni->n", force, vector) / square, 0.0))
 
     def _meet(self, position: Floats, rays: NDArray[np.int64], face: Ints) -> tuple[Floats, Floats]:
         """Barycentric coordinates where normals meet the planes of triangles, and area vectors."""
@@ -202,7 +363,9 @@ CLAMP_X_M, CLAMP_BLEND_M = -13.96e-3, 0.7e-3
 SIDES_RAD = (0.85, 1.25)
 
 
-def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> tuple[Floats, Floats]:
+def gap_adjustment(
+    points: Floats, normals: Floats, specimen: SpecimenParameters
+) -> tuple[Floats, Floats]:
     """How a specimen's gap differs from that of the mechanics, which all specimens share.
 
     Behind the clamp's edge skin and core are anchored together, as in the paper's model ("Finite
@@ -210,9 +373,14 @@ def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> tuple[Floats
     specimens differ: real ones rise by up to 0.17 of full scale where the skin bulges, which needs
     films of 0.05-0.2 mm at rest (learning notes, section 4.4). Under the pad the fill decides.
 
+    A core that sits elsewhere in the skin (`core_offset_m`) is nearer to it by the part of its
+    offset along the normal, and the clamp holds both behind its edge. Real sensors differ in it:
+    on one E1 rests 260 counts above its mirror image E11, on its neighbour as much below.
+
     Args:
         points: Nodes of the film [m], shape (N, 3), sensor frame.
-        specimen: Its `clamp_closing` and `side_closing_m` are used.
+        normals: Of the core there, shape (N, 3).
+        specimen: Its `clamp_closing`, `side_closing_m` and `core_offset_m` are used.
 
     Returns:
         The share of the gap that stays open [1], and how much closer to the core the specimen's
@@ -223,7 +391,9 @@ def gap_adjustment(points: Floats, specimen: SpecimenParameters) -> tuple[Floats
     angle = np.arctan2(np.abs(y), -z)
     low, high = SIDES_RAD
     t = np.clip((angle - low) / (high - low), 0.0, 1.0)
-    return 1 - specimen.clamp_closing * behind, specimen.side_closing_m * t * t * (3 - 2 * t)
+    share = 1 - specimen.clamp_closing * behind
+    nearer = specimen.side_closing_m * t * t * (3 - 2 * t)
+    return share, nearer + share * (normals @ np.array(specimen.core_offset_m))
 
 
 def thickness(

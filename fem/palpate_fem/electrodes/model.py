@@ -37,19 +37,36 @@ class ElectrodeResponse:
     conduction: FilmSolution
     _slope: Floats
     _by_gap: Floats
+    _by_pressure: Floats
 
     def gradient_gap(self) -> Floats:
         """Derivative d counts_i / d gap_j at fixed contact pressure [1/m], shape (19, N)."""
-        return np.asarray(
-            self._slope[:, None] * self.conduction.gradient_film() * self._by_gap[None]
-        )
+        return self._by_film * self._by_gap
+
+    def gradient_pressure(self) -> Floats:
+        """Derivative d counts_i / d pressure_j at fixed gaps [1/Pa], shape (19, N)."""
+        return self._by_film * self._by_pressure
+
+    @property
+    def _by_film(self) -> Floats:
+        return np.asarray(self._slope[:, None] * self.conduction.gradient_film())
 
     def to_skin(self, gradient: Floats, count: int) -> Floats:
         """Gradient of a scalar by skin positions, shape (V, 3) [1/m], from that by counts, (19,).
 
-        The transpose of the derivative; contact pressures are held fixed.
+        The transpose of the derivative, with the nodal forces of the core held. In contact these
+        change with the positions, too: see `to_core_force`.
         """
-        return self.gap.to_skin(gradient @ self.gradient_gap(), count)
+        by_film = self.conduction.to_film(gradient * self._slope)
+        return self.gap.to_skin(by_film * self._by_gap, count, by_film * self._by_pressure)
+
+    def to_core_force(self, gradient: Floats, count: int) -> Floats:
+        """Gradient of a scalar by nodal forces of the core, (V, 3) [1/N], from that by counts.
+
+        With the positions held: it is the forces that squeeze the residual film.
+        """
+        by_film = self.conduction.to_film(gradient * self._slope)
+        return self.gap.to_core_force(by_film * self._by_pressure, count)
 
 
 class ElectrodeModel:
@@ -83,7 +100,7 @@ class ElectrodeModel:
         )
         self.finder = GapFinder(self.film, geometry.mesh)
         self.conduction = FilmConduction(self.film, disc_radius_m=specimen.disc_diameter_m / 2)
-        self._adjustment = gap_adjustment(self.film.nodes, specimen)
+        self._adjustment = gap_adjustment(self.film.nodes, self.film.normals, specimen)
 
     def with_specimen(self, specimen: SpecimenParameters) -> ElectrodeModel:
         """The model of another specimen; shares the film mesh if discs and core are the same."""
@@ -91,7 +108,10 @@ class ElectrodeModel:
         if (specimen.disc_diameter_m, specimen.recess_m) != (old.disc_diameter_m, old.recess_m):
             return ElectrodeModel(self.geometry, specimen, edge_m=self._edge_m)
         other = copy(self)
-        other.specimen, other._adjustment = specimen, gap_adjustment(self.film.nodes, specimen)
+        other.specimen, other._adjustment = (
+            specimen,
+            gap_adjustment(self.film.nodes, self.film.normals, specimen),
+        )
         return other
 
     def respond(
@@ -113,7 +133,7 @@ class ElectrodeModel:
         """Response to known gaps."""
         specimen = self.specimen
         share, closer_m = self._adjustment
-        film, by_gap, _ = thickness(share * gap.gap - closer_m, gap.pressure, specimen)
+        film, by_gap, by_pressure = thickness(share * gap.gap - closer_m, gap.pressure, specimen)
         solved = self.conduction.solve(
             film,
             sigma_s_m=specimen.sigma_s_m * float(np.exp(log_sigma)),
@@ -127,4 +147,5 @@ class ElectrodeModel:
             conduction=solved,
             _slope=counts_slope(solved.impedance, specimen),
             _by_gap=by_gap * share,
+            _by_pressure=by_pressure,
         )

@@ -39,6 +39,7 @@ LIMITS = {
     "recess_m": (-0.1e-3, 0.3e-3),
     "clamp_closing": (0.0, 1.0),
     "side_closing_m": (0.0, 1.5e-3),
+    "core_offset_m": (-1.5e-3, 1.5e-3),
     "asperity_m": (1e-6, 300e-6),
     "floor_m": (0.5e-6, 50e-6),
     "squeeze_pa": (1e2, 1e7),
@@ -93,6 +94,9 @@ UNIFORM = {
     "pac_offset": (2020.0, 2035.0),
 }
 PER_ELECTRODE = ("asymmetry", "gain", "offset")
+LENGTHS = {"core_offset_m": 3} | dict.fromkeys(PER_ELECTRODE, SENSING)
+"""Number of values of those parameters that have several."""
+
 _REMEDY = "give it in SI units and within these limits"
 _ZERO_EACH = (0.0,) * SENSING
 
@@ -111,6 +115,8 @@ class SpecimenParameters:
         recess_m: Depth of the film's floor under the core's surface [m]; see `film_mesh`.
         clamp_closing: Share of the gap that the clamp closes behind its edge; see `gap_adjustment`.
         side_closing_m: How much nearer to the core the skin stands at the sides [m]; see
+            `gap_adjustment`.
+        core_offset_m: Displacement of the core in the skin [m], sensor frame, x distal; see
             `gap_adjustment`.
         asperity_m: Residual film of an unloaded contact [m]: the fluid between the asperities.
         floor_m: Residual film at infinite pressure [m].
@@ -149,6 +155,7 @@ class SpecimenParameters:
     recess_m: float = 0.0
     clamp_closing: float = 1.0
     side_closing_m: float = 0.0
+    core_offset_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     asperity_m: float = 80e-6
     floor_m: float = 5e-6
     squeeze_pa: float = 30e3
@@ -177,11 +184,11 @@ class SpecimenParameters:
     def __post_init__(self) -> None:
         for key, (low, high) in LIMITS.items():
             value = getattr(self, key)
-            many = key in PER_ELECTRODE
-            if many and not (isinstance(value, tuple) and len(value) == SENSING):
+            many = LENGTHS.get(key)
+            if many and not (isinstance(value, tuple) and len(value) == many):
                 raise ConfigError(
-                    f"{key} is not a tuple of {SENSING} values",
-                    remedy="give one for each electrode",
+                    f"{key} is not a tuple of {many} values",
+                    remedy="give one for each electrode, or x, y and z",
                 )
             for one in value if many else (value,):
                 if (

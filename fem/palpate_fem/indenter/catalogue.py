@@ -9,7 +9,8 @@ The paper names eight: *sphere small*, *medium*, *large*, *cylinder small*, *cyl
 
 *texture* is unpublished but for a small figure and one sentence: it "modeled scattered grains and
 debris". `texture` here is a **stand-in**: a rounded plate with hemispherical grains whose places
-and sizes follow a fixed sequence. Results with it say nothing about the paper's texture.
+and sizes follow a fixed sequence, with fillets between them. Results with it say nothing about the
+paper's texture.
 """
 
 from __future__ import annotations
@@ -173,7 +174,11 @@ def _texture() -> tuple[Primitive, ...]:
     """Stand-in: grains of radius 0.5-1.0 mm on a plate of 14 x 14 mm, 0.5-1.0 mm high.
 
     Places follow the golden angle (a sunflower: even, but nowhere regular); sizes the fractional
-    parts of multiples of sqrt(2). The highest grain, in the middle, touches the tip.
+    parts of multiples of sqrt(2). The highest grain, in the middle, touches the tip. Creases have
+    fillets of 0.5 mm, a radius chosen for robustness. Over a crease the direction of the distance
+    jumps at the centres of its arc. Faces of skin hang there over the valleys between grains, 0.45
+    mm up and more, and contact weighs them too: with fillets of 0.15 and 0.3 mm it often does not
+    come to rest, with these seldom.
     """
     grains, reach, largest = 24, 6e-3, 1.0e-3
     golden = math.pi * (3.0 - math.sqrt(5.0))
@@ -197,6 +202,7 @@ _MAKERS: dict[str, Callable[[], tuple[Primitive, ...]]] = {
     "ring": _ring,
     "texture": _texture,
 }
+_FILLETS_M = {"texture": 0.5e-3}
 
 
 def indenter_names() -> tuple[str, ...]:
@@ -222,4 +228,4 @@ def make_indenter(name: str) -> Indenter:
             f"there is no indenter {name!r}",
             remedy=f"did you mean {near[0]!r}? known: {', '.join(_MAKERS)}",
         )
-    return Indenter(key, _MAKERS[key]())
+    return Indenter(key, _MAKERS[key](), _FILLETS_M.get(key, 0.0))

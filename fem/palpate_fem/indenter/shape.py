@@ -46,17 +46,24 @@ class Indenter:
     Its frame: tip at the origin, the body towards -z, so it presses along +z. With the identity
     orientation in the sensor frame it presses the ventral pad straight towards the nail, and x runs
     along the finger.
+
+    Attributes:
+        name: Name of the catalogue.
+        primitives: Its parts, at least one.
+        fillet_m: Radius of the concave creases between parts [m]; 0 leaves them sharp. A sharp
+            crease has two normals, between which contact need not come to rest.
     """
 
     name: str
     primitives: tuple[Primitive, ...]
+    fillet_m: float = 0.0
 
     def packed(self) -> Floats:
-        """Rows for the kernels: kind, axis, centre (3), sizes (4), rounding; shape (P, 10)."""
+        """Rows for the kernels, (P, 11): kind, axis, centre (3), sizes (4), rounding, fillet."""
         return np.array(
             [
-                [float(p.kind), float(p.axis), *p.centre, *p.sizes, p.rounding]
+                [float(p.kind), float(p.axis), *p.centre, *p.sizes, p.rounding, self.fillet_m]
                 for p in self.primitives
             ],
             np.float64,
-        ).reshape(-1, 10)
+        ).reshape(-1, 11)

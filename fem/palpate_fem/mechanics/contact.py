@@ -14,11 +14,13 @@ import warp as wp
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE, launch, scalars, vec3s
+from palpate_fem.indenter.distance import distance
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels
 from palpate_fem.mechanics.contact_kernels import ContactLaw
-from palpate_fem.mechanics.reference_element import corner_element, face_element
-from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.mortar import HANGING_M, MortarWeights
+from palpate_fem.mechanics.reference_element import corner_element, face_element, point_areas
+from palpate_fem.mechanics.state import MortarCorrection, SolutionState
 from palpate_fem.mesh.core import DistanceGrid
 
 
@@ -34,12 +36,15 @@ class ContactSettings:
             (mu over the size of an element): with more, a point whose displacement changes sign
             from iteration to iteration slides for ever (ADR 0013).
         margin_m: Points farther than this from a surface are not evaluated [m].
+        mortar: Whether gaps are weighted means over the faces around a node (``mortar``), or those
+            of the nodes alone, which is softer.
     """
 
     stiffness: float = 2e12
     tangential_stiffness: float = 5e10
     complement: float = 3e8
     margin_m: float = 0.5e-3
+    mortar: bool = True
 
     def scaled(self, factor: float) -> ContactSettings:
         """The same relative to a skin that is stiffer by a factor."""
@@ -57,6 +62,7 @@ class ContactSettings:
         law.friction = wp.float64(friction)
         law.tangential_stiffness = wp.float64(self.tangential_stiffness)
         law.complement = wp.float64(self.complement)
+        law.at_nodes = wp.float64(0.0 if self.mortar else 1.0)
         return law
 
 
@@ -78,6 +84,16 @@ class PosedIndenter:
     def to_local(self, points: Floats) -> Floats:
         """Points of the sensor frame in the indenter frame."""
         return np.asarray((points - self.tip) @ self.rotation)
+
+    def distance(self, points: Floats) -> tuple[Floats, Floats]:
+        """Gaps [m], (N,), and their gradients, (N, 3), at points (N, 3) of the sensor frame [m]."""
+        gap, normal, _ = distance(self.shape, self.to_local(points))
+        return gap, normal @ self.rotation.T
+
+    def curved(self, points: Floats) -> tuple[Floats, Floats]:
+        """Gradients (N, 3) and second derivatives (N, 3, 3) [1/m] of the gaps at points (N, 3)."""
+        _, normal, hessian = distance(self.shape, self.to_local(points))
+        return normal @ self.rotation.T, self.rotation @ hessian @ self.rotation.T
 
 
 class ContactSurface:
@@ -101,7 +117,10 @@ class ContactSurface:
         self.shape_values = element.shape
         self._corners = faces.reshape(-1, corners)
         self.area_values = self.current_area(nodes)
+        self.mortar = MortarWeights(nodes, self._corners)
         size = self.area_values.shape
+        self.no_correction = MortarCorrection.none(self._corners, len(nodes))
+        self._correction, self._pressure = self.no_correction, np.zeros(size)
         self.gap, self._wanted = np.full(size, np.inf), np.zeros(size)
         self._wanted_traction = np.zeros((*size, 3))
         self.faces = wp.array(faces.reshape(-1, corners), dtype=wp.int32, device=DEVICE)
@@ -124,6 +143,12 @@ class ContactSurface:
         self.of_friction = [
             self.wanted_traction_array, self.traction_slope, self.coupled, self.unsymmetric,
         ]  # fmt: skip
+        # The same of the pressure at the faces' quadrature points.
+        self.mortar_status = wp.zeros_like(self.status)
+        self.mortar_tangent = wp.zeros_like(self.tangent)
+        self.mortar_shape = scalars(self.mortar.shape)
+        self.quadrature = [self.faces, self.mortar_shape, scalars(self.mortar.weight)]
+        self.loaded = [self.mortar_status, self.mortar_tangent]
         self._freezing = (self.slope, self.traction_slope, self.status, self.unsymmetric)
         self._frozen = [wp.clone(array) for array in self._freezing]
         self._sliding = wp.zeros(0, dtype=wp.int32, device=DEVICE)
@@ -136,10 +161,14 @@ class ContactSurface:
         sliding = np.flatnonzero(np.any(unsymmetric != 0.0, axis=1)).astype(np.int32)
         self._sliding = wp.array(sliding, dtype=wp.int32, device=DEVICE)
 
+    def keep(self, correction: MortarCorrection, pressure: Floats) -> None:
+        """Keep the mortar correction and the pressures [Pa], (F, Q), of an evaluation."""
+        self._correction, self._pressure = correction, pressure
+
     @property
     def is_unsymmetric(self) -> bool:
-        """Whether the frozen tangent has an unsymmetric share."""
-        return len(self._sliding) > 0
+        """Whether the frozen tangent has an unsymmetric share: friction, and mortar's loads."""
+        return len(self._sliding) > 0 or self._correction.spread.nnz > 0
 
     def add_tangent(self, blocks: wp.array) -> None:
         """Add the symmetric tangents of the touching points."""
@@ -147,6 +176,12 @@ class ContactSurface:
             contact_kernels.point_tangent,
             self.count,
             [self.shape, self.pairs, self.status, self.tangent],
+            [blocks],
+        )
+        launch(
+            contact_kernels.point_tangent,
+            self.count,
+            [self.mortar_shape, self.pairs, self.mortar_status, self.mortar_tangent],
             [blocks],
         )
 
@@ -158,16 +193,35 @@ class ContactSurface:
             [self.faces, self.shape, self._sliding, self._frozen[3]],
             [change, product],
         )
+        if self._correction.spread.nnz:
+            # The change of pressure is minus the slope times that of the position.
+            moved = change.numpy()[self._corners]
+            slope = np.einsum("fqi,fqi->fq", self._frozen[0].numpy(), moved)
+            product.numpy()[:] += self._correction.load(slope)
+
+    def subtract_coupled(self, force: wp.array) -> None:
+        """Subtract what nodal forces lack: friction and mortar's loads follow wanted pressures."""
+        self.subtract_load(self.coupled, force)
+        if self._correction.spread.nnz:
+            touching = self.status.numpy() > 0
+            lacking = np.where(touching, self._wanted - self._pressure, 0.0)
+            force.numpy()[:] -= self._correction.load(lacking)
 
     @property
     def changed(self) -> bool:
         """Whether the status of any point differs from the frozen one."""
         return not np.array_equal(self._frozen[2].numpy(), self.status.numpy())
 
+    @property
+    def smallest_gap(self) -> float:
+        """Smallest gap of the last evaluation [m], mortar correction included."""
+        return float(self.gap.min(initial=np.inf))
+
     def clear(self) -> None:
         """Set the results of a surface that nothing is near to."""
-        for array in (*self.results, *self.of_friction):
+        for array in (*self.results, *self.of_friction, *self.loaded):
             array.zero_()
+        self.keep(self.no_correction, np.zeros(self.area_values.shape))
         self.gap[:] = np.inf
 
     def pressure_misfit(self, pressure: Floats) -> float:
@@ -213,10 +267,8 @@ class ContactSurface:
         The Jacobian at the corner itself is its share of the area on parallelograms only. On a
         distorted face an even pressure with such weights would push unevenly.
         """
-        element = face_element(self.points)
-        edges = np.einsum("qad,fai->fqdi", element.gradient, position[self._corners])
-        size = np.linalg.norm(np.cross(edges[:, :, 0], edges[:, :, 1]), axis=2)
-        return np.asarray(np.einsum("q,fq,qa->fa", element.weight, size, element.shape))
+        size, shape = point_areas(position, self._corners), face_element(self.points).shape
+        return np.asarray(np.einsum("fq,qa->fa", size, shape))
 
 
 class IndenterContact:
@@ -247,6 +299,7 @@ class IndenterContact:
                 wp.vec3d(*indenter.tip),
                 wp.mat33d(*indenter.rotation.ravel()),
                 position,
+                scalars(state.on_indenter.gap),
                 scalars(state.indenter_pressure),
                 vec3s(state.traction),
                 vec3s(state.anchor),
@@ -256,6 +309,33 @@ class IndenterContact:
                 *surface.of_friction,
                 self._force,
             ],
+        )
+        surface.keep(state.on_indenter, state.indenter_pressure)
+        if self.settings.mortar:
+            launch(
+                contact_kernels.mortar_on_indenter,
+                surface.count,
+                [
+                    *surface.quadrature,
+                    indenter.primitives,
+                    wp.vec3d(*indenter.tip),
+                    wp.mat33d(*indenter.rotation.ravel()),
+                    position,
+                    scalars(state.indenter_pressure),
+                    vec3s(state.on_indenter.held),
+                ],
+                [*surface.loaded, self._force],
+            )
+
+    def correction(self, state: SolutionState, indenter: PosedIndenter | None) -> MortarCorrection:
+        """The mortar correction at a state."""
+        surface = self.surface
+        if indenter is None or not surface.count or not self.settings.mortar:
+            return surface.no_correction
+        # An indenter whose creases skin reaches has fillets.
+        hanging_m = HANGING_M if indenter.shape.fillet_m > 0.0 else np.inf
+        return surface.mortar.correction(
+            state.position, indenter.distance, self.settings.margin_m, hanging_m
         )
 
 
@@ -273,6 +353,9 @@ class CoreContact:
         self.force = np.zeros((nodes, 3))
         self._force = vec3s(self.force)
         self._table = scalars(core.coefficients if core else np.zeros((4, 4, 4)))
+        # The kernels first look at one coefficient of the point's cell, whose node is up to sqrt(3)
+        # spacings away from the point.
+        self._margin = wp.float64(settings.margin_m + (2 * core.spacing if core else 0.0))
 
     def evaluate(self, state: SolutionState, position: wp.array) -> None:
         """Evaluate minus the nodal forces on the skin, and the results at each point."""
@@ -290,11 +373,54 @@ class CoreContact:
                 wp.vec3d(*core.origin),
                 wp.float64(core.spacing),
                 self.settings.law(0.0),
-                # The kernel first looks at one coefficient of the point's cell, whose node is up
-                # to sqrt(3) spacings away from the point.
-                wp.float64(self.settings.margin_m + 2 * core.spacing),
+                self._margin,
                 position,
+                scalars(state.on_core.gap),
                 scalars(state.core_pressure),
             ],
             [*surface.results, self._force],
         )
+        surface.keep(state.on_core, state.core_pressure)
+        if self.settings.mortar:
+            launch(
+                contact_kernels.mortar_on_core,
+                surface.count,
+                [
+                    *surface.quadrature,
+                    self._table,
+                    wp.vec3d(*core.origin),
+                    wp.float64(core.spacing),
+                    position,
+                    scalars(state.core_pressure),
+                ],
+                [*surface.loaded, self._force],
+            )
+
+    def correction(self, state: SolutionState) -> MortarCorrection:
+        """The mortar correction at a state."""
+        surface, core = self.surface, self.core
+        if core is None or not surface.count or not self.settings.mortar:
+            return surface.no_correction
+        return surface.mortar.correction(state.position, self._distance, self.settings.margin_m)
+
+    def _distance(self, points: Floats) -> tuple[Floats, Floats]:
+        """Distance to the core [m], (N,), and its gradient, (N, 3); see `DistanceGrid.evaluate`.
+
+        Without a margin: the means of gaps need it wherever a touching face's points are, as the
+        forces at these points do.
+        """
+        assert self.core is not None
+        gap, normal = np.empty(len(points)), np.empty((len(points), 3))
+        launch(
+            contact_kernels.core_distances,
+            len(points),
+            [
+                self._table,
+                wp.vec3d(*self.core.origin),
+                wp.float64(self.core.spacing),
+                wp.float64(np.inf),
+                vec3s(np.ascontiguousarray(points)),
+            ],
+            [scalars(gap), vec3s(normal)],
+        )
+        return gap, normal

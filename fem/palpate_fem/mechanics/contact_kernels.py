@@ -1,7 +1,8 @@
 # mypy: ignore-errors
 """Contact laws and kernels: friction with the indenter, frictionless contact with the core.
 
-Contact points are the corners of the surface faces (Lobatto points).
+Contact points are the corners of the surface faces (Lobatto points). Their gap is that of the node
+and its mortar correction (``mortar``), which is kept while Newton's method solves.
 
 **Normal law**, with gap g and stiffness e per *undeformed* area, so that frictionless contact has
 an energy::
@@ -44,6 +45,7 @@ class ContactLaw:
     friction: wp.float64
     tangential_stiffness: wp.float64
     complement: wp.float64
+    at_nodes: wp.float64  # share of the pressure's force that acts at the nodes: 0 with mortar
 
 
 @wp.struct
@@ -54,6 +56,35 @@ class LinearisedFriction:
     wanted: wp.vec3d
     by_position: wp.mat33d
     by_pressure: wp.vec3d
+
+
+@wp.func
+def at_point(
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    nodal: wp.array(dtype=wp.vec3d),
+    f: int,
+    q: int,
+) -> wp.vec3d:
+    """A nodal field at point q of face f."""
+    value = wp.vec3d()
+    for a in range(faces.shape[1]):
+        value += shape[q, a] * nodal[faces[f, a]]
+    return value
+
+
+@wp.func
+def add_at_nodes(
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    load: wp.vec3d,
+    f: int,
+    q: int,
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Share a load at point q of face f out to its nodes."""
+    for a in range(faces.shape[1]):
+        wp.atomic_add(force_out, faces[f, a], shape[q, a] * load)
 
 
 @wp.func
@@ -121,6 +152,7 @@ def indenter_contact(
     tip: wp.vec3d,
     rotation: wp.mat33d,
     position_in: wp.array(dtype=wp.vec3d),
+    correction_in: wp.array2d(dtype=wp.float64),
     pressure_in: wp.array2d(dtype=wp.float64),
     traction_in: wp.array2d(dtype=wp.vec3d),
     anchor_in: wp.array2d(dtype=wp.vec3d),
@@ -145,14 +177,12 @@ def indenter_contact(
     coefficient.
     """
     f = wp.tid()
-    k = faces.shape[1]
     for q in range(shape.shape[0]):
-        x = wp.vec3d()
-        for a in range(k):
-            x += shape[q, a] * position_in[faces[f, a]]
+        x = at_point(faces, shape, position_in, f, q)
         local = wp.transpose(rotation) * (x - tip)
         near = indenter_distance(primitives, local, margin)
-        gap_out[f, q] = near.gap
+        gap = near.gap + correction_in[f, q]
+        gap_out[f, q] = gap
         status_out[f, q] = 0
         wanted_out[f, q] = wp.float64(0.0)
         slope_out[f, q] = wp.vec3d()
@@ -165,7 +195,7 @@ def indenter_contact(
         # Points beyond the margin have no pressure: it was set to zero when they separated.
         if near.gap < margin:
             normal = rotation * near.normal
-            answer = normal_law(law, p, near.gap)
+            answer = normal_law(law, p, gap)
             if answer[1] > wp.float64(0.0):
                 status_out[f, q] = 1
                 w = area[f, q]
@@ -173,9 +203,9 @@ def indenter_contact(
                 slope = answer[1] * normal
                 wanted_out[f, q] = answer[0]
                 slope_out[f, q] = slope
-                residual = p * normal
+                residual = law.at_nodes * p * normal
                 misfit = (answer[0] - p) * normal
-                d = wp.outer(slope, normal) - p * curvature
+                d = wp.outer(slope, normal) - law.at_nodes * p * curvature
                 unsymmetric = wp.mat33d()
                 if law.friction > wp.float64(0.0):
                     t = traction_in[f, q]
@@ -195,8 +225,7 @@ def indenter_contact(
                     d += symmetric
                     unsymmetric = rub.by_position - symmetric - coupled
                 misfit_out[f, q] = w * misfit
-                for a in range(k):
-                    wp.atomic_sub(force_out, faces[f, a], (w * shape[q, a]) * residual)
+                add_at_nodes(faces, shape, -w * residual, f, q, force_out)
                 unsymmetric_out[f, q] = w * unsymmetric
                 tangent_out[f, q] = w * d
 
@@ -231,14 +260,9 @@ def unsymmetric_product(
 ):
     """Add (tangent - its symmetric approximation) times a nodal vector, over the listed faces."""
     f = sliding_in[wp.tid()]
-    k = faces.shape[1]
     for q in range(shape.shape[0]):
-        v = wp.vec3d()
-        for a in range(k):
-            v += shape[q, a] * vector_in[faces[f, a]]
-        moved = unsymmetric_in[f, q] * v
-        for a in range(k):
-            wp.atomic_add(product_out, faces[f, a], shape[q, a] * moved)
+        moved = unsymmetric_in[f, q] * at_point(faces, shape, vector_in, f, q)
+        add_at_nodes(faces, shape, moved, f, q, product_out)
 
 
 @wp.kernel
@@ -253,8 +277,7 @@ def subtract_load(
     for q in range(shape.shape[0]):
         m = load_in[f, q]
         if wp.length_sq(m) > wp.float64(0.0):
-            for a in range(faces.shape[1]):
-                wp.atomic_sub(force_out, faces[f, a], shape[q, a] * m)
+            add_at_nodes(faces, shape, -m, f, q, force_out)
 
 
 @wp.kernel
@@ -279,9 +302,7 @@ def pressure_update(
         p = wp.float64(0.0)
         t = wp.vec3d()
         if status_in[f, q] > 0:
-            moved = wp.vec3d()
-            for a in range(faces.shape[1]):
-                moved += shape[q, a] * change_in[faces[f, a]]
+            moved = at_point(faces, shape, change_in, f, q)
             p = wp.max(wanted_in[f, q] - wp.dot(slope_in[f, q], moved), wp.float64(0.0))
             if p > wp.float64(0.0):
                 t = wanted_traction_in[f, q] + traction_slope_in[f, q] * moved
@@ -316,6 +337,111 @@ def bspline(t: wp.float64, order: int) -> wp.vec4d:
     )
 
 
+@wp.struct
+class CoreDistance:
+    """Distance to the core at a point, its gradient and second derivative."""
+
+    gap: wp.float64
+    normal: wp.vec3d
+    hessian: wp.mat33d
+
+
+@wp.func
+def grid_cell(
+    coefficients: wp.array3d(dtype=wp.float64), origin: wp.vec3d, spacing: wp.float64, x: wp.vec3d
+) -> wp.vec3i:
+    """The cell of a point, clamped so that its 4 x 4 x 4 coefficients exist."""
+    u = (x - origin) / spacing
+    return wp.vec3i(
+        wp.clamp(int(wp.floor(u[0])), 1, coefficients.shape[0] - 3),
+        wp.clamp(int(wp.floor(u[1])), 1, coefficients.shape[1] - 3),
+        wp.clamp(int(wp.floor(u[2])), 1, coefficients.shape[2] - 3),
+    )
+
+
+@wp.func
+def core_distance(
+    coefficients: wp.array3d(dtype=wp.float64), origin: wp.vec3d, spacing: wp.float64, x: wp.vec3d
+) -> CoreDistance:
+    """The tensor product of cubic B-splines at a point."""
+    cell = grid_cell(coefficients, origin, spacing, x)
+    u = (x - origin) / spacing
+    tx = u[0] - wp.float64(cell[0])
+    ty = u[1] - wp.float64(cell[1])
+    tz = u[2] - wp.float64(cell[2])
+    # Value, gradient and hessian of the tensor product: 0, 1, 2 are orders of derivative.
+    x0 = bspline(tx, 0)
+    x1 = bspline(tx, 1)
+    x2 = bspline(tx, 2)
+    y0 = bspline(ty, 0)
+    y1 = bspline(ty, 1)
+    y2 = bspline(ty, 2)
+    z0 = bspline(tz, 0)
+    z1 = bspline(tz, 1)
+    z2 = bspline(tz, 2)
+    value = wp.float64(0.0)
+    gx = wp.float64(0.0)
+    gy = wp.float64(0.0)
+    gz = wp.float64(0.0)
+    hxx = wp.float64(0.0)
+    hyy = wp.float64(0.0)
+    hzz = wp.float64(0.0)
+    hyz = wp.float64(0.0)
+    hxz = wp.float64(0.0)
+    hxy = wp.float64(0.0)
+    for r in range(4):
+        for s in range(4):
+            row0 = wp.float64(0.0)
+            row1 = wp.float64(0.0)
+            row2 = wp.float64(0.0)
+            for t in range(4):
+                c = coefficients[cell[0] + r - 1, cell[1] + s - 1, cell[2] + t - 1]
+                row0 += c * z0[t]
+                row1 += c * z1[t]
+                row2 += c * z2[t]
+            value += x0[r] * y0[s] * row0
+            gx += x1[r] * y0[s] * row0
+            gy += x0[r] * y1[s] * row0
+            gz += x0[r] * y0[s] * row1
+            hxx += x2[r] * y0[s] * row0
+            hyy += x0[r] * y2[s] * row0
+            hzz += x0[r] * y0[s] * row2
+            hyz += x0[r] * y1[s] * row1
+            hxz += x1[r] * y0[s] * row1
+            hxy += x1[r] * y1[s] * row0
+    answer = CoreDistance()
+    answer.gap = value
+    answer.normal = wp.vec3d(gx, gy, gz) / spacing
+    answer.hessian = wp.mat33d(
+        hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz
+    ) / (spacing * spacing)  # fmt: skip
+    return answer
+
+
+@wp.kernel
+def core_distances(
+    coefficients: wp.array3d(dtype=wp.float64),
+    origin: wp.vec3d,
+    spacing: wp.float64,
+    margin: wp.float64,
+    point_in: wp.array(dtype=wp.vec3d),
+    gap_out: wp.array(dtype=wp.float64),
+    normal_out: wp.array(dtype=wp.vec3d),
+):
+    """`core_distance` at each point, but its second derivative.
+
+    Where the coefficient of a point's cell exceeds ``margin``, the gap is that, the gradient zero.
+    """
+    i = wp.tid()
+    cell = grid_cell(coefficients, origin, spacing, point_in[i])
+    gap_out[i] = coefficients[cell[0], cell[1], cell[2]]
+    normal_out[i] = wp.vec3d()
+    if gap_out[i] < margin:
+        near = core_distance(coefficients, origin, spacing, point_in[i])
+        gap_out[i] = near.gap
+        normal_out[i] = near.normal
+
+
 @wp.kernel
 def core_contact(
     faces: wp.array2d(dtype=wp.int32),
@@ -327,6 +453,7 @@ def core_contact(
     law: ContactLaw,
     margin: wp.float64,
     position_in: wp.array(dtype=wp.vec3d),
+    correction_in: wp.array2d(dtype=wp.float64),
     pressure_in: wp.array2d(dtype=wp.float64),
     status_out: wp.array2d(dtype=wp.int32),
     gap_out: wp.array2d(dtype=wp.float64),
@@ -342,79 +469,107 @@ def core_contact(
     ``margin`` are skipped.
     """
     f = wp.tid()
-    k = faces.shape[1]
     for q in range(shape.shape[0]):
-        x = wp.vec3d()
-        for a in range(k):
-            x += shape[q, a] * position_in[faces[f, a]]
-        # The cell of the point, clamped so that its 4 x 4 x 4 coefficients exist.
-        u = (x - origin) / spacing
-        i = wp.clamp(int(wp.floor(u[0])), 1, coefficients.shape[0] - 3)
-        j = wp.clamp(int(wp.floor(u[1])), 1, coefficients.shape[1] - 3)
-        m = wp.clamp(int(wp.floor(u[2])), 1, coefficients.shape[2] - 3)
-        gap_out[f, q] = coefficients[i, j, m]
+        x = at_point(faces, shape, position_in, f, q)
+        cell = grid_cell(coefficients, origin, spacing, x)
+        rough = coefficients[cell[0], cell[1], cell[2]]
+        gap_out[f, q] = rough
         status_out[f, q] = 0
         wanted_out[f, q] = wp.float64(0.0)
         slope_out[f, q] = wp.vec3d()
         misfit_out[f, q] = wp.vec3d()
         p = pressure_in[f, q]
-        if coefficients[i, j, m] < margin or p > wp.float64(0.0):
-            tx = u[0] - wp.float64(i)
-            ty = u[1] - wp.float64(j)
-            tz = u[2] - wp.float64(m)
-            # Value, gradient and hessian of the tensor product: 0, 1, 2 are orders of derivative.
-            x0 = bspline(tx, 0)
-            x1 = bspline(tx, 1)
-            x2 = bspline(tx, 2)
-            y0 = bspline(ty, 0)
-            y1 = bspline(ty, 1)
-            y2 = bspline(ty, 2)
-            z0 = bspline(tz, 0)
-            z1 = bspline(tz, 1)
-            z2 = bspline(tz, 2)
-            value = wp.float64(0.0)
-            gx = wp.float64(0.0)
-            gy = wp.float64(0.0)
-            gz = wp.float64(0.0)
-            hxx = wp.float64(0.0)
-            hyy = wp.float64(0.0)
-            hzz = wp.float64(0.0)
-            hyz = wp.float64(0.0)
-            hxz = wp.float64(0.0)
-            hxy = wp.float64(0.0)
-            for r in range(4):
-                for s in range(4):
-                    row0 = wp.float64(0.0)
-                    row1 = wp.float64(0.0)
-                    row2 = wp.float64(0.0)
-                    for t in range(4):
-                        c = coefficients[i + r - 1, j + s - 1, m + t - 1]
-                        row0 += c * z0[t]
-                        row1 += c * z1[t]
-                        row2 += c * z2[t]
-                    value += x0[r] * y0[s] * row0
-                    gx += x1[r] * y0[s] * row0
-                    gy += x0[r] * y1[s] * row0
-                    gz += x0[r] * y0[s] * row1
-                    hxx += x2[r] * y0[s] * row0
-                    hyy += x0[r] * y2[s] * row0
-                    hzz += x0[r] * y0[s] * row2
-                    hyz += x0[r] * y1[s] * row1
-                    hxz += x1[r] * y0[s] * row1
-                    hxy += x1[r] * y1[s] * row0
-            normal = wp.vec3d(gx, gy, gz) / spacing
-            gap_out[f, q] = value
-            answer = normal_law(law, p, value)
+        if rough < margin or p > wp.float64(0.0):
+            near = core_distance(coefficients, origin, spacing, x)
+            gap = near.gap + correction_in[f, q]
+            gap_out[f, q] = gap
+            answer = normal_law(law, p, gap)
             if answer[1] > wp.float64(0.0):
                 status_out[f, q] = 1
                 wanted_out[f, q] = answer[0]
                 w = area[f, q]
-                slope_out[f, q] = answer[1] * normal
-                misfit_out[f, q] = (w * (answer[0] - p)) * normal
-                for a in range(k):
-                    wp.atomic_sub(force_out, faces[f, a], (w * shape[q, a] * p) * normal)
-                curvature = wp.mat33d(
-                    hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz
-                ) / (spacing * spacing)  # fmt: skip
+                slope_out[f, q] = answer[1] * near.normal
+                misfit_out[f, q] = (w * (answer[0] - p)) * near.normal
+                load = (law.at_nodes * w * p) * near.normal
+                add_at_nodes(faces, shape, -load, f, q, force_out)
                 # -d(p n)/dx: stiffness along the normal, and the turn of the normal under p.
-                tangent_out[f, q] = w * (answer[1] * wp.outer(normal, normal) - p * curvature)
+                tangent_out[f, q] = w * (
+                    answer[1] * wp.outer(near.normal, near.normal) - law.at_nodes * p * near.hessian
+                )
+
+
+@wp.func
+def load_at_point(
+    f: int,
+    q: int,
+    weight: wp.array3d(dtype=wp.float64),
+    pressure: wp.array2d(dtype=wp.float64),
+) -> wp.float64:
+    """Pressure at a quadrature point, by the dual shape functions, times its area [N]."""
+    load = wp.float64(0.0)
+    for a in range(weight.shape[2]):
+        load += weight[f, q, a] * pressure[f, a]
+    return load
+
+
+@wp.kernel
+def mortar_on_indenter(
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    weight: wp.array3d(dtype=wp.float64),
+    primitives: wp.array2d(dtype=wp.float64),
+    tip: wp.vec3d,
+    rotation: wp.mat33d,
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array2d(dtype=wp.float64),
+    held_in: wp.array2d(dtype=wp.vec3d),
+    status_out: wp.array2d(dtype=wp.int32),
+    tangent_out: wp.array2d(dtype=wp.mat33d),
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Pressure of the indenter at the quadrature points of the outer faces (``mortar``).
+
+    Adds minus its forces to ``force_out``; the tangent is that at constant pressures. Where
+    ``held_in`` is not zero, the pressure acts along it, and does not turn.
+    """
+    f = wp.tid()
+    for q in range(shape.shape[0]):
+        load = load_at_point(f, q, weight, pressure_in)
+        status_out[f, q] = 0
+        if load != wp.float64(0.0):
+            normal = held_in[f, q]
+            if normal == wp.vec3d():
+                x = at_point(faces, shape, position_in, f, q)
+                local = wp.transpose(rotation) * (x - tip)
+                near = indenter_distance(primitives, local, wp.float64(1.0e300))
+                normal = rotation * near.normal
+                status_out[f, q] = 1
+                tangent_out[f, q] = -load * (rotation * near.hessian * wp.transpose(rotation))
+            add_at_nodes(faces, shape, -load * normal, f, q, force_out)
+
+
+@wp.kernel
+def mortar_on_core(
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    weight: wp.array3d(dtype=wp.float64),
+    coefficients: wp.array3d(dtype=wp.float64),
+    origin: wp.vec3d,
+    spacing: wp.float64,
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array2d(dtype=wp.float64),
+    status_out: wp.array2d(dtype=wp.int32),
+    tangent_out: wp.array2d(dtype=wp.mat33d),
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """`mortar_on_indenter` for the core and the inner faces."""
+    f = wp.tid()
+    for q in range(shape.shape[0]):
+        load = load_at_point(f, q, weight, pressure_in)
+        status_out[f, q] = 0
+        if load != wp.float64(0.0):
+            x = at_point(faces, shape, position_in, f, q)
+            near = core_distance(coefficients, origin, spacing, x)
+            status_out[f, q] = 1
+            tangent_out[f, q] = -load * near.hessian
+            add_at_nodes(faces, shape, -load * near.normal, f, q, force_out)

@@ -6,7 +6,11 @@ Pister 1985). Its energy, with v its volume and p its pressure::
 
     sum_q w_q mu/2 (J^(-2/3) I1 - 3 + barrier b^2)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
 
-with the barrier's b = max(0, |ln J| - 0.25), see ``material``.
+with b = max(0, |ln J| - 0.25), the barrier of the volume. The pressure of an element keeps its
+*mean* volume, but not the volume at each of its quadrature points. Where skin is pinched between a
+hard indenter and the core, the points of one element may go to J = 0.3 beside J = 2, an hourglass
+mode that Q1-P0 does not resist, and Newton's method finds no equilibrium. The barrier resists it;
+for J within 0.78..1.28 it is exactly zero (ADR 0013).
 
 The pressure is condensed: the tangent is as large as the displacements alone. But p is an unknown
 of its own, updated by the linear solve, so the number of Newton iterations does not grow with
@@ -24,7 +28,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from palpate_fem.mechanics.material import BARRIER_FROM
+VOLUME_BARRIER = 60.0
+"""Stiffness of the barrier in shear moduli; ADR 0013 says how little it changes forces."""
+
+BARRIER_FROM = 0.25
+"""|ln J| at which the barrier begins."""
 
 FROM = wp.constant(wp.float64(BARRIER_FROM))
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from palpate.rigid import interpolate_pose
+from palpate.rigid import interpolate_pose, path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.material import VOLUME_BARRIER
+from palpate_fem.mechanics.element_kernels import VOLUME_BARRIER
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
@@ -33,8 +33,18 @@ OVERSHOOT = 0.1
 SNAP = 0.1
 """Share of the force that may be lost where only pseudo-transient continuation converges.
 
-A larger loss means that the solution has left its branch: nodes that carried the pinch have slipped
-out of it, which a continuous skin would not do. The indentation ends before the snap."""
+A larger loss, while the indenter moves into the skin, means that the solution has left its branch:
+nodes that carried the pinch have slipped out of it, which a continuous skin would not do. The
+indentation ends before the snap. On the way out or along the skin the force may fall."""
+
+INWARD = 0.5
+"""An indenter moves into the skin where its motion is within 60 degrees of its force on the skin.
+
+Friction turns the force of one that slides along the skin by atan(mu), 11 degrees by default, so
+its motion is 79 degrees away from it."""
+
+SUCTION_PA = 1.0
+"""How far the fluid pressure may fall below ambient [Pa]: what a solver may leave of none."""
 
 EASY_ITERATIONS = 8
 """After an increment that took no more Newton iterations than this, the next is twice as long."""
@@ -65,10 +75,22 @@ class SolverSettings:
     solver: str = "auto"
 
 
-def path_lengths(path: Floats) -> Floats:
-    """Length of the tip's way up to each pose [m], (K,)."""
-    moves = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(moves)])
+@dataclass(frozen=True, slots=True)
+class ConvergedIncrement:
+    """One increment of an indentation, recorded for its gradients (``adjoint``).
+
+    Attributes:
+        step: Step that it belongs to, from 1; it leads from pose step - 1 to pose step of the path.
+            0 is the start, pressurised and untouched.
+        share: How much of the step is done at its end; 1 = all of it.
+        state: Its solution, with the anchors that it leaves to the next one.
+        indenter: At its pose.
+    """
+
+    step: int
+    share: float
+    state: SolutionState
+    indenter: PosedIndenter
 
 
 @dataclass(slots=True)
@@ -78,16 +100,33 @@ class _Progress:
     Attributes:
         state: Converged solution.
         indenter: At the pose of that solution.
-        force: On the indenter [N].
+        load: Nodal forces of the indenter on the skin [N], (V, 3).
         previous: Solution one increment before, for the predictor; None = no prediction.
         previous_length: Length of the increment between the two, in steps.
     """
 
     state: SolutionState
     indenter: PosedIndenter
-    force: float = 0.0
+    load: Floats
     previous: SolutionState | None = None
     previous_length: float = 0.0
+
+    def moves_in(self, indenter: PosedIndenter) -> bool:
+        """Whether the indenter goes into the skin from here to another pose.
+
+        Its motion, turns included, is taken where it touches: the mean over the nodes, weighted by
+        their forces. What counts is its component along the net force, relative to its length, so
+        that a twist or a roll, whose points go every way, is none.
+        """
+        weight = np.linalg.norm(self.load, axis=1)
+        touched = weight > 0.0
+        place, weight = self.state.position[touched], weight[touched] / weight.sum()
+        motion = self.indenter.to_local(place) @ indenter.rotation.T + indenter.tip - place
+        net = self.load.sum(axis=0)
+        along = float(net @ (weight @ motion))
+        return along > INWARD * float(
+            np.linalg.norm(net) * (weight @ np.linalg.norm(motion, axis=1))
+        )
 
 
 @dataclass(slots=True)
@@ -119,22 +158,28 @@ class LoadStepping:
         path: Floats,
         *,
         friction: float,
+        fluid_m3: float,
         on_step: Callable[[IndentationStep], None] | None = None,
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
+        history: list[ConvergedIncrement] | None = None,
     ) -> None:
         """Prepare an indentation; see `Fingertip.indent`.
 
         ``rest`` is the pressurised, untouched state, which stays as it is. The sealed fluid keeps
-        the volume ``cavity_m3`` inside the skin [m^3].
+        the volume ``cavity_m3`` inside the skin [m^3], ``fluid_m3`` of it beside the core.
         """
         self.newton, self.settings, self.rest = newton, settings, rest
-        self.cavity_m3, self.path = cavity_m3, np.asarray(path, np.float64)
+        self.cavity_m3, self.fluid_m3 = cavity_m3, fluid_m3
+        self.path = np.asarray(path, np.float64)
         self.on_step, self.should_stop = on_step, should_stop
-        self.at = _Progress(rest.copy(), PosedIndenter(indenter, self.path[0], friction))
+        untouched = np.zeros_like(rest.position)
+        self.at = _Progress(rest.copy(), PosedIndenter(indenter, self.path[0], friction), untouched)
         self.outcome: IndentationOutcome | None = None
         self.reason = ""
+        self.history = history
         newton.system.update_anchors(self.at.state, self.at.indenter)
         newton.forget()
+        self._record(0, 1.0)
 
     def run(self) -> IndentationResult:
         """Follow the whole path."""
@@ -164,6 +209,7 @@ class LoadStepping:
                     continue
                 if report.converged:
                     done = goal
+                    self._record(k, done)
                     travel = lengths[k - 1] + done * (lengths[k] - lengths[k - 1])
                     if report.iterations <= EASY_ITERATIONS:
                         size = min(1.0, 2.0 * size)
@@ -190,6 +236,11 @@ class LoadStepping:
             seconds=time.perf_counter() - started,
         )
 
+    def _record(self, step: int, share: float) -> None:
+        """Append the last solution to the history, if there is one."""
+        if self.history is not None:
+            self.history.append(ConvergedIncrement(step, share, self.at.state, self.at.indenter))
+
     def increment(self, pose: Floats, length: float) -> tuple[NewtonReport, ForceBalance]:
         """Solve for one pose; the solution moves on only if it converged.
 
@@ -197,7 +248,7 @@ class LoadStepping:
             pose: Pose of the indenter (7,).
             length: Length of the increment, in steps.
         """
-        start, last_force = self.at.state, self.at.force
+        start = self.at.state
         indenter = self.at.indenter.at(pose)
         trial = self._predicted(length)
         report, balance = self._solve(trial, indenter)
@@ -209,12 +260,20 @@ class LoadStepping:
             second.iterations += report.iterations
             second.factorisations += report.factorisations
             report = second
-            if report.converged and _force(balance) < (1.0 - SNAP) * last_force:
+            force, last = _force(balance), float(np.linalg.norm(self.at.load.sum(axis=0)))
+            if report.converged and force < (1.0 - SNAP) * last and self.at.moves_in(indenter):
                 self.outcome = IndentationOutcome.DIVERGED
-                self.reason = f"the skin snaps: {last_force:.1f} N fall to {_force(balance):.1f} N"
+                self.reason = f"the skin snaps: {last:.1f} N fall to {force:.1f} N"
                 report.converged = False
+        if report.converged and trial.fluid_pressure < -SUCTION_PA:
+            self.outcome = IndentationOutcome.DIVERGED
+            self.reason = (
+                f"the fluid sucks the skin inwards: {trial.fluid_pressure / 1e3:.2f} kPa with "
+                f"{self.fluid_m3 * 1e6:.3f} ml; fill in more"
+            )
+            report.converged = False
         if report.converged:
-            self.at = _Progress(trial, indenter, _force(balance), start, length)
+            self.at = _Progress(trial, indenter, -balance.indenter, start, length)
             self.newton.system.update_anchors(trial, indenter)
         else:
             self.at.previous = None
@@ -302,7 +361,7 @@ class LoadStepping:
                 factorisations=cost.factorisations,
                 residual=balance.residual,
                 volume_error=abs(balance.volume - self.cavity_m3) / self.cavity_m3,
-                penetration_m=max(0.0, -float(surface.gap.min()), -float(system.inner.gap.min())),
+                penetration_m=max(0.0, -surface.smallest_gap, -system.inner.smallest_gap),
                 seconds=time.perf_counter() - cost.started,
             ),
         )

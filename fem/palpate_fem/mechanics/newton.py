@@ -24,8 +24,11 @@ from palpate_fem.sparse.factor import SparseFactor
 DAMP_FROM = 6
 """Iterations after which an error that does not decrease is taken for a cycle."""
 
-SMALL_CORRECTION = 0.3
-"""Share of the solution below which one correction for the unsymmetric tangent is enough."""
+MORTAR_FROM = 1e-2
+"""Error from which on the mortar correction is evaluated again: near enough to the solution."""
+
+HOPELESS = 0.3
+"""Error at which Newton's method, after some iterations, gives up; continuation takes over."""
 
 FIRST_VISCOSITY = 1.0
 VISCOSITY_FALL, VISCOSITY_RISE = 0.3, 3.0
@@ -45,7 +48,13 @@ class NewtonSettings:
         gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
         traction_tolerance: Error of a point's friction over the largest traction.
         iterations: Most iterations of Newton's method.
+        patience: Iterations of Newton's method after which an error above `HOPELESS` ends it.
         pseudo_transient_iterations: Most iterations of pseudo-transient continuation.
+        mortar_updates: How often the mortar correction of contact, which is first evaluated at the
+            start, is evaluated again near the solution. Each time leaves a tenth of its error or
+            less.
+        linear_tolerance: Share of a linear solution below which one correction for the unsymmetric
+            tangent is enough; else GMRES goes on until a third of this share of it is left over.
         largest_move_m: Displacement of any node in one iteration; longer moves are shortened [m].
         keep_factor: The factorised matrix is used again while each iteration shrinks the error to
             this share of it or less, and the active set of contact does not change.
@@ -58,7 +67,10 @@ class NewtonSettings:
     gap_tolerance_m: float = 0.1e-6
     traction_tolerance: float = 0.01
     iterations: int = 20
+    patience: int = 10
     pseudo_transient_iterations: int = field(default=40, metadata={"stored_as": "creep_iterations"})
+    mortar_updates: int = 2
+    linear_tolerance: float = 0.3
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
     keep_elastic: float = 0.15
@@ -155,16 +167,27 @@ class NewtonSolver:
         """
         continuation = PseudoTransient() if pseudo_transient else None
         settings, system, report = self.settings, self.system, NewtonReport()
-        balance = system.balance(state, indenter)
-        fits, elastic = False, not (self._has_elastic and settings.keep_elastic)
         limit = settings.pseudo_transient_iterations if continuation else settings.iterations
+        fits, elastic = False, not (self._has_elastic and settings.keep_elastic)
+        updates, done = 0, 0  # of the mortar correction, and the iterations before the last one
+        system.correct_contact(state, indenter)
+        balance = system.balance(state, indenter)
         error = self._error(balance, volume)
         report.residuals.append(error)
         while True:
+            moved = report.iterations > done
+            if moved and updates < settings.mortar_updates and error < MORTAR_FROM:
+                system.correct_contact(state, indenter)
+                balance = system.balance(state, indenter)
+                error = self._error(balance, volume)
+                updates, done = updates + 1, report.iterations
+                # The state hardly moves any more, so the factor fits as it did.
+                fits = fits and not system.sets_changed
             if self._converged(balance, volume):
                 report.converged = True
                 return report, balance
-            if report.iterations >= limit:
+            hopeless = report.iterations == settings.patience and error > HOPELESS
+            if report.iterations >= limit or (hopeless and not continuation):
                 report.reason = f"no equilibrium after {report.iterations} iterations"
                 return report, balance
             if should_stop is not None and should_stop():
@@ -176,7 +199,7 @@ class NewtonSolver:
                 elif not fits:
                     self._factorise(elastic=elastic)
                     report.factorisations += 1
-                damping = 1.0 if continuation else self._damping(report)
+                damping = 1.0 if continuation else self._damping(report.residuals[done:])
                 balance = self._step(state, indenter, balance, volume, damping)
             except SimulationError as failure:
                 report.reason = failure.problem
@@ -210,24 +233,34 @@ class NewtonSolver:
         By Sylvester's law of inertia the signs of the pivots are those of the eigenvalues, so the
         factor tells the number of unstable directions at no cost.
         """
-        self._factorise(elastic=True, viscosity=continuation.viscosity)
-        count = 1
-        while self.factor.negative and continuation.can_rise:
+        self._border = None
+        elastic, count = True, 0
+        while True:
+            values = self.system.tangent_values(elastic=elastic, viscosity=continuation.viscosity)
+            elastic, count = False, count + 1
+            if continuation.viscosity and continuation.can_rise:
+                stable = self.factor.factorise_definite(values)
+            else:  # single precision may doubt a tangent that is definite
+                self.factor.factorise(values)
+                stable = self.factor.negative == 0
+            if stable or not continuation.can_rise:
+                self._has_elastic = True
+                return count
             continuation.rise()
-            self._factorise(elastic=False, viscosity=continuation.viscosity)
-            count += 1
-        return count
 
-    def _damping(self, report: NewtonReport) -> float:
+    def _damping(self, past: list[float]) -> float:
         """Fraction of the next step: less than 1 where the error cycles.
 
         The sets of sticking and sliding points may alternate between two. Steps of half and three
         quarters, in turn, end between them.
+
+        Args:
+            past: Errors since the last mortar correction, the first before any iteration.
         """
-        past = report.residuals
-        if report.iterations < DAMP_FROM or past[-1] < 0.3 * min(past[-4:-1]):
+        done = len(past) - 1
+        if done < DAMP_FROM or past[-1] < 0.3 * min(past[-4:-1]):
             return 1.0
-        return 0.5 if report.iterations % 2 else 0.75
+        return 0.5 if done % 2 else 0.75
 
     def _error(self, balance: ForceBalance, volume: float | None) -> float:
         """Largest of the relative errors, weighted by their tolerances."""
@@ -316,8 +349,8 @@ class NewtonSolver:
         else:
             gradient = balance.volume_gradient.reshape(-1)[system.pattern.free].copy()
             change, answer = self.factor.solve(np.stack((right, gradient), axis=1)).T
-            # K^-1 b leaves out the unsymmetric share of friction. The volume is met exactly all the
-            # same; the error of the forces is small, as the pressure changes little in a step.
+            # K^-1 b leaves out the unsymmetric share. The volume is met exactly all the same; the
+            # error of the forces is small, as the pressure changes little in a step.
             self._border = (gradient, answer)
         if system.is_unsymmetric:
             change = self._with_unsymmetric_share(change, -system.coupled_force())
@@ -329,7 +362,9 @@ class NewtonSolver:
         return change + pressure_change * answer, pressure_change
 
     def _with_unsymmetric_share(self, answer: Floats, coupled: Floats) -> Floats:
-        """Correct a solution of the symmetric tangent for the unsymmetric share of friction.
+        """Correct a solution of the symmetric tangent for the unsymmetric share.
+
+        That is sliding friction, which follows the pressure, and mortar's loads at neighbours.
 
         Args:
             answer: Solution with the symmetric tangent S.
@@ -340,11 +375,12 @@ class NewtonSolver:
         """
         left_over = coupled - self.system.unsymmetric_product(answer)
         more = np.asarray(self.factor.solve(left_over))
-        if np.linalg.norm(more) > SMALL_CORRECTION * np.linalg.norm(answer):
+        tolerance = self.settings.linear_tolerance
+        if np.linalg.norm(more) > tolerance * np.linalg.norm(answer):
             operator = LinearOperator(
                 (len(answer), len(answer)),
                 matvec=lambda v: v + self.factor.solve(self.system.unsymmetric_product(v)),
                 dtype=np.float64,
             )
-            more, _ = gmres(operator, more, rtol=1e-1, atol=0.0, restart=8, maxiter=1)
+            more, _ = gmres(operator, more, rtol=tolerance / 3, atol=0.0, restart=8, maxiter=5)
         return np.asarray(answer + more)

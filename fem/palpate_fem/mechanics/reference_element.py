@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from palpate_fem.arrays import Floats
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.solid import SolidMesh
 
 _GAUSS = 1.0 / np.sqrt(3.0)
@@ -59,6 +59,19 @@ def face_element(nodes: int) -> ReferenceElement:
     if nodes == 3:
         return ReferenceElement(*triangle_at(_TRIANGLE_POINTS), np.full(3, 1 / 6))
     raise ValueError(f"no face with {nodes} nodes")
+
+
+def point_areas(position: Floats, faces: Ints) -> Floats:
+    """Area that each quadrature point of a face stands for [m^2], (F, Q).
+
+    Args:
+        position: Of the nodes [m], (V, 3).
+        faces: Node ids, (F, k).
+    """
+    element = face_element(faces.shape[1])
+    edges = np.einsum("qad,fai->fqdi", element.gradient, position[faces])
+    size = np.linalg.norm(np.cross(edges[:, :, 0], edges[:, :, 1]), axis=2)
+    return np.asarray(element.weight * size)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The skin's elements and the fluid cavity inside: arrays and launches of the kernels."""
+"""The skin's elements and the fluid cavity inside: energy, arrays and launches of the kernels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,26 @@ from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE, launch, mat33s, scalars, vec3s
 from palpate_fem.mechanics import element_kernels
 from palpate_fem.mechanics.contact import ContactSurface
+from palpate_fem.mechanics.element_kernels import BARRIER_FROM, VOLUME_BARRIER
 from palpate_fem.mechanics.reference_element import rest_gradients, volume_form
 from palpate_fem.mesh.solid import SolidMesh
+
+
+def energy_density(f: Floats, mu: float, barrier: float = VOLUME_BARRIER) -> Floats:
+    """W = mu/2 (J^(-2/3) tr(F^T F) - 3 + barrier max(0, |ln J| - 0.25)^2) [J/m^3], shape (...).
+
+    Per unit of undeformed volume. For J = 1 this is the paper's equation "neo_hookean" up to a
+    constant; the volumetric part belongs to the element and its pressure.
+
+    Args:
+        f: Deformation gradients, shape (..., 3, 3).
+        mu: Shear modulus [Pa].
+        barrier: Stiffness against a change of volume at a single point, in shear moduli; 0 = none.
+    """
+    j = np.linalg.det(f)
+    isochoric = j ** (-2 / 3) * np.sum(f * f, axis=(-2, -1)) - 3
+    beyond = np.maximum(0.0, np.abs(np.log(j)) - BARRIER_FROM)
+    return np.asarray(mu / 2 * (isochoric + barrier * beyond**2))
 
 
 class SkinElements:

@@ -1,6 +1,6 @@
 """A fingertip in finite elements: pressurised once, then indented again and again.
 
-Reading order of this folder: `material`, `reference_element`, `skin` (with ``element_kernels``),
+Reading order of this folder: `reference_element`, `skin` (with ``element_kernels``),
 `contact` (with ``contact_kernels``), `state`, `system`, `newton`, `load_stepping`, and this module.
 """
 
@@ -17,12 +17,16 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.path import check_path
 from palpate_fem.indenter.shape import Indenter
-from palpate_fem.mechanics.load_stepping import LoadStepping, SolverSettings
+from palpate_fem.mechanics.load_stepping import (
+    ConvergedIncrement,
+    LoadStepping,
+    SolverSettings,
+)
 from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.check import check_mesh
-from palpate_fem.mesh.solid import FingertipGeometry
+from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.sparse.factor import make_factor
 
@@ -42,14 +46,7 @@ class Fingertip:
     ) -> None:
         """An unpressurised fingertip; use `pressurised`."""
         self.geometry, self.parameters, self.settings = geometry, parameters, settings
-        self.system = EquilibriumSystem(
-            geometry.mesh,
-            geometry.core.grid if geometry.core else None,
-            shear_modulus_pa=parameters.shear_modulus_pa,
-            bulk_ratio=parameters.bulk_ratio,
-            contact=settings.contact.scaled(parameters.shear_modulus_pa / REFERENCE_MODULUS_PA),
-            volume_barrier=settings.volume_barrier,
-        )
+        self.system = self.equations(geometry.mesh)
         pattern = self.system.pattern
         self.newton = NewtonSolver(
             self.system,
@@ -78,13 +75,26 @@ class Fingertip:
             progress: Called with the fraction done.
 
         Raises:
-            SimulationError: No equilibrium, or the fluid volume does not fit the cavity.
+            SimulationError: No equilibrium, or the fluid volume does not fit the cavity: less than
+                the unpressurised skin holds would suck the skin inwards.
         """
         parameters = parameters or FingertipParameters()
         check_mesh(geometry.mesh)
         tip = cls(geometry, parameters, settings or SolverSettings())
         tip._pressurise(progress or (lambda _: None))
         return tip
+
+    def equations(self, mesh: SolidMesh) -> EquilibriumSystem:
+        """The equations of this finger with other nodes of its mesh."""
+        parameters, settings, core = self.parameters, self.settings, self.geometry.core
+        return EquilibriumSystem(
+            mesh,
+            core.grid if core else None,
+            shear_modulus_pa=parameters.shear_modulus_pa,
+            bulk_ratio=parameters.bulk_ratio,
+            contact=settings.contact.scaled(parameters.shear_modulus_pa / REFERENCE_MODULUS_PA),
+            volume_barrier=settings.volume_barrier,
+        )
 
     @property
     def nodes(self) -> Floats:
@@ -111,6 +121,7 @@ class Fingertip:
         parameters, state = self.parameters, self.state
         self.cavity_m3 = self.system.balance(state, None).volume
         if parameters.fluid_volume_m3 is not None:
+            self._check_suction(parameters.fluid_volume_m3)
             self._fill_to(parameters.fluid_volume_m3 + self.core_volume, STEPS_TO_PRESSURISE)
             progress(1.0)
             return
@@ -150,6 +161,27 @@ class Fingertip:
             remedy="check skin_thickness_m and total_thickness_m",
         )
 
+    def _check_suction(self, fluid_m3: float) -> None:
+        """Refuse a fill that pulls at the skin instead of pushing it out.
+
+        The unpressurised skin is free of stress, so what it holds beside the core is the fill of no
+        pressure. A BioTac is filled until it bulges, and a model of skin that is sucked onto the
+        core, folds included, was never checked.
+        """
+        least = self.cavity_m3 - self.core_volume
+        if fluid_m3 >= least:
+            return
+        try:
+            self._fill_to(fluid_m3 + self.core_volume, STEPS_TO_PRESSURISE)
+            found = f"{self.state.fluid_pressure / 1e3:.2f} kPa"
+        except SimulationError:
+            found = "below ambient, without an equilibrium"
+        raise SimulationError(
+            f"{fluid_m3 * 1e6:.3f} ml of fluid suck the skin inwards, at {found}",
+            remedy=f"fill in at least {math.ceil(least * 1e9) * 1e-3:.3f} ml, which the "
+            "unpressurised skin holds, or leave the volume out",
+        )
+
     def _fill_to(self, cavity: float, steps: int) -> None:
         """Bring the cavity to a volume [m^3] in steps; those that do not converge are halved."""
         start, done, size = self.cavity_m3, 0.0, 1.0 / steps
@@ -176,6 +208,7 @@ class Fingertip:
         *,
         on_step: Callable[[IndentationStep], None] | None = None,
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
+        history: list[ConvergedIncrement] | None = None,
     ) -> LoadStepping:
         """An indentation that is ready to run; its path is not checked, as `indent` does."""
         return LoadStepping(
@@ -186,8 +219,10 @@ class Fingertip:
             indenter,
             path,
             friction=self.parameters.friction_coefficient,
+            fluid_m3=self.fluid_volume_m3,
             on_step=on_step,
             should_stop=should_stop,
+            history=history,
         )
 
     def indent(
@@ -197,6 +232,7 @@ class Fingertip:
         *,
         on_step: Callable[[IndentationStep], None] | None = None,
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
+        history: list[ConvergedIncrement] | None = None,
     ) -> IndentationResult:
         """Move an indenter along a path and compute the skin's response.
 
@@ -206,6 +242,8 @@ class Fingertip:
                 does not touch the skin.
             on_step: Called with each converged step.
             should_stop: Called at least once in each iteration; an outcome ends the indentation.
+            history: An empty list that takes up the start and all increments, for the gradients of
+                the indentation (``adjoint``).
 
         Returns:
             The converged steps; if not all of them, why, and how far the indenter came.
@@ -217,5 +255,6 @@ class Fingertip:
         path = check_path(path)
         surface = OuterSurface(self.nodes, self.geometry.mesh.outer_faces)
         check_clear(indenter, path[0], surface)
-        stepping = self.load_stepping(indenter, path, on_step=on_step, should_stop=should_stop)
-        return stepping.run()
+        return self.load_stepping(
+            indenter, path, on_step=on_step, should_stop=should_stop, history=history
+        ).run()

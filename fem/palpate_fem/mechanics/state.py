@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.solid import SolidMesh
@@ -14,6 +15,35 @@ FORCE_FLOOR_N = 1e-6
 
 TRACTION_FLOOR_PA = 100.0
 """Least scale of the tractions [Pa]; a light touch makes a thousand times more."""
+
+
+@dataclass(frozen=True, slots=True)
+class MortarCorrection:
+    """What mortar contact adds to contact at the nodes of one surface; see ``mortar``.
+
+    Attributes:
+        gap: Added to the gap of each contact point [m], (faces, points).
+        spread: From the pressures of the contact points, (faces * points,), to the forces of the
+            other body on the nodes, (3 V,), less those of contact at the nodes [m^2]. For linear
+            solutions; the forces themselves are evaluated at the present positions.
+        held: Direction of the pressure at quadrature points that hang far above the other body,
+            (faces, points, 3); zero where it is that of the distance at the present position.
+    """
+
+    gap: Floats
+    spread: sparse.csr_array
+    held: Floats
+
+    @classmethod
+    def none(cls, faces: Ints, nodes: int) -> MortarCorrection:
+        """Contact at the nodes."""
+        size = (len(faces), _points(faces))
+        spread = sparse.csr_array((3 * nodes, faces.size))
+        return cls(np.zeros(size), spread, np.zeros((*size, 3)))
+
+    def load(self, pressure: Floats) -> Floats:
+        """Force of pressures (faces, points) [Pa] on the nodes [N], (V, 3)."""
+        return np.asarray(self.spread @ pressure.ravel()).reshape(-1, 3)
 
 
 @dataclass(slots=True)
@@ -28,6 +58,8 @@ class SolutionState:
         indenter_pressure: Contact pressure on the indenter [Pa], (outer faces, points).
         traction: Friction of each point on the indenter [Pa], (outer faces, points, 3).
         anchor: Where each point sticks to the indenter, in its frame [m], (outer faces, points, 3).
+        on_core: Mortar correction of the inner surface; replaced as a whole, so copies share it.
+        on_indenter: Mortar correction of the outer surface.
     """
 
     position: Floats
@@ -37,6 +69,8 @@ class SolutionState:
     indenter_pressure: Floats
     traction: Floats
     anchor: Floats
+    on_core: MortarCorrection
+    on_indenter: MortarCorrection
 
     @classmethod
     def at_rest(cls, mesh: SolidMesh) -> SolutionState:
@@ -51,6 +85,8 @@ class SolutionState:
             indenter_pressure=np.zeros(outer),
             traction=np.zeros((*outer, 3)),
             anchor=np.zeros((*outer, 3)),
+            on_core=MortarCorrection.none(mesh.inner_faces, len(mesh.nodes)),
+            on_indenter=MortarCorrection.none(mesh.outer_faces, len(mesh.nodes)),
         )
 
     def copy(self) -> SolutionState:
@@ -63,6 +99,8 @@ class SolutionState:
             self.indenter_pressure.copy(),
             self.traction.copy(),
             self.anchor.copy(),
+            self.on_core,
+            self.on_indenter,
         )
 
 

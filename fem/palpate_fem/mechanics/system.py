@@ -25,7 +25,7 @@ from palpate_fem.mechanics.contact import (
     IndenterContact,
     PosedIndenter,
 )
-from palpate_fem.mechanics.material import VOLUME_BARRIER
+from palpate_fem.mechanics.element_kernels import VOLUME_BARRIER
 from palpate_fem.mechanics.skin import FluidCavity, SkinElements
 from palpate_fem.mechanics.state import TRACTION_FLOOR_PA, ForceBalance, SolutionState
 from palpate_fem.mesh.core import DistanceGrid
@@ -203,6 +203,11 @@ class EquilibriumSystem:
         self._both(first_half, second_half)
         return self._sum_up(state)
 
+    def correct_contact(self, state: SolutionState, indenter: PosedIndenter | None) -> None:
+        """Evaluate the mortar corrections of a state and keep them in it."""
+        state.on_indenter = self.on_indenter.correction(state, indenter)
+        state.on_core = self.on_core.correction(state)
+
     def tangent_values(self, *, elastic: bool = True, viscosity: float = 0.0) -> Floats:
         """Upper triangle of the symmetric tangent at the last `balance`.
 
@@ -245,15 +250,16 @@ class EquilibriumSystem:
 
     @property
     def is_unsymmetric(self) -> bool:
-        """Whether the last tangent has an unsymmetric share, because a point slides."""
-        return self.outer.is_unsymmetric
+        """Whether the last tangent has an unsymmetric share."""
+        return self.outer.is_unsymmetric or self.inner.is_unsymmetric
 
     def unsymmetric_product(self, change: Floats) -> Floats:
         """(Tangent - its symmetric approximation) times a change of the free unknowns, (n,)."""
         full = np.zeros_like(self.mesh.nodes)
         full.reshape(-1)[self.pattern.free] = change
         product = np.zeros_like(full)
-        self.outer.add_unsymmetric_product(vec3s(full), vec3s(product))
+        for surface in (self.outer, self.inner):
+            surface.add_unsymmetric_product(vec3s(full), vec3s(product))
         return product.reshape(-1)[self.pattern.free]
 
     @property
@@ -282,13 +288,15 @@ class EquilibriumSystem:
         return force.reshape(-1)[self.pattern.free]
 
     def coupled_force(self) -> Floats:
-        """Load by the friction that follows a change of the contact pressures [N], (n,).
+        """Load by what follows a change of the contact pressures [N], (n,).
 
-        It is not part of `misfit_force`: the demanded pressure of a new point is its penetration
-        times an enormous stiffness. Friction has to follow the pressure after the linear solve.
+        That is friction, and mortar's loads at the neighbours. It is not part of `misfit_force`:
+        the demanded pressure of a new point is its penetration times an enormous stiffness. These
+        loads have to follow the pressure after the linear solve.
         """
         force = np.zeros_like(self.mesh.nodes)
-        self.outer.subtract_load(self.outer.coupled, vec3s(force))
+        for surface in (self.outer, self.inner):
+            surface.subtract_coupled(vec3s(force))
         return force.reshape(-1)[self.pattern.free]
 
     def update_anchors(self, state: SolutionState, indenter: PosedIndenter) -> None:

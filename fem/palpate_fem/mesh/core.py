@@ -1,7 +1,8 @@
 """The rigid core as a tabulated signed distance, and the tabulation of triangle surfaces.
 
 The distance is a tricubic B-spline, because Newton's method needs its second derivative to be
-continuous.
+continuous. SciPy is imported where a table is made: every process that only holds a mesh, such as
+a worker before its first job, would wait a third longer for its imports.
 """
 
 from __future__ import annotations
@@ -10,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.mesh.surface import face_vectors, node_normals
@@ -59,6 +58,8 @@ class DistanceGrid:
     @classmethod
     def sampled(cls, origin: Floats, spacing: float, values: Floats) -> DistanceGrid:
         """Interpolate values [m] given at the grid's nodes."""
+        from scipy import ndimage
+
         coefficients = ndimage.spline_filter(values, order=3, output=np.float64, mode="mirror")
         return cls(np.asarray(origin, np.float64), spacing, np.ascontiguousarray(coefficients))
 
@@ -194,6 +195,8 @@ def signed_distance(points: Floats, vertices: Floats, faces: Ints) -> tuple[Floa
     Returns:
         Distance [m], positive outside, shape (N,); nearest points of the surface [m], shape (N, 3).
     """
+    from scipy.spatial import cKDTree
+
     sample, owner = _samples(vertices, faces)
     tree = cKDTree(sample)
     normals = node_normals(vertices, faces)
@@ -268,6 +271,8 @@ def spread(at: Floats, near: NDArray[np.bool_], foot: Floats, sign: Floats) -> F
     Returns:
         Signed distance [m], shape (nx, ny, nz).
     """
+    from scipy import ndimage
+
     flat, inside_band = at.reshape(-1, 3), near.ravel()
     full = np.empty_like(flat)
     full[inside_band] = foot
@@ -289,6 +294,9 @@ def tabulate(vertices: Floats, faces: Ints, at: Floats, *, band_m: float = 0.6e-
     Returns:
         Signed distance [m], positive outside, shape (nx, ny, nz).
     """
+    from scipy import ndimage
+    from scipy.spatial import cKDTree
+
     sample, _ = _samples(vertices, faces)
     flat = at.reshape(-1, 3)
     rough, _ = cKDTree(sample).query(flat, distance_upper_bound=band_m)

@@ -125,6 +125,34 @@ def extrude(
     )
 
 
+def thickness_direction(mesh: SolidMesh) -> Floats:
+    """Derivative of the nodes of an extruded mesh by its thickness, (V, 3).
+
+    The inner surface stays; the nodes of a column move along it, in proportion to their layer.
+
+    Raises:
+        ConfigError: The mesh was not made by `extrude`.
+    """
+    layers = len(mesh.elements) // max(len(mesh.outer_faces), 1)
+    stride = layers + 1
+    fits = mesh.outer_faces.shape == mesh.inner_faces.shape and len(mesh.nodes) % stride == 0
+    if not (
+        fits
+        and layers > 0
+        and np.array_equal(mesh.outer_faces, mesh.inner_faces + np.int32(layers))
+        and not np.any(mesh.inner_faces % stride)
+    ):
+        raise ConfigError(
+            f"the mesh {mesh.name!r} has no columns between two surfaces, so no thickness",
+            remedy="use a mesh made by `biotac`, `read_nvlabs` or `extrude`",
+        )
+    columns = mesh.nodes.reshape(-1, stride, 3)
+    way = columns[:, -1] - columns[:, 0]
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    share = np.linspace(0.0, 1.0, stride)[None, :, None]
+    return np.asarray((share * unit[:, None]).reshape(-1, 3))
+
+
 # Arguments that the mesh builders accept. Thinner skins are not realistic, thicker ones fold at the
 # proximal edge; finer meshes are too large for a direct solver, coarser ones miss the shape.
 BUILDER_LIMITS = {"thickness_m": (0.5e-3, 3.0e-3), "edge_m": (0.25e-3, 1.5e-3), "layers": (1, 6)}

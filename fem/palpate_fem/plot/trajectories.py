@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
+from palpate.rigid import path_lengths
 from palpate_fem.plot.style import (
     AXES,
     AXIS_COLOURS,
@@ -29,16 +30,13 @@ Floats = NDArray[np.float64]
 
 
 def travel_m(path: Floats, pose: Floats) -> Floats:
-    """Travel of the indenter from its first pose to each step [m], shape (K,).
+    """Travel of the indenter from its first pose to each step [m], turns included, shape (K,).
 
     Args:
         path: Requested poses; only the first is used, shape (1 or more, 7).
         pose: Poses of the steps, shape (K, 7).
     """
-    places = np.concatenate([path[:1, :3], pose[:, :3]])
-    pieces = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    found: Floats = np.cumsum(pieces)
-    return found
+    return path_lengths(np.concatenate([path[:1], pose]))[1:]
 
 
 def travel_mm(trajectory: IndentationResult) -> Floats:

@@ -210,8 +210,8 @@ def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
     meshes = len({row.edge_m for row in rows}) > 1
     figure = new_figure(12.0, 3.6)
     force, moved, cost = figure.subplots(1, 3)
-    for name, colour in zip(dict.fromkeys(row.indenter for row in rows), COLOURS, strict=False):
-        mine = [row for row in rows if row.indenter == name]
+    for name, colour in zip(dict.fromkeys(row.press for row in rows), COLOURS, strict=False):
+        mine = [row for row in rows if row.press == name]
         across = [row.unknowns if meshes else row.steps for row in mine]
         style = {"color": colour, "marker": "o", "ms": 4, "lw": 1.5, "label": name}
         force.plot(across, [100 * abs(row.force_change) for row in mine], **style)
@@ -222,7 +222,7 @@ def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
     label(force, "", "change of the force [%]", "force, against the coarser one")
     label(moved, "", "mean change [mm]", "displacement of the outer skin")
     label(cost, "", "seconds a press", "cost")
-    first = [row for row in rows if row.indenter == rows[0].indenter]
+    first = [row for row in rows if row.press == rows[0].press]
     for axes in (force, moved, cost):
         grid(axes)
         axes.set_xscale("log")

@@ -56,6 +56,8 @@ class Worker:
             tips.get(setup.warm, lambda _: None)
         except Exception as error:
             self._report(JobFailed.of(error))
+            if isinstance(error, PalpateError):
+                sys.exit(1)  # the other end says it; a traceback is for defects
             raise
         self._report(JobStarted(tips.describe(setup.warm)))
         while True:

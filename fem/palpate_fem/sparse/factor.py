@@ -29,6 +29,12 @@ class SparseFactor(Protocol):
     def factorise(self, values: Floats) -> None:
         """Factorise the matrix with these values of its upper triangle."""
 
+    def factorise_definite(self, values: Floats) -> bool:
+        """Factorise it only if all its eigenvalues are clearly positive; returns whether they are.
+
+        Cheaper than `factorise` and `negative` where they are not: it ends at the first sign of it.
+        """
+
     def solve(self, right: Floats) -> Floats:
         """Solve for right-hand sides (n,) or (n, m)."""
 
@@ -101,6 +107,20 @@ class Multifrontal:
             ) from error
         self._current = self._double
 
+    def factorise_definite(self, values: Floats) -> bool:
+        """See `SparseFactor`."""
+        if self._single is None:
+            self.factorise(values)
+            return self.negative == 0
+        check_finite(values)
+        self._current = None
+        try:
+            self._single.factorise(values)
+        except UnsafePivotError:
+            return False
+        self._current = self._single
+        return True
+
     def solve(self, right: Floats) -> Floats:
         """See `SparseFactor`."""
         if self._current is None:
@@ -161,6 +181,11 @@ class SuperLu:
             raise SimulationError(
                 f"SuperLU cannot factorise the tangent: {error}", remedy="use smaller increments"
             ) from error
+
+    def factorise_definite(self, values: Floats) -> bool:
+        """See `SparseFactor`."""
+        self.factorise(values)
+        return self.negative == 0
 
     def solve(self, right: Floats) -> Floats:
         """See `SparseFactor`."""

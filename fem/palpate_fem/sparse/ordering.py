@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
 
-SMALL = 24
+SMALL = 12
 """Up to so many nodes a front takes in any child: small fronts cost more than stored zeros."""
 
 LARGE = 4 * SMALL
 """Above so many nodes a front takes in only children that add no zeros."""
 
-ZEROS = 0.15
+ZEROS = 0.1
 """Between the two, share of zeros that a child may add."""
 
 MOST_ON_TOP = 40

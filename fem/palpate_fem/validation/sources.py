@@ -9,6 +9,7 @@ import numpy as np
 
 from palpate.errors import DatasetError
 from palpate.files.simulation_store import SIMULATIONS
+from palpate.rigid import path_lengths
 from palpate_fem.calibration.alignment import Floats
 from palpate_fem.calibration.measured import (
     MEASURED,
@@ -18,7 +19,6 @@ from palpate_fem.calibration.measured import (
     read_indentations,
 )
 from palpate_fem.calibration.runs import SimulatedRun, from_rest
-from palpate_fem.mechanics.load_stepping import path_lengths
 from palpate_fem.store.content import TrajectorySummary
 from palpate_fem.store.read import SimulationStore
 

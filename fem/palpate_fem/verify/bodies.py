@@ -18,8 +18,8 @@ from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.load_stepping import SolverSettings
-from palpate_fem.mechanics.material import energy_density
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.skin import energy_density
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
@@ -79,7 +79,10 @@ TIGHT = NewtonSettings(
     volume_tolerance=1e-11,
     gap_tolerance_m=1e-14,
     traction_tolerance=1e-7,
-    iterations=40,
+    iterations=100,
+    patience=100,
+    mortar_updates=60,
+    linear_tolerance=1e-8,
     largest_move_m=1.0,
     keep_factor=0.0,
     keep_elastic=0.0,
@@ -185,6 +188,7 @@ INNER_M, OUTER_M, CORE_M, BALL_M = 3.0e-3, 4.5e-3, 2.95e-3, 2.0e-3
 FILLED = 1.06  # volume of the cavity over the unpressurised one
 ASIDE_M = (0.31e-3, 0.17e-3)  # offset of the indenter, which breaks the symmetry
 EDGE_M = 1.4e-3  # of the coarse BioTac
+TOUCH_ITERATIONS = 8  # of the height where an indenter touches; each leaves a tenth of the error
 
 
 @dataclass
@@ -221,7 +225,12 @@ def round_core(radius: float, spacing: float) -> DistanceGrid:
 
 
 def round_finger(
-    *, friction: float, scale: float = 1.0, mu: float = MU, stiffness: float = 1.0
+    *,
+    friction: float,
+    scale: float = 1.0,
+    mu: float = MU,
+    stiffness: float = 1.0,
+    mortar: bool = True,
 ) -> TouchedFingertip:
     """A hollow ball of skin around a ball, its upper part held, filled with fluid.
 
@@ -233,7 +242,7 @@ def round_finger(
     grid = round_core(CORE_M, 0.25e-3)
     core = DistanceGrid(grid.origin * scale, grid.spacing * scale, grid.coefficients * scale)
     usual = ContactSettings()
-    contact = replace(usual.scaled(stiffness), margin_m=usual.margin_m * scale)
+    contact = replace(usual.scaled(stiffness), margin_m=usual.margin_m * scale, mortar=mortar)
     body = VerificationBody(mesh, core=core, mu=mu, contact=contact)
     rest = body.system.balance(body.state, None).volume
     for share in (0.5, 1.0):
@@ -260,13 +269,19 @@ def biotac_finger(*, friction: float, aside: tuple[float, float]) -> TouchedFing
 def _touched(
     body: VerificationBody, volume: float, indenter: Indenter, aside: Floats, friction: float
 ) -> TouchedFingertip:
-    """Raise the indenter until it touches the first of the contact points above it."""
+    """Raise the indenter until the skin touches it."""
     press = PosedIndenter(indenter, pose((0.0, 0.0, 0.0)), friction)
     radius = indenter.primitives[0].rounding
     x, y, z = np.moveaxis(body.contact_points(), -1, 0)
     off = (x - aside[0]) ** 2 + (y - aside[1]) ** 2
     below = (off < radius**2) & (z < 0)
+    # Where it touches the first contact point; by the gap over whole faces it is there too high.
     height = (z[below] + radius - np.sqrt(radius**2 - off[below])).min()
+    for _ in range(TOUCH_ITERATIONS):
+        placed = press.at(pose((*aside, height)))
+        body.system.correct_contact(body.state, placed)
+        body.system.balance(body.state, placed)
+        height += body.system.outer.smallest_gap
     finger = TouchedFingertip(body, volume, press, np.array([*aside, height]))
     body.update_anchors(finger.placed(np.zeros(3)))
     return finger

@@ -216,14 +216,28 @@ def scaling(by: tuple[float, float, float]) -> Measurement:
     return Measurement(np.max([shape, off]), note=f"shape {shape:.1e}, forces {off:.1e}")
 
 
-@check("newton/order in contact", 0.1, at_least=True)
-def newton_in_contact() -> Measurement:
-    """Order of Newton's method without friction, once the set of touching points is found."""
-    finger = round_finger(friction=0.0)
+def _pressed_in_steps(*, mortar: bool) -> list[float]:
+    """Errors of Newton's method without friction in the last of five increments of 0.1 mm."""
+    finger = round_finger(friction=0.0, mortar=mortar)
     for k in range(1, 6):
         finger.at(0.1e-3 * k * UP)
-    residuals = finger.body.report.residuals
+    return finger.body.report.residuals
+
+
+@check("newton/order in contact at nodes", 0.1, at_least=True)
+def newton_in_contact() -> Measurement:
+    """Order of Newton's method, once the set of touching points is found."""
+    residuals = _pressed_in_steps(mortar=False)
     return Measurement(order_of(residuals), 2.0, " ".join(f"{r:.0e}" for r in residuals))
+
+
+@check("newton/left by an iteration in mortar contact", 0.5)
+def newton_in_mortar_contact() -> Measurement:
+    """Largest error over that before, once below 1 %: the correction has no part in the tangent."""
+    residuals = _pressed_in_steps(mortar=True)
+    last = [(a, b) for a, b in itertools.pairwise(residuals) if a < 1e-2 and b > 1e-13]
+    note = " ".join(f"{r:.0e}" for r in residuals)
+    return Measurement(max(b / a for a, b in last), 0.0, note)
 
 
 COARSE, FINE, FINEST = 4, 16, 32  # increments for each leg of a cycle

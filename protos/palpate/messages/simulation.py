@@ -135,7 +135,7 @@ class SimulationReply:
         more: Another part follows, or an error.
         first_step: Number of the first of ``steps``; step k ends at pose k + 1 of the path.
         outcome: In the last part: how it ended.
-        travel_m: In the last part: path length of the indenter up to the last converged
+        travel_m: In the last part: travel of the indenter, turns included, up to the last converged
             increment, which may lie between two poses [m].
     """
 
