@@ -27,7 +27,7 @@ import sys, time
 from palpate.bus import Session
 from palpate.config import LinkConfig
 endpoint, session_id = sys.argv[1], int(sys.argv[2])
-with Session.open(LinkConfig(connect=(endpoint,), wait_for_router_s=20)) as session:
+with Session.open(LinkConfig(connect=(endpoint,), wait_for_router_s=60)) as session:
     claims = session.claims(session_id=session_id, instance="child", lease_s=2.0)
     claims.want("finger")
     before = None

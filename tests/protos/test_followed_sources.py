@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Publisher, Session
 from palpate.bus.pubsub import MOST_SOURCES
 from palpate.bus.topics import ELECTRODES, sensor_key
 from palpate.codec import ELECTRODE_FRAME
@@ -164,6 +164,34 @@ class TestWaiting:
             with pytest.raises(LinkError, match="closed"):
                 subscriber.next(LIVE_S)
             assert subscriber.counters == {}
+
+    def test_a_session_closes_while_threads_close_and_publish_what_is_its(
+        self, link: LinkConfig, frame_of: FrameOf
+    ) -> None:
+        ended: list[int] = []
+        for count in range(1, 31):
+            with Session.open(link) as session:
+                subscriber = session.subscriber(ELECTRODES)
+                newest = session.subscriber(ELECTRODES, delivery=Delivery.NEWEST)
+                finger = session.publisher(ELECTRODES, sensor="finger")
+
+                def publish(finger: Publisher[ElectrodeFrame] = finger) -> None:
+                    try:
+                        while True:
+                            finger.put(frame_of(1))
+                    except LinkError:
+                        ended.append(threading.get_ident())
+
+                threads = [
+                    threading.Thread(target=target, daemon=True)
+                    for target in (publish, publish, subscriber.close, newest.close, finger.close)
+                ]
+                for thread in threads:
+                    thread.start()
+            for thread in threads:
+                thread.join(LIVE_S)
+                assert not thread.is_alive()
+            assert len(ended) == 2 * count
 
     def test_others_may_look_while_one_waits(
         self, pair: Any, frame_of: FrameOf, wait_until: WaitUntil

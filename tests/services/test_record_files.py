@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 
 from palpate.bus import TapSample
-from palpate.bus.topics import ELECTRODES, sensor_key
+from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ErrorCode
 from palpate.files import record as record_module
 from palpate.files.record import RecordWriter, check_readable, read_record, summarise
 from palpate.health import Health
-from palpate.messages import ElectrodeFrame, ServiceState
+from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
 from palpate_services.recorder import writer as writer_module
-from palpate_services.recorder.writer import RecordFiles, leftovers, recover_all
+from palpate_services.recorder.writer import FindTare, RecordFiles, leftovers, recover_all
 from palpate_services.viewer.live_view import LiveView, ViewPlan
 
 Frames = Callable[..., ElectrodeFrame]
@@ -50,10 +50,12 @@ def sample(make_frame: Frames) -> Callable[[int], TapSample]:
 @pytest.fixture
 def open_files(tmp_path: Path) -> Callable[..., Any]:
     @contextmanager
-    def opened(**config: Any) -> Iterator[tuple[RecordFiles, Health]]:
+    def opened(
+        find_tare: FindTare | None = None, **config: Any
+    ) -> Iterator[tuple[RecordFiles, Health]]:
         health = Health("recorder", "recorder")
         settings = {"out": tmp_path / "runs", "rrd": False, "min_free_bytes": 0, **config}
-        files = RecordFiles(RecorderConfig(**settings), "lab", health)
+        files = RecordFiles(RecorderConfig(**settings), "lab", health, find_tare)
         files.start()
         try:
             yield files, health
@@ -79,6 +81,39 @@ def test_record_holds_what_was_written(
     assert [item.payload for item in items] == [item.payload for item in samples]
     assert [item.sequence for item in items] == list(range(1, 50))
     assert health.counters["recorded_electrodes"] == 49
+
+
+def test_each_record_holds_the_tares_that_its_frames_name(
+    open_files: Any,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    asked: list[tuple[str, int]] = []
+
+    def find(sensor: str, tare_id: int) -> Tare | None:
+        asked.append((sensor, tare_id))
+        # It is not known at once, and that of id 6 never.
+        return make_tare(tare_id) if tare_id == 5 and len(asked) > 2 else None
+
+    with open_files(find, rotate_bytes=65536) as (files, health):
+        for sequence in range(1, 1500):
+            tare_id = (5, 6, NO_TARE)[sequence % 3]
+            frame = make_frame(sequence, tare_id=tare_id)
+            files.write(sample_of(ELECTRODE_FRAME.encode(frame)))
+            files.tick(idle=sequence % 100 == 0)
+    records = sorted((tmp_path / "runs").iterdir())
+    assert len(records) > 1
+    for record in records:
+        items = list(read_record(record))
+        tares = [TARE.codec.decode(i.payload) for i in items if i.address.topic == "tare"]
+        assert [tare.tare_id for tare in tares] == [5]
+        assert {i.address.sensor for i in items} == {"finger"}
+    assert ("finger", NO_TARE) not in asked
+    assert health.counters["recorded_electrodes"] == 1499
+    assert health.counters["recorded_tare"] == len(records)
 
 
 def test_broken_payload_is_kept_and_counted(open_files: Any, tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def station(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) ->
                 yield session
                 # The source is done; the recorder stops last, as the stack does it.
                 stops["features"].set()
-                nodes[0].join(timeout=10)
+                nodes[0].join(timeout=30)
                 stops["recorder"].set()
                 nodes[1].join(timeout=15)
         finally:
@@ -273,7 +273,7 @@ def test_kill_9_loses_a_moment_only(
             frames.put(make_frame(sequence))
             time.sleep(0.01)
         os.kill(process.pid, signal.SIGKILL)
-        process.wait(timeout=10)
+        process.wait(timeout=30)
         until(lambda: not session.alive())
     (record,) = recover_all(leftovers(tmp_path))
     kept = [i.sequence for i in read_record(record) if i.address.topic == "electrodes"]
@@ -297,6 +297,42 @@ def test_leftover_of_a_killed_recorder_is_recovered_by_the_next(
         until(lambda: status_of(session, "recorder").counters.get("recovered_records") == 1)
     items = list(read_record(tmp_path / "lab-killed.recovered.mcap"))
     assert [item.payload for item in items] == [payload]
+
+
+def test_a_recorder_that_stops_while_streams_go_on_loses_nothing_that_came(
+    link: LinkConfig, until: Until, make_frame: Frames, tmp_path: Path
+) -> None:
+    stop, done = threading.Event(), threading.Event()
+    config = RecorderConfig(out=tmp_path, topics=("electrodes",), rrd=False, drain_s=0.5)
+    with Session.open(link) as session:
+        statuses = session.subscriber(STATUS, service="recorder", delivery=Delivery.QUEUE)
+        node = threading.Thread(target=run_recorder, args=(config, link, "lab", stop))
+        node.start()
+        until(lambda: any(a.service == "recorder" and a.ready for a in session.alive()))
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        until(frames.matched)
+
+        def publish() -> None:
+            for sequence in range(1, 100_000):
+                if done.wait(0.001):
+                    return
+                frames.put(make_frame(sequence))
+
+        live = threading.Thread(target=publish)
+        live.start()
+        until(lambda: status_of(session, "recorder").counters.get("received", 0) >= 100)
+        stop.set()
+        node.join(timeout=30)
+        done.set()
+        live.join(timeout=30)
+        last = statuses.next(10).message
+        with contextlib.suppress(StreamTimeout):
+            while True:
+                last = statuses.next(0.5).message
+    assert "lost_at_stop" not in last.counters
+    (record,) = tmp_path.glob("*.mcap")
+    sequences = [item.sequence for item in read_record(record)]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
 
 
 def test_a_recorder_that_must_stop_counts_what_it_had_no_time_to_write(

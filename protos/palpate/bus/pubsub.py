@@ -17,7 +17,7 @@ from palpate import clock
 from palpate.bus.attachments import timings_of
 from palpate.bus.continuity import Continuity
 from palpate.bus.delivery import Delivery, FifoQueue
-from palpate.bus.ring import Alarm, Ring, is_wake
+from palpate.bus.ring import Alarm, Ring, is_wake, undeclare
 from palpate.bus.topics import (
     Priority,
     StreamAddress,
@@ -77,6 +77,7 @@ class Publisher(Generic[M], Closing):
             reliability=zenoh.Reliability.RELIABLE,
         )
         self._encode = topic.codec.encode
+        self._closed = False
 
     def encode(self, message: M) -> bytes:
         """Check and encode, for ``put_payload``.
@@ -104,8 +105,10 @@ class Publisher(Generic[M], Closing):
         """
         check_size(payload, self.topic.codec.schema, remedy="publish a smaller message")
         try:
+            if self._closed:
+                raise zenoh.ZError("the publisher is closed")
             self._publisher.put(payload, attachment=attachment)
-        except zenoh.ZError as error:
+        except (zenoh.ZError, RuntimeError) as error:  # RuntimeError: it is being undeclared
             raise LinkError(
                 f"cannot publish on {self.key}: {error}", remedy="open the session again"
             ) from error
@@ -116,8 +119,9 @@ class Publisher(Generic[M], Closing):
         return bool(getattr(status, "matching", status))
 
     def close(self) -> None:
-        """Undeclare."""
-        self._publisher.undeclare()
+        """Undeclare; another thread that publishes gets a ``LinkError``."""
+        self._closed = True
+        undeclare(self._publisher)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +215,7 @@ class _Queued:
 
     def close(self) -> None:
         self._waiting.close()
-        self._subscriber.undeclare()
+        undeclare(self._subscriber)
 
 
 class _Ringed:

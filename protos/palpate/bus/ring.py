@@ -8,6 +8,7 @@ this session.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -23,10 +24,39 @@ _WAKE = "palpate/wake"
 _LOOK_S = 0.05
 """After it woke somebody, the alarm looks for new deadlines within this time [s]."""
 
+_IN_USE_S = 1.0
+"""How long ``undeclare`` waits for other threads [s]."""
+
 
 def is_wake(sample: zenoh.Sample) -> bool:
     """Whether a sample only ends a wait; every subscriber of the session gets it."""
     return len(sample.payload) == 0 and str(sample.encoding) == _WAKE
+
+
+class _Declared(Protocol):
+    """What is declared on a session of Zenoh."""
+
+    def undeclare(self) -> None:
+        """Take it back."""
+
+
+def undeclare(declared: _Declared) -> None:
+    """Undeclare what other threads may be using, or undeclaring, at this moment.
+
+    A Zenoh object refuses to be undeclared while another thread is in one of its calls. One that
+    stays in it (a lossless sender whose receiver hangs) is left to the end of the session. Nothing
+    happens to one that is undeclared already.
+    """
+    give_up_s = time.monotonic() + _IN_USE_S
+    with contextlib.suppress(zenoh.ZError):  # undeclared before, or the session is closed
+        while True:
+            try:
+                declared.undeclare()
+                return
+            except RuntimeError:  # "Already borrowed"
+                if time.monotonic() >= give_up_s:
+                    return
+                time.sleep(0.001)
 
 
 class _Sleeper(Protocol):
@@ -159,4 +189,4 @@ class Ring(Closing):
     def close(self) -> None:
         """Undeclare; one that waits gets a ``LinkError``."""
         self._alarm.forget(self)
-        self._subscriber.undeclare()
+        undeclare(self._subscriber)

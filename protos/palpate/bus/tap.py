@@ -11,7 +11,7 @@ import zenoh
 
 from palpate import clock
 from palpate.bus.delivery import Delivery, DeliveryQueue, queue_for
-from palpate.bus.ring import is_wake
+from palpate.bus.ring import is_wake, undeclare
 from palpate.bus.topics import parse_key
 from palpate.errors import StreamTimeout, WireError
 from palpate.process import Closing
@@ -108,4 +108,4 @@ class Tap(Closing):
         """Undeclare; a blocked sender is released."""
         self._waiting.close()
         for subscriber in self._subscribers:
-            subscriber.undeclare()
+            undeclare(subscriber)

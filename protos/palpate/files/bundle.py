@@ -50,6 +50,7 @@ _DEPTH_MAX = 16
 _TENSORS_MAX = 32
 _RANK_MAX = 8
 _WIDTH_MAX = 100_000_000
+_SERIALS_MAX = 1000
 _DIGEST = re.compile(r"(?:[0-9a-f]{64})?")
 
 
@@ -78,6 +79,8 @@ class Manifest:
         range_file_sha256: Digest of ``range.npz``, hex; empty = no such file.
         basis: Names of the constants ``mean`` (3V) [m] and ``modes`` (K, 3V) in the graph, so that
             displacement = mean + coefficients x modes; empty = no output ``coefficients``.
+        sensor_serials: Serial numbers of the sensors that it was made for; one that ends in ``*``
+            stands for all that begin so. Estimates of any other sensor are flagged.
     """
 
     name: str
@@ -102,9 +105,17 @@ class Manifest:
     training_range: TrainingRange | None = None
     range_file_sha256: str = ""
     basis: Mapping[str, str] = field(default_factory=dict)
+    sensor_serials: tuple[str, ...] = ()
 
 
-_LATER_KEYS = ("mesh_sha256", "mesh_file_sha256", "training_range", "range_file_sha256", "basis")
+_LATER_KEYS = (
+    "mesh_sha256",
+    "mesh_file_sha256",
+    "training_range",
+    "range_file_sha256",
+    "basis",
+    "sensor_serials",
+)
 """Manifests were written before these keys; one that says nothing of them must keep its bytes."""
 
 
@@ -130,6 +141,14 @@ def _tensors(values: object, key: str) -> tuple[TensorInfo, ...]:
     if not isinstance(values, list) or len(values) > _TENSORS_MAX:
         raise ValueError(f"{key} are no list of at most {_TENSORS_MAX} tensors")
     return tuple(_tensor_info(value) for value in values)
+
+
+def _serials(values: object) -> tuple[str, ...]:
+    if not isinstance(values, list) or len(values) > _SERIALS_MAX:
+        raise ValueError(f"sensor_serials are no list of at most {_SERIALS_MAX} texts")
+    if not all(isinstance(value, str) and value for value in values):
+        raise ValueError("sensor_serials are not texts")
+    return tuple(values)
 
 
 def _tensor_info(values: Mapping[str, Any]) -> TensorInfo:
@@ -166,6 +185,8 @@ def parse_manifest(text: bytes, where: Path) -> Manifest:
             values["training_range"] = parse_training_range(
                 values["training_range"], values["inputs"], values["outputs"]
             )
+        if "sensor_serials" in values:
+            values["sensor_serials"] = _serials(values["sensor_serials"])
         manifest = Manifest(**values)
         _check_later_keys(manifest)
         if manifest.contract_version != BUNDLE_CONTRACT_VERSION:

@@ -46,6 +46,10 @@ def model_card(manifest: Manifest, digest: bytes) -> str:
         ("digest", f"`{digest.hex()}`"),
         ("made", f"{manifest.created[:10]} with palpate {manifest.palpate_version}"),
         ("trained on", manifest.trained_on),
+        (
+            "made for",
+            ", ".join(manifest.sensor_serials) or "no sensor in particular: estimates say so",
+        ),
         ("training data", f"content sha256 `{manifest.training_data_sha256}`"),
         ("ONNX operator set", str(manifest.opset)),
     ]

@@ -81,6 +81,9 @@ class QualityFlag(IntEnum):
     RANGE_UNKNOWN = 6
     """The bundle does not say what it was trained on, so the two above cannot be known."""
 
+    UNCALIBRATED = 7
+    """The bundle was not made for this sensor: its serial number is not among the bundle's."""
+
 
 UNIT_TOLERANCE = 1e-3
 """How much the length of a contact normal may differ from one."""

@@ -17,6 +17,7 @@ class QualityFlag(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     QUALITY_FLAG_OUT_OF_RANGE: _ClassVar[QualityFlag]
     QUALITY_FLAG_EXTRAPOLATING: _ClassVar[QualityFlag]
     QUALITY_FLAG_RANGE_UNKNOWN: _ClassVar[QualityFlag]
+    QUALITY_FLAG_UNCALIBRATED: _ClassVar[QualityFlag]
 QUALITY_FLAG_UNSPECIFIED: QualityFlag
 QUALITY_FLAG_STALE: QualityFlag
 QUALITY_FLAG_SATURATED: QualityFlag
@@ -24,6 +25,7 @@ QUALITY_FLAG_UNTARED: QualityFlag
 QUALITY_FLAG_OUT_OF_RANGE: QualityFlag
 QUALITY_FLAG_EXTRAPOLATING: QualityFlag
 QUALITY_FLAG_RANGE_UNKNOWN: QualityFlag
+QUALITY_FLAG_UNCALIBRATED: QualityFlag
 
 class FeatureEstimate(_message.Message):
     __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "in_contact", "force", "force_sd", "contact_location", "contact_location_sd", "quality", "bundle_name", "bundle_version", "centre_of_pressure", "centre_of_pressure_sd", "contact_normal", "contact_normal_sd")

@@ -10,7 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 from palpate.bus import Delivery, Session, Tap
-from palpate.bus.topics import TOPICS, Topic
+from palpate.bus.tares import TareBook
+from palpate.bus.topics import TARE, TOPICS, Topic
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, RecordingError, StreamTimeout
 from palpate.health import Health, HealthReporter
@@ -50,8 +51,9 @@ def run_recorder(
     """
     topics = _topics(config.topics)
     health = Health(SERVICE, instance)
-    files = RecordFiles(config, station, health)
     with Session.open(link, station=station) as session:
+        find_tare = TareBook(session).find if TARE in topics else None
+        files = RecordFiles(config, station, health, find_tare)
         presence = session.presence(SERVICE, instance=instance)
         tap = session.tap(
             topics,
@@ -69,9 +71,14 @@ def run_recorder(
                 presence.not_ready()
                 if health.state is not ServiceState.DEGRADED:
                     health.set_state(ServiceState.STOPPING, "draining")
-                until_s = time.monotonic() + config.drain_s
-                while _drain(tap, files, lambda: time.monotonic() < until_s):
+                now_s = time.monotonic()
+                until_s = now_s + config.drain_s
+                # Live streams go on and never let it run dry, so half of the time is kept for what
+                # has come when the tap closes.
+                while _drain(tap, files, lambda: time.monotonic() < now_s + config.drain_s / 2):
                     time.sleep(_BATCH_S)
+                tap.close()
+                _drain(tap, files, lambda: time.monotonic() < until_s)
             finally:
                 tap.close()
                 _count_the_rest(tap, health)

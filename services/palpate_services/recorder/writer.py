@@ -8,17 +8,18 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from palpate.bus import TapSample
-from palpate.bus.topics import FIELD, FIELD_TRUTH, TOPICS, Topic
+from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS, Topic, sensor_key
 from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import RecordWriter, is_being_written, recover
 from palpate.health import Health
-from palpate.messages import ServiceState
+from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.loop import RateLimit
 from palpate_services.inference.repository import MeshLibrary
@@ -163,14 +164,35 @@ RETRY_S = 1.0
 _FIELDS = (FIELD, FIELD_TRUTH)
 
 
+FindTare = Callable[[str, int], Tare | None]
+"""From a sensor and the id of one of its tares to the tare; None = not known yet."""
+
+
 class RecordFiles:
     """Writes samples to the present record, and draws them into its view. Use from one thread.
+
+    Frames name their tare. One that was taken before the record began is looked up and recorded,
+    too: without it nobody could read the frames.
+
+    Args:
+        config: Where and what.
+        station: Its name.
+        health: Of the recorder.
+        find_tare: Looks up a tare; None = only those are recorded that come while it records.
 
     Raises:
         ConfigError: One of ``config.bundles`` does not exist.
     """
 
-    def __init__(self, config: RecorderConfig, station: str, health: Health) -> None:
+    def __init__(
+        self,
+        config: RecorderConfig,
+        station: str,
+        health: Health,
+        find_tare: FindTare | None = None,
+    ) -> None:
+        self._find_tare = find_tare
+        self._tares: set[tuple[str, int]] = set()  # in the present record
         self._config = config
         self._station = station
         self._health = health
@@ -217,6 +239,10 @@ class RecordFiles:
             return
         message = self._decode(topic, sample)
         stamp = None if message is None else topic.stamp_of(message)
+        if isinstance(message, Tare):
+            self._tares.add((sample.sensor, message.tare_id))
+        elif isinstance(message, ElectrodeFrame):
+            self._write_tare_of(message, sample)
         stream = f"{sample.sensor}/{sample.topic}"
         field_stamp = stamp if topic in _FIELDS else None
         if field_stamp is not None and self._field_rate.reached(stream, field_stamp):
@@ -250,6 +276,24 @@ class RecordFiles:
         self._counts["recorded_bytes"] += len(sample.payload)
         if self._view is not None and message is not None and sample.topic in SensorTimeline.TOPICS:
             self._view.offer(ViewMessage(sample.sensor, sample.topic, sample.payload))
+
+    def _write_tare_of(self, frame: ElectrodeFrame, sample: TapSample) -> None:
+        """Record the tare that a frame names, if the present record does not hold it."""
+        name = sample.sensor, frame.tare_id
+        if self._find_tare is None or frame.tare_id == NO_TARE or name in self._tares:
+            return
+        tare = self._find_tare(*name)
+        if tare is not None:
+            self._tares.add(name)
+            self.write(
+                replace(
+                    sample,
+                    topic=TARE.name,
+                    key=sensor_key(sample.station, sample.sensor, TARE.name),
+                    encoding=TARE.encoding,
+                    payload=TARE.codec.encode(tare),
+                )
+            )
 
     def _decode(self, topic: Topic[Any], sample: TapSample) -> Any:
         """The message; None if it cannot be decoded.
@@ -322,6 +366,7 @@ class RecordFiles:
             self._fail(error.problem)
             return
         self._size = self._unflushed = 0
+        self._tares.clear()
         self._opened_s = time.monotonic()
         if self._config.rrd:
             plan = ViewPlan(
