@@ -170,6 +170,7 @@ def make_bundle(tmp_path: Path) -> MakeBundle:
             created="2026-01-01T00:00:00Z",
             palpate_version="0",
             opset=17,
+            sensor_serials=("*",),
         )
         folder = tmp_path / "bundles" / str(len(made))
         write_bundle(

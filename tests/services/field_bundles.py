@@ -141,6 +141,7 @@ def manifest_of(
         created="2026-01-01T00:00:00Z",
         palpate_version="0",
         opset=17,
+        sensor_serials=("*",),
     )
     return dataclasses.replace(manifest, **changes)
 

@@ -64,7 +64,7 @@ def station(
     finally:
         stop.set()
         for node in nodes:
-            node.join(timeout=10)
+            node.join(timeout=30)
 
 
 def announce(session: Session, tare: Tare) -> None:
@@ -190,7 +190,7 @@ def test_a_bundle_without_a_basis_has_no_reduced_form(
                 assert caught.value.code is ErrorCode.INVALID_REQUEST
     finally:
         stop.set()
-        node.join(timeout=10)
+        node.join(timeout=30)
 
 
 @pytest.mark.parametrize(

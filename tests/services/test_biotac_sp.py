@@ -45,7 +45,7 @@ def running(node: Callable[..., None], config: Any, link: LinkConfig) -> Iterato
         yield
     finally:
         stop.set()
-        thread.join(timeout=10)
+        thread.join(timeout=30)
     assert not thread.is_alive()
 
 

@@ -121,7 +121,7 @@ def serve(case: Case, folder: Path, link: LinkConfig, until: Until) -> Serve:
                 yield session
         finally:
             stop.set()
-            node.join(timeout=10)
+            node.join(timeout=30)
         assert not node.is_alive()
 
     return running

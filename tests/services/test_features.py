@@ -61,7 +61,7 @@ def serve(link: LinkConfig, make_bundle: Callable[..., Path], until: Until) -> S
                 yield session
         finally:
             stop.set()
-            node.join(timeout=10)
+            node.join(timeout=30)
         assert not node.is_alive()
 
     return running

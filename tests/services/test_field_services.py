@@ -53,7 +53,7 @@ def station(link: LinkConfig, tmp_path: Path, until: Until) -> Iterator[Client]:
     finally:
         stop.set()
         for node in nodes:
-            node.join(timeout=10)
+            node.join(timeout=30)
     assert not any(node.is_alive() for node in nodes)
 
 

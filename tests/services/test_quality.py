@@ -221,3 +221,29 @@ def test_the_shipped_features_bundle_knows_that_a_real_finger_is_another(
             flagged += bool(set(flags) & {OUT_OF_RANGE, EXTRAPOLATING})
     assert wrong > 0.9 * len(tared)  # a model of another finger is no use here
     assert flagged >= 0.99 * wrong
+
+
+@pytest.mark.parametrize(
+    ("serials", "flagged"),
+    [
+        ((), True),
+        (("BT-OTHER",), True),
+        (("BT-TES",), True),  # the beginning alone is another sensor
+        (("BT-OTHER", "BT-TEST"), False),
+        (("BT-*",), False),
+        (("*",), False),
+    ],
+)
+def test_a_sensor_that_the_bundle_was_not_made_for(
+    make_bundle: Callable[..., Path],
+    make_frame: Frames,
+    make_tare: Tares,
+    serials: tuple[str, ...],
+    *,
+    flagged: bool,
+) -> None:
+    runtime = load(read_bundle(make_bundle(sensor_serials=serials)), "features")
+    for _ in range(2):
+        flags = _flags(make_frame(60), make_tare(), runtime)
+        assert (QualityFlag.UNCALIBRATED in flags) is flagged
+        assert list(flags) == sorted(flags)

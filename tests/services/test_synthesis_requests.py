@@ -114,7 +114,7 @@ def robot(link: LinkConfig, tmp_path: Path, until: Until) -> Iterator[Client]:
             yield client
     finally:
         stop.set()
-        node.join(timeout=10)
+        node.join(timeout=30)
 
 
 @pytest.fixture

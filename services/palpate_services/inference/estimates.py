@@ -171,7 +171,10 @@ def sample_of_frame(
         return EstimateRefusal.UNTARED
     if not frame.electrodes_valid:
         return EstimateRefusal.INVALID_CHANNELS
-    return Sample(tared_counts(frame, tare), quality_of_frame(frame, tare))
+    quality = quality_of_frame(frame, tare)
+    if not runtime.made_for(frame.sensor_serial):
+        quality = (*quality, QualityFlag.UNCALIBRATED)
+    return Sample(tared_counts(frame, tare), quality)
 
 
 def quality_of_frame(frame: ElectrodeFrame, tare: Tare) -> tuple[QualityFlag, ...]:

@@ -164,6 +164,8 @@ _ALIGN = 16  # float32 values to a 64-byte cache line, the alignment ONNX Runtim
 
 _FEW_OUTPUTS = 8 * _ALIGN  # those of the features task: up to so many plain Python is faster
 
+_SERIALS_KEPT = 256
+
 _REMEDY = "export the bundle again with palpate_training, or serve another one"
 
 _DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(int64)": "int64"}
@@ -213,6 +215,7 @@ class Runtime:
         self.mesh = bundle.mesh
         self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
         self.range = RangeCheck.of(bundle)
+        self._made_for: dict[str, bool] = {}
         self._lock = threading.Lock()
         self.name, self.version = manifest.name, manifest.version
         self.label = f"{manifest.name}:{manifest.version}"
@@ -231,6 +234,19 @@ class Runtime:
         self._bind()
         self._warm_up()
         self.batch_most = self._equal_batches(bundle.golden[manifest.inputs[0].name])
+
+    def made_for(self, serial: str) -> bool:
+        """Whether the bundle was made for the sensor with this serial number."""
+        found = self._made_for.get(serial)
+        if found is None:
+            found = any(
+                serial.startswith(known[:-1]) if known.endswith("*") else serial == known
+                for known in self.manifest.sensor_serials
+            )
+            if len(self._made_for) >= _SERIALS_KEPT:
+                self._made_for.clear()
+            self._made_for[serial] = found
+        return found
 
     def run(self, sample: FloatArray) -> Outputs | None:
         """Run the model on one sample.
