@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +17,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.electronics import (
     ElectrodeSignals,
@@ -27,10 +28,16 @@ from palpate_fem.electrodes.electronics import (
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.outline import outline_of
+from palpate_fem.indenter.path import parse_segments
 from palpate_fem.population.members import Member, read_population
 from palpate_fem.population.responses import Population, clear_steps
 from palpate_fem.result import IndentationResult
-from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
+from palpate_fem.service.batch import (
+    BatchReport,
+    SimulationBatch,
+    TrajectoryPlan,
+    sweep_into_store,
+)
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.service.config import DEFAULT_FACTORY
 from palpate_fem.service.fingertips import skin_of
@@ -39,7 +46,13 @@ from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
-from palpate_fem.trajectory import CLEARANCE_M, Campaign, PlannedIndentation
+from palpate_fem.trajectory import (
+    CLEARANCE_M,
+    Campaign,
+    PlannedIndentation,
+    angled_direction,
+    segment_path,
+)
 from palpate_training.experiment.generate.simulator import (
     ElectrodeStream,
     ExperimentSpec,
@@ -50,7 +63,12 @@ from palpate_training.experiment.generate.simulator import (
     Specimen,
 )
 from palpate_training.experiment.generate.workers import RayCluster
-from palpate_training.experiment.plan import INCREMENT_M, PlannedTrajectory, assign_arm
+from palpate_training.experiment.plan import (
+    INCREMENT_M,
+    PlannedManipulation,
+    PlannedTrajectory,
+    assign_arm,
+)
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +103,7 @@ def specimens_of(members: Iterable[Member]) -> tuple[Specimen, ...]:
             parameters=member.specimen,
             parameters_json=member.specimen.to_json(),
             content=member.to_dict(),
-            pressed_with=member.published.pressed_with,
+            pressed_with=member.pressed_with,
             stream=partial(_stream, member.specimen),
             warming=partial(_warming, member.specimen),
         )
@@ -152,8 +170,8 @@ def _build(spec: ExperimentSpec) -> BiotacTip:
 _fingertip = lru_cache(maxsize=1)(_build)
 
 
-def _campaign(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:
-    """All planned trajectories, first points first: what is there early is a fair sample."""
+def _presses(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:
+    """All planned presses, first points first: what is there early is a fair sample."""
     names = tuple(make_indenter(name).name for name in spec.indenters) or indenter_names()
     plans = Campaign(
         skin_of(cast("StoredFingertip", fingertip)),
@@ -165,6 +183,37 @@ def _campaign(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[P
         overtravel_m=spec.overtravel_m,
     )
     return sorted(plans, key=lambda plan: (*plan.name.split("/")[1:], plan.name))
+
+
+def _paths(
+    spec: ExperimentSpec, fingertip: SimulatedFingertip
+) -> Iterator[tuple[PlannedManipulation, Floats]]:
+    """The experiment's other paths at the targets of its presses, with their poses."""
+    skin = skin_of(cast("StoredFingertip", fingertip))
+    for press in _presses(replace(spec, angled=0), fingertip) if spec.paths else ():
+        place = press.name.removesuffix("/normal")
+        for number, words in enumerate(spec.paths):
+            segments = parse_segments(words)
+            first = angled_direction(press.normal, segments[0].angle_rad, segments[0].azimuth_rad)
+            poses = segment_path(
+                make_indenter(press.indenter),
+                press.target,
+                press.normal,
+                segments,
+                skin,
+                step_m=INCREMENT_M,
+            )
+            name, arm = f"{place}/path-{number}", assign_arm(press.target)
+            yield PlannedManipulation(name, press.indenter, arm, first), poses
+
+
+def _campaign(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[TrajectoryPlan]:
+    """All trajectories to simulate."""
+    others = [
+        PlannedPath(plan.trajectory, plan.indenter, poses)
+        for plan, poses in _paths(spec, fingertip)
+    ]
+    return [*_presses(spec, fingertip), *others]
 
 
 class FemSimulator:
@@ -179,7 +228,7 @@ class FemSimulator:
     def plans(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
     ) -> Sequence[PlannedTrajectory]:
-        """All planned trajectories, each for the arm on its side of the finger."""
+        """All planned presses, each for the arm on its side of the finger."""
         return [
             PlannedTrajectory(
                 trajectory=plan.name,
@@ -190,8 +239,14 @@ class FemSimulator:
                 contact_m=plan.contact_m,
                 depth_m=plan.depth_m,
             )
-            for plan in _campaign(spec, fingertip)
+            for plan in _presses(spec, fingertip)
         ]
+
+    def manipulations(
+        self, spec: ExperimentSpec, fingertip: SimulatedFingertip
+    ) -> Sequence[PlannedManipulation]:
+        """The other paths at each point."""
+        return [plan for plan, _ in _paths(spec, fingertip)]
 
     def simulate(
         self,

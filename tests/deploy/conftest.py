@@ -43,11 +43,18 @@ def bundle() -> str:
 
 @pytest.fixture
 def palpate() -> Palpate:
-    """Run the command to its end, as a user does."""
+    """Run the command to its end, as a user does; ``first``: a program that it runs before."""
 
-    def run(*arguments: str | Path, timeout: float = 60) -> subprocess.CompletedProcess[str]:
+    def run(
+        *arguments: str | Path, timeout: float = 60, first: str = ""
+    ) -> subprocess.CompletedProcess[str]:
+        program = ["-c", f"{first}\nfrom palpate_deploy.cli import main\nmain()"]
         return subprocess.run(
-            [sys.executable, "-m", "palpate_deploy", *map(str, arguments)],
+            [
+                sys.executable,
+                *(program if first else ["-m", "palpate_deploy"]),
+                *map(str, arguments),
+            ],
             capture_output=True,
             text=True,
             timeout=timeout,
@@ -75,7 +82,7 @@ def station(tmp_path: Path) -> tuple[Path, LinkConfig]:
         """,
         encoding="utf-8",
     )
-    return profile, LinkConfig(connect=(endpoint,), wait_for_router_s=20)
+    return profile, LinkConfig(connect=(endpoint,), wait_for_router_s=60)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +43,10 @@ from palpate_training.experiment.generate.workers import (
 SPEC = ExperimentSpec(
     points=1, angled=1, edge_m=1.2e-3, overtravel_m=0.2e-3, indenters=("sphere_medium",)
 )
+
+
+SPEC_SHA256 = "dd2ae706a05ce458ab10708f60fefe6e2157f61f3c62a7cdc46175729a96b891"
+"""Of `SPEC`: data sets without paths other than presses keep their digest."""
 
 
 def specimens() -> tuple[Specimen, ...]:
@@ -108,13 +113,33 @@ def test_rows_carry_the_digest_of_all_that_decides_them(generated: GeneratedExpe
     assert other != digest
 
 
-def test_a_killed_run_goes_on_with_the_same_rows(generated: GeneratedExperiment) -> None:
+def test_a_run_that_was_stopped_or_killed_goes_on_with_the_same_rows(
+    generated: GeneratedExperiment,
+) -> None:
+    """Stopped among the trials, it keeps what has ended; killed, it may leave half a file."""
     before = generated.data.experiment
-    trial = next((generated.folder / TRIALS).glob("*normal.npz"))
-    kept = next((generated.folder / TRIALS).glob("*angled-0.npz"))
+    trials = sorted((generated.folder / TRIALS).glob("*.npz"))
+    for trial in trials:
+        trial.unlink()
+    stop = threading.Event()
+
+    def on_stage(stage: str, done: int, total: int, name: str) -> None:
+        if stage == "trials" and done:
+            stop.set()
+
+    stopped = generate(
+        generated.folder,
+        SPEC,
+        specimens(),
+        FemSimulator(),
+        workers=1,
+        stop=stop,
+        on_stage=on_stage,
+    )
+    assert stopped is None
+    (kept,) = (generated.folder / TRIALS).glob("*.npz")
     stamp = kept.stat().st_mtime_ns
-    trial.unlink()
-    half = trial.with_suffix(".part")
+    half = next(trial for trial in trials if trial != kept).with_suffix(".part")
     half.write_bytes(b"half")
     (generated.folder / EXPERIMENT).unlink()
     after = run(generated.folder).data.experiment
@@ -135,6 +160,38 @@ def test_a_cluster_gives_the_same_rows(generated: GeneratedExperiment, tmp_path:
     same = here.row_trajectory == here.trajectories.index("sphere_medium/00/normal")
     # The same solver on the same processor; threads may be shared out otherwise.
     np.testing.assert_allclose(there.force, here.force[same], atol=1e-3)
+
+
+def test_paths_that_slide_twist_and_go_back_become_rows_too(
+    generated: GeneratedExperiment, tmp_path: Path
+) -> None:
+    words = "press 1.5 mm, slide 0.6 mm towards +y, twist 15 deg, unload"
+    spec = replace(SPEC, angled=0, overtravel_m=0.0, paths=(words,))
+    done = generate(tmp_path / "paths", spec, specimens(), FemSimulator(), workers=1)
+    assert done is not None
+    data, name = done.data.experiment, "sphere_medium/00/path-0"
+    assert set(data.trajectories) == {"sphere_medium/00/normal", name}
+    # One that stands too high presses as deep: it feels its way to the skin.
+    mine = data.row_trajectory == data.trajectories.index(name)
+    hardest = [
+        np.sort(np.linalg.norm(data.force[mine & (data.row_unit == unit)], axis=1))[-8:].mean()
+        for unit in (0, 1)
+    ]
+    assert hardest[0] == pytest.approx(hardest[1], rel=0.08)  # 0.2 mm deeper would be a fifth more
+    for unit in (0, 1):
+        rows = mine & (data.row_unit == unit)
+        travel, force = data.travel_m[rows], np.linalg.norm(data.force[rows], axis=1)
+        assert np.all(np.diff(travel) > 0)
+        assert np.ptp(data.location[rows, 1]) > 0.5e-3
+        assert force.argmax() < len(force) - 5  # it goes back, down to where a press begins
+        assert force[-1] < 0.8 * force.max()
+    # The rows of the press are those of an experiment without further paths.
+    plain = replace(spec, paths=())
+    assert "paths" not in plain.content()
+    assert provenance_sha256(plain, specimens(), "") != provenance_sha256(spec, specimens(), "")
+    assert provenance_sha256(SPEC, specimens(), "") == SPEC_SHA256
+    mixed = done.data.mixed.experiment
+    assert name in {mixed.trajectories[t] for t in mixed.trial_trajectory}
 
 
 def test_another_experiment_does_not_go_into_the_same_folder(

@@ -65,6 +65,31 @@ def test_lasa_pairs_electrodes_with_the_force_before(lasa_archive: Path) -> None
     assert "2 rows before" in paired.provenance.notes
 
 
+def test_lasa_takes_whatever_fingers_an_archive_holds(lasa_archive: Path, tmp_path: Path) -> None:
+    arrays = dict(np.load(lasa_archive))
+    others = {key.replace("finger1", "finger12"): value for key, value in arrays.items()}
+    np.savez(tmp_path / "others.npz", **others)
+    assert ingest_lasa(tmp_path / "others.npz").sensor_names == ("lasa-finger2", "lasa-finger12")
+    one = ingest_lasa(tmp_path / "others.npz", fingers=(12,), lag_rows=0)
+    assert one.sensor_names == ("lasa-finger12",)
+    np.testing.assert_array_equal(one.electrodes, arrays["finger1_electrodes_raw"])
+    with pytest.raises(DatasetError, match="finger1_electrodes_raw"):
+        ingest_lasa(tmp_path / "others.npz", fingers=(1, 2))
+
+
+@pytest.mark.parametrize("rows", [0, 21])
+def test_lasa_refuses_arrays_that_do_not_fit(lasa_archive: Path, tmp_path: Path, rows: int) -> None:
+    arrays = dict(np.load(lasa_archive))
+    arrays["finger2_force_N"] = arrays["finger2_force_N"][:rows]
+    np.savez(tmp_path / "cut.npz", **arrays)
+    with pytest.raises(DatasetError, match="arrays of finger 2 have shapes"):
+        ingest_lasa(tmp_path / "cut.npz")
+    arrays["finger2_electrodes_raw"] = arrays["finger2_electrodes_raw"][:rows]
+    np.savez(tmp_path / "short.npz", **arrays)
+    with pytest.raises(DatasetError, match=f"finger 2 has {rows} rows, too few"):
+        ingest_lasa(tmp_path / "short.npz")
+
+
 def test_lasa_names_what_is_missing(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     with pytest.raises(DatasetError, match="finger1_electrodes_raw"):

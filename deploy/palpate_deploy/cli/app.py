@@ -13,7 +13,7 @@ import typer
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.bench import bench_app
 from palpate_deploy.cli.files import bundle_app, register
-from palpate_deploy.cli.models import model_app
+from palpate_deploy.cli.models import StationProfileOption, TokenOption, model_app
 from palpate_deploy.cli.options import (
     DEFAULT_CONNECT,
     DEFAULT_PROFILE,
@@ -28,6 +28,7 @@ from palpate_deploy.cli.options import (
     WantedOption,
     client_link,
     example,
+    existing_file,
     group,
     station_link,
 )
@@ -165,6 +166,65 @@ def tare(
     from palpate_deploy.station.tare import take_tare
 
     take_tare(client_link(connect, tls), station, sensor, frames=frames, timeout_s=timeout_s)
+
+
+@app.command(
+    epilog=example("palpate calibrate finger", "palpate calibrate finger --from runs/lab.mcap")
+)
+def calibrate(
+    sensor: Annotated[str, typer.Argument(help="Name of the finger.")] = "finger",
+    presses: Annotated[int, typer.Option(min=6, help="Presses to record.")] = 20,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            help="A record (.mcap) or data set (.h5) with presses, instead of recording them.",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the record.")] = Path("runs/calibrate"),
+    name: Annotated[str, typer.Option(help="Name of the bundle; default: features-SERIAL.")] = "",
+    serve: Annotated[
+        bool | None,
+        typer.Option(
+            help="Whether the station serves it for this finger; default: if it was recorded there."
+        ),
+    ] = None,
+    token: TokenOption = None,
+    profile: StationProfileOption = None,
+    connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
+    station: StationOption = DEFAULT_STATION,
+    json_: JsonOption = False,
+) -> None:
+    """Make a finger's own features bundle: guided presses against its force/torque sensor.
+
+    The bundle estimates the force of this finger alone. How wrong it is, on presses that were held
+    out, is printed and kept in the bundle.
+    """
+    from palpate.config import check_name
+    from palpate_deploy.station.calibrate import CalibrationOrder, calibrate_finger
+    from palpate_deploy.station.profile import load_profile
+
+    for one, what in ((sensor, "sensor"), (name, "name")):
+        if one:
+            check_name(one, what)
+    link, station = station_link(profile, connect, station, tls)
+    calibrate_finger(
+        link,
+        station,
+        CalibrationOrder(
+            sensor,
+            presses,
+            out,
+            None if source is None else existing_file(source),
+            name,
+            serve=source is None if serve is None else serve,
+        ),
+        token=token,
+        profile=None if profile is None else load_profile(profile),
+        as_json=json_,
+    )
 
 
 @app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))

@@ -114,6 +114,14 @@ def data_generate(
     seed: Annotated[int, typer.Option(min=0, help="Of points, registration and noise.")] = 0,
     indenter: IndenterOption = None,
     units: UnitsOption = None,
+    path: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SEGMENTS",
+            help="Also at each point: 'press 1.5 mm, slide 1 mm towards +y, unload', as in "
+            "palpate fem run --path; may be repeated.",
+        ),
+    ] = None,
     edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
     fill_ml: Annotated[float, typer.Option(help="Fluid under the skin [ml].")] = 0.6,
     workers: Annotated[
@@ -131,6 +139,7 @@ def data_generate(
     from palpate_fem.cli.terminal import progress_bar, stop_on_signal
     from palpate_fem.config import LIMITS
     from palpate_fem.indenter.catalogue import make_indenter
+    from palpate_fem.indenter.path import parse_segments, show_segments
     from palpate_training.experiment.generate.pipeline import generate as run
     from palpate_training.experiment.generate.simulator import ExperimentSpec
 
@@ -145,6 +154,7 @@ def data_generate(
         edge_m=edge_mm * 1e-3,
         fluid_volume_m3=fill_ml * 1e-6,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),
+        paths=tuple(show_segments(parse_segments(words)) for words in path or ()),
     )
     count, threads = workers_for(workers)
     with stop_on_signal() as stop, progress_bar() as bar:

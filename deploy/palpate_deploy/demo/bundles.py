@@ -136,6 +136,7 @@ def make_virtual_bundle(out: Path | None, *, frames: int, seed: int) -> None:
             name=NAME,
             version=version,
             seed=seed,
+            serials=("VIRTUAL-*",),
             on_epoch=on_epoch,
         )
         for task in steps.values():  # training may stop before the last epoch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_training.evaluation.intervals import drawn_medians, interval
+from palpate_training.learning.metrics import drawn_medians, interval
 
 
 def test_draws_are_medians_of_repeated_clusters() -> None:

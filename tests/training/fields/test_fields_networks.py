@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,12 @@ from palpate_training.tasks.fields import (
     fit_field,
     tared_counts,
 )
-from palpate_training.tasks.synthesis import fit_synthesis, synthesis_bundle, synthesis_features
+from palpate_training.tasks.synthesis import (
+    SynthesisModel,
+    fit_synthesis,
+    synthesis_bundle,
+    synthesis_features,
+)
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +45,31 @@ def held(mixed: MixedDataset) -> RowSplit:
 @pytest.fixture(scope="module")
 def model(mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig) -> FieldModel:
     return fit_field(mixed, held, config=quick)
+
+
+@pytest.fixture(scope="module")
+def synthesis(mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig) -> SynthesisModel:
+    return fit_synthesis(mixed, held, config=quick)
+
+
+@dataclass(frozen=True)
+class Bundled:
+    """A bundle of fields: its folder, the metrics, and how many epochs were told."""
+
+    folder: Path
+    metrics: dict[str, float]
+    epochs: int
+
+
+@pytest.fixture(scope="module")
+def bundled(
+    mixed: MixedDataset, quick: FieldFitConfig, tmp_path_factory: pytest.TempPathFactory
+) -> Bundled:
+    folder, epochs = tmp_path_factory.mktemp("fields") / "f", []
+    metrics = field_bundle(
+        mixed, folder, name="field-test", config=quick, on_epoch=lambda: epochs.append(1)
+    )
+    return Bundled(folder, metrics, len(epochs))
 
 
 def test_field_network_beats_the_mean_and_repeats(
@@ -81,9 +111,9 @@ def test_standardisation_comes_from_the_training_rows(
 
 
 def test_synthesis_follows_the_film(
-    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig
+    mixed: MixedDataset, held: RowSplit, synthesis: SynthesisModel
 ) -> None:
-    fitted = fit_synthesis(mixed, held, config=quick)
+    fitted = synthesis
     x, y = synthesis_features(mixed, fitted.code, fitted.pooling), tared_counts(mixed)
     test, train = held.test, held.train
     residual = fitted.counts(x[test]) - y[test]
@@ -102,7 +132,7 @@ def test_small_modes_are_not_blown_up(
 
 
 def test_graphs_compute_what_the_models_do(
-    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, model: FieldModel
+    mixed: MixedDataset, held: RowSplit, model: FieldModel, synthesis: SynthesisModel
 ) -> None:
     counts, rows = tared_counts(mixed), held.test[:5]
     sd = np.arange(len(mixed.mesh.nodes), dtype=np.float32)
@@ -117,7 +147,7 @@ def test_graphs_compute_what_the_models_do(
     decoded = coefficients.numpy() @ modes + model.code.mean
     np.testing.assert_allclose(decoded, wanted, atol=1e-6 * np.abs(wanted).max())
 
-    fitted = fit_synthesis(mixed, held, config=quick)
+    fitted = synthesis
     graph = SynthesisGraph(fitted.net, fitted.code, fitted.pooling, np.ones(19, np.float32))
     flat = torch.from_numpy(mixed.displacement(rows).reshape(5, -1))
     with torch.inference_mode():
@@ -126,13 +156,9 @@ def test_graphs_compute_what_the_models_do(
     np.testing.assert_allclose(answer, fitted.counts(features), atol=0.5)
 
 
-def test_field_bundle(mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path) -> None:
-    epochs = []
-    metrics = field_bundle(
-        mixed, tmp_path / "f", name="field-test", config=quick, on_epoch=lambda: epochs.append(1)
-    )
-    bundle = read_bundle(tmp_path / "f")
-    assert len(epochs) == quick.members * quick.epochs
+def test_field_bundle(mixed: MixedDataset, quick: FieldFitConfig, bundled: Bundled) -> None:
+    metrics, bundle = bundled.metrics, read_bundle(bundled.folder)
+    assert bundled.epochs == quick.members * quick.epochs
     assert bundle.manifest.task == "field"
     assert "biotac-1, biotac-2" in bundle.manifest.trained_on
     assert metrics["skill_subset"] > 0.3
@@ -150,14 +176,13 @@ def test_field_bundle(mixed: MixedDataset, quick: FieldFitConfig, tmp_path: Path
     scale = np.abs(field).max()
     np.testing.assert_allclose(field, bundle.golden["displacement"][:1], atol=1e-5 * scale)
     with pytest.raises(BundleError, match="immutable"):
-        field_bundle(mixed, tmp_path / "f", config=quick)
+        field_bundle(mixed, bundled.folder, config=quick)
 
 
 def test_field_bundle_has_its_basis_and_knows_its_rows(
-    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, tmp_path: Path
+    mixed: MixedDataset, held: RowSplit, quick: FieldFitConfig, bundled: Bundled
 ) -> None:
-    field_bundle(mixed, tmp_path / "f", config=quick)
-    bundle = read_bundle(tmp_path / "f")
+    bundle = read_bundle(bundled.folder)
     constants = {
         one.name: onnx.numpy_helper.to_array(one).astype(np.float32)
         for one in onnx.load_from_string(bundle.model).graph.initializer

@@ -49,6 +49,10 @@ ForceOption = Annotated[
 def data_ingest_lasa(
     source: Annotated[Path, typer.Argument(help="force_calibration.npz")],
     out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    finger: Annotated[
+        list[int] | None,
+        typer.Option(min=0, help="Which; may be repeated; none = all in the archive."),
+    ] = None,
     blocks: Annotated[
         int, typer.Option(min=10, help="Contiguous blocks that each recording is cut into.")
     ] = BLOCKS_PER_RECORDING,
@@ -56,12 +60,16 @@ def data_ingest_lasa(
         int, typer.Option(min=0, help="Rows by which electrodes lag the force; 0 = as stored.")
     ] = ELECTRODE_LAG_ROWS,
 ) -> None:
-    """LASA force calibration (two real BioTacs) -> data set. Its rows may not be redistributed.
+    """LASA force calibration (real BioTacs) -> data set. Its rows may not be redistributed.
 
     palpate data ingest-lasa force_calibration.npz lasa.h5
     """
     data = ingest_lasa(
-        source, command=typed_command(), blocks_per_recording=blocks, lag_rows=lag_rows
+        source,
+        fingers=tuple(finger or ()),
+        command=typed_command(),
+        blocks_per_recording=blocks,
+        lag_rows=lag_rows,
     )
     write_dataset(out, data)
     console.print(contents(data, str(out)))

@@ -25,6 +25,14 @@ Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes over the rows at most, each network.")]
 Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
 
+Serials = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--serial",
+        help="Serial number of a sensor that the bundle is made for; one that ends in * stands for "
+        "all that begin so; may be repeated. Estimates of other sensors are flagged UNCALIBRATED.",
+    ),
+]
 GainSpread = Annotated[
     float,
     typer.Option(
@@ -53,6 +61,7 @@ def train_field(
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
+    serials: Serials = None,
 ) -> None:
     """Electrodes -> displacement of the whole skin: train, test on unseen trajectories, write.
 
@@ -72,6 +81,7 @@ def train_field(
         name=name,
         version=version,
         seed=seed,
+        serials=serials or (),
     )
     _show(metrics, f"{name} {version}: unseen trajectories", out)
 
@@ -116,10 +126,11 @@ def train_all(
         int | None,
         typer.Option(min=0, max=4095, help="Rest [counts] of trials whose file has none."),
     ] = None,
+    serials: Serials = None,
 ) -> None:
     """Bundles of all tasks from one data set: features, field, synthesis, and their model cards.
 
-    palpate train all runs/rest/mixed.h5 models --unit biotac-2 --version 5
+    palpate train all runs/rest/mixed.h5 models --unit biotac-2 --version 6 --serial 'VIRTUAL-*'
     """
     from palpate_training.datasets.experiment import MixedDataset
     from palpate_training.datasets.export import features
@@ -140,11 +151,28 @@ def train_all(
         rows = Path(scratch) / "features.h5"
         write_dataset(rows, features(experiment, assumed_rest=assumed_rest))
         train_features_command(
-            rows, folders["features"], f"features-{name}", version, seed, epochs, gain_spread
+            rows,
+            folders["features"],
+            f"features-{name}",
+            version,
+            seed,
+            epochs,
+            gain_spread,
+            serials,
         )
     if isinstance(experiment, MixedDataset):
         chosen = unit or experiment.experiment.unit_names[0]
-        train_field(data, folders["field"], "", f"field-{name}", version, seed, epochs, gain_spread)
+        train_field(
+            data,
+            folders["field"],
+            "",
+            f"field-{name}",
+            version,
+            seed,
+            epochs,
+            gain_spread,
+            serials,
+        )
         synthesis = f"synthesis-{name}"
         train_synthesis(data, folders["synthesis"], chosen, synthesis, version, seed, epochs)
     else:
@@ -176,6 +204,73 @@ def train_force_real(
     console.print(f"wrote {out}/force-real.md, .json, .png")
 
 
+def train_transfer(
+    train: Annotated[
+        list[Path], typer.Option(help="Data set (.h5) of other fingers; may be repeated.")
+    ],
+    test: Annotated[Path, typer.Option(help="Data set (.h5) of the finger that is tested.")],
+    shots: Annotated[int, typer.Option(min=0, help="Its presses with known forces.")] = 0,
+    unlabelled: Annotated[
+        bool | None,
+        typer.Option(
+            "--unlabelled/--tare-only",
+            help="Whether mean and spread of its electrodes over the whole recording may be used; "
+            "not given: only with shots.",
+        ),
+    ] = None,
+    draws: Annotated[
+        int, typer.Option(min=1, help="How often the presses are drawn; results are means.")
+    ] = 12,
+    seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """Force on a finger that training has not met, and after a few presses of it.
+
+    palpate train transfer --train one.h5 --test two.h5 --shots 5
+    """
+    from palpate_training.evaluation.transfer import (
+        FIGURES,
+        fingers_of,
+        run_transfer,
+        steps_of,
+        worst_of,
+    )
+
+    known = [finger for path in train for finger in fingers_of(open_dataset(path))]
+    tested = fingers_of(open_dataset(test))
+    with _progress(Console(stderr=True)) as progress:
+        steps = len(tested) * steps_of(len(known), shots=shots, draws=draws)
+        bar = progress.add_task("transfer", total=steps)
+        results = [
+            run_transfer(
+                known,
+                finger,
+                shots=shots,
+                unlabelled=shots > 0 if unlabelled is None else unlabelled,
+                draws=draws,
+                seed=seed,
+                on_step=lambda: progress.advance(bar),
+            )
+            for finger in tested
+        ]
+    if as_json:
+        console.print_json(data=results[0] if len(results) == 1 else worst_of(results))
+        return
+    for result in results:
+        names = ", ".join(result["train"])
+        table = Table(title=f"{result['test']}, from {names}, with {shots} labelled presses")
+        for column in ("", "magnitude, median [N]", "95 % below [N]", "angle, median [rad]"):
+            table.add_column(column, justify="right" if column else "left")
+        rows = {"palpate": result, "ridge": result["ridge"], "constant": result["constant"]}
+        for name, one in rows.items():
+            table.add_row(name, *(f"{one[figure]:.3f}" for figure in FIGURES))
+        console.print(table)
+        console.print(
+            f"90 % intervals: half width {result['interval_median_n']:.2f} N,"
+            f" hold {100 * result['coverage_90']:.0f} % of the true magnitudes"
+        )
+
+
 def train_features_command(
     data: Annotated[Path, typer.Option(help="Data set (.h5).")],
     out: Annotated[Path, typer.Option(help="Folder of the bundle; must not exist.")],
@@ -184,6 +279,7 @@ def train_features_command(
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
+    serials: Serials = None,
 ) -> None:
     """Train force and contact location, test on unseen presses, write the bundle.
 
@@ -206,6 +302,7 @@ def train_features_command(
             version=version,
             config=replace(FEATURES_CONFIG, epochs=epochs, gain_spread=gain_spread),
             seed=seed,
+            serials=serials or (),
             on_epoch=on_epoch,
         )
     _show(report.metrics, f"{name} {version}: unseen presses", out)
@@ -252,13 +349,13 @@ def _bundle(
         )
 
 
-def _progress() -> Progress:
+def _progress(to: Console = console) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        console=console,
+        console=to,
     )
 
 

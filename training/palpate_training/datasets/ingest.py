@@ -1,6 +1,6 @@
 """Ingest of a record: electrodes, wrench and indenter pose of each sensor, aligned by time.
 
-Ingest of the LASA force calibration: two real BioTacs pressed and sheared on a force sensor.
+Ingest of the LASA force calibration: real BioTacs pressed and sheared on a force sensor.
 
 The file's authors publish the rows without a licence: measure, do not redistribute.
 
@@ -16,7 +16,8 @@ changes neither magnitudes nor angles.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ import numpy.typing as npt
 
 from palpate import __version__
 from palpate.alignment import linear
-from palpate.bus.topics import ELECTRODES, POSE, TARE, WRENCH
+from palpate.bus import topics
 from palpate.errors import DatasetError
 from palpate.files.record import read_record
 from palpate.messages import (
@@ -39,7 +40,7 @@ from palpate.messages import (
 )
 from palpate.sampling import sample_offsets
 from palpate_training.datasets.container import Provenance, read_archive, sha256_of
-from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
+from palpate_training.datasets.features import ELECTRODES, FeatureDataset, cut_into_blocks
 
 _log = logging.getLogger(__name__)
 
@@ -80,7 +81,17 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
         DatasetError: The record lacks a stream, no row could be aligned, or a sensor is no BioTac
             with 19 electrodes.
     """
-    sensors = read_streams(path)
+    return rows_of_streams(path, read_streams(path), command=command, licence=licence)
+
+
+def rows_of_streams(
+    path: Path,
+    sensors: Mapping[str, SensorStreams],
+    *,
+    command: str = "",
+    licence: str = "own record",
+) -> FeatureDataset:
+    """As ``ingest_record``, of streams that were read already, or of some of them."""
     parts: list[dict[str, npt.NDArray[Any]]] = []
     names: list[str] = []
     for name, streams in sorted(sensors.items()):
@@ -126,17 +137,22 @@ def read_streams(path: Path) -> dict[str, SensorStreams]:
     for item in read_record(path):
         sensor = item.address.sensor
         topic = item.address.topic
-        if topic not in (ELECTRODES.name, WRENCH.name, POSE.name, TARE.name):
+        if topic not in (
+            topics.ELECTRODES.name,
+            topics.WRENCH.name,
+            topics.POSE.name,
+            topics.TARE.name,
+        ):
             continue
         streams = sensors.setdefault(sensor, SensorStreams())
-        if topic == ELECTRODES.name:
-            streams.frames.append(ELECTRODES.codec.decode(item.payload))
-        elif topic == WRENCH.name:
-            streams.wrenches.append(WRENCH.codec.decode(item.payload))
-        elif topic == POSE.name:
-            streams.poses.append(POSE.codec.decode(item.payload))
+        if topic == topics.ELECTRODES.name:
+            streams.frames.append(topics.ELECTRODES.codec.decode(item.payload))
+        elif topic == topics.WRENCH.name:
+            streams.wrenches.append(topics.WRENCH.codec.decode(item.payload))
+        elif topic == topics.POSE.name:
+            streams.poses.append(topics.POSE.codec.decode(item.payload))
         else:
-            tare = TARE.codec.decode(item.payload)
+            tare = topics.TARE.codec.decode(item.payload)
             streams.tares[tare.tare_id] = tare
     return sensors
 
@@ -256,8 +272,6 @@ def number_presses(touching: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
     return press
 
 
-FINGERS = (1, 2)
-
 BLOCKS_PER_RECORDING = 20
 """About 9 s each; the force's autocorrelation is below 0.3 after 5 s, below 0.1 after 4-11 s."""
 
@@ -266,41 +280,65 @@ ELECTRODE_LAG_ROWS = 2
 explains the force 2-3 rows (20-30 ms) before a row of electrodes best, on both fingers. Pairing so
 lowers the error on validation blocks (training/LOG.md); 0 takes the rows as stored."""
 
+_LASA_ARRAYS = ("electrodes_raw", "baseline_mean", "force_N")
+
 _NOTES = (
     "force rotated from the authors' axes (x lateral, y distal, z ventral) to the sensor frame:"
     " (x, y, z) = (y, x, -z); always in contact; no time stamps, about 100 Hz"
 )
 
 
+_LASA_KEY = re.compile(r"finger(\d+)_electrodes_raw")
+
+
 def ingest_lasa(
     path: Path,
     *,
+    fingers: Sequence[int] = (),
     command: str = "",
     blocks_per_recording: int = BLOCKS_PER_RECORDING,
     lag_rows: int = ELECTRODE_LAG_ROWS,
 ) -> FeatureDataset:
-    """Read ``force_calibration.npz``: both fingers, one recording (group) each, in order of time.
+    """Read ``force_calibration.npz``: one recording (group) of each finger, in order of time.
 
     Args:
-        path: The archive.
+        path: The archive: ``fingerN_electrodes_raw`` [counts], ``fingerN_baseline_mean`` [counts]
+            and ``fingerN_force_N`` [N] of any number of fingers N.
+        fingers: Which of them; none = all.
         command: The command line, for provenance.
         blocks_per_recording: Contiguous pieces each recording is cut into.
         lag_rows: Electrodes of a row are paired with the force so many rows before.
 
     Raises:
-        DatasetError: The archive is missing, damaged, or not this one.
+        DatasetError: The archive is missing, damaged, or not this one; it lacks a finger; a
+            finger's arrays do not fit together.
     """
-    names = [
-        f"finger{finger}_{what}"
-        for finger in FINGERS
-        for what in ("electrodes_raw", "baseline_mean", "force_N")
-    ]
     remedy = "give the archive force_calibration.npz of the LASA force calibration"
-    arrays = iter(read_archive(path, lambda _: names, remedy=remedy).values())
-    parts = [
-        (electrodes[lag_rows:], baseline, theirs[: len(theirs) - lag_rows])
-        for electrodes, baseline, theirs in zip(arrays, arrays, arrays, strict=True)
-    ]
+    chosen: list[int] = []
+
+    def names(held: Sequence[str]) -> list[str]:
+        found = sorted(int(match[1]) for key in held if (match := _LASA_KEY.fullmatch(key)))
+        chosen.extend(fingers or found or (1,))  # of an archive without any, 1 is missing
+        return [f"finger{finger}_{what}" for finger in chosen for what in _LASA_ARRAYS]
+
+    arrays = iter(read_archive(path, names, remedy=remedy).values())
+    parts = []
+    for finger, electrodes, baseline, theirs in zip(chosen, arrays, arrays, arrays, strict=True):
+        shapes = electrodes.shape, baseline.shape, theirs.shape
+        rows_of_finger = len(electrodes)
+        if shapes != ((rows_of_finger, ELECTRODES), (ELECTRODES,), (rows_of_finger, 3)):
+            raise DatasetError(
+                f"{path}: arrays of finger {finger} have shapes {shapes}, not (N, 19), (19,),"
+                " (N, 3)",
+                remedy=remedy,
+            )
+        if rows_of_finger <= lag_rows + blocks_per_recording:
+            raise DatasetError(
+                f"{path}: finger {finger} has {rows_of_finger} rows, too few for {lag_rows} rows of"
+                f" lag and {blocks_per_recording} blocks",
+                remedy="cut it into fewer blocks",
+            )
+        parts.append((electrodes[lag_rows:], baseline, theirs[: rows_of_finger - lag_rows]))
     rows = [len(electrodes) for electrodes, _, _ in parts]
     force = np.concatenate([theirs for _, _, theirs in parts]).astype(np.float32)
     return FeatureDataset(
@@ -317,10 +355,10 @@ def ingest_lasa(
             ]
         ).astype(np.int32),
         sensor=np.repeat(np.arange(len(rows), dtype=np.int32), rows),
-        sensor_names=tuple(f"lasa-finger{finger}" for finger in FINGERS),
+        sensor_names=tuple(f"lasa-finger{finger}" for finger in chosen),
         in_contact=np.ones(sum(rows), dtype=np.bool_),
         provenance=Provenance(
-            source="LASA force calibration (MiaoLi/syntouchcontact), two real BioTacs",
+            source=f"LASA force calibration (MiaoLi/syntouchcontact), {len(chosen)} real BioTac(s)",
             command=command,
             input_sha256=sha256_of(path),
             licence="none stated by the authors: measure, do not redistribute",

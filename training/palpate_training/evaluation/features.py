@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
-from palpate_training.evaluation.intervals import drawn_medians, interval
 from palpate_training.learning.metrics import (
     FORCE_BINS_N,
     angles,
+    drawn_medians,
     force_errors,
+    interval,
     location_errors,
 )
 from palpate_training.learning.splits import RowSplit

@@ -12,8 +12,13 @@ from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.evaluation.cells import Arrays, Cell, CellResult, Tested, grouped
 from palpate_training.evaluation.features import Scores
-from palpate_training.evaluation.intervals import drawn_medians, interval
-from palpate_training.learning.metrics import by_force, cluster_bootstrap, root_mean
+from palpate_training.learning.metrics import (
+    by_force,
+    cluster_bootstrap,
+    drawn_medians,
+    interval,
+    root_mean,
+)
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS, FieldSystem
 from palpate_training.systems.synthesis import SYNTHESIS_SYSTEMS, SynthesisSystem

@@ -98,6 +98,25 @@ class PlannedTrajectory:
         return np.hstack([positions, np.tile(facing(self.direction), (len(positions), 1))])
 
 
+@dataclass(frozen=True, slots=True)
+class PlannedManipulation:
+    """A planned path of the twin that is no straight press: it slides, turns or goes back.
+
+    Its poses are in the simulation. A real robot does not execute it yet.
+
+    Attributes:
+        trajectory: Id, ``<indenter>/<point>/path-<k>``.
+        indenter: Name of the indenter.
+        arm: ``left`` or ``right``.
+        direction: Where the tip moves at first, unit, shape (3,).
+    """
+
+    trajectory: str
+    indenter: str
+    arm: str
+    direction: Floats
+
+
 def increments_of(length_m: float) -> Floats:
     """Travel at the start and after each whole increment within a length [m], shape (I + 1,).
 

@@ -109,10 +109,11 @@ def export_features(
 
 def features_scale(graph: FeaturesGraph) -> Allowed:
     """What differences of the ``features`` task are divided by."""
-    sd = graph.net.output_sd.reshape(-1, 3)  # type: ignore[operator]
     scales = [1.0, 1.0]
-    for name, spread in zip(graph.names, sd[1:], strict=True):
-        scales += 2 * [1.0 if name == "contact_normal" else float(spread.max())]
+    if graph.names:
+        sd = graph.net.output_sd.reshape(-1, 3)  # type: ignore[operator]
+        for name, spread in zip(graph.names, sd[1:], strict=True):
+            scales += 2 * [1.0 if name == "contact_normal" else float(spread.max())]
     # float32 resolves relative to the value: 30 N cannot be as exact as 1 N.
     return lambda i, right: np.maximum(scales[i], np.linalg.norm(right, axis=1, keepdims=True))
 
@@ -189,6 +190,7 @@ def _export(
     mesh: FieldMesh | None = None,
     training_range: TrainingRange | None = None,
     known_inputs: KnownInputs | None = None,
+    sensor_serials: tuple[str, ...] = (),
 ) -> bytes:
     """Export, compare, write."""
     names = [tensor.name for tensor in gives]
@@ -215,6 +217,7 @@ def _export(
         opset=OPSET,
         normalisation=dict(normalisation or {}),
         training_range=training_range,
+        sensor_serials=sensor_serials,
         basis=basis_of(model, dict(zip(names, gives, strict=True))),
     )
     golden = {input_name: golden_inputs} | dict(zip(names, answers, strict=True))

@@ -16,7 +16,7 @@ Rows of one block are nearly copies, so confidence intervals resample whole bloc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,9 @@ Statistic = Callable[[npt.NDArray[np.float64]], float]
 
 FORCE_BINS_N = {"below_2n": (0.0, 2.0), "2_to_8n": (2.0, 8.0), "above_8n": (8.0, np.inf)}
 """The paper's bounds of low and high force; its rows begin at 0.5 N."""
+
+DRAWS = 2000
+_PART = 250
 
 MIN_MAGNITUDE_N = 1e-3
 """Below this true force a direction has no meaning [N]; such rows have no angle."""
@@ -166,6 +169,45 @@ def cluster_bootstrap(
     tail = 50.0 * (1.0 - level)
     low, high = np.percentile(results, [tail, 100.0 - tail], axis=0)
     return {name: (float(low[i]), float(high[i])) for i, name in enumerate(names)}
+
+
+def drawn_medians(
+    errors: Sequence[Rows64], cluster: npt.NDArray[np.integer], *, draws: int = DRAWS, seed: int = 0
+) -> Rows64:
+    """The median error in each draw of whole clusters, averaged over seeds, shape (draws,).
+
+    A median of such a draw is that of all rows with a weight for each cluster: rows are sorted
+    once, and all draws are made at the same time.
+
+    The same clusters, draws and seed give the same draws, so those of two systems can be divided.
+
+    Args:
+        errors: Of every row, shape (N,), one for each seed of a system; rows that are NaN do not
+            count.
+        cluster: Trajectory of every row, shape (N,).
+        draws: How many.
+        seed: Of the draws.
+    """
+    names, number = np.unique(cluster, return_inverse=True)
+    rng = np.random.default_rng(seed)
+    counts = rng.multinomial(len(names), np.full(len(names), 1.0 / len(names)), size=draws)
+    total = np.zeros(draws)
+    for values in errors:
+        order = np.argsort(values, kind="stable")
+        order = order[: np.count_nonzero(~np.isnan(values))]
+        for start in range(0, draws, _PART):
+            part = slice(start, start + _PART)
+            weight = np.cumsum(counts[part][:, number[order]], axis=1)
+            middle = (weight >= 0.5 * weight[:, -1:]).argmax(axis=1)
+            total[part] += np.where(weight[:, -1] > 0, values[order][middle], np.nan)
+    return total / len(errors)
+
+
+def interval(drawn: Rows64, level: float = 0.95) -> tuple[float, float]:
+    """Ends of the interval that holds a share of the draws."""
+    tail = 50.0 * (1.0 - level)
+    low, high = np.nanpercentile(drawn, [tail, 100.0 - tail])
+    return float(low), float(high)
 
 
 def _pair(estimate: Float, truth: Float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

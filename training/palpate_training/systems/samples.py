@@ -90,7 +90,7 @@ def samples_of(data: ExperimentDataset, contact: SimulatedContact | None = None)
     )
 
 
-def impedance_ohm(counts: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+def impedance_ohm(counts: npt.NDArray[np.number]) -> npt.NDArray[np.float64]:
     """Impedance of electrodes that read so many counts [ohm] (BioTac SP manual).
 
     Readings at either end of the range are taken as one count inside it.

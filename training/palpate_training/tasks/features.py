@@ -9,7 +9,7 @@ afterwards.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -88,11 +88,13 @@ def train_features(
     version: int = 1,
     config: FeaturesNetConfig = FEATURES_CONFIG,
     seed: int = 0,
+    serials: Sequence[str] = (),
     on_epoch: OnEpoch | None = None,
 ) -> FeaturesReport:
     """Train, evaluate on presses that were never seen, and write the bundle.
 
-    The seed decides the split, the weights and the order of rows.
+    The seed decides the split, the weights and the order of rows; ``serials`` are those of the
+    manifest.
 
     Raises:
         DatasetError: The data set breaks its schema or has too few presses.
@@ -199,6 +201,7 @@ def train_features(
         seed=seed,
         training_range=features_range(data, split.train),
         known_inputs=known_inputs(x[split.train], data.group[split.train]),
+        sensor_serials=tuple(serials),
     )
     return FeaturesReport(
         digest, metrics, (len(split.train), len(split.validation), len(split.test))
@@ -241,8 +244,12 @@ def _residual_sd(estimate: FloatArray, truth: FloatArray) -> FloatArray:
 def _contact_threshold(data: FeatureDataset, estimate: FloatArray, split: RowSplit) -> float:
     if data.in_contact is None or data.in_contact[split.validation].all():
         return MIN_CONTACT_THRESHOLD_N
-    untouched = np.linalg.norm(estimate[~data.in_contact[split.validation]], axis=1)
-    quantile = float(np.quantile(untouched, 1.0 - FALSE_CONTACT_SHARE))
+    return threshold_above(np.linalg.norm(estimate[~data.in_contact[split.validation]], axis=1))
+
+
+def threshold_above(untouched_n: npt.NDArray[np.floating]) -> float:
+    """Force from which there is contact [N], by the estimated magnitudes of untouched rows [N]."""
+    quantile = float(np.quantile(untouched_n, 1.0 - FALSE_CONTACT_SHARE))
     return round(max(MIN_CONTACT_THRESHOLD_N, quantile), 4)
 
 

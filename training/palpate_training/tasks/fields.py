@@ -316,9 +316,12 @@ def field_bundle(
     version: int = 1,
     config: FieldFitConfig | None = None,
     seed: int = 0,
+    serials: Sequence[str] = (),
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
     """Electrodes -> field of some units, empty = all, as a bundle; returns its held-out metrics.
+
+    ``serials`` are those of the manifest.
 
     Raises:
         DatasetError: A unit is not known, or too few trajectories are left.
@@ -353,6 +356,7 @@ def field_bundle(
         version=version,
         training_data_sha256=content_sha256(data),
         trained_on=trained_on_line(data, units, split),
+        sensor_serials=tuple(serials),
         metrics=metrics,
         normalisation={
             "electrodes": "tared counts and logarithms of impedances for an assumed rest,"

@@ -24,6 +24,7 @@ from palpate_training.experiment.generate.simulator import (
     OnProgress,
     SimulatedFingertip,
     SimulatedTrajectory,
+    travelled,
 )
 from palpate_training.experiment.generate.trials import file_of, read_trials
 
@@ -152,8 +153,7 @@ def simulated_trial(
         outer: Nodes of the outer surface, ascending.
     """
     steps = trajectory.steps[:believed]
-    poses = np.array([step.pose[:3] for step in steps])
-    travel = np.linalg.norm(poses - trajectory.path[0, :3], axis=1) - clearance_m
+    travel = travelled(trajectory, steps) - clearance_m
     fields = np.array([step.displacement for step in steps], np.float32)
     contact = np.array([step.indenter_force[outer] for step in steps], np.float32)
     return SimulatedTrial(

@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,7 @@ def generate(
         began = time.monotonic()
         runner: TaskRunner = cluster if cluster is not None else WorkerProcesses(workers)
         try:
-            make_trials(
+            complete = make_trials(
                 spec,
                 store,
                 specimens,
@@ -138,10 +138,13 @@ def generate(
                 folder / TRIALS,
                 runner,
                 on_progress=partial(on_stage, "trials"),
+                stop=stop,
             )
         finally:
             if runner is not cluster:
                 runner.close()
+        if not complete:
+            return None
         seconds["trials"] = time.monotonic() - began
     finally:
         if cluster is not None:
@@ -149,7 +152,8 @@ def generate(
     began = time.monotonic()
     digest = provenance_sha256(spec, specimens, store.fingertip().key)
     provenance = Provenance(
-        source=f"twin: {spec.points} points x {1 + spec.angled} trajectories an indenter",
+        source=f"twin: {spec.points} points x {1 + spec.angled + len(spec.paths)} trajectories an "
+        "indenter",
         command=command,
         input_sha256=digest,
         licence="generated; use as you like",
@@ -189,7 +193,7 @@ def _files(path: Path) -> list[Path]:
 def provenance_sha256(spec: ExperimentSpec, specimens: Sequence[Specimen], fingertip: str) -> str:
     """Digest, hex, of all that decides the rows: spec, specimens and the fingertip's own digest."""
     content = {
-        "spec": asdict(spec),
+        "spec": spec.content(),
         "members": [specimen.content for specimen in specimens],
         "fingertip": fingertip,
     }
@@ -204,7 +208,7 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
     """
     wanted: dict[str, Any] = {
         "schema": SPEC_SCHEMA,
-        "spec": asdict(spec),
+        "spec": spec.content(),
         "members": [specimen.content for specimen in specimens],
     }
     wanted = json.loads(json.dumps(wanted))  # tuples become lists, as in the file

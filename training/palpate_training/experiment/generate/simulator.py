@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from palpate.rigid import path_lengths
 from palpate_training.experiment.generate.workers import RayCluster
-from palpate_training.experiment.plan import PlannedTrajectory
+from palpate_training.experiment.plan import PlannedManipulation, PlannedTrajectory
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -30,6 +31,9 @@ FLUID_VOLUME_M3 = 6.0e-7
 
 EDGE_M = 0.6e-3
 """Edge of the mesh on the pad [m]; the mesh study puts its force error below 1 %."""
+
+_STRAIGHT_M = 1e-9
+"""A path that is longer than the distance of its ends by no more than this is straight [m]."""
 
 OVERTRAVEL_M = 0.6e-3
 """How much deeper than the paper's depths paths go [m]: robots stand wrong by up to that."""
@@ -47,6 +51,8 @@ class ExperimentSpec:
         fluid_volume_m3: Fill [m^3].
         overtravel_m: How much deeper than the paper's depths the paths go [m].
         indenters: Names; empty = all nine.
+        paths: Further paths at each point, in words of segments (``palpate fem run --path``), whose
+            direction and length are as written: no overtravel.
     """
 
     points: int = 10
@@ -56,6 +62,14 @@ class ExperimentSpec:
     fluid_volume_m3: float = FLUID_VOLUME_M3
     overtravel_m: float = OVERTRAVEL_M
     indenters: tuple[str, ...] = ()
+    paths: tuple[str, ...] = ()
+
+    def content(self) -> dict[str, Any]:
+        """As plain values; without paths as they were before there were any."""
+        values = asdict(self)
+        if not self.paths:
+            del values["paths"]
+        return values
 
 
 class SimulatedStep(Protocol):
@@ -104,6 +118,20 @@ class SimulatedTrajectory(SimulatedPath, Protocol):
     @property
     def steps(self) -> Sequence[SimulatedStep]:
         """Converged steps, in order of the path."""
+
+
+def travelled(trajectory: SimulatedPath, steps: Sequence[SimulatedStep]) -> Floats:
+    """Travel from the first pose of a trajectory to each of its first steps [m], shape (S,).
+
+    Of a straight press it is the distance, which stored data sets hold to the last bit; of any
+    other path its length, turns included.
+    """
+    path = trajectory.path
+    whole = float(np.linalg.norm(path[-1, :3] - path[0, :3]))
+    if path_lengths(path)[-1] <= whole + _STRAIGHT_M:
+        poses = np.array([step.pose[:3] for step in steps])
+        return np.asarray(np.linalg.norm(poses - path[0, :3], axis=1))
+    return path_lengths(np.array([path[0], *(step.pose for step in steps)]))[1:]
 
 
 class SkinSolid(Protocol):
@@ -227,7 +255,12 @@ class TwinSimulator(Protocol):
     def plans(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
     ) -> Sequence[PlannedTrajectory]:
-        """All trajectories of an experiment, first points first, each for the arm on its side."""
+        """All presses of an experiment, first points first, each for the arm on its side."""
+
+    def manipulations(
+        self, spec: ExperimentSpec, fingertip: SimulatedFingertip
+    ) -> Sequence[PlannedManipulation]:
+        """Its other paths, likewise."""
 
     def simulate(
         self,

@@ -7,6 +7,7 @@ what is expensive to make (the specimens' electrodes) between tasks.
 from __future__ import annotations
 
 import io
+import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -33,9 +34,15 @@ from palpate_training.experiment.generate.simulator import (
     SimulatedTrajectory,
     Specimen,
     TwinSimulator,
+    travelled,
 )
 from palpate_training.experiment.generate.workers import TaskRunner
-from palpate_training.experiment.plan import APPROACH_M, ARMS, PlannedTrajectory
+from palpate_training.experiment.plan import (
+    APPROACH_M,
+    ARMS,
+    PlannedManipulation,
+    PlannedTrajectory,
+)
 from palpate_training.experiment.stand_in_arm import sensor_robot, stand_in_arm
 from palpate_training.experiment.virtual_testbed import contact_travel, perform
 
@@ -60,20 +67,28 @@ def make_trials(
     runner: TaskRunner,
     *,
     on_progress: OnProgress,
-) -> None:
+    stop: threading.Event,
+) -> bool:
     """Execute what the store holds; trials that the folder holds already are not made again.
+
+    Returns:
+        Whether all are there; False = stopped.
 
     Raises:
         DatasetError: The store is damaged, or the disk refuses.
     """
     fingertip = store.fingertip()
     there = set(store.ids())
-    plans = [plan for plan in simulator.plans(spec, fingertip) if plan.trajectory in there]
+    every: list[PlannedTrajectory | PlannedManipulation] = [
+        *simulator.plans(spec, fingertip),
+        *simulator.manipulations(spec, fingertip),
+    ]
+    plans = [plan for plan in every if plan.trajectory in there]
     left = [plan for plan in plans if not file_of(folder, plan.trajectory).exists()]
     done = len(plans) - len(left)
     on_progress(done, len(plans), "")
     if not left:
-        return
+        return True
     make = simulator.make_specimens(fingertip, specimens)
     work: Callable[[TrialTask], bytes] = partial(_work, make)
     tasks = _tasks(spec, store, specimens, left, simulator)
@@ -82,6 +97,9 @@ def make_trials(
             part.write_bytes(data)
         done += 1
         on_progress(done, len(plans), task.name)
+        if stop.is_set():
+            break
+    return done == len(plans)
 
 
 def read_trials(folder: Path, name: str) -> TrialsDone:
@@ -131,7 +149,9 @@ class TrialTask:
         name: Its id.
         arm: Which arm executes it.
         direction: Where it moves, shape (3,).
-        planned_m: Planned travel past first contact [m].
+        planned_m: Planned travel past first contact [m]; None = all of a path that is no press.
+            Such a path is felt its way to the skin, so that a registration error does not change
+            how deep it is.
         trajectory: The simulation.
         clear_steps: Its steps before the indenter bears on what holds the finger.
         specimens: Those that execute it.
@@ -143,7 +163,7 @@ class TrialTask:
     name: str
     arm: str
     direction: Floats
-    planned_m: float
+    planned_m: float | None
     trajectory: SimulatedTrajectory
     clear_steps: int
     specimens: tuple[Specimen, ...]
@@ -205,11 +225,15 @@ def _perform(
         )
     start = task.trajectory.path[0, :3]
     poses = np.array([step.pose[:3] for step in steps])
-    travel = np.linalg.norm(poses - start, axis=1) - task.clearance_m
+    travel = travelled(task.trajectory, steps) - task.clearance_m
     tip = np.concatenate([start[None] + task.clearance_m * task.direction, poses])
     force = np.concatenate([np.zeros((1, 3)), [step.force for step in steps]])
-    contact_m = contact_travel(error, task.direction)
-    length_m = min(APPROACH_M + task.planned_m, contact_m + float(travel[-1]))
+    if task.planned_m is None:
+        contact_m = APPROACH_M
+        length_m = contact_m + float(travel[-1])
+    else:
+        contact_m = contact_travel(error, task.direction)
+        length_m = min(APPROACH_M + task.planned_m, contact_m + float(travel[-1]))
     label = f"{specimen.name}/{task.name}".encode()
     seed = zlib.crc32(label) ^ task.seed
     stream = specimen.stream(counts[0], seed)
@@ -278,7 +302,7 @@ def _tasks(
     spec: ExperimentSpec,
     store: IndentationStore,
     specimens: Sequence[Specimen],
-    plans: Sequence[PlannedTrajectory],
+    plans: Sequence[PlannedTrajectory | PlannedManipulation],
     simulator: TwinSimulator,
 ) -> Iterator[TrialTask]:
     fingertip = store.fingertip()
@@ -292,7 +316,9 @@ def _tasks(
             name=plan.trajectory,
             arm=plan.arm,
             direction=plan.direction,
-            planned_m=plan.depth_m - spec.overtravel_m,
+            planned_m=plan.depth_m - spec.overtravel_m
+            if isinstance(plan, PlannedTrajectory)
+            else None,
             trajectory=trajectory,
             clear_steps=simulator.clear_steps(trajectory, fingertip),
             specimens=tuple(specimens[i] for i in who),

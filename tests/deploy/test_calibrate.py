@@ -1,0 +1,127 @@
+"""``palpate calibrate``: from presses at a station to a bundle that serves that finger."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import FEATURES, WRENCH
+from palpate.config import LinkConfig
+from palpate.files.bundle import read_bundle
+from palpate.messages import QualityFlag
+from palpate_deploy.station.calibrate import HELD_S, PressCounter
+
+Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+pytest.importorskip("torch")
+
+
+def count(*readings: tuple[float, float]) -> tuple[int, float]:
+    counter = PressCounter()
+    for now_s, force_n in readings:
+        counter.take(now_s, force_n)
+    return counter.count, counter.largest_n
+
+
+class TestPresses:
+    def test_a_press_is_counted_when_it_ends(self) -> None:
+        counter = PressCounter()
+        assert not counter.take(0.0, 0.1)
+        assert not counter.take(0.1, 2.0)
+        assert counter.pressed
+        assert not counter.take(0.1 + HELD_S, 3.0)
+        assert not counter.take(0.2 + HELD_S, 0.3)
+        assert counter.count == 0
+        assert counter.take(0.3 + HELD_S, 0.1)
+        assert (counter.count, counter.largest_n, counter.pressed) == (1, 3.0, False)
+
+    def test_a_knock_does_not_count(self) -> None:
+        assert count((0.0, 0.0), (0.1, 5.0), (0.15, 0.0), (1.0, 0.0)) == (0, 5.0)
+
+    def test_a_force_about_the_threshold_is_one_press(self) -> None:
+        wavering = [(0.1 * k, 0.45 + 0.1 * (k % 2)) for k in range(20)]
+        assert count(*wavering, (2.0, 0.0))[0] == 1
+
+
+def test_from_presses_to_estimates(
+    up: subprocess.Popen[bytes],
+    station: tuple[Path, LinkConfig],
+    palpate: Palpate,
+    tmp_path: Path,
+) -> None:
+    """The bundle is served for the finger, and as good as it says on presses that come later."""
+    profile, link = station[0], station[1].model_copy(update={"wait_for_router_s": 90.0})
+    with Session.open(link, station="test") as session:
+        first = session.subscriber(FEATURES, sensor="finger")
+        assert QualityFlag.UNCALIBRATED not in first.next(60).message.quality
+    other = palpate("calibrate", "thumb", "--profile", profile, timeout=240)
+    assert other.returncode != 0
+    assert "nothing comes on electrodes of 'thumb'" in other.stderr
+    assert "palpate status" in other.stderr
+    (tmp_path / "file").write_text("not a folder")
+    blocked = palpate("calibrate", "--profile", profile, "--out", tmp_path / "file", timeout=240)
+    assert blocked.returncode != 0
+    assert "recorder.out" in blocked.stderr
+    assert "press 9 of" not in blocked.stdout, "nobody presses for nothing"
+    done = palpate(
+        *("calibrate", "finger", "--presses", "16", "--profile", profile),
+        *("--out", tmp_path / "rec", "--json"),
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert "press 16 of 16" in done.stderr
+    manifest = read_bundle(Path(report["folder"])).manifest
+    assert manifest.sensor_serials == tuple(report["serials"])
+    assert report["presses"] >= 16
+    (record,) = (tmp_path / "rec").glob("*.mcap")
+    assert Path(report["source"]) == record
+
+    with Session.open(link, station="test") as session:
+        estimates = session.subscriber(FEATURES, sensor="finger", delivery=Delivery.QUEUE)
+        forces = session.subscriber(WRENCH, sensor="finger", delivery=Delivery.QUEUE)
+        time.sleep(25.0)
+        answers = [one.message for one in estimates.next_batch(20, most=4000)]
+        truths = [one.message for one in forces.next_batch(20, most=4000)]
+    for answer in answers:
+        assert answer.bundle_sha256.hex() == report["digest"]
+        assert QualityFlag.UNCALIBRATED not in answer.quality
+    times = [wrench.stamp.monotonic_ns for wrench in truths]
+    magnitude = [float(np.linalg.norm(wrench.force)) for wrench in truths]
+    # Harder presses than any of the sixteen are flagged; the others are estimated.
+    known = [answer for answer in answers if not answer.quality]
+    truth = np.interp([answer.source.monotonic_ns for answer in known], times, magnitude)
+    errors = np.abs([np.linalg.norm(answer.force) for answer in known] - truth)[truth > 0.5]
+    assert len(errors) > 50
+    constant = report["metrics"]["constant_force_magnitude_median_n"]
+    assert np.median(errors) < 0.5 * constant
+
+    back = palpate("model", "rollback", "--sensor", "finger", "--profile", profile, timeout=240)
+    assert back.returncode == 0, back.stderr
+
+    # The record that is left is enough to do it again, as the next version, with no station.
+    again = palpate("calibrate", "finger", "--from", record, "--json", timeout=240)
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout)["bundle"] == report["bundle"].replace(":1", ":2")
+
+
+def test_a_record_without_presses_is_refused(
+    palpate: Palpate, virtual_record: Path, tmp_path: Path
+) -> None:
+    record = tmp_path / "lab.mcap"
+    shutil.copy(virtual_record, record)
+    short = palpate("calibrate", "virtual-finger", "--from", record, timeout=120)
+    assert short.returncode != 0
+    assert "presses of at least 0.5 N; 6 are needed" in short.stderr
+    other = palpate("calibrate", "thumb", "--from", record, timeout=120)
+    assert "holds no sensor 'thumb'" in other.stderr
+    assert "it holds: virtual-finger" in other.stderr
+    assert not list(tmp_path.glob("data/palpate/models/*"))

@@ -1,0 +1,126 @@
+"""A finger's own bundle: what it learns, what is said of it, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from palpate.errors import BundleError, DatasetError
+from palpate.files.bundle import read_bundle
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.learning.force_process import Floats, ForceProcesses
+from palpate_training.tasks import finger
+from palpate_training.tasks.finger import STEPS, known_rows, train_finger
+
+MakeData = Callable[..., FeatureDataset]
+
+
+@pytest.fixture(autouse=True)
+def few_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finger, "ROWS_MOST", 240)
+
+
+def test_a_bundle_of_its_own(press_data: MakeData, tmp_path: Path) -> None:
+    steps: list[int] = []
+    data = press_data(presses=16)
+    report = train_finger(
+        data,
+        tmp_path / "b",
+        name="features-mine",
+        version=3,
+        serials=["BT-7"],
+        on_step=lambda: steps.append(1),
+    )
+    assert len(steps) == STEPS
+    bundle = read_bundle(tmp_path / "b")
+    manifest = bundle.manifest
+    assert bundle.sha256 == report.digest
+    assert (manifest.name, manifest.version) == ("features-mine", 3)
+    assert manifest.sensor_serials == ("BT-7",)
+    assert [one.name for one in manifest.outputs] == ["force", "force_sd"]
+    assert (report.presses, report.rows) == (16, 240)
+    found = report.metrics
+    assert found["force_magnitude_median_n"] < 0.1 * found["constant_force_magnitude_median_n"]
+    assert found["force_angle_median_rad"] < 0.1
+    assert found["coverage_90"] >= 0.85
+    assert 0.05 <= manifest.contact_threshold_n < 0.3
+    answers = bundle.golden["force"]
+    assert np.isfinite(answers).all()
+    assert 2.0 < np.linalg.norm(answers, axis=1).max() < 6.0
+
+
+def test_what_is_said_of_it_comes_from_presses_that_were_held_out(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    """Electrodes that know which press it is, but nothing of its force, help nobody."""
+    data = press_data(presses=12)
+    assert data.in_contact is not None
+    rng = np.random.default_rng(3)
+    fingerprint = rng.normal(0, 300, (12, 19))[data.group] * data.in_contact[:, None]
+    invented = replace(
+        data, electrodes=np.clip(data.baseline + fingerprint, 0, 4095).astype(np.uint16)
+    )
+    found = train_finger(invented, tmp_path / "b", name="features-mine").metrics
+    assert found["force_magnitude_median_n"] > 0.5 * found["constant_force_magnitude_median_n"]
+    assert found["coverage_90"] >= 0.8
+
+
+def test_a_recording_without_presses_counts_its_blocks(press_data: MakeData) -> None:
+    data = press_data(presses=8)
+    rows = replace(
+        data,
+        group=np.zeros_like(data.group),
+        in_contact=None,
+        contact_location=None,
+        centre_of_pressure=None,
+        contact_normal=None,
+    )
+    known, touched = known_rows(rows)
+    assert len(np.unique(known.press)) == 8
+    np.testing.assert_array_equal(touched, known.force.any(axis=1))
+
+
+def test_few_presses_are_refused(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data(presses=5)
+    with pytest.raises(DatasetError, match=r"5 presses of at least 0\.5 N; 6 are needed"):
+        train_finger(data, tmp_path / "b", name="features-mine")
+    light = replace(press_data(presses=8), force=press_data(presses=8).force * np.float32(0.05))
+    with pytest.raises(DatasetError, match="0 presses of at least"):
+        train_finger(light, tmp_path / "b", name="features-mine")
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_fingers_are_refused(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data(presses=8)
+    two = replace(data, sensor=(data.group >= 4).astype(np.int32), sensor_names=("one", "two"))
+    with pytest.raises(DatasetError, match="holds 2 fingers: one, two"):
+        train_finger(two, tmp_path / "b", name="features-mine")
+
+
+def test_no_bundle_is_overwritten(press_data: MakeData, tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    with pytest.raises(BundleError, match="exists"):
+        train_finger(press_data(presses=8), tmp_path / "b", name="features-mine")
+
+
+def test_a_common_rise_of_all_impedances_turns_no_force_round(press_data: MakeData) -> None:
+    """A warmer fluid: directions see nothing of the common mode, or a tenth of it."""
+    data = press_data(presses=16)
+    known, touched = known_rows(data)
+    rest = data.baseline[0].astype(np.float64)
+    net = ForceProcesses(known, rest, local=0.1)
+    counts = rest + known.tared[touched]
+    warmer = 4095.0 / (1.0 + 0.9 * (4095.0 / counts - 1.0)) - rest
+
+    def directions(tared: Floats) -> Floats:
+        with torch.inference_mode():
+            force = net(torch.from_numpy(tared)).numpy().astype(np.float64)
+        return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
+
+    cosine = np.sum(directions(known.tared[touched]) * directions(warmer), axis=1)
+    assert np.median(np.arccos(np.clip(cosine, -1, 1))) < 0.05

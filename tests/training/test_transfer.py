@@ -1,0 +1,250 @@
+"""Force on a finger that training has not met: invented fingers with one physics."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from typer.testing import CliRunner
+
+from palpate.anatomy import ELECTRODE_MIRROR
+from palpate.errors import DatasetError
+from palpate_training.cli import train_app
+from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.features import FeatureDataset, write_dataset
+from palpate_training.datasets.ingest import ingest_lasa
+from palpate_training.evaluation.transfer import Finger, fingers_of, run_transfer, worst_of
+from palpate_training.systems import transfer
+from palpate_training.systems.transfer import FingerRecording, ForceTransfer, LabelledPresses
+
+Floats = npt.NDArray[np.float64]
+
+ROWS = 1600
+ALL_ROWS = transfer.SOURCE_ROWS
+
+GOALS = {0: (0.24, 0.125), 5: (0.26, 0.08)}
+"""Median error of the magnitude [N] and angle [rad] of the worse real finger, by presses."""
+
+
+def pattern(force: Floats) -> Floats:
+    """Logarithms of the impedance over that at rest, (N, 19).
+
+    The mirror image of a force gives the mirror image of the pattern.
+    """
+    random = np.random.default_rng(7)
+    weight = random.normal(0.0, 0.05, (3, 19))
+    weight = 0.5 * (weight + np.array([[1.0], [-1.0], [1.0]]) * weight[:, ELECTRODE_MIRROR])
+    return np.asarray(np.tanh(force @ weight))
+
+
+def invented(seed: int, *, conductivity: float = 0.0, name: str = "") -> FeatureDataset:
+    """A finger in ordinary use; ``conductivity`` shifts all its logarithms since the tare."""
+    random = np.random.default_rng(seed)
+    steps = random.normal(size=(ROWS, 3)).cumsum(axis=0)
+    steps -= np.linspace(0.0, 1.0, ROWS)[:, None] * steps[-1]
+    force = np.array([0.0, 0.0, 4.0]) + np.array([1.0, 0.7, 1.2]) * steps / steps.std(axis=0)
+    force[:, 2] = np.maximum(force[:, 2], 0.5)
+    baseline = random.uniform(2400.0, 3000.0, 19)
+    ratio = 4095.0 / baseline - 1.0
+    logs = pattern(force) + random.normal(0.0, 0.002, (ROWS, 19)) + conductivity
+    counts = np.clip(np.rint(4095.0 / (1.0 + ratio * np.exp(logs))), 0, 4095)
+    return FeatureDataset(
+        electrodes=counts.astype(np.uint16),
+        baseline=np.tile(baseline, (ROWS, 1)).astype(np.float32),
+        force=force.astype(np.float32),
+        group=np.zeros(ROWS, np.int32),
+        block=np.zeros(ROWS, np.int32),
+        sensor=np.zeros(ROWS, np.int32),
+        sensor_names=(name or f"finger-{seed}",),
+        provenance=Provenance("invented", "", "", "", ""),
+    )
+
+
+def finger(seed: int, *, conductivity: float = 0.0) -> Finger:
+    return fingers_of(invented(seed, conductivity=conductivity))[0]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_rows() -> Iterator[None]:
+    """Real fingers give more rows, which take longer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(transfer, "SOURCE_ROWS", 150)
+        yield
+
+
+@pytest.fixture(scope="module")
+def model(few_rows: None) -> ForceTransfer:
+    """Fitted to the first finger."""
+    return ForceTransfer([finger(1).recording])
+
+
+def test_a_finger_that_was_never_met_is_estimated_better_than_by_the_mean() -> None:
+    result = run_transfer([finger(1)], finger(2))
+    assert result["magnitude_median_n"] < 0.3 * result["constant"]["magnitude_median_n"]
+    assert result["angle_median_rad"] < 0.3 * result["constant"]["angle_median_rad"]
+    assert 0.0 < result["magnitude_median_n"] < result["magnitude_p95_n"]
+    assert 0.5 < result["coverage_90"] <= 1.0
+
+
+def test_a_common_offset_changes_nothing(
+    model: ForceTransfer,
+) -> None:
+    """Conductivity and temperature multiply all impedances: no reason to see another force."""
+    plain, shifted = finger(2).recording, finger(2, conductivity=0.05).recording
+    for unlabelled in (False, True):
+        moved = model.estimate(shifted, unlabelled=unlabelled) - model.estimate(
+            plain, unlabelled=unlabelled
+        )
+        # A count is about 0.001 of a logarithm.
+        assert np.abs(moved).max() < 0.1 + (0.2 if unlabelled else 0.0)
+
+
+def test_without_labels_a_row_depends_on_the_tare_and_the_rows_before_it_only(
+    model: ForceTransfer,
+) -> None:
+    whole = finger(2).recording
+    some = replace(
+        whole,
+        electrodes=whole.electrodes[:800],
+        baseline=whole.baseline[:800],
+        segment=whole.segment[:800],
+        force=whole.force[:800],
+    )
+    early = model.estimate(whole, unlabelled=False)[:800]
+    np.testing.assert_allclose(model.estimate(some, unlabelled=False), early, atol=1e-9)
+
+
+def test_a_moving_mean_begins_anew_after_an_interruption(
+    model: ForceTransfer,
+) -> None:
+    whole = finger(2).recording
+    order = np.r_[900:ROWS, 0:900]
+    broken = replace(whole, segment=(np.arange(ROWS) >= 900).astype(int))
+    turned = FingerRecording(
+        whole.electrodes[order],
+        whole.baseline[order],
+        broken.segment[order],
+        whole.period_s,
+        whole.force[order],
+    )
+    np.testing.assert_allclose(
+        model.estimate(turned, unlabelled=False),
+        model.estimate(broken, unlabelled=False)[order],
+        atol=1e-9,
+    )
+
+
+def test_the_mirror_image_of_a_finger_has_the_mirror_image_of_the_force(
+    model: ForceTransfer,
+) -> None:
+    one = finger(2).recording
+    image = model.estimate(one.mirrored(), unlabelled=False)
+    np.testing.assert_allclose(
+        image, model.estimate(one, unlabelled=False) * [1.0, -1.0, 1.0], atol=1e-6
+    )
+
+
+def test_forces_that_are_not_labelled_are_not_looked_at(
+    model: ForceTransfer,
+) -> None:
+    one = finger(2).recording
+    labelled = LabelledPresses(np.arange(100, 300, 5), np.repeat([0, 1], 20))
+    hidden = replace(one, force=np.full_like(one.force, np.nan))
+    hidden.force[labelled.rows] = one.force[labelled.rows]
+    estimate = model.estimate(one, unlabelled=True)
+    np.testing.assert_array_equal(estimate, model.estimate(hidden, unlabelled=True))
+    first, second = (model.correct(each, estimate, labelled) for each in (one, hidden))
+    np.testing.assert_array_equal(first.force, second.force)
+
+
+def test_labelled_presses_correct_what_is_wrong_near_them(
+    model: ForceTransfer,
+) -> None:
+    one = finger(2).recording
+    wrong = replace(one, force=one.force + np.array([0.0, 0.0, 0.5]))
+    estimate = model.estimate(wrong, unlabelled=False)
+    rows = np.arange(0, ROWS, 10)
+    labelled = LabelledPresses(rows, rows // 200)
+    corrected = model.correct(wrong, estimate, labelled)
+    before, after = (np.abs(each - wrong.force).mean() for each in (estimate, corrected.force))
+    assert after < 0.5 * before
+
+
+def test_a_held_out_press_is_estimated_as_if_it_had_not_been_labelled(
+    model: ForceTransfer,
+) -> None:
+    one = finger(2).recording
+    estimate = model.estimate(one, unlabelled=False)
+    rows = np.concatenate([np.arange(at, at + 200, 20) for at in (0, 600, 1200)])
+    press = np.repeat([0, 1, 2], 10)
+    whole = model.correct(one, estimate, LabelledPresses(rows, press))
+    others = press != 1
+    without = model.correct(one, estimate, LabelledPresses(rows[others], press[others]))
+    np.testing.assert_allclose(whole.held_out[~others], without.force[rows[~others]], atol=1e-8)
+
+
+def test_what_cannot_be_tested_is_refused() -> None:
+    one, two = finger(1), finger(2)
+    with pytest.raises(DatasetError, match="is among those to train on"):
+        run_transfer([one, two], replace(two, name="another name"))
+    with pytest.raises(DatasetError, match="8 presses of 2 s, 8 are to be labelled"):
+        run_transfer([one], two, shots=8)
+
+
+def test_draws_are_reproducible_and_leave_the_labelled_rows_out() -> None:
+    results = [run_transfer([finger(1)], finger(2), shots=3, draws=2) for _ in range(2)]
+    assert results[0] == results[1]
+    other = run_transfer([finger(1)], finger(2), shots=3, draws=2, seed=1)
+    assert other["magnitude_median_n"] != results[0]["magnitude_median_n"]
+
+
+def test_the_worst_of_several_fingers_counts() -> None:
+    results = [run_transfer([finger(1)], finger(seed)) for seed in (2, 3)]
+    worst = worst_of(results)
+    for key in ("magnitude_median_n", "angle_median_rad"):
+        assert worst[key] == max(one[key] for one in results)
+    assert worst["fingers"] == {"finger-2": results[0], "finger-3": results[1]}
+
+
+@pytest.mark.parametrize("shots", [0, 2])
+def test_command_prints_json(tmp_path: Path, shots: int) -> None:
+    for seed in (1, 2):
+        write_dataset(tmp_path / f"{seed}.h5", invented(seed))
+    arguments = ["transfer", "--train", str(tmp_path / "1.h5"), "--test", str(tmp_path / "2.h5")]
+    options = ["--shots", str(shots), "--draws", "2", "--json"]
+    done = CliRunner().invoke(train_app, arguments + options)
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert {"magnitude_median_n", "magnitude_p95_n", "angle_median_rad", "coverage_90"} <= set(
+        found
+    )
+    assert (found["shots"], found["unlabelled"], found["test"]) == (shots, shots > 0, "finger-2")
+    assert set(found["ridge"]) == set(found["constant"]) > {"magnitude_median_n"}
+    table = CliRunner().invoke(train_app, [*arguments, "--draws", "1"])
+    assert "ridge" in table.output
+    assert "90 % intervals" in table.output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shots", sorted(GOALS))
+def test_real_fingers_that_were_never_met(
+    shared_data: Path, shots: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transfer, "SOURCE_ROWS", ALL_ROWS)
+    source = shared_data / "lasa_force_calibration" / "force_calibration.npz"
+    if not source.is_file():
+        pytest.skip("the LASA force calibration is not among the real data")
+    one, two = fingers_of(ingest_lasa(source))
+    magnitude_n, angle_rad = GOALS[shots]
+    for known, tested in ((one, two), (two, one)):
+        result = run_transfer([known], tested, shots=shots, unlabelled=shots > 0, draws=4)
+        assert result["magnitude_median_n"] <= magnitude_n
+        assert result["angle_median_rad"] <= angle_rad
+        assert 0.8 < result["coverage_90"] < 0.99
+        for rival in ("constant", "ridge"):
+            assert result["angle_median_rad"] < result[rival]["angle_median_rad"]

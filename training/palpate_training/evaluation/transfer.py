@@ -1,0 +1,314 @@
+"""How well forces are estimated on a finger that was never met, and after a few presses of it.
+
+The finger that is tested is none of those that are trained on. Three ways of using it: nothing but
+its tare; its electrodes without forces, as a minute of ordinary use gives them; and some presses
+against a force sensor, of 2 s each, drawn at random several times. Rows within a second of a
+labelled press are not tested.
+
+    palpate train transfer --train one.h5 --test two.h5 --shots 5
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate_training.datasets.container import add_array
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.learning.baselines import ridge
+from palpate_training.learning.metrics import force_errors
+from palpate_training.systems.transfer import FingerRecording, ForceTransfer, LabelledPresses
+
+Floats = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.integer]
+
+PRESS_S = 2.0
+GUARD_S = 1.0
+NOMINAL_PERIOD_S = 0.01
+"""Time between rows where a data set has no times: a BioTac's 100 Hz."""
+
+GAP_S = 1.0
+"""A longer gap between rows ends an uninterrupted piece."""
+
+LABELLED_HZ = 20.0
+"""Labelled rows that are used; those between are nearly copies."""
+
+FIGURES = ("magnitude_median_n", "magnitude_p95_n", "angle_median_rad")
+"""What is told of every estimate, those of the constant and the ridge regression included."""
+
+LEVEL = 0.9
+"""Share of true magnitudes that the intervals should hold."""
+
+FLOOR_N = 1.0
+"""Errors grow with the force: an interval is a multiple of this plus the estimated magnitude."""
+
+PRESSES_OF_OTHERS = 5
+"""As many labelled presses count as much as the other fingers where intervals are made."""
+
+_VALIDATION = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Finger:
+    """Rows of one finger and its name."""
+
+    name: str
+    recording: FingerRecording
+    tared: npt.NDArray[np.float32]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its electrodes and forces, which tells the same rows under two names."""
+        digest = hashlib.sha256()
+        add_array(digest, "electrodes", np.asarray(self.recording.electrodes))
+        add_array(digest, "force", self.recording.force)
+        return digest.hexdigest()
+
+
+def fingers_of(data: FeatureDataset) -> list[Finger]:
+    """The fingers of a data set, each with all its rows."""
+    return [_finger(data, sensor) for sensor in range(len(data.sensor_names))]
+
+
+def _finger(data: FeatureDataset, sensor: int) -> Finger:
+    rows = np.flatnonzero(data.sensor == sensor)
+    group = data.group[rows]
+    period_s, broken = NOMINAL_PERIOD_S, np.diff(group, prepend=group[:1]) != 0
+    if data.time_ns is not None:
+        steps_s = 1e-9 * np.diff(data.time_ns[rows].astype(np.float64))
+        forward = steps_s[steps_s > 0.0]
+        period_s = float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+        broken = np.concatenate([[False], (steps_s > GAP_S) | (steps_s < 0.0)])
+    recording = FingerRecording(
+        data.electrodes[rows],
+        data.baseline[rows],
+        np.cumsum(broken),
+        period_s,
+        data.force[rows].astype(np.float64),
+    )
+    return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])
+
+
+def run_transfer(
+    train: Sequence[Finger],
+    test: Finger,
+    *,
+    shots: int = 0,
+    unlabelled: bool = False,
+    draws: int = 12,
+    seed: int = 0,
+    on_step: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Fit to some fingers, and measure on another.
+
+    Args:
+        train: Fingers to learn from.
+        test: The finger that is tested.
+        shots: Its presses whose forces are known.
+        unlabelled: Whether mean and spread of its electrodes may be used.
+        draws: How often the labelled presses are drawn; results are means over the draws.
+        seed: Of the draws.
+        on_step: Called ``steps_of`` times, for a progress bar.
+
+    Returns:
+        ``magnitude_median_n``, ``magnitude_p95_n``, ``angle_median_rad``, ``coverage_90`` (share of
+        the true magnitudes inside their 90 % intervals), ``interval_median_n`` (half its width),
+        and in ``constant`` and ``ridge`` the first three of a constant and of a ridge regression
+        that know the same forces; which finger, how many presses, draws and tested rows.
+
+    Raises:
+        DatasetError: The tested finger is among the others, or has too few presses.
+    """
+    for finger in train:
+        if finger.digest == test.digest:
+            raise DatasetError(
+                f"the tested finger {test.name!r} is among those to train on, as {finger.name!r}",
+                remedy="test a finger that the training has not met",
+            )
+    pieces = _presses(test.recording)
+    if shots >= len(pieces):
+        raise DatasetError(
+            f"{test.name!r} has {len(pieces)} presses of {PRESS_S:g} s, {shots} are to be labelled",
+            remedy=f"label at most {len(pieces) - 1}, so that some are left to test",
+        )
+    sources = [finger.recording for finger in train]
+    width = _width_on_others(train, on_step)
+    model = ForceTransfer(sources)
+    on_step()
+    zero = model.estimate(test.recording, unlabelled=unlabelled)
+    on_step()
+    rng = np.random.default_rng(seed)
+    found: dict[str, list[dict[str, float]]] = {"": [], "constant": [], "ridge": []}
+    for _ in range(draws if shots else 1):
+        labelled, tested = _draw(pieces, shots, test.recording, rng)
+        force, own_width = zero, width
+        if shots:
+            corrected = model.correct(test.recording, zero, labelled)
+            force = corrected.force
+            known = test.recording.force[labelled.rows]
+            share = shots / (shots + PRESSES_OF_OTHERS)
+            own_width = (1.0 - share) * width + share * _width(corrected.held_out, known)
+        truth = test.recording.force[tested]
+        result = summary(force[tested], truth)
+        half = own_width * (FLOOR_N + np.linalg.norm(force[tested], axis=1))
+        errors = force_errors(force[tested], truth)["magnitude_n"]
+        result |= {
+            "coverage_90": float(np.mean(errors <= half)),
+            "interval_median_n": float(np.median(half)),
+        }
+        found[""].append(result)
+        for name, estimate in _baselines(train, test, labelled.rows, tested).items():
+            found[name].append(summary(estimate, truth))
+        on_step()
+    means = {
+        name: {key: float(np.mean([one[key] for one in results])) for key in results[0]}
+        for name, results in found.items()
+    }
+    return {
+        **means.pop(""),
+        **means,
+        "test": test.name,
+        "train": [finger.name for finger in train],
+        "shots": shots,
+        "unlabelled": unlabelled,
+        "draws": draws if shots else 1,
+        "seed": seed,
+        "rows": len(test.recording.force),
+    }
+
+
+def steps_of(train: int, *, shots: int, draws: int) -> int:
+    """How often ``run_transfer`` calls ``on_step`` with so many training fingers."""
+    return max(2, train) + 2 + (draws if shots else 1)
+
+
+def summary(estimate: Floats, truth: Floats) -> dict[str, float]:
+    """``FIGURES`` of estimated forces [N], each of shape (N, 3)."""
+    errors = force_errors(estimate, truth)
+    values = (
+        np.median(errors["magnitude_n"]),
+        np.percentile(errors["magnitude_n"], 95.0),
+        np.nanmedian(errors["angle_rad"]),
+    )
+    return dict(zip(FIGURES, map(float, values), strict=True))
+
+
+def _presses(recording: FingerRecording) -> list[Rows]:
+    """Rows of the presses that may be labelled: pieces of 2 s, none over an interruption."""
+    size = max(1, round(PRESS_S / recording.period_s))
+    starts = np.flatnonzero(np.diff(recording.segment)) + 1
+    pieces: list[Rows] = []
+    for rows in np.split(np.arange(len(recording.segment)), starts):
+        pieces += [rows[at : at + size] for at in range(0, len(rows) - size + 1, size)]
+    return pieces
+
+
+def _draw(
+    pieces: Sequence[Rows], shots: int, recording: FingerRecording, rng: np.random.Generator
+) -> tuple[LabelledPresses, Rows]:
+    """Labelled rows, and the rows to test."""
+    guard = round(GUARD_S / recording.period_s)
+    step = max(1, round(1.0 / (LABELLED_HZ * recording.period_s)))
+    tested = np.ones(len(recording.segment), bool)
+    labelled: list[Rows] = []
+    for at in rng.choice(len(pieces), shots, replace=False):
+        rows = pieces[at]
+        tested[max(0, rows[0] - guard) : rows[-1] + 1 + guard] = False
+        labelled.append(rows[::step])
+    press = np.repeat(np.arange(shots), [len(rows) for rows in labelled])
+    known = np.concatenate(labelled) if labelled else np.zeros(0, np.int64)
+    return LabelledPresses(known, press), np.flatnonzero(tested)
+
+
+def _width(estimate: Floats, truth: Floats) -> float:
+    """Half width of the intervals over ``FLOOR_N`` plus the magnitude, from known forces."""
+    errors = force_errors(estimate, truth)["magnitude_n"]
+    return float(np.quantile(errors / (FLOOR_N + np.linalg.norm(estimate, axis=1)), LEVEL))
+
+
+def _width_on_others(train: Sequence[Finger], on_step: Callable[[], None]) -> float:
+    """The same from the training fingers: each estimated from the others, or a half from the other.
+
+    Halves of one finger know nothing of what differs from finger to finger, so the intervals of one
+    training finger are too narrow. Magnitudes do not depend on what unlabelled electrodes tell.
+    """
+    if len(train) > 1:
+        held_out = [
+            ([other.recording for other in train if other is not finger], finger.recording)
+            for finger in train
+        ]
+    else:
+        (finger,) = train
+        halves = [_half(finger.recording, k) for k in range(2)]
+        held_out = [([halves[1 - k]], halves[k]) for k in range(2)]
+    estimates, truths = [], []
+    for sources, tested in held_out:
+        estimates.append(ForceTransfer(sources).estimate(tested, unlabelled=False))
+        truths.append(tested.force)
+        on_step()
+    return _width(np.vstack(estimates), np.vstack(truths))
+
+
+def _half(recording: FingerRecording, which: int) -> FingerRecording:
+    middle = len(recording.force) // 2
+    rows = slice(0, middle) if which == 0 else slice(middle, None)
+    return replace(
+        recording,
+        electrodes=recording.electrodes[rows],
+        baseline=recording.baseline[rows],
+        segment=recording.segment[rows],
+        force=recording.force[rows],
+    )
+
+
+def _baselines(
+    train: Sequence[Finger], test: Finger, labelled: Rows, tested: Rows
+) -> dict[str, Floats]:
+    """Estimates of the tested rows by a constant and by a ridge regression on tared counts.
+
+    The constant is the mean of what is known of the tested finger, else of the others. The
+    regression knows both; labelled rows count as much as all others together.
+    """
+    parts: list[tuple[Floats, Floats]] = []
+    ends: list[tuple[Floats, Floats]] = []
+    for finger in train:
+        border = round(len(finger.tared) * (1.0 - _VALIDATION))
+        force, tared = finger.recording.force, finger.tared.astype(np.float64)
+        parts.append((tared[:border], force[:border]))
+        ends.append((tared[border:], force[border:]))
+    known = test.recording.force[labelled]
+    mean = known.mean(axis=0) if len(labelled) else np.vstack([y for _, y in parts]).mean(axis=0)
+    if len(labelled):
+        own = test.tared[labelled].astype(np.float64)
+        times = max(1, sum(len(x) for x, _ in parts) // len(own))
+        parts.append((np.tile(own, (times, 1)), np.tile(known, (times, 1))))
+    x, y = (np.vstack(columns) for columns in zip(*parts, strict=True))
+    x_end, y_end = (np.vstack(columns) for columns in zip(*ends, strict=True))
+    line = ridge(x, y, x_end, y_end)
+    return {
+        "constant": np.tile(mean, (len(tested), 1)),
+        "ridge": line.predict(test.tared[tested]),
+    }
+
+
+def worst_of(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Of several tested fingers: the worst of each figure, and all of them by name."""
+
+    def worst(tables: Sequence[dict[str, Any]]) -> dict[str, float]:
+        return {key: max(table[key] for table in tables) for key in FIGURES}
+
+    first = results[0]
+    return {
+        **worst(results),
+        "coverage_90": min(one["coverage_90"] for one in results),
+        "constant": worst([one["constant"] for one in results]),
+        "ridge": worst([one["ridge"] for one in results]),
+        **{key: first[key] for key in ("train", "shots", "unlabelled", "draws", "seed")},
+        "fingers": {one["test"]: one for one in results},
+    }

@@ -1,0 +1,323 @@
+"""Force on a finger that was never met: Gaussian processes on inputs that fingers share.
+
+What differs from finger to finger is mostly a common mode: conductivity and temperature of the
+fluid multiply the impedance of all electrodes, and the tare is never of the same moment. So inputs
+are logarithms of the impedance over that at rest, less their mean over the electrodes, and beside
+them their changes over half a second to twenty seconds, which no slow drift reaches. A Gaussian
+process with a linear and a local part becomes a line where it extrapolates. Estimates are means
+over a few such processes, none of them chosen alone.
+
+From a finger's electrodes *without* forces comes more about the direction: a recording's mean and
+spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
+comes a correction that reaches as far as what was pressed, by the common mode, too.
+
+All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
+worse counting, and then frozen (training/LOG.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
+from scipy.signal import lfilter
+
+from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
+from palpate_training.learning.electrode_nets import MIRROR_AXES
+from palpate_training.systems.samples import impedance_ohm
+
+Floats = npt.NDArray[np.float64]
+Counts = npt.NDArray[np.number]
+
+ELECTRODES = len(ELECTRODE_POSITIONS)
+
+SOURCE_ROWS = 450
+"""Rows of each training finger, evenly spaced; each is used with its mirror image."""
+
+NOISE = 0.1
+"""Variance of the noise, over that of the forces: neighbouring rows err together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What one process sees of a row.
+
+    Attributes:
+        contexts_s: Times of the moving means [s]; what the present values differ by from each of
+            them stands beside these values.
+        weight: Of those differences, each in units of its spread.
+        common: Share of the common mode that is kept.
+    """
+
+    contexts_s: tuple[float, ...]
+    weight: float = 1.0
+    common: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """``linear a.b / 19 + exp(-local |a - b|^2 / 19)``."""
+
+    linear: float
+    local: float
+
+    def __call__(self, a: Floats, b: Floats) -> Floats:
+        """Covariances of rows (N, D) and (M, D), shape (N, M)."""
+        product = a @ b.T
+        squares = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * product
+        return np.asarray(
+            self.linear / ELECTRODES * product + np.exp(-self.local / ELECTRODES * squares)
+        )
+
+
+_SHORT = Inputs((0.5, 5.0))
+_KERNELS = (Kernel(1.5, 0.05), Kernel(1.5, 0.1))
+MAGNITUDE = [(inputs, kernel) for inputs in (Inputs((0.5,)), _SHORT) for kernel in _KERNELS]
+"""Processes whose mean length is the estimated magnitude."""
+
+DIRECTION = [
+    (inputs, kernel)
+    for inputs in (_SHORT, Inputs((1.0, 10.0), weight=1.5), Inputs((0.5, 20.0)))
+    for kernel in _KERNELS
+]
+"""Processes whose mean direction is the estimated direction."""
+
+ALIGNED_DIRECTION = [
+    (Inputs(contexts, common=common), Kernel(0.5, local))
+    for contexts in ((0.5,), (0.5, 5.0))
+    for common in (0.1, 0.3)
+    for local in (0.05, 0.1)
+]
+"""The same on inputs that are aligned by the mean and the spread of each recording."""
+
+CORRECTION_INPUTS = Inputs((0.5,), common=1.0)
+CORRECTION = Kernel(0.0, 1.0)
+CORRECTION_VARIANCE_N2 = 0.3
+"""Of the error that labelled presses correct, near them."""
+
+OFFSET_VARIANCE_N2 = 0.01
+"""Of the error's share that is the same everywhere."""
+
+PRESS_VARIANCE_N2 = 0.02
+"""Of what the rows of one press share and another press does not: a baseline that wanders."""
+
+ROW_VARIANCE_N2 = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class FingerRecording:
+    """Rows of one finger in order of time.
+
+    Attributes:
+        electrodes: Raw counts, shape (N, 19).
+        baseline: Untouched counts, shape (N, 19).
+        segment: Number of the uninterrupted piece that each row belongs to, shape (N,).
+        period_s: Time between two rows [s].
+        force: [N], sensor frame, shape (N, 3).
+    """
+
+    electrodes: Counts
+    baseline: Counts
+    segment: npt.NDArray[np.integer]
+    period_s: float
+    force: Floats
+
+    def parts(self, inputs: Inputs) -> list[Floats]:
+        """Present values, then their differences from moving means, each of shape (N, 19)."""
+        values = np.log(impedance_ohm(self.electrodes) / impedance_ohm(self.baseline))
+        values -= (1.0 - inputs.common) * values.mean(axis=1, keepdims=True)
+        means = (self._moving_mean(values, context_s) for context_s in inputs.contexts_s)
+        return [values, *(values - mean for mean in means)]
+
+    def mirrored(self) -> FingerRecording:
+        """What the finger would have read, had all been its mirror image."""
+        return replace(
+            self,
+            electrodes=self.electrodes[:, ELECTRODE_MIRROR],
+            baseline=self.baseline[:, ELECTRODE_MIRROR],
+            force=self.force * MIRROR_AXES,
+        )
+
+    def _moving_mean(self, values: Floats, context_s: float) -> Floats:
+        """Exponential moving mean within each segment, from the first row on."""
+        share = -np.expm1(-self.period_s / context_s)
+        mean = np.empty_like(values)
+        starts = np.flatnonzero(np.diff(self.segment, prepend=self.segment[0] - 1))
+        for rows in np.split(np.arange(len(values)), starts[1:]):
+            piece = values[rows]
+            mean[rows], _ = lfilter(
+                [share], [1.0, share - 1.0], piece, axis=0, zi=(1.0 - share) * piece[:1]
+            )
+        return mean
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """Centre and spread of each input, shape (D,)."""
+
+    centre: Floats
+    spread: Floats
+
+    @classmethod
+    def of(cls, recording: FingerRecording, inputs: Inputs) -> _Scale:
+        """Those of a recording; electrodes that never change count with one."""
+        rows = np.hstack(recording.parts(inputs))
+        spread = rows.std(axis=0)
+        return cls(rows.mean(axis=0), np.where(spread > 0.0, spread, 1.0))
+
+    @classmethod
+    def shared(cls, recordings: Sequence[FingerRecording], inputs: Inputs) -> _Scale:
+        """No centre, and the mean spread of several recordings and their mirror images."""
+        both = [*recordings, *(recording.mirrored() for recording in recordings)]
+        spreads = [cls.of(recording, inputs).spread for recording in both]
+        spread = np.sqrt(np.mean(np.square(spreads), axis=0))
+        return cls(np.zeros(len(spread)), spread)
+
+    def apply(
+        self, recording: FingerRecording, inputs: Inputs, rows: npt.NDArray[np.integer]
+    ) -> Floats:
+        """Inputs of some rows, shape (M, D)."""
+        parts = np.hstack([part[rows] for part in recording.parts(inputs)])
+        weight = np.repeat([1.0, *[inputs.weight] * len(inputs.contexts_s)], ELECTRODES)
+        return np.asarray(weight * (parts - self.centre) / self.spread)
+
+
+class _Process:
+    """One Gaussian process of the force."""
+
+    def __init__(
+        self, sources: Sequence[FingerRecording], inputs: Inputs, kernel: Kernel, *, aligned: bool
+    ) -> None:
+        self._inputs, self._kernel, self._aligned = inputs, kernel, aligned
+        self._scale = _Scale.shared(sources, inputs)
+        rows, targets = [], []
+        for source in sources:
+            some = np.linspace(0, len(source.force), SOURCE_ROWS, endpoint=False).astype(int)
+            some = np.unique(some)
+            for one in (source, source.mirrored()):
+                rows.append(self._scale_of(one).apply(one, inputs, some))
+                targets.append(one.force[some])
+        self._rows = np.vstack(rows)
+        force = np.vstack(targets)
+        self._unit = force.std()
+        covariance = kernel(self._rows, self._rows)
+        covariance[np.diag_indices(len(covariance))] += NOISE
+        self._weight = cho_solve(cho_factor(covariance, lower=True), force / self._unit)
+
+    def _scale_of(self, recording: FingerRecording) -> _Scale:
+        return _Scale.of(recording, self._inputs) if self._aligned else self._scale
+
+    def __call__(self, recording: FingerRecording) -> Floats:
+        """Forces of all rows [N], shape (N, 3)."""
+        everything = np.arange(len(recording.electrodes))
+        rows = self._scale_of(recording).apply(recording, self._inputs, everything)
+        parts = np.array_split(rows, max(1, len(rows) // 4000))
+        estimate = [self._kernel(part, self._rows) @ self._weight for part in parts]
+        return np.asarray(self._unit * np.vstack(estimate))
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledPresses:
+    """Rows of the finger with a known force.
+
+    Attributes:
+        rows: Their numbers, shape (M,).
+        press: Press of each, shape (M,).
+    """
+
+    rows: npt.NDArray[np.integer]
+    press: npt.NDArray[np.integer]
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedForces:
+    """Estimates of all rows of a recording after labelled presses.
+
+    Attributes:
+        force: [N], shape (N, 3).
+        held_out: Estimates of the labelled rows, each without its own press, shape (M, 3).
+    """
+
+    force: Floats
+    held_out: Floats
+
+
+class ForceTransfer:
+    """Estimates forces on fingers that are not among those it was fitted to."""
+
+    def __init__(self, sources: Sequence[FingerRecording]) -> None:
+        """Fit to recordings of other fingers, with their forces."""
+        self._sources = sources
+        self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
+        # Some estimate both magnitude and direction.
+        self._processes = {
+            each: _Process(sources, *each, aligned=False) for each in (*MAGNITUDE, *DIRECTION)
+        }
+
+    @cached_property
+    def _aligned(self) -> list[_Process]:
+        """Only needed where unlabelled electrodes may be used."""
+        return [_Process(self._sources, *each, aligned=True) for each in ALIGNED_DIRECTION]
+
+    def estimate(self, recording: FingerRecording, *, unlabelled: bool) -> Floats:
+        """Forces [N], shape (N, 3); those of the recording are not looked at.
+
+        Args:
+            recording: Of the new finger.
+            unlabelled: Whether mean and spread of all its electrodes may be used, later rows
+                included; else a row's estimate follows from the tare and the rows before it.
+        """
+        forces = {each: process(recording) for each, process in self._processes.items()}
+        direction = _mean_direction([forces[each] for each in DIRECTION])
+        if unlabelled:
+            direction += _mean_direction([process(recording) for process in self._aligned])
+            direction = _unit(direction)
+        lengths = [np.linalg.norm(forces[each], axis=1) for each in MAGNITUDE]
+        return np.asarray(np.mean(lengths, axis=0)[:, None] * direction)
+
+    def correct(
+        self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses
+    ) -> CorrectedForces:
+        """Correct estimates by labelled presses of the same finger.
+
+        Args:
+            recording: With the forces of the labelled rows; no others are looked at.
+            estimate: Of all its rows [N], shape (N, 3).
+            labelled: Which rows.
+        """
+        everything = np.arange(len(estimate))
+        rows = self._scale.apply(recording, CORRECTION_INPUTS, everything)
+        known = rows[labelled.rows]
+        error = recording.force[labelled.rows] - estimate[labelled.rows]
+
+        def covariance(a: Floats, b: Floats) -> Floats:
+            return OFFSET_VARIANCE_N2 + CORRECTION_VARIANCE_N2 * CORRECTION(a, b)
+
+        same = labelled.press[:, None] == labelled.press
+        inverse = np.linalg.inv(
+            covariance(known, known)
+            + PRESS_VARIANCE_N2 * same
+            + ROW_VARIANCE_N2 * np.eye(len(same))
+        )
+        weight = inverse @ error
+        parts = np.array_split(rows, max(1, len(rows) // 4000))
+        force = estimate + np.vstack([covariance(part, known) @ weight for part in parts])
+        # What is left of a press when it is left out follows from the inverse alone.
+        held_out = np.empty_like(error)
+        for press in np.unique(labelled.press):
+            own = labelled.press == press
+            left = np.linalg.solve(inverse[np.ix_(own, own)], weight[own])
+            held_out[own] = recording.force[labelled.rows[own]] - left
+        return CorrectedForces(force, held_out)
+
+
+def _mean_direction(forces: Sequence[Floats]) -> Floats:
+    return _unit(np.sum([_unit(force) for force in forces], axis=0))
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
