@@ -51,12 +51,14 @@ class Published:
 
     Attributes:
         at_s: When it was published, host's monotonic clock [s].
+        sampled_s: Its time stamp, on the same clock [s].
         right: It says what was measured, in every channel that it claims to be good.
         good: It is right, and nothing in it is marked as bad.
         order: Its sequence number and stamp follow on those of the one before.
     """
 
     at_s: float
+    sampled_s: float
     right: bool
     good: bool
     order: bool
@@ -128,7 +130,7 @@ class _Sink:
             self._whole |= message.validity
             sober = was_measured(message.electrodes, slow, message.pac, message.validity)
             good = sober and message.validity == self._whole
-        self.seen.append(Published(now_s, right, good, order))
+        self.seen.append(Published(now_s, 1e-9 * stamp.monotonic_ns, right, good, order))
 
     def put_payload(self, payload: bytes) -> None:
         raise AssertionError("a live device has no recorded messages")
@@ -220,15 +222,22 @@ class FaultBench(AbstractContextManager["FaultBench"]):
         return Counter(self._worker.counters())
 
     def _until_sound(self, from_s: float) -> float:
-        """When the first of the good messages was published that follow one another."""
+        """When the first of the good messages was published that follow one another.
+
+        They must have been sampled after ``from_s``: a worker that lags publishes messages from
+        before a fault when the fault has ended and was counted.
+        """
+
+        def sound(one: Published) -> bool:
+            return one.good and one.sampled_s >= from_s
 
         def found() -> float | None:
             seen = self._sink.seen
             last = seen[-SOUND:]
-            if len(last) < SOUND or last[0].at_s < from_s or not all(one.good for one in last):
+            if len(last) < SOUND or not all(sound(one) for one in last):
                 return None
             at = len(seen)
-            while at and seen[at - 1].at_s >= from_s and seen[at - 1].good:
+            while at and sound(seen[at - 1]):
                 at -= 1
             return seen[at].at_s
 

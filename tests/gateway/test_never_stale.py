@@ -44,7 +44,7 @@ stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: stop.set())
 values, connect = json.loads(sys.argv[1]), sys.argv[2]
 config = parse_config(GatewayConfig, values, where="test")
-node.run(config, LinkConfig(connect=(connect,), wait_for_router_s=20.0), "lab", stop)
+node.run(config, LinkConfig(connect=(connect,), wait_for_router_s=60.0), "lab", stop)
 """
 
 
@@ -135,18 +135,21 @@ def test_what_waited_is_published_with_its_true_time(
         told = source.frame if name == "finger" else source.wrench
         if source.late_s > WAITED_S:
             pytest.skip("this machine stood still itself, and the emulated devices with it")
-        waited = _check(queue, told, stopped_s, went_on_s)
+        waited = _check(queue, source, told, stopped_s, went_on_s)
         assert waited >= 5, f"{name}: {waited} messages had waited"
 
 
-def _check(queue: Any, told: Callable[[Any], float], stopped_s: float, went_on_s: float) -> int:
+def _check(
+    queue: Any, source: Now, told: Callable[[Any], float], stopped_s: float, went_on_s: float
+) -> int:
     """Read until it is live again; the number of messages that had waited while it stood still."""
     waited, fresh = 0, 0
     while fresh < 20:
         received: ReceivedMessage[Any] = queue.next(timeout_s=PATIENCE_S)
         stamp = received.message.stamp
         taken_s = told(received.message)
-        assert 1e-9 * stamp.monotonic_ns - taken_s < TOO_NEW_S
+        # What an emulator sends late it has measured before: no gateway can know that.
+        assert 1e-9 * stamp.monotonic_ns - taken_s < TOO_NEW_S + source.late_s
         came_s = 1e-9 * received.received_monotonic_ns
         if taken_s > stopped_s and came_s - taken_s > WAITED_S:
             waited += 1

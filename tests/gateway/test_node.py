@@ -24,7 +24,7 @@ from palpate_gateway.readings import Reading
 from palpate_gateway.service import node
 from palpate_gateway.virtual import finger as virtual
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 
 
 def test_live_virtual_finger(bus: Any) -> None:

@@ -18,7 +18,7 @@ from palpate.errors import RecordingError, RemoteError
 from palpate.files.record import RecordWriter, read_record
 from palpate.messages import ElectrodeFrame, Origin, ServiceState
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 
 
 def replay(path: Path, **more: Any) -> dict[str, Any]:

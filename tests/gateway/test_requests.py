@@ -28,7 +28,7 @@ import sys
 from palpate.bus import Session
 from palpate.client.estimates import ask_tare
 from palpate.config import LinkConfig
-with Session.open(LinkConfig(connect=(sys.argv[1],), wait_for_router_s=20)) as session:
+with Session.open(LinkConfig(connect=(sys.argv[1],), wait_for_router_s=60)) as session:
     print("asks", flush=True)
     ask_tare(session, "finger", frames=int(sys.argv[2]), timeout_s=20)
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import site
 import subprocess
 import sys
@@ -136,7 +137,8 @@ def test_planted_violation_is_caught(
     assert any(contract in text for text in broken), result.stdout
 
 
-def _imported(path: Path) -> set[str]:
+@functools.cache  # each package below looks at every file
+def _imported(path: Path) -> frozenset[str]:
     """Every module that a file imports, also inside functions."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -145,7 +147,7 @@ def _imported(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names.add(node.module)
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return names
+    return frozenset(names)
 
 
 @pytest.mark.parametrize("package", HOMES)
