@@ -32,7 +32,7 @@ from tests.gateway.fault_names import (
 LASTS_S = 0.25
 """Longer than any sensor may be silent before it is said to be lost."""
 
-AT_ONCE = 6
+AT_ONCE = 3
 """Devices that are tried at the same time: most of a trial is waiting."""
 
 TRIALS = 3

@@ -230,7 +230,7 @@ def calibrate(
 @app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))
 def demo(
     seconds: Annotated[
-        float, typer.Option(min=1, help="Duration after the first estimate [s].")
+        float, typer.Option(min=1, help="Duration after the first estimates [s].")
     ] = 20,
     out: Annotated[Path, typer.Option(help="Folder for record, view and picture.")] = Path(
         "runs/demo"

@@ -180,6 +180,12 @@ class FieldComparison:
         self._moved: list[float] = []
         self._errors: list[float] = []
         self._electrodes: list[float] = []
+        self._came: set[str] = set()
+
+    @property
+    def complete(self) -> bool:
+        """Whether a field and a synthesis have come."""
+        return len(self._came) == 2
 
     def subscribe(self, session: Session, sensor: str) -> FieldStreams:
         """Subscribe to estimates and truth of a sensor."""
@@ -203,9 +209,11 @@ class FieldComparison:
         for truth in _all(streams.truth):
             self._truth.append((truth.stamp.monotonic_ns, truth.displacement))
         for estimate in _all(streams.field):
+            self._came.add("field")
             self._waiting.append((estimate.source.monotonic_ns, estimate.displacement))
         self._match()
         for synthesis in _all(streams.synthesis):
+            self._came.add("synthesis")
             self._compare(synthesis, streams.tare)
 
     def medians(self) -> FieldMedians:

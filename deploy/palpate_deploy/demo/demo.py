@@ -32,11 +32,11 @@ _REFRESH_S = 0.1
 _LINE_S = 1.0
 _JOIN_S = 15.0
 _FIRST_S = 20.0
-"""A cold host may take this long to import, load, tare and give the first estimate [s]."""
+"""A cold host may take this long to import, load, tare and give the first estimates [s]."""
 
 
 def run_demo(seconds: float, out: Path) -> int:
-    """Run the demo until ``seconds`` after the first estimate; the exit code, 1 if none came.
+    """Run the demo until ``seconds`` after the first estimates; the exit code, 1 if none came.
 
     Raises:
         PalpateError: The demo cannot start.
@@ -51,7 +51,7 @@ def run_demo(seconds: float, out: Path) -> int:
     stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     console.print(
         "virtual finger -> features, fields, synthesis -> recorder, for "
-        f"{seconds:g} s after the first estimate",
+        f"{seconds:g} s after the first estimates",
     )
     comparison, fields = TouchComparison(), FieldComparison()
     with Supervisor(profile, "demo") as supervisor:
@@ -78,7 +78,10 @@ def _watch(
     seconds: float,
     stop: threading.Event,
 ) -> None:
-    """Compare estimates with truth until ``seconds`` after the first estimate."""
+    """Compare estimates with truth until ``seconds`` after the first of every kind.
+
+    A kind that does not come is not waited for longer than ``_FIRST_S``.
+    """
     with (
         Client(profile.link.connect[0], station=profile.station, timeout_s=_JOIN_S) as robot,
         Live(console=console, auto_refresh=False, transient=False) as live,
@@ -88,15 +91,19 @@ def _watch(
         end = time.monotonic() + _FIRST_S
         redraw = 0.0
         started = False
-        while (now := time.monotonic()) < end and not stop.is_set():
+        while not stop.is_set():
+            now = time.monotonic()
+            all_came = comparison.count and fields.complete
+            if not started and (all_came or (comparison.count and now >= end)):
+                started, end = True, now + seconds
+            if now >= end:
+                break
             try:
                 comparison.take(timeout_s=0.05)
             except StreamTimeout:
                 continue
             finally:
                 fields.take(field_streams)
-            if comparison.count and not started:
-                started, end = True, now + seconds
             if comparison.newest is None or now < redraw:
                 continue
             if console.is_terminal:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache, partial
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -197,8 +198,8 @@ def make_cells(
 ) -> None:
     """Make the cells that the folder does not hold, in ``workers`` processes (0 = in this one).
 
-    Networks are trained on ``device``, as torch calls it. ``on_cell`` is told each cell, and
-    whether it had to be made.
+    Networks are trained on ``device``, as torch calls it; with ``cuda`` the processes take turns
+    among the GPUs that there are. ``on_cell`` is told each cell, and whether it had to be made.
 
     Raises:
         DatasetError: The disk refuses.
@@ -217,11 +218,12 @@ def make_cells(
             _keep(folder, by_name[cell.task], cell, content)
             on_cell(cell, True)
         return
+    context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         min(workers, max(1, len(left))),
-        mp_context=multiprocessing.get_context("spawn"),
+        mp_context=context,
         initializer=_take_tasks,
-        initargs=(by_name, device),
+        initargs=(by_name, device, context.Value("i", 0)),
     ) as pool:
         waiting = iter(left)
         running: dict[Future[bytes], Cell] = {}
@@ -249,9 +251,13 @@ def _finish_some(
 _tasks: dict[str, Task] = {}
 
 
-def _take_tasks(tasks: dict[str, Task], device: str) -> None:
+def _take_tasks(tasks: dict[str, Task], device: str, begun: Synchronized[int]) -> None:
     end_with_parent()
     os.nice(5)  # so that the machine stays usable during a night's work
+    if device == "cuda":
+        with begun.get_lock():
+            torch.cuda.set_device(begun.value % torch.cuda.device_count())
+            begun.value += 1
     torch.set_default_device(device)
     _tasks.update(tasks)
 
