@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -162,11 +163,16 @@ def test_monitor_for_machines(kms40: Kms40Emulator) -> None:
 
 
 def test_monitor_opens_a_lost_device_again(kms40: Kms40Emulator) -> None:
-    timer = threading.Timer(0.5, kms40.inject, ("restart",))
-    timer.start()
-    result = gateway("monitor", *at(kms40), "--seconds", "2.5", "--json")
-    timer.join()
-    last = json.loads(result.output.splitlines()[-1])
+    def restart() -> None:
+        while kms40.sent < 20:
+            time.sleep(0.01)
+        kms40.inject("restart")
+
+    breaker = threading.Thread(target=restart, daemon=True)
+    breaker.start()
+    result = gateway("monitor", *at(kms40), "--seconds", "4", "--json")
+    breaker.join(1.0)
+    last = json.loads(result.stdout.splitlines()[-1])
     assert last["counters"]["device_lost"] == 1
     assert last["state"] == "open"
 

@@ -158,8 +158,10 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
     options: dict[str, Any] = {
         "data": tmp_path, "out": tmp_path / "out", "tasks": "force", "splits": "trajectory",
         "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 2, "device": "cpu",
-        "cells": None,
+        "cells": None, "so_far": False,
     }  # fmt: skip
+    with pytest.raises(ConfigError, match="holds no finished training"):
+        train_report(**{**options, "so_far": True})
     train_report(**options)
     kept = sorted((tmp_path / "out" / "cells" / "force").glob("*.npz"))
     times = [path.stat().st_mtime_ns for path in kept]
@@ -197,7 +199,7 @@ def test_the_published_layout_goes_through_the_same_command(
     train_report(
         data=tmp_path / "published", out=tmp_path / "out", tasks="location, force",
         splits="trajectory", systems="ridge, mean of three", seeds=1, whole=True, workers=0,
-        device="cpu", cells=None,
+        device="cpu", cells=None, so_far=False,
     )  # fmt: skip
     values = json.loads((tmp_path / "out" / "study.json").read_text())
     assert "biotac1.hdf5" in values["sources"][0]["source"]
@@ -205,6 +207,33 @@ def test_the_published_layout_goes_through_the_same_command(
     for row in values["scores"]:
         error = "distance_m_median" if row["task"] == "location" else "magnitude_n_median"
         assert np.isfinite(row["metrics"][error])
+
+
+def test_what_is_made_so_far_is_shown_without_ratios_to_half_of_the_paper(
+    data: ExperimentDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ours, "OURS_CONFIG", replace(ours.OURS_CONFIG, epochs=1))
+    write_experiment(tmp_path / "experiment.h5", data)
+    source = ExperimentSource(data, None)
+    plan = StudyPlan(
+        tasks=("force",), splits=("trajectory",), seeds=(0,), whole=True,
+        systems=("zero", "MLP (the paper's)", "residual network", "voxel network"),
+    )  # fmt: skip
+    first = Study(source, replace(plan, systems=plan.systems[:3]))
+    first.make(tmp_path / "cells", workers=0)
+    known = [row["test"] for row in first.results(tmp_path / "cells")["ratios"]]
+    assert known, "without the voxel network in the plan the best is that of those in it"
+    train_report(
+        data=tmp_path, out=tmp_path / "out", tasks="force", splits="trajectory",
+        systems=", ".join(plan.systems), seeds=1, whole=True, workers=1, device="cpu",
+        cells=tmp_path / "cells", so_far=True,
+    )  # fmt: skip
+    values = json.loads((tmp_path / "out" / "study.json").read_text())
+    assert (values["missing"], values["trainings"]) == (1, len(first.cells) + 1)
+    assert {row["system"] for row in values["scores"]} == {one.system for one in first.cells}
+    assert values["ratios"] == []
+    said = f"1 of {values['trainings']} trainings are not made yet"
+    assert said in (tmp_path / "out" / "report.md").read_text()
 
 
 def test_weights_give_the_forces_the_paper_s_spread() -> None:

@@ -23,7 +23,7 @@ from palpate.process import typed_command
 
 if TYPE_CHECKING:
     from palpate_training.evaluation.cells import Cell
-    from palpate_training.evaluation.study import StudySource
+    from palpate_training.evaluation.study import Study, StudySource
 
 console = Console()
 
@@ -62,6 +62,9 @@ def train_report(
     cells: Annotated[
         Path | None, typer.Option(help="Folder of finished trainings; by default OUT/cells.")
     ] = None,
+    so_far: Annotated[
+        bool, typer.Option("--so-far", help="Train nothing; show what is finished.")
+    ] = False,
 ) -> None:
     """Train and test every system on every split; goes on where a run was killed.
 
@@ -89,6 +92,25 @@ def train_report(
     )
     study = Study(read_folder(data), plan)
     folder = cells or out / "cells"
+    if not so_far:
+        make_with_progress(study, folder, workers or os.cpu_count() or 1, device)
+    if len(study.missing(folder)) == len(study.cells):
+        raise ConfigError(
+            f"{folder} holds no finished training of these tasks and splits",
+            remedy="leave --so-far out, or name the folder of the trainings with --cells",
+        )
+    with console.status("scoring and drawing: minutes for a whole study"):
+        values = study.results(folder)
+        values["pictures"] = study.draw(folder, out)
+    write_study(out / "study.json", values)
+    # The file has null where a metric is not known; the pages are made from it.
+    read = json.loads((out / "study.json").read_text(encoding="utf-8"))
+    for path in (out / "study.json", *write_pages(out, read, command=typed_command())):
+        console.print(f"wrote {path}", soft_wrap=True)
+
+
+def make_with_progress(study: Study, folder: Path, workers: int, device: str) -> None:
+    """Make what the folder does not hold, under a bar with the time left."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -107,14 +129,7 @@ def train_report(
                 return
             progress.update(bar, advance=1, description=f"{cell.task}: {cell.system}"[:48])
 
-        study.make(folder, workers=workers or os.cpu_count() or 1, device=device, on_cell=on_cell)
-    values = study.results(folder)
-    values["pictures"] = study.draw(folder, out)
-    write_study(out / "study.json", values)
-    # The file has null where a metric is not known; the pages are made from it.
-    read = json.loads((out / "study.json").read_text(encoding="utf-8"))
-    for path in (out / "study.json", *write_pages(out, read, command=typed_command())):
-        console.print(f"wrote {path}", soft_wrap=True)
+        study.make(folder, workers=workers, device=device, on_cell=on_cell)
 
 
 def read_folder(folder: Path) -> StudySource:

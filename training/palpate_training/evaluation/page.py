@@ -289,9 +289,17 @@ def preface(values: Mapping[str, Any], command: str) -> list[str]:
     """Paragraphs on top: which data, and what the numbers are."""
     sources = "; ".join(dict.fromkeys(one["source"] for one in values["sources"]))
     rows = ", ".join(f"{count:,} {what}" for what, count in values["rows"].items())
+    left = []
+    if values.get("missing"):
+        left = [
+            f"**{values['missing']:,} of {values['trainings']:,} trainings are not made yet.** A "
+            "system is left out of each test that lacks one of its trainings, and a ratio where "
+            "one of the paper's three networks is left out."
+        ]
     return [
         f"Data: **{sources}**; {rows}. Rows called the paper's are of its real BioTacs and its own "
         "data.",
+        *left,
         f"Made by `{command}`.",
         "Brackets are 95 % intervals, whole trajectories (touches, blocks) drawn with replacement. "
         "A system that depends on a seed is shown as the mean over its seeds. Re-weighted medians "

@@ -6,6 +6,7 @@ What the page shows is in that file, so tables and documents never disagree with
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from palpate_training.evaluation.cells import (
 )
 from palpate_training.evaluation.experiments import TASKS
 from palpate_training.evaluation.features import (
+    PAPER_SYSTEMS,
     FeatureTask,
     Scores,
     ratios_to_paper,
@@ -156,11 +158,15 @@ class Study:
             on_cell=on_cell,
         )
 
+    def missing(self, folder: Path) -> list[Cell]:
+        """Cells that are not made."""
+        return [cell for cell in self.cells if not self._path(folder, cell).exists()]
+
     def results(self, folder: Path) -> dict[str, Any]:
-        """All tables as plain values, from cells that are all made.
+        """All tables as plain values, of the tests whose cells are all made.
 
         Raises:
-            DatasetError: A cell is missing or damaged.
+            DatasetError: A cell is damaged.
         """
         scores: list[Scores] = []
         ratios: list[dict[str, Any]] = []
@@ -176,28 +182,34 @@ class Study:
             "rows": self.source.row_counts,
             "forces": self.source.forces,
             "plan": asdict(self.plan),
+            "trainings": len(self.cells),
+            "missing": len(self.missing(folder)),
             "scores": [asdict(one) for one in scores],
             "ratios": ratios,
         }
 
     def draw(self, folder: Path, out: Path) -> list[dict[str, str]]:
-        """Draw the pictures of all tasks into ``out``, from cells that are all made.
+        """Draw the pictures of all tasks into ``out``, of the tests whose cells are all made.
 
         Returns:
             Of each its ``task``, ``file`` and ``caption``, for the page.
 
         Raises:
-            DatasetError: A cell is missing or damaged, or the disk refused.
+            DatasetError: A cell is damaged, or the disk refused.
         """
         made = {name: (task, self._made(folder, name)) for name, task in self.tasks.items()}
         return [asdict(one) for one in self.source.draw(out, made)]
 
+    def _path(self, folder: Path, cell: Cell) -> Path:
+        return cell_path(folder, self.tasks[cell.task], cell)
+
     def _made(self, folder: Path, name: str) -> dict[Cell, CellResult]:
-        task = self.tasks[name]
+        """Cells of a task; none of a system in a test that lacks one of its cells."""
+        lacking = {_tested(cell) for cell in self.missing(folder)}
         return {
-            cell: read_cell(cell_path(folder, task, cell))
+            cell: read_cell(self._path(folder, cell))
             for cell in self.cells
-            if cell.task == name
+            if cell.task == name and _tested(cell) not in lacking
         }
 
     def _scores(self, task: Task, made: dict[Cell, CellResult]) -> list[Scores]:
@@ -220,14 +232,28 @@ class Study:
             "centre": [(distance, 0.0, float("inf"))],
             "normal": [(angle, 0.0, float("inf"))],
         }[task.name]  # fmt: skip
+        papers: dict[tuple[str, str], set[str]] = defaultdict(set)
+        there: dict[tuple[str, str], set[str]] = defaultdict(set)
+        for cell in self.cells:
+            if cell.task == task.name and cell.system in PAPER_SYSTEMS:
+                papers[cell.fold.split, cell.fold.test].add(cell.system)
+        for cell in made:
+            there[cell.fold.split, cell.fold.test].add(cell.system)
         for error, least_n, most_n in wanted:
             found = ratios_to_paper(task, made, error=error, least_n=least_n, most_n=most_n)
             for (split, test, system), (ratio, low, high) in found.items():
+                if not papers[split, test] <= there[split, test]:
+                    continue  # the best of the three is not known
                 yield {
                     "task": task.name, "split": split, "test": test, "system": system,
                     "error": error, "least_n": least_n, "ratio": ratio, "interval": [low, high],
                     "most_n": most_n if most_n != float("inf") else None,
                 }  # fmt: skip
+
+
+def _tested(cell: Cell) -> tuple[str, str, str, str]:
+    """What a row of a table is of."""
+    return cell.task, cell.fold.split, cell.fold.test, cell.system
 
 
 def write_study(path: Path, values: dict[str, Any]) -> None:
