@@ -16,11 +16,11 @@ TORCH := torch==2.13.0
 BASELINE := tests/golden/palpate-v1.binpb
 # One worker more than cores, four at most: many tests wait for a process or for time to pass. A file
 # stays on one worker, so that its fixtures are made once. Numerical libraries would start threads
-# for every core in every worker; the limit holds for a training, too, which asks torch for two
-# threads: on busy cores they spin and wait for one another, and it takes five times as long.
+# for every core in every worker. OMP_THREAD_LIMIT is no way to stop them: scikit-learn then merges
+# the neighbours that threads found which never ran.
 WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) < 3 ? $$(getconf _NPROCESSORS_ONLN) + 1 : 4)))
 PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-ONE_THREAD := OMP_NUM_THREADS=1 OMP_THREAD_LIMIT=1 OPENBLAS_NUM_THREADS=1
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 pytest_parallel = $(ONE_THREAD) $(BIN)/pytest $(PARALLEL)
 
 help:  ## this list

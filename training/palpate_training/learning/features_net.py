@@ -32,8 +32,6 @@ _SMOOTH = 1e-4  # of a normalised distance's square, so that its root has a slop
 class FeaturesNetConfig(MembersConfig):
     """Settings of a training of all features."""
 
-    threads: int = 2
-
 
 class FeaturesNet(ElectrodeNet):
     """Tared counts ``(N, 19)`` -> some quantities ``(N, 3 Q)``, three values each.
