@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,13 +31,9 @@ from palpate_training.evaluation.cells import (
     read_cell,
 )
 from palpate_training.evaluation.experiments import ExperimentSource
-from palpate_training.evaluation.features import FeatureTask, Scores, score
-from palpate_training.evaluation.skin import (
-    FieldTask,
-    SynthesisTask,
-    score_fields,
-    score_synthesis,
-)
+from palpate_training.evaluation.features import FeatureTask
+from palpate_training.evaluation.skin import FieldTask, SynthesisTask
+from palpate_training.evaluation.study import score_task
 from palpate_training.figures.style import INK, finish, grid, label, new_figure, unit_colour
 from palpate_training.learning.splits import ALL_UNITS, Fold, RowSplit
 
@@ -120,22 +115,13 @@ def fewer(rows: RowSplit, trajectory: Any, share: float, seed: int) -> RowSplit:
     return replace(rows, train=rows.train[np.isin(trajectory[rows.train], kept)])
 
 
-def scores(curve: Curve, made: dict[Cell, CellResult]) -> Iterator[Scores]:
-    """Of each share, averaged over the seeds."""
-    for name, task in curve.tasks.items():
-        own = {cell: result for cell, result in made.items() if cell.task == name}
-        if isinstance(task, FieldTask):
-            yield from score_fields(task, own)
-        elif isinstance(task, SynthesisTask):
-            yield from score_synthesis(task, own)
-        else:
-            assert isinstance(task, FeatureTask)
-            yield from score(task, own)
-
-
 def result(curve: Curve, made: dict[Cell, CellResult]) -> dict[str, Any]:
     """What the page and the picture need."""
-    found = {(one.task, one.test): one for one in scores(curve, made)}
+    found = {
+        (name, one.test): one
+        for name, task in curve.tasks.items()
+        for one in score_task(task, {cell: made[cell] for cell in made if cell.task == name})
+    }
     rows = []
     for task, metric, factor, what, goal in CURVES:
         tests = [one for one in (ALL_UNITS, UNIT) if (task, one) in found]

@@ -172,7 +172,7 @@ class Study:
         ratios: list[dict[str, Any]] = []
         for name, task in self.tasks.items():
             made = self._made(folder, name)
-            scores += self._scores(task, made)
+            scores += score_task(task, made)
             if isinstance(task, FeatureTask):
                 ratios += list(self._ratios(task, made))
         return {
@@ -205,20 +205,11 @@ class Study:
 
     def _made(self, folder: Path, name: str) -> dict[Cell, CellResult]:
         """Cells of a task; none of a system in a test that lacks one of its cells."""
-        lacking = {_tested(cell) for cell in self.missing(folder)}
+        paths = {cell: self._path(folder, cell) for cell in self.cells if cell.task == name}
+        lacking = {_tested(cell) for cell, path in paths.items() if not path.exists()}
         return {
-            cell: read_cell(self._path(folder, cell))
-            for cell in self.cells
-            if cell.task == name and _tested(cell) not in lacking
+            cell: read_cell(path) for cell, path in paths.items() if _tested(cell) not in lacking
         }
-
-    def _scores(self, task: Task, made: dict[Cell, CellResult]) -> list[Scores]:
-        if isinstance(task, FieldTask):
-            return score_fields(task, made)
-        if isinstance(task, SynthesisTask):
-            return score_synthesis(task, made)
-        assert isinstance(task, FeatureTask)
-        return score(task, made)
 
     def _ratios(self, task: FeatureTask, made: dict[Cell, CellResult]) -> Iterable[dict[str, Any]]:
         """Ours over the best of the paper's networks, where the goals count."""
@@ -251,9 +242,19 @@ class Study:
                 }  # fmt: skip
 
 
-def _tested(cell: Cell) -> tuple[str, str, str, str]:
-    """What a row of a table is of."""
-    return cell.task, cell.fold.split, cell.fold.test, cell.system
+def score_task(task: Task, made: Mapping[Cell, CellResult]) -> list[Scores]:
+    """The table of any task."""
+    if isinstance(task, FieldTask):
+        return score_fields(task, made)
+    if isinstance(task, SynthesisTask):
+        return score_synthesis(task, made)
+    assert isinstance(task, FeatureTask)
+    return score(task, made)
+
+
+def _tested(cell: Cell) -> tuple[str, str, str]:
+    """What a row of a task's table is of."""
+    return cell.fold.split, cell.fold.test, cell.system
 
 
 def write_study(path: Path, values: dict[str, Any]) -> None:
