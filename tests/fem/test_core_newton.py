@@ -16,7 +16,7 @@ from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics import newton as newton_module
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver, damping_after
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
@@ -329,9 +329,9 @@ def test_the_skins_share_is_made_anew_once_an_iteration_has_come_near(
     ],
 )
 def test_steps_are_shortened_where_the_error_goes_round_in_circles(
-    cup: SolidMesh, last: list[float], factor: float
+    last: list[float], factor: float
 ) -> None:
-    assert newton_of(cup)._damping(last) == factor
+    assert damping_after(last) == factor
 
 
 @pytest.mark.parametrize(("strength", "left"), [(0.02, None), (1.0, 0.1)])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.load_stepping import SolverSettings, moves_in
 from palpate_fem.mechanics.newton import (
     FIRST_VISCOSITY,
     LEAST_VISCOSITY,
@@ -204,4 +204,5 @@ def test_a_turn_on_the_spot_does_not_go_into_the_skin(fill: Fill, axis: tuple[fl
     assert run.increment(path[1], 1.0)[0].converged
     turned = path[1].copy()
     turned[3:] = np.cos(0.05), *(np.sin(0.05) * np.array(axis))
-    assert not run.at.moves_in(run.at.indenter.at(turned))
+    at = run.at
+    assert not moves_in(at.state.position, at.load, at.indenter, at.indenter.at(turned))

@@ -13,7 +13,7 @@ import warp as wp
 
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.device import DEVICE, launch, scalars, vec3s
+from palpate_fem.device import DEVICE, indices, launch, mat33s, scalars, vec3s
 from palpate_fem.indenter.distance import distance
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels
@@ -73,9 +73,20 @@ class PosedIndenter:
         self, shape: Indenter, pose: Floats, friction: float, primitives: wp.array | None = None
     ) -> None:
         self.shape, self.friction = shape, friction
-        self.primitives = scalars(shape.packed()) if primitives is None else primitives
+        self.primitives = scalars(shape.packed()[None]) if primitives is None else primitives
         self.tip = np.asarray(pose[:3], np.float64)
         self.rotation = rotation_matrices(pose[3:])
+
+    @property
+    def model(self) -> list[wp.array]:
+        """Arguments of the contact kernels: kinds of indenters, the kind, tip, rotation."""
+        kind = indices(np.zeros(1, np.int32))
+        return [
+            self.primitives,
+            kind,
+            vec3s(self.tip[None].copy()),
+            mat33s(self.rotation[None].copy()),
+        ]
 
     def at(self, pose: Floats) -> PosedIndenter:
         """The same indenter at another pose."""
@@ -110,7 +121,8 @@ class ContactSurface:
             faces: Node ids (F, k); may be empty.
             pairs: Block of each node pair of each face in the tangent, (F, k, k).
         """
-        self.count = len(faces)
+        self.count, self.nodes = len(faces), len(nodes)
+        self.items = indices(np.arange(self.count, dtype=np.int32))
         corners = faces.shape[1] if faces.ndim == 2 else 3
         self.points = corners
         element = corner_element(corners)
@@ -175,13 +187,20 @@ class ContactSurface:
         launch(
             contact_kernels.point_tangent,
             self.count,
-            [self.shape, self.pairs, self.status, self.tangent],
+            [self.shape, self.pairs, len(blocks), self.items, self.status, self.tangent],
             [blocks],
         )
         launch(
             contact_kernels.point_tangent,
             self.count,
-            [self.mortar_shape, self.pairs, self.mortar_status, self.mortar_tangent],
+            [
+                self.mortar_shape,
+                self.pairs,
+                len(blocks),
+                self.items,
+                self.mortar_status,
+                self.mortar_tangent,
+            ],
             [blocks],
         )
 
@@ -190,7 +209,7 @@ class ContactSurface:
         launch(
             contact_kernels.unsymmetric_product,
             len(self._sliding),
-            [self.faces, self.shape, self._sliding, self._frozen[3]],
+            [self.faces, self.shape, self.nodes, self._sliding, self._frozen[3]],
             [change, product],
         )
         if self._correction.spread.nnz:
@@ -242,6 +261,8 @@ class ContactSurface:
             [
                 self.faces,
                 self.shape,
+                self.nodes,
+                self.items,
                 self.status,
                 self.wanted_array,
                 self._frozen[0],
@@ -255,7 +276,12 @@ class ContactSurface:
 
     def subtract_load(self, load: wp.array, force: wp.array) -> None:
         """Subtract a load at the points (F, Q) from nodal forces."""
-        launch(contact_kernels.subtract_load, self.count, [self.faces, self.shape, load], [force])
+        launch(
+            contact_kernels.subtract_load,
+            self.count,
+            [self.faces, self.shape, self.nodes, self.items, load],
+            [force],
+        )
 
     def points_at(self, position: Floats) -> Floats:
         """Positions of the contact points [m], (F, Q, 3)."""
@@ -288,16 +314,20 @@ class IndenterContact:
         if indenter is None or not surface.count:
             surface.clear()
             return
+        primitives, kind, tip, rotation = indenter.model
         launch(
             contact_kernels.indenter_contact,
             surface.count,
             [
                 *surface.model,
-                indenter.primitives,
+                primitives,
+                kind,
                 self.settings.law(indenter.friction),
                 wp.float64(self.settings.margin_m),
-                wp.vec3d(*indenter.tip),
-                wp.mat33d(*indenter.rotation.ravel()),
+                tip,
+                rotation,
+                surface.nodes,
+                surface.items,
                 position,
                 scalars(state.on_indenter.gap),
                 scalars(state.indenter_pressure),
@@ -317,9 +347,9 @@ class IndenterContact:
                 surface.count,
                 [
                     *surface.quadrature,
-                    indenter.primitives,
-                    wp.vec3d(*indenter.tip),
-                    wp.mat33d(*indenter.rotation.ravel()),
+                    *indenter.model,
+                    surface.nodes,
+                    surface.items,
                     position,
                     scalars(state.indenter_pressure),
                     vec3s(state.on_indenter.held),
@@ -372,6 +402,8 @@ class CoreContact:
                 self._table,
                 wp.vec3d(*core.origin),
                 wp.float64(core.spacing),
+                surface.nodes,
+                surface.items,
                 self.settings.law(0.0),
                 self._margin,
                 position,
@@ -390,6 +422,8 @@ class CoreContact:
                     self._table,
                     wp.vec3d(*core.origin),
                     wp.float64(core.spacing),
+                    surface.nodes,
+                    surface.items,
                     position,
                     scalars(state.core_pressure),
                 ],

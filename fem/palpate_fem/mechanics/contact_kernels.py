@@ -63,13 +63,14 @@ def at_point(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     nodal: wp.array(dtype=wp.vec3d),
-    f: int,
+    s: int,
     q: int,
+    begin: int,
 ) -> wp.vec3d:
-    """A nodal field at point q of face f."""
+    """A nodal field at point q of face s; its nodes are numbered from ``begin`` on."""
     value = wp.vec3d()
     for a in range(faces.shape[1]):
-        value += shape[q, a] * nodal[faces[f, a]]
+        value += shape[q, a] * nodal[begin + faces[s, a]]
     return value
 
 
@@ -78,13 +79,14 @@ def add_at_nodes(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     load: wp.vec3d,
-    f: int,
+    s: int,
     q: int,
+    begin: int,
     force_out: wp.array(dtype=wp.vec3d),
 ):
-    """Share a load at point q of face f out to its nodes."""
+    """Share a load at point q of face s out to its nodes."""
     for a in range(faces.shape[1]):
-        wp.atomic_add(force_out, faces[f, a], shape[q, a] * load)
+        wp.atomic_add(force_out, begin + faces[s, a], shape[q, a] * load)
 
 
 @wp.func
@@ -146,11 +148,14 @@ def indenter_contact(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     area: wp.array2d(dtype=wp.float64),
-    primitives: wp.array2d(dtype=wp.float64),
+    primitives: wp.array3d(dtype=wp.float64),
+    kind: wp.array(dtype=wp.int32),
     law: ContactLaw,
     margin: wp.float64,
-    tip: wp.vec3d,
-    rotation: wp.mat33d,
+    tip_in: wp.array(dtype=wp.vec3d),
+    rotation_in: wp.array(dtype=wp.mat33d),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     correction_in: wp.array2d(dtype=wp.float64),
     pressure_in: wp.array2d(dtype=wp.float64),
@@ -176,11 +181,17 @@ def indenter_contact(
     symmetrised: its transpose would make the matrix indefinite, by the square of half the friction
     coefficient.
     """
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    copy = f // faces.shape[0]
+    begin = copy * nodes
+    tip = tip_in[copy]
+    rotation = rotation_in[copy]
+    shape_of = primitives[kind[copy]]
     for q in range(shape.shape[0]):
-        x = at_point(faces, shape, position_in, f, q)
+        x = at_point(faces, shape, position_in, s, q, begin)
         local = wp.transpose(rotation) * (x - tip)
-        near = indenter_distance(primitives, local, margin)
+        near = indenter_distance(shape_of, local, margin)
         gap = near.gap + correction_in[f, q]
         gap_out[f, q] = gap
         status_out[f, q] = 0
@@ -198,7 +209,7 @@ def indenter_contact(
             answer = normal_law(law, p, gap)
             if answer[1] > wp.float64(0.0):
                 status_out[f, q] = 1
-                w = area[f, q]
+                w = area[s, q]
                 curvature = rotation * near.hessian * wp.transpose(rotation)
                 slope = answer[1] * normal
                 wanted_out[f, q] = answer[0]
@@ -225,7 +236,7 @@ def indenter_contact(
                     d += symmetric
                     unsymmetric = rub.by_position - symmetric - coupled
                 misfit_out[f, q] = w * misfit
-                add_at_nodes(faces, shape, -w * residual, f, q, force_out)
+                add_at_nodes(faces, shape, -w * residual, s, q, begin, force_out)
                 unsymmetric_out[f, q] = w * unsymmetric
                 tangent_out[f, q] = w * d
 
@@ -234,56 +245,69 @@ def indenter_contact(
 def point_tangent(
     shape: wp.array2d(dtype=wp.float64),
     pair: wp.array3d(dtype=wp.int32),
+    blocks: int,
+    items: wp.array(dtype=wp.int32),
     status_in: wp.array2d(dtype=wp.int32),
     tangent_in: wp.array2d(dtype=wp.mat33d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
     """Add the tangents of the touching points to the upper node-pair blocks."""
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % pair.shape[0]
+    begin = (f // pair.shape[0]) * blocks
     for q in range(shape.shape[0]):
         if status_in[f, q] > 0:
             for a in range(shape.shape[1]):
                 for b in range(shape.shape[1]):
                     weight = shape[q, a] * shape[q, b]
-                    if weight != wp.float64(0.0) and pair[f, a, b] >= 0:
-                        wp.atomic_add(block_out, pair[f, a, b], weight * tangent_in[f, q])
+                    if weight != wp.float64(0.0) and pair[s, a, b] >= 0:
+                        wp.atomic_add(block_out, begin + pair[s, a, b], weight * tangent_in[f, q])
 
 
 @wp.kernel
 def unsymmetric_product(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
-    sliding_in: wp.array(dtype=wp.int32),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     unsymmetric_in: wp.array2d(dtype=wp.mat33d),
     vector_in: wp.array(dtype=wp.vec3d),
     product_out: wp.array(dtype=wp.vec3d),
 ):
     """Add (tangent - its symmetric approximation) times a nodal vector, over the listed faces."""
-    f = sliding_in[wp.tid()]
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    begin = (f // faces.shape[0]) * nodes
     for q in range(shape.shape[0]):
-        moved = unsymmetric_in[f, q] * at_point(faces, shape, vector_in, f, q)
-        add_at_nodes(faces, shape, moved, f, q, product_out)
+        moved = unsymmetric_in[f, q] * at_point(faces, shape, vector_in, s, q, begin)
+        add_at_nodes(faces, shape, moved, s, q, begin, product_out)
 
 
 @wp.kernel
 def subtract_load(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     load_in: wp.array2d(dtype=wp.vec3d),
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """Subtract a load at the contact points from nodal forces."""
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    begin = (f // faces.shape[0]) * nodes
     for q in range(shape.shape[0]):
         m = load_in[f, q]
         if wp.length_sq(m) > wp.float64(0.0):
-            add_at_nodes(faces, shape, -m, f, q, force_out)
+            add_at_nodes(faces, shape, -m, s, q, begin, force_out)
 
 
 @wp.kernel
 def pressure_update(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     status_in: wp.array2d(dtype=wp.int32),
     wanted_in: wp.array2d(dtype=wp.float64),
     slope_in: wp.array2d(dtype=wp.vec3d),
@@ -297,12 +321,14 @@ def pressure_update(
 
     The slopes are those of the factorised tangent, see `element_kernels.pressure_update`.
     """
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    begin = (f // faces.shape[0]) * nodes
     for q in range(shape.shape[0]):
         p = wp.float64(0.0)
         t = wp.vec3d()
         if status_in[f, q] > 0:
-            moved = at_point(faces, shape, change_in, f, q)
+            moved = at_point(faces, shape, change_in, s, q, begin)
             p = wp.max(wanted_in[f, q] - wp.dot(slope_in[f, q], moved), wp.float64(0.0))
             if p > wp.float64(0.0):
                 t = wanted_traction_in[f, q] + traction_slope_in[f, q] * moved
@@ -450,6 +476,8 @@ def core_contact(
     coefficients: wp.array3d(dtype=wp.float64),
     origin: wp.vec3d,
     spacing: wp.float64,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     law: ContactLaw,
     margin: wp.float64,
     position_in: wp.array(dtype=wp.vec3d),
@@ -468,9 +496,11 @@ def core_contact(
     Adds minus the contact force to ``force_out``. Points in a cell whose coefficient exceeds
     ``margin`` are skipped.
     """
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    begin = (f // faces.shape[0]) * nodes
     for q in range(shape.shape[0]):
-        x = at_point(faces, shape, position_in, f, q)
+        x = at_point(faces, shape, position_in, s, q, begin)
         cell = grid_cell(coefficients, origin, spacing, x)
         rough = coefficients[cell[0], cell[1], cell[2]]
         gap_out[f, q] = rough
@@ -487,11 +517,11 @@ def core_contact(
             if answer[1] > wp.float64(0.0):
                 status_out[f, q] = 1
                 wanted_out[f, q] = answer[0]
-                w = area[f, q]
+                w = area[s, q]
                 slope_out[f, q] = answer[1] * near.normal
                 misfit_out[f, q] = (w * (answer[0] - p)) * near.normal
                 load = (law.at_nodes * w * p) * near.normal
-                add_at_nodes(faces, shape, -load, f, q, force_out)
+                add_at_nodes(faces, shape, -load, s, q, begin, force_out)
                 # -d(p n)/dx: stiffness along the normal, and the turn of the normal under p.
                 tangent_out[f, q] = w * (
                     answer[1] * wp.outer(near.normal, near.normal) - law.at_nodes * p * near.hessian
@@ -501,6 +531,7 @@ def core_contact(
 @wp.func
 def load_at_point(
     f: int,
+    s: int,
     q: int,
     weight: wp.array3d(dtype=wp.float64),
     pressure: wp.array2d(dtype=wp.float64),
@@ -508,7 +539,7 @@ def load_at_point(
     """Pressure at a quadrature point, by the dual shape functions, times its area [N]."""
     load = wp.float64(0.0)
     for a in range(weight.shape[2]):
-        load += weight[f, q, a] * pressure[f, a]
+        load += weight[s, q, a] * pressure[f, a]
     return load
 
 
@@ -517,9 +548,12 @@ def mortar_on_indenter(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
     weight: wp.array3d(dtype=wp.float64),
-    primitives: wp.array2d(dtype=wp.float64),
-    tip: wp.vec3d,
-    rotation: wp.mat33d,
+    primitives: wp.array3d(dtype=wp.float64),
+    kind: wp.array(dtype=wp.int32),
+    tip_in: wp.array(dtype=wp.vec3d),
+    rotation_in: wp.array(dtype=wp.mat33d),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array2d(dtype=wp.float64),
     held_in: wp.array2d(dtype=wp.vec3d),
@@ -532,20 +566,26 @@ def mortar_on_indenter(
     Adds minus its forces to ``force_out``; the tangent is that at constant pressures. Where
     ``held_in`` is not zero, the pressure acts along it, and does not turn.
     """
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    copy = f // faces.shape[0]
+    begin = copy * nodes
+    tip = tip_in[copy]
+    rotation = rotation_in[copy]
+    shape_of = primitives[kind[copy]]
     for q in range(shape.shape[0]):
-        load = load_at_point(f, q, weight, pressure_in)
+        load = load_at_point(f, s, q, weight, pressure_in)
         status_out[f, q] = 0
         if load != wp.float64(0.0):
             normal = held_in[f, q]
             if normal == wp.vec3d():
-                x = at_point(faces, shape, position_in, f, q)
+                x = at_point(faces, shape, position_in, s, q, begin)
                 local = wp.transpose(rotation) * (x - tip)
-                near = indenter_distance(primitives, local, wp.float64(1.0e300))
+                near = indenter_distance(shape_of, local, wp.float64(1.0e300))
                 normal = rotation * near.normal
                 status_out[f, q] = 1
                 tangent_out[f, q] = -load * (rotation * near.hessian * wp.transpose(rotation))
-            add_at_nodes(faces, shape, -load * normal, f, q, force_out)
+            add_at_nodes(faces, shape, -load * normal, s, q, begin, force_out)
 
 
 @wp.kernel
@@ -556,6 +596,8 @@ def mortar_on_core(
     coefficients: wp.array3d(dtype=wp.float64),
     origin: wp.vec3d,
     spacing: wp.float64,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array2d(dtype=wp.float64),
     status_out: wp.array2d(dtype=wp.int32),
@@ -563,13 +605,15 @@ def mortar_on_core(
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """`mortar_on_indenter` for the core and the inner faces."""
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    begin = (f // faces.shape[0]) * nodes
     for q in range(shape.shape[0]):
-        load = load_at_point(f, q, weight, pressure_in)
+        load = load_at_point(f, s, q, weight, pressure_in)
         status_out[f, q] = 0
         if load != wp.float64(0.0):
-            x = at_point(faces, shape, position_in, f, q)
+            x = at_point(faces, shape, position_in, s, q, begin)
             near = core_distance(coefficients, origin, spacing, x)
             status_out[f, q] = 1
             tangent_out[f, q] = -load * near.hessian
-            add_at_nodes(faces, shape, -load * near.normal, f, q, force_out)
+            add_at_nodes(faces, shape, -load * near.normal, s, q, begin, force_out)

@@ -19,9 +19,14 @@ kappa. One pressure for each element avoids volumetric locking: only the *mean* 
 The fluid's volume is a third of the integral of x . n over the closed inner surface; its gradient
 and second derivative are exact for bilinear faces (``reference_element.volume_form``).
 
-One Warp thread handles one element or face. Two host threads may run two ranges of elements at
-once, so each adds into arrays of its own. Arrays named ``_in`` hold the state, those named ``_out``
-take the results. NumPy twins: ``tests/fem/numpy_mechanics.py``.
+One Warp thread handles one element or face of those that ``items`` lists. Two host threads may run
+two lists at once, so each adds into arrays of its own. Arrays named ``_in`` hold the state, those
+named ``_out`` take the results. NumPy twins: ``tests/fem/numpy_mechanics.py``.
+
+The same kernels work on many copies of one mesh (``batched``). Item number i belongs to copy
+``i // count``, with count the elements or faces of one mesh; state and results of the copies follow
+one another, each with ``nodes`` nodes and ``blocks`` blocks, and what the mesh decides is stored
+once.
 """
 
 from __future__ import annotations
@@ -53,7 +58,8 @@ def element_state(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
-    first: int,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
     volume_out: wp.array(dtype=wp.float64),
@@ -62,7 +68,9 @@ def element_state(
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """Add internal nodal forces; set element volumes, their gradients and the smallest J."""
-    e = first + wp.tid()
+    e = items[wp.tid()]
+    s = e % elements.shape[0]
+    begin = (e // elements.shape[0]) * nodes
     n = elements.shape[1]
     pressure = pressure_in[e]
     volume = wp.float64(0.0)
@@ -73,10 +81,10 @@ def element_state(
         # F = sum_a x_a (x) grad N_a, by the gradients on the undeformed element.
         f = wp.mat33d()
         for a in range(n):
-            f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
+            f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
         j = wp.determinant(f)
         smallest = wp.min(smallest, j)
-        w = weight[e, q]
+        w = weight[s, q]
         volume += w * j
         inverse_t = wp.transpose(wp.inverse(f))
         scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
@@ -85,8 +93,8 @@ def element_state(
         along = w * (pressure * j + mu * barrier * beyond(j)) - scale * i1 / wp.float64(3.0)
         stress = scale * f + along * inverse_t
         for a in range(n):
-            g = gradient[e, q, a]
-            wp.atomic_add(force_out, elements[e, a], stress * g)
+            g = gradient[s, q, a]
+            wp.atomic_add(force_out, begin + elements[s, a], stress * g)
             # dJ/dF = J F^-T
             volume_gradient_out[e, a] = volume_gradient_out[e, a] + (w * j) * (inverse_t * g)
     volume_out[e] = volume
@@ -100,7 +108,8 @@ def point_state(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
-    first: int,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
     spatial_out: wp.array3d(dtype=wp.vec3d),
@@ -114,15 +123,17 @@ def point_state(
     w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J)),
     c = w mu J^(-2/3).
     """
-    e = first + wp.tid()
+    e = items[wp.tid()]
+    s = e % elements.shape[0]
+    begin = (e // elements.shape[0]) * nodes
     n = elements.shape[1]
     pressure = pressure_in[e]
     for q in range(weight.shape[1]):
         f = wp.mat33d()
         for a in range(n):
-            f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
+            f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
         j = wp.determinant(f)
-        w = weight[e, q]
+        w = weight[s, q]
         inverse_t = wp.transpose(wp.inverse(f))
         c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
         ci1 = c * wp.ddot(f, f)
@@ -132,8 +143,8 @@ def point_state(
         if b != wp.float64(0.0):
             along += w * mu * barrier
         for a in range(n):
-            g = inverse_t * gradient[e, q, a]
-            left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[e, q, a])
+            g = inverse_t * gradient[s, q, a]
+            left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[s, q, a])
             spatial_out[e, q, a] = g
             left_out[e, q, a] = left
             right_out[e, q, a] = left + along * g
@@ -145,7 +156,8 @@ def element_tangent(
     pair: wp.array3d(dtype=wp.int32),
     gradient: wp.array3d(dtype=wp.vec3d),
     bulk_over_volume: wp.array(dtype=wp.float64),
-    first: int,
+    blocks: int,
+    items: wp.array(dtype=wp.int32),
     spatial_in: wp.array3d(dtype=wp.vec3d),
     left_in: wp.array3d(dtype=wp.vec3d),
     right_in: wp.array3d(dtype=wp.vec3d),
@@ -157,13 +169,15 @@ def element_tangent(
 
     K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga, plus kappa/v0 dv dv.
     """
-    e = first + wp.tid()
+    e = items[wp.tid()]
+    element = e % pair.shape[0]
+    begin = (e // pair.shape[0]) * blocks
     n = pair.shape[1]
     points = spatial_in.shape[1]
-    stiff = bulk_over_volume[e]
+    stiff = bulk_over_volume[element]
     for a in range(n):
         for b in range(n):
-            block = pair[e, a, b]
+            block = pair[element, a, b]
             if block >= 0:
                 # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
                 k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
@@ -172,12 +186,12 @@ def element_tangent(
                     ga = spatial_in[e, q, a]
                     gb = spatial_in[e, q, b]
                     s = scale_in[e, q]
-                    diagonal += s[0] * wp.dot(gradient[e, q, a], gradient[e, q, b])
+                    diagonal += s[0] * wp.dot(gradient[element, q, a], gradient[element, q, b])
                     k += wp.outer(ga, right_in[e, q, b])
                     k += wp.outer(left_in[e, q, a], gb)
                     k += wp.outer(s[1] * gb, ga)
                 k += diagonal * wp.identity(n=3, dtype=wp.float64)
-                wp.atomic_add(block_out, block, k)
+                wp.atomic_add(block_out, begin + block, k)
 
 
 @wp.kernel
@@ -185,6 +199,8 @@ def pressure_update(
     elements: wp.array2d(dtype=wp.int32),
     rest_volume: wp.array(dtype=wp.float64),
     bulk_over_volume: wp.array(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     volume_in: wp.array(dtype=wp.float64),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     change_in: wp.array(dtype=wp.vec3d),
@@ -195,11 +211,13 @@ def pressure_update(
     The gradients are those of the factorised tangent, so that pressures and displacements solve one
     linear system: kappa would magnify any difference.
     """
-    e = wp.tid()
-    v = volume_in[e] - rest_volume[e]
+    e = items[wp.tid()]
+    s = e % elements.shape[0]
+    begin = (e // elements.shape[0]) * nodes
+    v = volume_in[e] - rest_volume[s]
     for a in range(elements.shape[1]):
-        v += wp.dot(volume_gradient_in[e, a], change_in[elements[e, a]])
-    pressure_out[e] = bulk_over_volume[e] * v
+        v += wp.dot(volume_gradient_in[e, a], change_in[begin + elements[s, a]])
+    pressure_out[e] = bulk_over_volume[s] * v
 
 
 @wp.kernel
@@ -207,16 +225,20 @@ def pressure_misfit(
     elements: wp.array2d(dtype=wp.int32),
     rest_volume: wp.array(dtype=wp.float64),
     bulk_over_volume: wp.array(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     volume_in: wp.array(dtype=wp.float64),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """Add the load on the nodes by static condensation of the element pressures."""
-    e = wp.tid()
-    misfit = bulk_over_volume[e] * (volume_in[e] - rest_volume[e]) - pressure_in[e]
+    e = items[wp.tid()]
+    s = e % elements.shape[0]
+    begin = (e // elements.shape[0]) * nodes
+    misfit = bulk_over_volume[s] * (volume_in[e] - rest_volume[s]) - pressure_in[e]
     for a in range(elements.shape[1]):
-        wp.atomic_add(force_out, elements[e, a], misfit * volume_gradient_in[e, a])
+        wp.atomic_add(force_out, begin + elements[s, a], misfit * volume_gradient_in[e, a])
 
 
 @wp.kernel
@@ -226,28 +248,31 @@ def element_stress(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
-    first: int,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     pressure_in: wp.array(dtype=wp.float64),
     stress_out: wp.array(dtype=wp.mat33d),
 ):
     """Cauchy stress, mean over the current volume of each element."""
-    e = first + wp.tid()
+    e = items[wp.tid()]
+    s = e % elements.shape[0]
+    begin = (e // elements.shape[0]) * nodes
     total = wp.mat33d()
     volume = wp.float64(0.0)
     for q in range(weight.shape[1]):
         f = wp.mat33d()
         for a in range(elements.shape[1]):
-            f += wp.outer(position_in[elements[e, a]], gradient[e, q, a])
+            f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
         j = wp.determinant(f)
         b = f * wp.transpose(f)
         third = wp.trace(b) / wp.float64(3.0)
         deviator = b - third * wp.identity(n=3, dtype=wp.float64)
         power = wp.pow(wp.abs(j), wp.float64(-2.0) / wp.float64(3.0))
-        total += (weight[e, q] * mu * power) * deviator
+        total += (weight[s, q] * mu * power) * deviator
         # J times the barrier's mean stress; the weights are of the undeformed volume.
-        total += (weight[e, q] * mu * barrier * beyond(j)) * wp.identity(n=3, dtype=wp.float64)
-        volume += weight[e, q] * j
+        total += (weight[s, q] * mu * barrier * beyond(j)) * wp.identity(n=3, dtype=wp.float64)
+        volume += weight[s, q] * j
     stress_out[e] = total / volume + pressure_in[e] * wp.identity(n=3, dtype=wp.float64)
 
 
@@ -255,12 +280,16 @@ def element_stress(
 def cavity_volume(
     faces: wp.array2d(dtype=wp.int32),
     form: wp.array3d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
     volume_out: wp.array(dtype=wp.float64),
     gradient_out: wp.array(dtype=wp.vec3d),
 ):
     """Set the volume under each face; add its gradient to the nodes."""
-    f = wp.tid()
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    begin = (f // faces.shape[0]) * nodes
     k = faces.shape[1]
     volume = wp.float64(0.0)
     for a in range(k):
@@ -268,10 +297,12 @@ def cavity_volume(
         for b in range(k):
             for c in range(k):
                 if c > b:
-                    area = wp.cross(position_in[faces[f, b]], position_in[faces[f, c]])
+                    area = wp.cross(
+                        position_in[begin + faces[s, b]], position_in[begin + faces[s, c]]
+                    )
                     g += (wp.float64(2.0) * form[a, b, c]) * area
-        volume += wp.dot(position_in[faces[f, a]], g)
-        wp.atomic_add(gradient_out, faces[f, a], wp.float64(3.0) * g)
+        volume += wp.dot(position_in[begin + faces[s, a]], g)
+        wp.atomic_add(gradient_out, begin + faces[s, a], wp.float64(3.0) * g)
     volume_out[f] = volume
 
 
@@ -280,19 +311,25 @@ def cavity_tangent(
     faces: wp.array2d(dtype=wp.int32),
     form: wp.array3d(dtype=wp.float64),
     pair: wp.array3d(dtype=wp.int32),
-    factor: wp.float64,
+    nodes: int,
+    blocks: int,
+    items: wp.array(dtype=wp.int32),
+    pressure_in: wp.array(dtype=wp.float64),
     position_in: wp.array(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
-    """Add ``factor`` times the second derivative of the volume to the upper node-pair blocks."""
-    f = wp.tid()
+    """Add the tangent of the fluid's pressure, a follower load, to the upper node-pair blocks."""
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    copy = f // faces.shape[0]
     k = faces.shape[1]
+    # Minus the pressure times the volume's: d/dx_b of 6 C_abc x_b x x_c = -6 C_abc skew(x_c).
+    factor = wp.float64(6.0) * pressure_in[copy]
     for a in range(k):
         for b in range(k):
-            block = pair[f, a, b]
+            block = pair[s, a, b]
             if block >= 0:
                 arm = wp.vec3d()
                 for c in range(k):
-                    arm += form[a, b, c] * position_in[faces[f, c]]
-                # d/dx_b of 6 C_abc x_b x x_c = -6 C_abc skew(x_c)
-                wp.atomic_add(block_out, block, (wp.float64(-6.0) * factor) * wp.skew(arm))
+                    arm += form[a, b, c] * position_in[copy * nodes + faces[s, c]]
+                wp.atomic_add(block_out, copy * blocks + block, factor * wp.skew(arm))

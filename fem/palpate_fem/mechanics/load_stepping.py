@@ -19,6 +19,7 @@ from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.element_kernels import VOLUME_BARRIER
 from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 
 CONTACT_SHARE = 1e-3
@@ -111,22 +112,27 @@ class _Progress:
     previous: SolutionState | None = None
     previous_length: float = 0.0
 
-    def moves_in(self, indenter: PosedIndenter) -> bool:
-        """Whether the indenter goes into the skin from here to another pose.
 
-        Its motion, turns included, is taken where it touches: the mean over the nodes, weighted by
-        their forces. What counts is its component along the net force, relative to its length, so
-        that a twist or a roll, whose points go every way, is none.
-        """
-        weight = np.linalg.norm(self.load, axis=1)
-        touched = weight > 0.0
-        place, weight = self.state.position[touched], weight[touched] / weight.sum()
-        motion = self.indenter.to_local(place) @ indenter.rotation.T + indenter.tip - place
-        net = self.load.sum(axis=0)
-        along = float(net @ (weight @ motion))
-        return along > INWARD * float(
-            np.linalg.norm(net) * (weight @ np.linalg.norm(motion, axis=1))
-        )
+def moves_in(position: Floats, load: Floats, at: PosedIndenter, to: PosedIndenter) -> bool:
+    """Whether an indenter goes into the skin from one pose to another.
+
+    Its motion, turns included, is taken where it touches: the mean over the nodes, weighted by
+    their forces. What counts is its component along the net force, relative to its length, so
+    that a twist or a roll, whose points go every way, is none.
+
+    Args:
+        position: Nodal positions [m], (V, 3).
+        load: Nodal forces of the indenter on the skin [N], (V, 3).
+        at: The indenter there.
+        to: The indenter at its next pose.
+    """
+    weight = np.linalg.norm(load, axis=1)
+    touched = weight > 0.0
+    place, weight = position[touched], weight[touched] / weight.sum()
+    motion = at.to_local(place) @ to.rotation.T + to.tip - place
+    net = load.sum(axis=0)
+    along = float(net @ (weight @ motion))
+    return along > INWARD * float(np.linalg.norm(net) * (weight @ np.linalg.norm(motion, axis=1)))
 
 
 @dataclass(slots=True)
@@ -261,7 +267,8 @@ class LoadStepping:
             second.factorisations += report.factorisations
             report = second
             force, last = _force(balance), float(np.linalg.norm(self.at.load.sum(axis=0)))
-            if report.converged and force < (1.0 - SNAP) * last and self.at.moves_in(indenter):
+            fell = report.converged and force < (1.0 - SNAP) * last
+            if fell and moves_in(start.position, self.at.load, self.at.indenter, indenter):
                 self.outcome = IndentationOutcome.DIVERGED
                 self.reason = f"the skin snaps: {last:.1f} N fall to {force:.1f} N"
                 report.converged = False
@@ -333,38 +340,64 @@ class LoadStepping:
 
     def _step(self, pose: Floats, balance: ForceBalance, cost: _StepCost) -> IndentationStep:
         """Quantities of the converged solution."""
-        system, state = self.newton.system, self.at.state
-        surface, on_skin = system.outer, -balance.indenter
-        weight = state.indenter_pressure * surface.area_values
-        points = surface.points_at(state.position)
-        touching = state.indenter_pressure > CONTACT_SHARE * max(
-            float(state.indenter_pressure.max()), 1.0
+        system = self.newton.system
+        convergence = Convergence(
+            increments=cost.increments,
+            iterations=cost.iterations,
+            factorisations=cost.factorisations,
+            residual=balance.residual,
+            volume_error=abs(balance.volume - self.cavity_m3) / self.cavity_m3,
+            penetration_m=max(0.0, -system.outer.smallest_gap, -system.inner.smallest_gap),
+            seconds=time.perf_counter() - cost.started,
         )
-        centre = np.full(3, np.nan)
-        if touching.any():
-            centre = (weight[..., None] * points).sum(axis=(0, 1)) / weight.sum()
-        stress = system.skin.stress(state.position, state.pressure)
-        return IndentationStep(
-            pose=np.array(pose),
-            displacement=state.position - self.rest.position,
-            fluid_pressure_pa=state.fluid_pressure,
-            force=on_skin.sum(axis=0),
-            torque=np.cross(state.position, on_skin).sum(axis=0),
-            indenter_force=on_skin,
-            core_force=-balance.core,
-            contact_area_m2=float(surface.current_area(state.position)[touching].sum()),
-            centre_of_pressure=centre,
-            stress=stress.reshape(-1, 9)[:, VOIGT],
-            convergence=Convergence(
-                increments=cost.increments,
-                iterations=cost.iterations,
-                factorisations=cost.factorisations,
-                residual=balance.residual,
-                volume_error=abs(balance.volume - self.cavity_m3) / self.cavity_m3,
-                penetration_m=max(0.0, -surface.smallest_gap, -system.inner.smallest_gap),
-                seconds=time.perf_counter() - cost.started,
-            ),
+        return indentation_step(
+            system, self.rest, self.at.state, pose, -balance.indenter, -balance.core, convergence
         )
+
+
+def indentation_step(
+    system: EquilibriumSystem,
+    rest: SolutionState,
+    state: SolutionState,
+    pose: Floats,
+    indenter_force: Floats,
+    core_force: Floats,
+    convergence: Convergence,
+) -> IndentationStep:
+    """Quantities of a converged solution.
+
+    Args:
+        system: The equations.
+        rest: Pressurised, untouched state.
+        state: The solution.
+        pose: Of the indenter (7,).
+        indenter_force: Nodal forces of the indenter on the skin [N], (V, 3).
+        core_force: Of the core on the skin [N], (V, 3).
+        convergence: How it was solved.
+    """
+    surface = system.outer
+    weight = state.indenter_pressure * surface.area_values
+    points = surface.points_at(state.position)
+    touching = state.indenter_pressure > CONTACT_SHARE * max(
+        float(state.indenter_pressure.max()), 1.0
+    )
+    centre = np.full(3, np.nan)
+    if touching.any():
+        centre = (weight[..., None] * points).sum(axis=(0, 1)) / weight.sum()
+    stress = system.skin.stress(state.position, state.pressure)
+    return IndentationStep(
+        pose=np.array(pose),
+        displacement=state.position - rest.position,
+        fluid_pressure_pa=state.fluid_pressure,
+        force=indenter_force.sum(axis=0),
+        torque=np.cross(state.position, indenter_force).sum(axis=0),
+        indenter_force=indenter_force,
+        core_force=core_force,
+        contact_area_m2=float(surface.current_area(state.position)[touching].sum()),
+        centre_of_pressure=centre,
+        stress=stress.reshape(-1, 9)[:, VOIGT],
+        convergence=convergence,
+    )
 
 
 def _force(balance: ForceBalance) -> float:

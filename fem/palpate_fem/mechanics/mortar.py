@@ -51,6 +51,8 @@ class MortarWeights:
         shape: Shape functions of a face at its quadrature points, (Q, k).
         weight: Dual shape function of each corner times the area of each quadrature point [m^2],
             (F, Q, k).
+        corner_area: Integral of each corner's shape function [m^2], (F, k).
+        area: The same of each node, over its faces [m^2], (V,).
     """
 
     def __init__(self, nodes: Floats, faces: Ints) -> None:
@@ -63,13 +65,13 @@ class MortarWeights:
         element = face_element(faces.shape[1])
         self._faces, self.shape = faces, element.shape
         size = point_areas(nodes, faces)
-        self._corner_area = np.einsum("fq,qa->fa", size, element.shape)
+        self.corner_area = np.einsum("fq,qa->fa", size, element.shape)
         mass = np.einsum("fq,qa,qb->fab", size, element.shape, element.shape)
-        dual = self._corner_area[:, :, None] * np.linalg.inv(mass)
+        dual = self.corner_area[:, :, None] * np.linalg.inv(mass)
         self.weight = np.einsum("fq,fab,qb->fqa", size, dual, element.shape)
         self._nodes = np.unique(faces)
-        self._area = np.zeros(len(nodes))
-        np.add.at(self._area, faces, self._corner_area)
+        self.area = np.zeros(len(nodes))
+        np.add.at(self.area, faces, self.corner_area)
 
     def correction(
         self, position: Floats, distance: Distance, near_m: float, hanging_m: float = np.inf
@@ -93,11 +95,11 @@ class MortarWeights:
         inside, outward = distance(points.reshape(-1, 3))
         mean = np.zeros(len(position))
         np.add.at(mean, faces, np.einsum("fqa,fq->fa", weight, inside.reshape(points.shape[:2])))
-        offset[touchable] = mean[touchable] / self._area[touchable] - gap[touchable]
+        offset[touchable] = mean[touchable] / self.area[touchable] - gap[touchable]
         # Force on corner b for a pressure at corner a: at the points, less that at the corner.
         spread = np.einsum("fqa,qb,fqi->fabi", weight, self.shape, outward.reshape(points.shape))
         corner = np.arange(faces.shape[1])
-        spread[:, corner, corner] -= self._corner_area[near][..., None] * normal[faces]
+        spread[:, corner, corner] -= self.corner_area[near][..., None] * normal[faces]
         held = np.zeros((len(self._faces), *points.shape[1:]))
         outward[inside < hanging_m] = 0.0
         held[near] = outward.reshape(points.shape)

@@ -7,8 +7,9 @@ skin is pinched so hard that this does not converge, pseudo-transient continuati
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
@@ -134,6 +135,77 @@ class PseudoTransient:
         self._residuals.append(residual)
 
 
+class BalanceErrors(Protocol):
+    """How far a state is from equilibrium; see `ForceBalance`."""
+
+    @property
+    def residual(self) -> float:
+        """Unbalanced force over the scale of the forces that cancel."""
+
+    @property
+    def volume(self) -> float:
+        """Of the cavity [m^3]."""
+
+    @property
+    def strain_error(self) -> float:
+        """Largest relative error of an element's volume."""
+
+    @property
+    def gap_error_m(self) -> float:
+        """Largest error of a contact point's gap [m]."""
+
+    @property
+    def traction_error(self) -> float:
+        """Largest error of a traction, over the largest one."""
+
+
+def largest_error(balance: BalanceErrors, volume: float | None) -> float:
+    """Largest of the relative errors, weighted by their tolerances.
+
+    Args:
+        balance: At some state.
+        volume: Volume that the cavity has to take [m^3]; None = any.
+    """
+    error = balance.residual
+    if volume is not None:
+        error = max(error, abs(balance.volume - volume) / volume)
+    # A micrometre of gap counts as much as a hundredth of the force, and as all of friction.
+    return max(
+        error,
+        balance.strain_error,
+        balance.gap_error_m * 1e4,
+        balance.traction_error * 1e-2,
+    )
+
+
+def has_converged(balance: BalanceErrors, volume: float | None, settings: NewtonSettings) -> bool:
+    """Whether all errors are within their tolerances; see `largest_error`."""
+    if balance.residual > settings.tolerance:
+        return False
+    if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
+        return False
+    if balance.gap_error_m > settings.gap_tolerance_m:
+        return False
+    if balance.traction_error > settings.traction_tolerance:
+        return False
+    return balance.strain_error <= settings.volume_tolerance
+
+
+def damping_after(errors: Sequence[float]) -> float:
+    """Share of the next step: less than 1 where the error cycles.
+
+    The sets of sticking and sliding points may alternate between two. Steps of half and three
+    quarters, in turn, end between them.
+
+    Args:
+        errors: Since the last mortar correction, the first before any iteration.
+    """
+    done = len(errors) - 1
+    if done < DAMP_FROM or errors[-1] < 0.3 * min(errors[-4:-1]):
+        return 1.0
+    return 0.5 if done % 2 else 0.75
+
+
 class NewtonSolver:
     """Solves increments of one system; keeps its factorised tangent between them."""
 
@@ -172,18 +244,18 @@ class NewtonSolver:
         updates, done = 0, 0  # of the mortar correction, and the iterations before the last one
         system.correct_contact(state, indenter)
         balance = system.balance(state, indenter)
-        error = self._error(balance, volume)
+        error = largest_error(balance, volume)
         report.residuals.append(error)
         while True:
             moved = report.iterations > done
             if moved and updates < settings.mortar_updates and error < MORTAR_FROM:
                 system.correct_contact(state, indenter)
                 balance = system.balance(state, indenter)
-                error = self._error(balance, volume)
+                error = largest_error(balance, volume)
                 updates, done = updates + 1, report.iterations
                 # The state hardly moves any more, so the factor fits as it did.
                 fits = fits and not system.sets_changed
-            if self._converged(balance, volume):
+            if has_converged(balance, volume, settings):
                 report.converged = True
                 return report, balance
             hopeless = report.iterations == settings.patience and error > HOPELESS
@@ -199,13 +271,13 @@ class NewtonSolver:
                 elif not fits:
                     self._factorise(elastic=elastic)
                     report.factorisations += 1
-                damping = 1.0 if continuation else self._damping(report.residuals[done:])
+                damping = 1.0 if continuation else damping_after(report.residuals[done:])
                 balance = self._step(state, indenter, balance, volume, damping)
             except SimulationError as failure:
                 report.reason = failure.problem
                 return report, balance
             report.iterations += 1
-            before, error = error, self._error(balance, volume)
+            before, error = error, largest_error(balance, volume)
             report.residuals.append(error)
             if not np.isfinite(error):
                 report.reason = "the equations gave no number"
@@ -247,45 +319,6 @@ class NewtonSolver:
                 self._has_elastic = True
                 return count
             continuation.rise()
-
-    def _damping(self, past: list[float]) -> float:
-        """Fraction of the next step: less than 1 where the error cycles.
-
-        The sets of sticking and sliding points may alternate between two. Steps of half and three
-        quarters, in turn, end between them.
-
-        Args:
-            past: Errors since the last mortar correction, the first before any iteration.
-        """
-        done = len(past) - 1
-        if done < DAMP_FROM or past[-1] < 0.3 * min(past[-4:-1]):
-            return 1.0
-        return 0.5 if done % 2 else 0.75
-
-    def _error(self, balance: ForceBalance, volume: float | None) -> float:
-        """Largest of the relative errors, weighted by their tolerances."""
-        error = balance.residual
-        if volume is not None:
-            error = max(error, abs(balance.volume - volume) / volume)
-        # A micrometre of gap counts as much as a hundredth of the force, and as all of friction.
-        return max(
-            error,
-            balance.strain_error,
-            balance.gap_error_m * 1e4,
-            balance.traction_error * 1e-2,
-        )
-
-    def _converged(self, balance: ForceBalance, volume: float | None) -> bool:
-        settings = self.settings
-        if balance.residual > settings.tolerance:
-            return False
-        if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
-            return False
-        if balance.gap_error_m > settings.gap_tolerance_m:
-            return False
-        if balance.traction_error > settings.traction_tolerance:
-            return False
-        return balance.strain_error <= settings.volume_tolerance
 
     def _step(
         self,

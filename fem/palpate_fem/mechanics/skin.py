@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.device import DEVICE, launch, mat33s, scalars, vec3s
+from palpate_fem.device import DEVICE, indices, launch, mat33s, scalars, vec3s
 from palpate_fem.mechanics import element_kernels
 from palpate_fem.mechanics.contact import ContactSurface
 from palpate_fem.mechanics.element_kernels import BARRIER_FROM, VOLUME_BARRIER
@@ -52,11 +52,14 @@ class SkinElements:
         self.rest_volume = self.weight_values.sum(axis=1)
         self.count, nodes = mesh.elements.shape
         points = self.weight_values.shape[1]
+        self.items = indices(np.arange(self.count, dtype=np.int32))
+        self._nodes = len(mesh.nodes)
         self._elements = wp.array(mesh.elements, dtype=wp.int32, device=DEVICE)
         self._pairs = wp.array(pairs, dtype=wp.int32, device=DEVICE)
         self._gradient, self._weight = vec3s(self.gradient_values), scalars(self.weight_values)
         self._rest_volume = scalars(self.rest_volume)
-        self._bulk_over_volume = scalars(bulk_ratio * shear_modulus_pa / self.rest_volume)
+        self.bulk_over_volume = bulk_ratio * shear_modulus_pa / self.rest_volume
+        self._bulk_over_volume = scalars(self.bulk_over_volume)
         self._volume, self._jacobian = scalars(np.zeros(self.count)), scalars(np.zeros(self.count))
         self._volume_gradient = vec3s(np.zeros((self.count, nodes, 3)))
         self._frozen_gradient = vec3s(np.zeros((self.count, nodes, 3)))
@@ -65,34 +68,35 @@ class SkinElements:
         self._parts.append(wp.zeros((self.count, points), dtype=wp.vec2d, device=DEVICE))
 
     def add_forces(
-        self, first: int, count: int, position: wp.array, pressure: wp.array, force: wp.array
+        self, items: wp.array, position: wp.array, pressure: wp.array, force: wp.array
     ) -> None:
-        """Add the internal nodal forces of a range of elements."""
+        """Add the internal nodal forces of the listed elements."""
         launch(
             element_kernels.element_state,
-            count,
-            [*self._model, first, position, pressure],
+            len(items),
+            [*self._model, items, position, pressure],
             [self._volume, self._jacobian, self._volume_gradient, force],
         )
 
     def add_tangent(
-        self, first: int, count: int, position: wp.array, pressure: wp.array, blocks: wp.array
+        self, items: wp.array, position: wp.array, pressure: wp.array, blocks: wp.array
     ) -> None:
-        """Add the tangent of a range of elements; `add_forces` comes first, at the same state."""
+        """Add the tangent of the listed elements; `add_forces` comes first, at the same state."""
         launch(
             element_kernels.point_state,
-            count,
-            [*self._model, first, position, pressure],
+            len(items),
+            [*self._model, items, position, pressure],
             self._parts,
         )
         launch(
             element_kernels.element_tangent,
-            count,
+            len(items),
             [
                 self._pairs,
                 self._gradient,
                 self._bulk_over_volume,
-                first,
+                len(blocks),
+                items,
                 *self._parts,
                 self._volume_gradient,
             ],
@@ -129,7 +133,7 @@ class SkinElements:
         launch(
             element_kernels.element_stress,
             self.count,
-            [*self._model, 0, vec3s(position), scalars(pressure)],
+            [*self._model, self.items, vec3s(position), scalars(pressure)],
             [mat33s(stress)],
         )
         return stress
@@ -137,9 +141,7 @@ class SkinElements:
     def strain_error(self, pressure: Floats) -> float:
         """Largest |v - v0 - v0 p / kappa| / v0."""
         excess = self._volume.numpy() - self.rest_volume
-        return float(
-            np.max(np.abs(excess - pressure / self._bulk_over_volume.numpy()) / self.rest_volume)
-        )
+        return float(np.max(np.abs(excess - pressure / self.bulk_over_volume) / self.rest_volume))
 
     def smallest_jacobian(self) -> float:
         """Smallest determinant of the deformation gradient at any quadrature point."""
@@ -148,14 +150,16 @@ class SkinElements:
     @property
     def _model(self) -> list[object]:
         constants = wp.float64(self.mu), wp.float64(self.volume_barrier)
-        return [self._elements, self._gradient, self._weight, *constants]
+        return [self._elements, self._gradient, self._weight, *constants, self._nodes]
 
     @property
-    def _condensed(self) -> list[wp.array]:
+    def _condensed(self) -> list[object]:
         return [
             self._elements,
             self._rest_volume,
             self._bulk_over_volume,
+            self._nodes,
+            self.items,
             self._volume,
             self._frozen_gradient,
         ]
@@ -183,7 +187,7 @@ class FluidCavity:
         launch(
             element_kernels.cavity_volume,
             surface.count,
-            [surface.faces, self._form, position],
+            [surface.faces, self._form, surface.nodes, surface.items, position],
             [self._volumes, self._gradient],
         )
 
@@ -193,6 +197,15 @@ class FluidCavity:
         launch(
             element_kernels.cavity_tangent,
             surface.count,
-            [surface.faces, self._form, surface.pairs, wp.float64(-pressure), position],
+            [
+                surface.faces,
+                self._form,
+                surface.pairs,
+                surface.nodes,
+                len(blocks),
+                surface.items,
+                scalars(np.array([pressure])),
+                position,
+            ],
             [blocks],
         )

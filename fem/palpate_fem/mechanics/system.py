@@ -154,7 +154,8 @@ class EquilibriumSystem:
             bulk_ratio=bulk_ratio,
             volume_barrier=volume_barrier,
         )
-        nodes = len(mesh.nodes)
+        half, nodes = self.skin.count // 2, len(mesh.nodes)
+        self._halves = self.skin.items[:half], self.skin.items[half:]
         self.outer = ContactSurface(mesh.nodes, mesh.outer_faces, self.pattern.outer_pairs)
         self.inner = ContactSurface(mesh.nodes, mesh.inner_faces, self.pattern.inner_pairs)
         self.on_indenter = IndenterContact(self.outer, nodes, contact)
@@ -174,7 +175,7 @@ class EquilibriumSystem:
         share = np.zeros(nodes)
         corners = mesh.elements.shape[1]
         np.add.at(share, mesh.elements, (self.skin.rest_volume / corners)[:, None])
-        self._viscosity = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
+        self.viscosity = shear_modulus_pa * np.cbrt(np.repeat(share, 3)[self.pattern.free])
         self._at: tuple[wp.array, wp.array, float] | None = None
 
     def balance(self, state: SolutionState, indenter: PosedIndenter | None) -> ForceBalance:
@@ -186,17 +187,15 @@ class EquilibriumSystem:
         """
         position, pressure = vec3s(state.position), scalars(state.pressure)
         self._at = (position, pressure, state.fluid_pressure)
-        half = self.skin.count // 2
 
         def first_half() -> None:
             self._forces[0][:] = 0.0
-            self.skin.add_forces(0, half, position, pressure, self._force_arrays[0])
+            self.skin.add_forces(self._halves[0], position, pressure, self._force_arrays[0])
             self.on_indenter.evaluate(state, indenter, position)
 
         def second_half() -> None:
             self._forces[1][:] = 0.0
-            rest = self.skin.count - half
-            self.skin.add_forces(half, rest, position, pressure, self._force_arrays[1])
+            self.skin.add_forces(self._halves[1], position, pressure, self._force_arrays[1])
             self._cavity.evaluate(position)
             self.on_core.evaluate(state, position)
 
@@ -224,16 +223,14 @@ class EquilibriumSystem:
         if elastic:
             assert self._at is not None
             position, pressure, fluid_pressure = self._at
-            half = self.skin.count // 2
 
             def first_half() -> None:
                 self._blocks[0][:] = 0.0
-                self.skin.add_tangent(0, half, position, pressure, self._block_arrays[0])
+                self.skin.add_tangent(self._halves[0], position, pressure, self._block_arrays[0])
 
             def second_half() -> None:
                 self._blocks[1][:] = 0.0
-                rest = self.skin.count - half
-                self.skin.add_tangent(half, rest, position, pressure, self._block_arrays[1])
+                self.skin.add_tangent(self._halves[1], position, pressure, self._block_arrays[1])
                 self._cavity.add_tangent(position, fluid_pressure, self._block_arrays[1])
 
             self._both(first_half, second_half)
@@ -245,7 +242,7 @@ class EquilibriumSystem:
             surface.freeze()
         values = self._sum.reshape(-1)[self.pattern.gather]
         # Each row of the triangle begins with its diagonal.
-        values[self.pattern.indptr[:-1]] += viscosity * self._viscosity
+        values[self.pattern.indptr[:-1]] += viscosity * self.viscosity
         return values
 
     @property

@@ -1,0 +1,1 @@
+"""Many trajectories of one fingertip at once, on a GPU."""

@@ -1,0 +1,589 @@
+"""The discrete equilibrium of many copies of one fingertip: residuals, tangents, moves.
+
+What ``system``, ``skin`` and ``contact`` do for one state, with the same kernels on arrays of all
+copies; a method works on the listed slots and leaves the others alone. Nothing is read back but by
+`BatchedEquations.numbers` and where it is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from palpate_fem.arrays import Floats, Ints
+from palpate_fem.batched import kernels, mortar_kernels
+from palpate_fem.batched.state import (
+    BatchedState,
+    Listed,
+    SlotNumbers,
+    flat,
+    on_device,
+    rows_of_slots,
+    rows_of_three,
+)
+from palpate_fem.batched.surface import BatchedSurface
+from palpate_fem.indenter.shape import Indenter
+from palpate_fem.mechanics import contact_kernels, element_kernels
+from palpate_fem.mechanics.mortar import HANGING_M
+from palpate_fem.mechanics.reference_element import volume_form
+from palpate_fem.mechanics.state import FORCE_FLOOR_N, TRACTION_FLOOR_PA
+from palpate_fem.mechanics.system import EquilibriumSystem
+
+FAR_BELOW_M = -1.0
+"""Height of the primitives that fill the rows of simpler indenters [m]: beyond any margin."""
+
+
+class BatchedEquations:
+    """The equations of ``slots`` copies of one fingertip."""
+
+    def __init__(
+        self,
+        system: EquilibriumSystem,
+        indenters: Sequence[Indenter],
+        *,
+        slots: int,
+        device: str,
+        friction: float,
+    ) -> None:
+        """Put what is constant on the device, and make room.
+
+        Args:
+            system: The equations of one fingertip.
+            indenters: All kinds of indenters.
+            slots: Number of copies.
+            device: A Warp device.
+            friction: Coulomb coefficient of the skin on the indenters.
+        """
+        self.system, self.slots, self.device = system, slots, device
+        mesh, pattern, skin = system.mesh, system.pattern, system.skin
+        self._law, self._core_law = system.contact.law(friction), system.contact.law(0.0)
+        self._nodes, self._elements_each = len(mesh.nodes), len(mesh.elements)
+        self._blocks_each = pattern.blocks
+        self.size = len(pattern.free)
+
+        def ints(values: Ints) -> wp.array:
+            return on_device(np.asarray(values, np.int32), wp.int32, device)
+
+        def numbers(values: Floats) -> wp.array:
+            return on_device(values, wp.float64, device)
+
+        self._elements, self._pairs = ints(mesh.elements), ints(pattern.element_pairs)
+        self._gradient = on_device(skin.gradient_values, wp.vec3d, device)
+        self._weight, self._rest_volume = numbers(skin.weight_values), numbers(skin.rest_volume)
+        self._bulk = numbers(skin.bulk_over_volume)
+        self._free, self._gather = ints(pattern.free), ints(pattern.gather)
+        self._starts = ints(pattern.indptr[:-1])
+        self._node_viscosity = numbers(system.viscosity)
+        held = np.ones(3 * self._nodes, np.int32)
+        held[pattern.free] = 0
+        self._held = ints(held)
+        total, corners = slots * self._elements_each, mesh.elements.shape[1]
+        points = skin.weight_values.shape[1]
+
+        def room(kind: type, *shape: int) -> wp.array:
+            return wp.zeros(shape, dtype=kind, device=device)
+
+        self._volume, self._jacobian = room(wp.float64, total), room(wp.float64, total)
+        self._volume_gradient = room(wp.vec3d, total, corners)
+        self._frozen_gradient = room(wp.vec3d, total, corners)
+        self._target = room(wp.float64, total)
+        self._parts = [room(wp.vec3d, total, points, corners) for _ in range(3)]
+        self._parts.append(room(wp.vec2d, total, points))
+        self._elastic = room(wp.mat33d, slots * pattern.blocks)
+        self._sum = room(wp.mat33d, slots * pattern.blocks)
+        self._internal, self._gradient_of_volume, self._unbalanced, self._field = (
+            room(wp.vec3d, slots * self._nodes) for _ in range(4)
+        )
+        self.outer = BatchedSurface(system.outer, self._nodes, slots, device)
+        self.inner = BatchedSurface(system.inner, self._nodes, slots, device)
+        self._form = numbers(volume_form(system.inner.points))
+        self._face_volume = room(wp.float64, slots * self.inner.count)
+        self._kinds(indenters)
+        self._kind, self._tip = room(wp.int32, slots), room(wp.vec3d, slots)
+        self._rotation = room(wp.mat33d, slots)
+        core = system.on_core.core
+        self._core: list[Any] = []
+        if core is not None:
+            self._core = [
+                numbers(core.coefficients), wp.vec3d(*core.origin), wp.float64(core.spacing)
+            ]  # fmt: skip
+            self._core_margin = wp.float64(system.contact.margin_m + 2 * core.spacing)
+        self._margin = wp.float64(system.contact.margin_m)
+        self._numbers = room(wp.float64, slots, kernels.NUMBERS)
+        self._longest = room(wp.float64, slots)
+        self._fraction = room(wp.float64, slots)
+
+    def _kinds(self, indenters: Sequence[Indenter]) -> None:
+        """Rows of all indenters, and from which gap on each holds directions."""
+        packed = [one.packed() for one in indenters]
+        most = max(len(rows) for rows in packed)
+        table = np.zeros((len(packed), most, packed[0].shape[1]))
+        for k, rows in enumerate(packed):
+            table[k, : len(rows)] = rows
+            table[k, len(rows) :] = rows[0]
+            table[k, len(rows) :, 4] = FAR_BELOW_M  # z of the centre
+        self._primitives = on_device(table, wp.float64, self.device)
+        hanging = [HANGING_M if one.fillet_m > 0.0 else np.inf for one in indenters]
+        self._hanging = on_device(np.array(hanging), wp.float64, self.device)
+
+    def listed(self, numbers: Ints) -> Listed:
+        """The lists of some slots."""
+        slots = on_device(np.asarray(numbers, np.int32), wp.int32, self.device)
+
+        def items(count: int) -> wp.array:
+            found = wp.empty(len(numbers) * count, dtype=wp.int32, device=self.device)
+            self._launch(kernels.expand, (len(numbers), count), [slots, count], [found])
+            return found
+
+        return Listed(
+            np.asarray(numbers),
+            slots,
+            items(self._elements_each),
+            items(self.outer.count),
+            items(self.inner.count),
+        )
+
+    def pose(self, slots: Ints, kind: Ints, tip: Floats, rotation: Floats) -> None:
+        """Put indenters: their kinds (m,), tips [m], (m, 3), and rotations (m, 3, 3)."""
+        for array, values in ((self._kind, kind), (self._tip, tip), (self._rotation, rotation)):
+            now = array.numpy()
+            now[slots] = values
+            array.assign(now)
+
+    def correct_contact(self, state: BatchedState, listed: Listed) -> None:
+        """Evaluate the mortar corrections of both surfaces and keep them."""
+        if not self.system.contact.mortar:
+            return
+        posed = [self._primitives, self._kind, self._tip, self._rotation]
+        surface = self.outer
+        nodal = [surface.node_gap, surface.node_normal, surface.node_mean]
+        self._launch(
+            mortar_kernels.near_indenter,
+            (len(listed.slots), len(surface.nodes)),
+            [listed.slots, surface.nodes, self._nodes, *posed, self._margin, state.position],
+            nodal,
+        )
+        means = [surface.faces, surface.mortar_shape, surface.weight]
+        self._launch(
+            mortar_kernels.mean_gaps_to_indenter,
+            len(listed.outer),
+            [*means, *posed, self._nodes, listed.outer, self._margin, self._hanging,
+             state.position, surface.node_gap],
+            [surface.outward, surface.held, surface.node_mean],
+        )  # fmt: skip
+        surface.offset_gaps(listed.outer, self._margin)
+        if not self._core:
+            return
+        surface = self.inner
+        nodal = [surface.node_gap, surface.node_normal, surface.node_mean]
+        self._launch(
+            mortar_kernels.near_core,
+            (len(listed.slots), len(surface.nodes)),
+            [listed.slots, surface.nodes, self._nodes, *self._core, self._margin, state.position],
+            nodal,
+        )
+        self._launch(
+            mortar_kernels.mean_gaps_to_core,
+            len(listed.inner),
+            [surface.faces, surface.mortar_shape, surface.weight, *self._core, self._nodes,
+             listed.inner, self._margin, state.position, surface.node_gap],
+            [surface.outward, surface.node_mean],
+        )  # fmt: skip
+        surface.offset_gaps(listed.inner, self._margin)
+
+    def balance(self, state: BatchedState, listed: Listed) -> None:
+        """Evaluate forces and all that `numbers` tells; see `EquilibriumSystem.balance`."""
+        outer, inner = self.outer, self.inner
+        for field in (self._internal, self._gradient_of_volume, outer.force, inner.force):
+            self._clear(listed, field)
+        self._launch(
+            element_kernels.element_state,
+            len(listed.elements),
+            [*self._model, listed.elements, state.position, state.pressure],
+            [self._volume, self._jacobian, self._volume_gradient, self._internal],
+        )
+        self._launch(
+            element_kernels.cavity_volume,
+            len(listed.inner),
+            [inner.faces, self._form, self._nodes, listed.inner, state.position],
+            [self._face_volume, self._gradient_of_volume],
+        )
+        posed = [self._primitives, self._kind]
+        place = [self._tip, self._rotation, self._nodes, listed.outer]
+        self._launch(
+            contact_kernels.indenter_contact,
+            len(listed.outer),
+            [outer.faces, outer.shape, outer.area, *posed, self._law, self._margin, *place,
+             state.position, outer.offset, state.indenter_pressure, state.traction, state.anchor],
+            [*outer.results, outer.wanted_traction, outer.traction_slope, outer.coupled,
+             outer.unsymmetric, outer.force],
+        )  # fmt: skip
+        mortar = self.system.contact.mortar
+        if mortar:
+            self._launch(
+                contact_kernels.mortar_on_indenter,
+                len(listed.outer),
+                [outer.faces, outer.mortar_shape, outer.weight, *posed, *place,
+                 state.position, state.indenter_pressure, outer.held],
+                [outer.mortar_status, outer.mortar_tangent, outer.force],
+            )  # fmt: skip
+        if self._core:
+            place = [*self._core, self._nodes, listed.inner]
+            self._launch(
+                contact_kernels.core_contact,
+                len(listed.inner),
+                [inner.faces, inner.shape, inner.area, *place, self._core_law, self._core_margin,
+                 state.position, inner.offset, state.core_pressure],
+                [*inner.results, inner.force],
+            )  # fmt: skip
+            if mortar:
+                self._launch(
+                    contact_kernels.mortar_on_core,
+                    len(listed.inner),
+                    [inner.faces, inner.mortar_shape, inner.weight, *place,
+                     state.position, state.core_pressure],
+                    [inner.mortar_status, inner.mortar_tangent, inner.force],
+                )  # fmt: skip
+        self._reduce(state, listed)
+
+    def _reduce(self, state: BatchedState, listed: Listed) -> None:
+        """Sums and maxima of the listed slots."""
+        slots, outer, inner = listed.slots, self.outer, self.inner
+        count = len(slots)
+        self._launch(kernels.clear_numbers, (count, kernels.NUMBERS), [slots], [self._numbers])
+        self._launch(
+            kernels.sum_nodes,
+            (count, self._nodes),
+            [slots, self._held, self._nodes, self._internal, outer.force, inner.force,
+             self._gradient_of_volume, state.fluid_pressure],
+            [self._unbalanced, self._numbers],
+        )  # fmt: skip
+        self._launch(
+            kernels.sum_elements,
+            (count, self._elements_each),
+            [slots, self._elements_each, self._rest_volume, self._bulk, self._volume,
+             self._jacobian, state.pressure],
+            [self._numbers],
+        )  # fmt: skip
+        self._launch(
+            kernels.sum_cavity,
+            (count, inner.count),
+            [slots, inner.count, self._face_volume],
+            [self._numbers],
+        )
+        for surface, items, pressure in (
+            (outer, listed.outer, state.indenter_pressure),
+            (inner, listed.inner, state.core_pressure),
+        ):
+            traction = state.traction if surface is outer else surface.wanted_traction
+            self._launch(
+                kernels.sum_contact,
+                len(items),
+                [items, surface.count, surface.wanted, pressure, surface.wanted_traction,
+                 traction, surface.status, surface.frozen_status],
+                [self._numbers],
+            )  # fmt: skip
+
+    def numbers(self, state: BatchedState, listed: Listed) -> list[SlotNumbers]:
+        """Numbers of the last `balance`, read back, for each listed slot."""
+        rows, fluid = self._numbers.numpy(), state.fluid_pressure.numpy()
+        found = []
+        for slot in listed.numbers:
+            row = rows[slot]
+            norms = np.sqrt(row[[kernels.FLUID, kernels.INDENTER, kernels.CORE, kernels.INTERNAL]])
+            scale = max(float(norms.sum()), FORCE_FLOOR_N)
+            largest = max(float(row[kernels.LARGEST]), TRACTION_FLOOR_PA)
+            found.append(
+                SlotNumbers(
+                    residual=float(np.sqrt(row[kernels.UNBALANCED])) / scale,
+                    volume=float(row[kernels.VOLUME]),
+                    strain_error=float(row[kernels.STRAIN]),
+                    gap_error_m=float(row[kernels.GAP]) / self.system.contact.stiffness,
+                    traction_error=float(row[kernels.TRACTION]) / largest,
+                    smallest_jacobian=float(row[kernels.JACOBIAN]),
+                    net_force=-row[kernels.NET : kernels.NET + 3],
+                    fluid_pressure=float(fluid[slot]),
+                    sets_changed=bool(row[kernels.CHANGED]),
+                )
+            )
+        return found
+
+    def nodal_forces(self, slots: Ints) -> tuple[Floats, Floats]:
+        """Minus the nodal forces of indenter and core on the skin [N], (m, V, 3), read back."""
+        on_indenter, on_core = (
+            rows_of_slots(rows_of_three(surface.force), slots, self._nodes)
+            for surface in (self.outer, self.inner)
+        )
+        return on_indenter, on_core
+
+    def tangent(
+        self,
+        state: BatchedState,
+        listed: Listed,
+        values: wp.array,
+        *,
+        elastic: Listed | None,
+        viscosity: wp.array,
+    ) -> None:
+        """Upper triangles of the listed slots; see `EquilibriumSystem.tangent_values`.
+
+        Args:
+            state: That of the last `balance`.
+            listed: Slots.
+            values: Takes the entries, (slots, nnz).
+            elastic: Those whose tangent of skin and fluid is evaluated anew; None = none.
+            viscosity: See `PseudoTransient`, (slots,).
+        """
+        inner = self.inner
+        if elastic is not None:
+            self._launch(
+                kernels.clear_matrices,
+                (len(elastic.slots), self._blocks_each),
+                [elastic.slots, self._blocks_each],
+                [self._elastic],
+            )
+            self._launch(
+                element_kernels.point_state,
+                len(elastic.elements),
+                [*self._model, elastic.elements, state.position, state.pressure],
+                self._parts,
+            )
+            self._launch(
+                element_kernels.element_tangent,
+                len(elastic.elements),
+                [self._pairs, self._gradient, self._bulk, self._blocks_each, elastic.elements,
+                 *self._parts, self._volume_gradient],
+                [self._elastic],
+            )  # fmt: skip
+            self._launch(
+                element_kernels.cavity_tangent,
+                len(elastic.inner),
+                [inner.faces, self._form, inner.pairs, self._nodes, self._blocks_each,
+                 elastic.inner, state.fluid_pressure, state.position],
+                [self._elastic],
+            )  # fmt: skip
+            corners = self._volume_gradient.shape[1]
+            self._copy(
+                elastic, 3 * corners * self._elements_each, self._volume_gradient,
+                self._frozen_gradient,
+            )  # fmt: skip
+        self._copy(listed, 9 * self._blocks_each, self._elastic, self._sum)
+        for surface, items in ((self.outer, listed.outer), (inner, listed.inner)):
+            surface.add_tangent(items, self._blocks_each, self._sum)
+            for now, kept, each in surface.frozen:
+                self._copy(listed, each * surface.count, now, kept)
+        count = len(listed.slots)
+        self._launch(
+            kernels.gather_values,
+            (count, len(self._gather)),
+            [listed.slots, self._gather, self._blocks_each, flat(self._sum)],
+            [values],
+        )
+        self._launch(
+            kernels.add_viscosity,
+            (count, self.size),
+            [listed.slots, self._starts, self._node_viscosity, viscosity],
+            [values],
+        )
+
+    def right_hand_side(
+        self, state: BatchedState, listed: Listed, vectors: wp.array, lane: int
+    ) -> None:
+        """Minus the unbalanced force and the misfits' load of the free unknowns [N]."""
+        field = self._cleared_field(listed)
+        self._launch(
+            element_kernels.pressure_misfit,
+            len(listed.elements),
+            [*self._condensed, listed.elements, self._volume, self._frozen_gradient,
+             state.pressure],
+            [field],
+        )  # fmt: skip
+        for surface, items in ((self.inner, listed.inner), (self.outer, listed.outer)):
+            surface.subtract_load(items, surface.misfit, field)
+        self._gather_load(listed, -1.0, self._unbalanced, vectors, lane)
+        self._gather_load(listed, -1.0, field, vectors, lane, add=True)
+
+    def volume_gradient(self, listed: Listed, vectors: wp.array, lane: int) -> None:
+        """Derivative of the cavity's volume by the free unknowns [m^2]."""
+        self._gather_load(listed, 1.0, self._gradient_of_volume, vectors, lane)
+
+    def coupled(self, state: BatchedState, listed: Listed, vectors: wp.array, lane: int) -> None:
+        """Minus `EquilibriumSystem.coupled_force` [N]."""
+        field, outer = self._cleared_field(listed), self.outer
+        outer.subtract_load(listed.outer, outer.coupled, field)
+        self._spread(state, listed, field, change=None)
+        self._gather_load(listed, -1.0, field, vectors, lane)
+
+    def subtract_unsymmetric_product(
+        self, state: BatchedState, listed: Listed, change: wp.array, of: int, vectors: wp.array,
+        lane: int,
+    ) -> None:  # fmt: skip
+        """Subtract `EquilibriumSystem.unsymmetric_product` of a change of the free unknowns."""
+        moved = self._as_field(listed, change, of)
+        field, outer = self._unbalanced_field(listed), self.outer
+        self._launch(
+            contact_kernels.unsymmetric_product,
+            len(listed.outer),
+            [outer.faces, outer.shape, self._nodes, listed.outer, outer.frozen_unsymmetric, moved],
+            [field],
+        )
+        self._spread(state, listed, field, change=moved)
+        self._gather_load(listed, -1.0, field, vectors, lane, add=True)
+
+    def _spread(
+        self, state: BatchedState, listed: Listed, field: wp.array, change: wp.array | None
+    ) -> None:
+        """Add mortar's loads at neighbours, by a change of the nodes or what they lack."""
+        if not self.system.contact.mortar:
+            return
+        surfaces = [(self.outer, listed.outer, state.indenter_pressure)]
+        if self._core:
+            surfaces.append((self.inner, listed.inner, state.core_pressure))
+        for surface, items, pressure in surfaces:
+            surface.add_spread(items, self._margin, pressure, change, field)
+
+    def longest_move(self, listed: Listed, change: wp.array, lane: int) -> Floats:
+        """Longest move of a node of each listed slot [m], (m,); infinite if one is no number."""
+        moved = self._as_field(listed, change, lane)
+        self._longest.zero_()
+        self._launch(
+            kernels.longest_moves,
+            (len(listed.slots), self._nodes),
+            [listed.slots, self._nodes, moved],
+            [self._longest],
+        )
+        square = self._longest.numpy()[listed.numbers]
+        return np.asarray(np.where(square < 1e299, np.sqrt(square), np.inf))
+
+    def targets(self, listed: Listed, change: wp.array, lane: int) -> None:
+        """Recover the condensed unknowns; see `EquilibriumSystem.updated_pressures`."""
+        moved = self._as_field(listed, change, lane)
+        self._launch(
+            element_kernels.pressure_update,
+            len(listed.elements),
+            [*self._condensed, listed.elements, self._volume, self._frozen_gradient, moved],
+            [self._target],
+        )
+        for surface, items in ((self.inner, listed.inner), (self.outer, listed.outer)):
+            surface.set_targets(items, moved)
+
+    def move(
+        self,
+        state: BatchedState,
+        start: BatchedState,
+        listed: Listed,
+        change: wp.array,
+        lane: int,
+        fraction: Floats,
+        pressure_change: wp.array,
+    ) -> None:
+        """Go a share, (slots,), of the way from a state to its targets."""
+        self._fraction.assign(fraction)
+        slots, count = listed.slots, len(listed.slots)
+        self._launch(
+            kernels.move_nodes,
+            (count, self.size),
+            [slots, self._free, self._nodes, self._fraction, change, lane,
+             rows_of_three(start.position)],
+            [rows_of_three(state.position)],
+        )  # fmt: skip
+        self._launch(
+            kernels.move_fluid,
+            count,
+            [slots, self._fraction, start.fluid_pressure, pressure_change],
+            [state.fluid_pressure],
+        )
+        self._launch(
+            kernels.go_towards,
+            (count, self._elements_each),
+            [slots, self._elements_each, self._fraction, start.pressure, self._target],
+            [state.pressure],
+        )
+        outer, inner = self.outer, self.inner
+        self._launch(
+            kernels.move_contact,
+            len(listed.outer),
+            [listed.outer, outer.count, self._fraction, start.indenter_pressure, outer.target,
+             start.traction, outer.target_traction],
+            [state.indenter_pressure, state.traction],
+        )  # fmt: skip
+        self._launch(
+            kernels.move_contact,
+            len(listed.inner),
+            [listed.inner, inner.count, self._fraction, start.core_pressure, inner.target,
+             inner.wanted_traction, inner.wanted_traction],
+            [state.core_pressure, inner.target_traction],
+        )  # fmt: skip
+
+    def update_anchors(self, state: BatchedState, listed: Listed) -> None:
+        """See `EquilibriumSystem.update_anchors`."""
+        outer = self.outer
+        softness = wp.float64(1.0 / self.system.contact.tangential_stiffness)
+        self._launch(
+            mortar_kernels.place_anchors,
+            len(listed.outer),
+            [listed.outer, outer.faces, outer.shape, self._nodes, softness, self._tip,
+             self._rotation, state.position, state.traction],
+            [state.anchor],
+        )  # fmt: skip
+
+    @property
+    def _model(self) -> list[Any]:
+        skin = self.system.skin
+        constants = wp.float64(skin.mu), wp.float64(skin.volume_barrier)
+        return [self._elements, self._gradient, self._weight, *constants, self._nodes]
+
+    @property
+    def _condensed(self) -> list[Any]:
+        return [self._elements, self._rest_volume, self._bulk, self._nodes]
+
+    def _clear(self, listed: Listed, field: wp.array) -> None:
+        dim = (len(listed.slots), self._nodes)
+        self._launch(kernels.clear_vectors, dim, [listed.slots, self._nodes], [field])
+
+    def _cleared_field(self, listed: Listed) -> wp.array:
+        self._clear(listed, self._field)
+        return self._field
+
+    def _unbalanced_field(self, listed: Listed) -> wp.array:
+        """Room for another nodal field: the unbalanced force has been read by then."""
+        self._clear(listed, self._unbalanced)
+        return self._unbalanced
+
+    def _as_field(self, listed: Listed, vectors: wp.array, lane: int) -> wp.array:
+        """A vector of the free unknowns as a nodal field."""
+        field = self._cleared_field(listed)
+        self._launch(
+            kernels.spread_change,
+            (len(listed.slots), self.size),
+            [listed.slots, self._free, self._nodes, vectors, lane],
+            [rows_of_three(field)],
+        )
+        return field
+
+    def _gather_load(
+        self, listed: Listed, sign: float, field: wp.array, vectors: wp.array, lane: int,
+        *, add: bool = False,
+    ) -> None:  # fmt: skip
+        self._launch(
+            kernels.add_load if add else kernels.gather_load,
+            (len(listed.slots), self.size),
+            [listed.slots, self._free, self._nodes, wp.float64(sign), rows_of_three(field)],
+            [vectors, lane],
+        )
+
+    def _copy(self, listed: Listed, each: int, source: wp.array, copy: wp.array) -> None:
+        """Copy ``each`` numbers of every listed slot between arrays of one kind."""
+        integers = source.dtype is wp.int32
+        self._launch(
+            kernels.copy_integers if integers else kernels.copy_rows,
+            (len(listed.slots), each),
+            [listed.slots, each, source.flatten() if integers else flat(source)],
+            [copy.flatten() if integers else flat(copy)],
+        )
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

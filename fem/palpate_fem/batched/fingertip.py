@@ -1,0 +1,383 @@
+"""Many indentations of one fingertip at once, on a GPU: the batched solver.
+
+A slot holds one trajectory at a time, and takes the next when its own has ended; no trajectory
+waits for another. A sweep serves the requests of all slots (``trajectory``), kind by kind: starts
+of increments and mortar corrections, factorisations, Newton steps.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import warp as wp
+
+from palpate.errors import ConfigError
+from palpate_fem.arrays import Floats
+from palpate_fem.batched.equations import BatchedEquations
+from palpate_fem.batched.linear import CHANGE, BatchedLinearSystem
+from palpate_fem.batched.state import (
+    BatchedState,
+    SlotNumbers,
+    rows_of_slots,
+    rows_of_three,
+)
+from palpate_fem.batched.trajectory import (
+    Accept,
+    BatchedTrajectory,
+    Begin,
+    Correct,
+    Factorise,
+    MovesIn,
+    Reach,
+    Request,
+    Requests,
+    Step,
+)
+from palpate_fem.indenter.approach import OuterSurface, check_clear
+from palpate_fem.indenter.path import check_path
+from palpate_fem.indenter.shape import Indenter
+from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.load_stepping import indentation_step, moves_in
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
+
+HALVINGS = 8
+"""How often a Newton step is halved where an element would turn inside out."""
+
+HOST_THREADS = 4
+"""Threads that make steps of what the device has solved."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatchedPress:
+    """A trajectory to compute.
+
+    Attributes:
+        indenter: Number of the indenter, among those of the `BatchedFingertip`.
+        path: Poses (K, 7), see `Fingertip.indent`; the first is clear of the skin.
+    """
+
+    indenter: int
+    path: Floats
+
+
+@dataclass(slots=True)
+class _Live:
+    """The trajectory in a slot, and what it asks for."""
+
+    number: int
+    press: BatchedPress
+    trajectory: BatchedTrajectory
+    requests: Requests
+    accepted: Floats
+    started: float = field(default_factory=time.perf_counter)
+    wanted: Request | None = None
+    pose: Floats = field(default_factory=lambda: np.zeros(7))
+    numbers: SlotNumbers | None = None
+    steps: list[Future[IndentationStep]] = field(default_factory=list)
+
+
+class BatchedFingertip:
+    """A pressurised fingertip, ``slots`` times on a device."""
+
+    def __init__(
+        self, tip: Fingertip, indenters: Sequence[Indenter], *, slots: int, device: str
+    ) -> None:
+        """Make room on the device.
+
+        Args:
+            tip: The fingertip; its state and its settings are used, and it answers rare questions.
+            indenters: All that the presses name.
+            slots: Trajectories at once.
+            device: A Warp device, for example ``cuda:0``.
+
+        Raises:
+            ConfigError: There are no slots or no indenters.
+        """
+        if slots < 1 or not indenters:
+            raise ConfigError(
+                f"{slots} slots and {len(indenters)} indenters", remedy="give one or more of each"
+            )
+        self.tip, self.indenters, self.slots = tip, tuple(indenters), slots
+        system, friction = tip.system, tip.parameters.friction_coefficient
+        self.equations = BatchedEquations(
+            system, self.indenters, slots=slots, device=device, friction=friction
+        )
+        self.linear = BatchedLinearSystem(self.equations, tip.cavity_m3)
+        self._now, self._before, self._trial, self._start = (
+            BatchedState(tip.geometry.mesh, slots, device) for _ in range(4)
+        )
+        self._viscosity = np.zeros(slots)
+        self._device = device
+        self._skin = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
+
+    def indent(
+        self, presses: Iterable[BatchedPress], *, on_sweep: Callable[[int], None] | None = None
+    ) -> Iterator[tuple[int, IndentationResult]]:
+        """Compute trajectories, in whatever order they end.
+
+        One that finds no equilibrium, pseudo-transient continuation included, is computed again on
+        the CPU when all others have ended: its factor copes with indefinite tangents.
+
+        Args:
+            presses: Any number, taken and checked one by one.
+            on_sweep: Called with the number of trajectories at work on the device.
+
+        Yields:
+            Number of the trajectory, and its result, as `Fingertip.indent` returns it.
+
+        Raises:
+            ConfigError: A press names no indenter, or its path is not valid, see `check_path`.
+            SimulationError: A press starts inside the skin.
+        """
+        hard: list[_Live] = []
+        waiting = iter(enumerate(presses))
+        live: dict[int, _Live] = {}
+        with ThreadPoolExecutor(HOST_THREADS, thread_name_prefix="palpate-steps") as pool:
+            while True:
+                self._fill(live, waiting)
+                if not live:
+                    break
+                if on_sweep is not None:
+                    on_sweep(len(live))
+                self._evaluate(live, pool)
+                self._factorise(live)
+                self._step(live, pool)
+                for slot in [slot for slot, one in live.items() if one.wanted is None]:
+                    one = live.pop(slot)
+                    if one.trajectory.unsolved:
+                        hard.append(one)
+                    else:
+                        yield one.number, self._result(one)
+        for one in hard:
+            stepping = self.tip.load_stepping(self._indenter(one), one.press.path)
+            yield one.number, stepping.run()
+
+    def _fill(self, live: dict[int, _Live], waiting: Iterator[tuple[int, BatchedPress]]) -> None:
+        """Give free slots their next trajectories."""
+        tip, fresh = self.tip, []
+        for slot in range(self.slots):
+            if slot in live:
+                continue
+            number, press = next(waiting, (-1, None))
+            if press is None:
+                break
+            press = self._checked(number, press)
+            trajectory = BatchedTrajectory(press.path, tip.settings, tip.cavity_m3)
+            one = _Live(number, press, trajectory, trajectory.requests(), press.path[0])
+            live[slot] = one
+            fresh.append(slot)
+            self._now.put(slot, tip.state)
+            self._before.put(slot, tip.state)
+            one.pose = press.path[0]
+            self._go_on(one, None)
+        if fresh:
+            self._pose(live, fresh)
+            self.equations.update_anchors(self._now, self.equations.listed(np.array(fresh)))
+
+    def _checked(self, number: int, press: BatchedPress) -> BatchedPress:
+        """A press whose path is valid and begins clear of the skin."""
+        if not 0 <= press.indenter < len(self.indenters):
+            raise ConfigError(
+                f"press {number} has indenter {press.indenter}",
+                remedy=f"give one of 0 to {len(self.indenters) - 1}",
+            )
+        path = check_path(press.path, source=f"the path of press {number}")
+        check_clear(self.indenters[press.indenter], path[0], self._skin)
+        return BatchedPress(press.indenter, path)
+
+    def _pose(self, live: dict[int, _Live], slots: list[int]) -> None:
+        """Put the indenters of slots where they are wanted."""
+        posed = [PosedIndenter(self._indenter(live[k]), live[k].pose, 0.0) for k in slots]
+        self.equations.pose(
+            np.array(slots),
+            np.array([live[k].press.indenter for k in slots]),
+            np.array([one.tip for one in posed]),
+            np.array([one.rotation for one in posed]),
+        )
+
+    def _indenter(self, one: _Live) -> Indenter:
+        return self.indenters[one.press.indenter]
+
+    @staticmethod
+    def _go_on(one: _Live, answer: object) -> None:
+        """Resume a trajectory with an answer; ``wanted`` is None when it has ended."""
+        try:
+            one.wanted = one.requests.send(answer)
+        except StopIteration:
+            one.wanted = None
+
+    @staticmethod
+    def _asking(live: dict[int, _Live], *kinds: type) -> list[int]:
+        return [slot for slot, one in live.items() if isinstance(one.wanted, kinds)]
+
+    def _evaluate(self, live: dict[int, _Live], pool: ThreadPoolExecutor) -> None:
+        """Serve starts of increments and mortar corrections, until none is asked for."""
+        while slots := self._asking(live, Begin, Correct):
+            begin = [slot for slot in slots if isinstance(live[slot].wanted, Begin)]
+            if begin:
+                ratio = np.zeros(self.slots)
+                for slot in begin:
+                    wanted = live[slot].wanted
+                    assert isinstance(wanted, Begin)
+                    live[slot].pose, ratio[slot] = wanted.pose, wanted.ratio
+                self._pose(live, begin)
+                listed = self.equations.listed(np.array(begin))
+                ratios = wp.array(ratio, dtype=wp.float64, device=self._device)
+                self._trial.extrapolate(self._now, self._before, ratios, listed.slots)
+            listed = self.equations.listed(np.array(slots))
+            self.equations.correct_contact(self._trial, listed)
+            self.equations.balance(self._trial, listed)
+            numbers = self.equations.numbers(self._trial, listed)
+            for slot, found in zip(slots, numbers, strict=True):
+                live[slot].numbers = found
+                self._go_on(live[slot], found)
+            self._end_increments(live, pool)
+
+    def _factorise(self, live: dict[int, _Live]) -> None:
+        """Serve factorisations, again where a viscosity has to rise."""
+        while slots := self._asking(live, Factorise):
+            elastic = []
+            for slot in slots:
+                wanted = live[slot].wanted
+                assert isinstance(wanted, Factorise)
+                self._viscosity[slot] = wanted.viscosity
+                if wanted.elastic:
+                    elastic.append(slot)
+            listed = self.equations.listed(np.array(slots))
+            anew = self.equations.listed(np.array(elastic)) if elastic else None
+            viscosity = wp.array(self._viscosity, dtype=wp.float64, device=self._device)
+            definite = self.linear.factorise(self._trial, listed, anew, viscosity)
+            for slot, fine in zip(slots, definite, strict=True):
+                self._go_on(live[slot], bool(fine))
+
+    def _step(self, live: dict[int, _Live], pool: ThreadPoolExecutor) -> None:
+        """Serve Newton steps; see `NewtonSolver._step`."""
+        slots = self._asking(live, Step)
+        if not slots:
+            return
+        equations, linear, fraction = self.equations, self.linear, np.zeros(self.slots)
+        listed = equations.listed(np.array(slots))
+        missing = [self.tip.cavity_m3 - _known(live[slot]).volume for slot in slots]
+        linear.solve(self._trial, listed, np.array(missing))
+        longest = equations.longest_move(listed, linear.change, CHANGE)
+        most = self.tip.settings.newton.largest_move_m
+        for slot, far in zip(slots, longest, strict=True):
+            wanted = live[slot].wanted
+            assert isinstance(wanted, Step)
+            fraction[slot] = min(wanted.damping, most / max(float(far), 1e-300))
+        equations.targets(listed, linear.change, CHANGE)
+        self._start.copy_slots(self._trial, listed.slots)
+        left = [slot for slot, far in zip(slots, longest, strict=True) if np.isfinite(far)]
+        answers: dict[int, SlotNumbers] = {}
+        for _ in range(HALVINGS):
+            if not left:
+                break
+            some = listed if len(left) == len(slots) else equations.listed(np.array(left))
+            equations.move(
+                self._trial, self._start, some, linear.change, CHANGE, fraction,
+                linear.pressure_change,
+            )  # fmt: skip
+            equations.balance(self._trial, some)
+            for slot, found in zip(left, equations.numbers(self._trial, some), strict=True):
+                if found.smallest_jacobian > 0.0:
+                    answers[slot] = found
+            left = [slot for slot in left if slot not in answers]
+            fraction[left] *= 0.5
+        for slot in slots:
+            live[slot].numbers = answers.get(slot, live[slot].numbers)
+            self._go_on(live[slot], answers.get(slot))
+        self._end_increments(live, pool)
+
+    def _end_increments(self, live: dict[int, _Live], pool: ThreadPoolExecutor) -> None:
+        """Serve what ends an increment: snaps, the new solution, and the steps that are kept."""
+        for slot in self._asking(live, MovesIn):
+            self._go_on(live[slot], self._moves_in(slot, live[slot]))
+        if slots := self._asking(live, Accept):
+            listed = self.equations.listed(np.array(slots))
+            self._before.copy_slots(self._now, listed.slots)
+            self._now.copy_slots(self._trial, listed.slots)
+            self.equations.update_anchors(self._now, listed)
+            for slot in slots:
+                live[slot].accepted = live[slot].pose
+                self._go_on(live[slot], None)
+        if slots := self._asking(live, Reach):
+            self._keep_steps(slots, live, pool)
+            for slot in slots:
+                self._go_on(live[slot], None)
+
+    def _moves_in(self, slot: int, one: _Live) -> bool:
+        """Whether the indenter moves in from the last solution; rare, so on the CPU."""
+        wanted, system, state = one.wanted, self.tip.system, self._now.get(slot)
+        assert isinstance(wanted, MovesIn)
+        friction = self.tip.parameters.friction_coefficient
+        at = PosedIndenter(self._indenter(one), one.accepted, friction)
+        system.correct_contact(state, at)
+        load = -system.balance(state, at).indenter
+        return moves_in(state.position, load, at, at.at(wanted.pose))
+
+    def _keep_steps(
+        self, slots: list[int], live: dict[int, _Live], pool: ThreadPoolExecutor
+    ) -> None:
+        """Steps of solutions: fetched from the device now, made by other threads."""
+        tip, now, wanted = self.tip, self._now, np.array(slots)
+        mesh = tip.geometry.mesh
+        position = rows_of_slots(rows_of_three(now.position), wanted, len(mesh.nodes))
+        pressure = rows_of_slots(now.pressure, wanted, len(mesh.elements))
+        contact = rows_of_slots(now.indenter_pressure, wanted, len(mesh.outer_faces))
+        on_core = rows_of_slots(now.core_pressure, wanted, len(mesh.inner_faces))
+        indenter_force, core_force = self.equations.nodal_forces(wanted)
+        for k, slot in enumerate(slots):
+            one, reach = live[slot], live[slot].wanted
+            assert isinstance(reach, Reach)
+            numbers = reach.numbers
+            deepest = max(contact[k].max(initial=0.0), on_core[k].max(initial=0.0))
+            convergence = Convergence(
+                increments=reach.increments,
+                iterations=reach.iterations,
+                factorisations=reach.factorisations,
+                residual=numbers.residual,
+                volume_error=abs(numbers.volume - tip.cavity_m3) / tip.cavity_m3,
+                penetration_m=float(deepest) / tip.system.contact.stiffness,
+                seconds=time.perf_counter() - one.started,
+            )
+            state = replace(
+                tip.state,
+                position=position[k],
+                pressure=pressure[k],
+                indenter_pressure=contact[k],
+                fluid_pressure=numbers.fluid_pressure,
+            )
+            one.steps.append(
+                pool.submit(
+                    indentation_step,
+                    tip.system,
+                    tip.state,
+                    state,
+                    reach.pose,
+                    -indenter_force[k],
+                    -core_force[k],
+                    convergence,
+                )
+            )
+
+    def _result(self, one: _Live) -> IndentationResult:
+        trajectory = one.trajectory
+        return IndentationResult(
+            indenter=self._indenter(one).name,
+            path=one.press.path,
+            steps=tuple(step.result() for step in one.steps),
+            outcome=trajectory.outcome or IndentationOutcome.DIVERGED,
+            reason=trajectory.reason,
+            travel_m=trajectory.travel_m,
+            seconds=time.perf_counter() - one.started,
+        )
+
+
+def _known(one: _Live) -> SlotNumbers:
+    assert one.numbers is not None
+    return one.numbers

@@ -1,0 +1,167 @@
+"""The linear system of a Newton iteration for many slots: factor, border, unsymmetric share.
+
+What `NewtonSolver` does for one state, in the same order: the symmetric tangent is factorised, the
+fluid pressure is its border, and one more solve corrects for sliding friction and for mortar's
+loads at the neighbours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from palpate_fem.arrays import Floats
+from palpate_fem.batched import linear_kernels
+from palpate_fem.batched.equations import BatchedEquations
+from palpate_fem.batched.factor import BatchedFactor
+from palpate_fem.batched.state import BatchedState, Listed
+
+Flags = NDArray[np.bool_]
+
+THREADS = 128
+"""Threads of a block that adds up a stretch of a vector."""
+
+CHANGE, MORE = 0, 1
+"""Lanes of the vectors: the solution, and the border or the correction."""
+
+GRADIENT, ANSWER = 0, 1
+"""Lanes of the border: the volume gradient b at the last tangent, and K^-1 b."""
+
+
+class BatchedLinearSystem:
+    """Factors of the listed slots, and what is solved with them.
+
+    Attributes:
+        change: Solutions, (slots, 2, n); lane `CHANGE` is the change of the free unknowns.
+        pressure_change: Change of the fluid pressure [Pa], (slots,).
+    """
+
+    def __init__(self, equations: BatchedEquations, cavity_m3: float) -> None:
+        """Make room for all slots.
+
+        Args:
+            equations: Of all slots.
+            cavity_m3: Volume that the cavities have to take [m^3].
+        """
+        pattern, device = equations.system.pattern, equations.device
+        slots = equations.slots
+        self.equations, self.cavity_m3 = equations, cavity_m3
+        self._size = len(pattern.free)
+        self.factor = BatchedFactor(
+            pattern.indptr, pattern.indices, pattern.free // 3, slots=slots, device=device
+        )
+        shape = (slots, 2, self._size)
+        self.change = wp.zeros(shape, dtype=wp.float64, device=device)
+        self._border = wp.zeros(shape, dtype=wp.float64, device=device)
+        self._load = wp.zeros(shape, dtype=wp.float64, device=device)
+        self.pressure_change = wp.zeros(slots, dtype=wp.float64, device=device)
+        self._missing = wp.zeros(slots, dtype=wp.float64, device=device)
+        self._stiffness = wp.zeros(slots, dtype=wp.float64, device=device)
+        self._moved = wp.zeros(slots, dtype=wp.float64, device=device)
+        self._has_border = np.zeros(slots, bool)
+
+    def factorise(
+        self, state: BatchedState, listed: Listed, elastic: Listed | None, viscosity: wp.array
+    ) -> Flags:
+        """Factorise the tangents of the present states.
+
+        Args:
+            state: Present states, just evaluated.
+            listed: Slots to factorise.
+            elastic: Those of them whose tangent of skin and fluid is evaluated anew; None = none.
+            viscosity: See `PseudoTransient`, (slots,).
+
+        Returns:
+            Whether each is positive definite, (m,).
+        """
+        self.equations.tangent(
+            state, listed, self.factor.values, elastic=elastic, viscosity=viscosity
+        )
+        self.factor.factorise(listed.slots)
+        self._has_border[listed.numbers] = False
+        return np.asarray(self.factor.bad.numpy()[listed.numbers] == 0)
+
+    def solve(self, state: BatchedState, listed: Listed, missing_m3: Floats) -> None:
+        """Change of the free unknowns and of the fluid pressure; see `NewtonSolver`.
+
+        Args:
+            state: Present states, just evaluated.
+            listed: Slots.
+            missing_m3: Volume that each cavity lacks [m^3], (m,).
+        """
+        equations, slots = self.equations, listed.slots
+        equations.right_hand_side(state, listed, self.change, CHANGE)
+        new = listed.numbers[~self._has_border[listed.numbers]]
+        if len(new):
+            fresh = listed if len(new) == len(listed.numbers) else equations.listed(new)
+            equations.volume_gradient(fresh, self.change, MORE)
+            self._copy(fresh, self.change, MORE, self._border, GRADIENT)
+            self.factor.solve(fresh.slots, self.change, 2)
+            self._copy(fresh, self.change, MORE, self._border, ANSWER)
+            self._product(fresh, self._border, GRADIENT, self._border, ANSWER, self._stiffness)
+            self._has_border[new] = True
+        old = np.setdiff1d(listed.numbers, new)
+        if len(old):
+            kept = listed if not len(new) else equations.listed(old)
+            self.factor.solve(kept.slots, self.change, 1)
+        # (S + U) x = S answer + coupled, by one correction.
+        equations.coupled(state, listed, self._load, 0)
+        equations.subtract_unsymmetric_product(state, listed, self.change, CHANGE, self._load, 0)
+        self.factor.solve(slots, self._load, 1)
+        every = self.pressure_change
+        every.fill_(1.0)
+        self._add(listed, self._load, 0, every, self.change, CHANGE)
+        missing = self._missing.numpy()
+        missing[listed.numbers] = missing_m3
+        self._missing.assign(missing)
+        self._product(listed, self._border, GRADIENT, self.change, CHANGE, self._moved)
+        wp.launch(
+            linear_kernels.fluid_pressure_change,
+            dim=len(listed.numbers),
+            inputs=[slots, self._missing, self._moved, self._stiffness],
+            outputs=[self.pressure_change],
+            device=equations.device,
+        )
+        self._add(listed, self._border, ANSWER, self.pressure_change, self.change, CHANGE)
+
+    def _product(
+        self,
+        listed: Listed,
+        first: wp.array,
+        lane: int,
+        second: wp.array,
+        other: int,
+        out: wp.array,
+    ) -> None:
+        count, device = len(listed.numbers), self.equations.device
+        wp.launch(linear_kernels.clear_sums, dim=count, inputs=[listed.slots, out], device=device)
+        parts = -(-self._size // linear_kernels.STRETCH)
+        wp.launch_tiled(
+            linear_kernels.add_products,
+            dim=[count, parts],
+            inputs=[listed.slots, first, lane, second, other],
+            outputs=[out],
+            block_dim=THREADS,
+            device=device,
+        )
+
+    def _copy(self, listed: Listed, source: wp.array, lane: int, out: wp.array, to: int) -> None:
+        wp.launch(
+            linear_kernels.copy_lane,
+            dim=(len(listed.numbers), self._size),
+            inputs=[listed.slots, source, lane],
+            outputs=[out, to],
+            device=self.equations.device,
+        )
+
+    def _add(
+        self, listed: Listed, source: wp.array, lane: int, factor: wp.array, out: wp.array, to: int
+    ) -> None:
+        wp.launch(
+            linear_kernels.add_scaled_lane,
+            dim=(len(listed.numbers), self._size),
+            inputs=[listed.slots, source, lane, factor],
+            outputs=[out, to],
+            device=self.equations.device,
+        )

@@ -1,0 +1,206 @@
+"""Many presses at once on a GPU: time a trajectory, and agreement with the CPU.
+
+    python tests/benchmarks/bench_batched.py --device cuda:0 --slots 1 16 64 128 --out batched.json
+
+Presses are the twin's: points of the pad in turn with the nine indenters, one 3 mm deep along the
+normal and one 1.5 mm deep at 30 degrees to it, in 20 steps. ``--check N`` computes the first N on
+the CPU, too, in ``--processes`` processes. Results are written after each size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from palpate.rigid import unit
+from palpate_fem.batched.fingertip import BatchedFingertip, BatchedPress
+from palpate_fem.indenter.approach import OuterSurface
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.trajectory import (
+    ANGLE_RAD,
+    ANGLED_DEPTH_M,
+    NORMAL_DEPTH_M,
+    angled_direction,
+    press_path,
+    sample_targets,
+)
+
+
+def presses_on(tip: Fingertip, count: int) -> list[BatchedPress]:
+    """The first presses: nine indenters, normal and angled, at points of the pad."""
+    surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
+    targets, normals = sample_targets(surface, -(-count // 18), seed=1)
+    presses = []
+    for k in range(count):
+        point, kind = divmod(k, 18)
+        number, angled = divmod(kind, 2)
+        normal = normals[point]
+        way = angled_direction(normal, ANGLE_RAD, point) if angled else -unit(normal, "normal")
+        depth = ANGLED_DEPTH_M if angled else NORMAL_DEPTH_M
+        indenter = make_indenter(indenter_names()[number])
+        path = press_path(indenter, targets[point], way, surface, depth_m=depth)
+        presses.append(BatchedPress(number, path))
+    return presses
+
+
+def on_cpu(edge_m: float, count: int, numbers: list[int]) -> dict[int, dict[str, Any]]:
+    """The same presses by the CPU's solver."""
+    tip = Fingertip.pressurised(biotac(edge_m=edge_m))
+    presses = presses_on(tip, count)
+    found = {}
+    for k in numbers:
+        indenter = make_indenter(indenter_names()[presses[k].indenter])
+        started = time.process_time()
+        result = tip.indent(indenter, presses[k].path)
+        found[k] = summary(result) | {"cpu_s": time.process_time() - started}
+    return found
+
+
+def summary(result: IndentationResult) -> dict[str, Any]:
+    """What is compared of a result."""
+    return {
+        "indenter": result.indenter,
+        "outcome": str(result.outcome),
+        "reason": result.reason,
+        "travel_m": result.travel_m,
+        "forces": result.forces,
+        "last": result.steps[-1].displacement if result.steps else None,
+        "iterations": sum(step.convergence.iterations for step in result.steps),
+        "factorisations": sum(step.convergence.factorisations for step in result.steps),
+        "increments": sum(step.convergence.increments for step in result.steps),
+    }
+
+
+def say(value: object) -> None:
+    """Print a line at once."""
+    sys.stdout.write(f"{value}\n")
+    sys.stdout.flush()
+
+
+def differences(ours: dict[str, Any], cpu: dict[str, Any]) -> dict[str, Any]:
+    """How far two summaries are apart."""
+    steps = min(len(ours["forces"]), len(cpu["forces"]))
+    size = float(np.linalg.norm(cpu["forces"], axis=1).max(initial=1e-9))
+    force = float(np.abs(ours["forces"][:steps] - cpu["forces"][:steps]).max(initial=0.0)) / size
+    field = float("nan")
+    if len(ours["forces"]) == len(cpu["forces"]) and steps:
+        field = float(np.linalg.norm(ours["last"] - cpu["last"], axis=1).max())
+    return {
+        "indenter": cpu["indenter"],
+        "steps": [len(ours["forces"]), len(cpu["forces"])],
+        "outcome": [ours["outcome"], cpu["outcome"]],
+        "reason": [ours["reason"], cpu["reason"]],
+        "force_relative": force,
+        "last_field_m": field,
+        "iterations": [ours["iterations"], cpu["iterations"]],
+        "cpu_s": cpu["cpu_s"],
+    }
+
+
+def watch(batched: BatchedFingertip) -> dict[str, float]:
+    """Time the parts from now on [s]; each is waited for, which costs some overlap."""
+    spent: dict[str, float] = defaultdict(float)
+
+    def timed(owner: object, name: str) -> None:
+        whole = getattr(owner, name)
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            wp.synchronize()
+            started = time.perf_counter()
+            answer = whole(*arguments, **named)
+            wp.synchronize()
+            spent[name] += time.perf_counter() - started
+            return answer
+
+        setattr(owner, name, call)
+
+    for name in ("balance", "numbers", "tangent", "correct_contact", "listed", "pose", "targets",
+                 "move", "right_hand_side", "coupled", "subtract_unsymmetric_product",
+                 "longest_move"):  # fmt: skip
+        timed(batched.equations, name)
+    for name in ("factorise", "solve"):
+        timed(batched.linear.factor, name)
+    for name in ("_keep_steps", "_fill", "_go_on", "_result"):
+        timed(batched, name)
+    return spent
+
+
+def main() -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--slots", type=int, nargs="+", default=[64])
+    parser.add_argument("--rounds", type=float, default=2.0, help="presses for each slot")
+    parser.add_argument("--edge-mm", type=float, default=0.47)
+    parser.add_argument("--parts", action="store_true", help="time parts, which waits for each")
+    parser.add_argument("--check", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    edge = options.edge_mm * 1e-3
+    tip = Fingertip.pressurised(biotac(edge_m=edge))
+    most = max(options.check, *(int(options.rounds * slots) for slots in options.slots))
+    presses = presses_on(tip, most)
+    pool = multiprocessing.get_context("spawn").Pool(options.processes)
+    shares = [list(range(k, options.check, options.processes)) for k in range(options.processes)]
+    running = [pool.apply_async(on_cpu, (edge, most, share)) for share in shares if share]
+    report: dict[str, Any] = {
+        "device": options.device,
+        "edge_mm": options.edge_mm,
+        "unknowns": len(tip.system.pattern.free),
+        "runs": [],
+    }
+    cpu: dict[int, dict[str, Any]] = {}
+    indenters = [make_indenter(name) for name in indenter_names()]
+    for slots in options.slots:
+        batched = BatchedFingertip(tip, indenters, slots=slots, device=options.device)
+        spent = watch(batched) if options.parts else {}
+        for warm in (True, False):  # the first run compiles the kernels
+            chosen = presses[: 1 if warm else max(int(options.rounds * slots), options.check)]
+            spent.clear()
+            sweeps: list[int] = []
+            started = time.perf_counter()
+            results = dict(batched.indent(chosen, on_sweep=sweeps.append))
+            seconds = time.perf_counter() - started
+        found = {k: summary(result) for k, result in results.items()}
+        for some in running if not cpu else ():
+            cpu |= some.get()
+        run = {
+            "slots": slots,
+            "presses": len(chosen),
+            "seconds": seconds,
+            "ms_a_trajectory": 1e3 * seconds / len(chosen),
+            "sweeps": len(sweeps),
+            "busy": float(np.mean(sweeps)) / slots,
+            "outcomes": Counter(one["outcome"] for one in found.values()),
+            "iterations": float(np.mean([one["iterations"] for one in found.values()])),
+            "parts_s": dict(spent),
+            "diverged": [
+                [k, one["indenter"], one["reason"]]
+                for k, one in found.items()
+                if one["outcome"] == str(IndentationOutcome.DIVERGED)
+            ],
+            "against_cpu": [differences(found[k], cpu[k]) for k in sorted(cpu) if k in found],
+        }
+        report["runs"].append(run)
+        say({k: v for k, v in run.items() if k != "against_cpu"})
+        for one in run["against_cpu"]:
+            say(one)
+        options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        del batched
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,580 @@
+"""Many copies of one fingertip on a device give what the CPU's classes give for each state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from numpy.typing import NDArray
+
+from palpate_fem.batched.equations import BatchedEquations
+from palpate_fem.batched.state import FIELDS, BatchedState, Listed, SlotNumbers
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.load_stepping import LoadStepping
+from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver, largest_error
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mechanics.state import ForceBalance, SolutionState
+from palpate_fem.mechanics.system import EquilibriumSystem
+
+Floats = NDArray[np.float64]
+Fill = Callable[..., Fingertip]
+
+SLOTS = 5
+PLACES = (3, 0, 4)  # of the cases; slots 1 and 2 stay as they are
+BYSTANDERS = (1, 2)
+VISCOSITIES = (0.0, 0.3, 2.0)
+RATIOS = (0.7, 0.0, 2.5)  # of extrapolation
+DAMPINGS = (1.0, 0.4, 0.7)
+PRESSURE_CHANGE_PA = 120.0
+LARGEST_MOVE_M = 0.02e-3
+UNTOUCHED = 7.0  # what bystanders hold
+
+# Indenter, and how far it goes aside and in [m].
+PRESSES = (
+    ("sphere_medium", 0.0, 1.2e-3),  # down to the core; some points stick, some slide
+    ("texture", 0.2e-3, 0.6e-3),  # with valleys, over which directions are held
+    ("cube", 0.3e-3, 0.4e-3),
+)
+DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
+SCRATCH = ("_longest", "_fraction")  # of all slots, whichever are listed
+
+
+@dataclass
+class Case:
+    """A press on the CPU: two states near its end, and what the CPU's classes say of them.
+
+    The tangent is that of ``first``; all that Newton's method does with it happens at ``second``,
+    which ends at ``moved``.
+    """
+
+    run: LoadStepping
+    indenter: PosedIndenter
+    first: SolutionState
+    second: SolutionState
+    moved: SolutionState
+    change: Floats
+    balances: tuple[ForceBalance, ForceBalance, ForceBalance]
+    changed: tuple[bool, bool]
+    values: tuple[Floats, Floats]
+    vectors: dict[str, Floats]
+    targets: tuple[Floats, Floats, Floats, Floats]
+    statuses: Floats
+    corrected: SolutionState
+
+
+def perturbed(state: SolutionState, seed: int, move_m: float) -> SolutionState:
+    """A copy of a state, out of balance; some points that touch let go, and others begin."""
+    random, other = np.random.default_rng(seed), state.copy()
+    other.position += random.uniform(-move_m, move_m, state.position.shape)
+    other.pressure *= random.uniform(0.9, 1.1, state.pressure.shape)
+    other.fluid_pressure *= 1.0 + 0.1 * random.random()
+    for pressure in (other.core_pressure, other.indenter_pressure):
+        pressure *= random.uniform(0.5, 1.5, pressure.shape)
+        pressure[random.random(pressure.shape) < 0.1] = 0.0
+    other.traction *= random.uniform(0.5, 1.5, state.traction.shape)
+    return other
+
+
+def press(finger: Fingertip, number: int) -> Case:
+    """Press on the CPU and evaluate."""
+    name, aside, deep = PRESSES[number]
+    system, free = finger.system, finger.system.pattern.free
+    low = finger.nodes[:, 2].min()
+    ways = ((0.0, -0.6e-3), (0.0, deep / 2), (0.0, deep), (aside, deep))
+    path = np.array([[x, 0.1e-3, low + depth, 1.0, 0.05, 0.03, 0.0] for x, depth in ways])
+    path[:, 3:] /= np.linalg.norm(path[:, 3:], axis=1)[:, None]
+    run = finger.load_stepping(make_indenter(name), path)
+    run.run()
+    indenter = run.at.indenter
+    first = perturbed(run.at.state, 10 + number, 0.2e-6)
+    system.correct_contact(first, indenter)
+    at_first = system.balance(first, indenter)
+    values = system.tangent_values(viscosity=VISCOSITIES[number])
+    second = perturbed(first, 20 + number, 1e-6)
+    at_second = system.balance(second, indenter)
+    changed = system.sets_changed
+    statuses = system.outer.status.numpy().copy()
+    move = np.random.default_rng(30 + number).normal(0.0, 3e-6, system.mesh.nodes.shape)
+    change = move.reshape(-1)[free].copy()
+    move[finger.geometry.mesh.fixed] = 0.0
+    vectors = {
+        "right": -(at_second.unbalanced + system.misfit_force(second)),
+        "border": at_second.volume_gradient.reshape(-1)[free],
+        "coupled": -system.coupled_force(),
+        "product": system.unsymmetric_product(change),
+    }
+    targets = system.updated_pressures(move)
+    moved = second.copy()
+    at_moved = step(finger, moved, indenter, at_second, change, DAMPINGS[number])
+    changed_again = system.sets_changed
+    kept = system.tangent_values(elastic=False)
+    corrected = moved.copy()
+    system.update_anchors(corrected, indenter)
+    system.correct_contact(corrected, indenter)
+    return Case(
+        run=run,
+        indenter=indenter,
+        first=first,
+        second=second,
+        moved=moved,
+        change=change,
+        balances=(at_first, at_second, at_moved),
+        changed=(changed, changed_again),
+        values=(values, kept),
+        vectors=vectors,
+        targets=targets,
+        statuses=np.asarray(statuses, np.float64),
+        corrected=corrected,
+    )
+
+
+def step(
+    finger: Fingertip,
+    state: SolutionState,
+    indenter: PosedIndenter,
+    balance: ForceBalance,
+    change: Floats,
+    damping: float,
+) -> ForceBalance:
+    """The step of `NewtonSolver` with a given solution of its linear system."""
+    settings = NewtonSettings(largest_move_m=LARGEST_MOVE_M)
+    newton = NewtonSolver(finger.system, finger.newton.factor, settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(newton, "_linear_solution", lambda *_: (change, PRESSURE_CHANGE_PA))
+        return newton._step(state, indenter, balance, None, damping)
+
+
+class Batch:
+    """The same on a device."""
+
+    def __init__(self, finger: Fingertip, cases: list[Case], device: str) -> None:
+        mesh = finger.geometry.mesh
+        self.cases, self.device = cases, device
+        self.indenters = [make_indenter(name) for name, _, _ in reversed(PRESSES)]
+        self.equations = BatchedEquations(
+            finger.system,
+            self.indenters,
+            slots=SLOTS,
+            device=device,
+            friction=finger.parameters.friction_coefficient,
+        )
+        self.size = len(finger.system.pattern.free)
+        self.entries = len(finger.system.pattern.gather)
+        self.state, self.start = (BatchedState(mesh, SLOTS, device) for _ in range(2))
+        for slot in range(SLOTS):
+            self.state.put(slot, finger.state)
+        self.values = self.full(SLOTS, self.entries)
+        self.vectors = self.full(SLOTS, 2, self.size)
+        self.change = self.full(SLOTS, 2, self.size)
+        self.viscosity = self.per_slot(VISCOSITIES)
+        self.all = self.equations.listed(np.array(PLACES))
+        number = [len(PRESSES) - 1 - k for k in range(len(PRESSES))]
+        self.equations.pose(
+            np.array(PLACES),
+            np.array(number),
+            np.array([case.indenter.tip for case in cases]),
+            np.array([case.indenter.rotation for case in cases]),
+        )
+        found = self.change.numpy()
+        for slot, case in zip(PLACES, cases, strict=True):
+            found[slot, 0] = case.change
+        self.change.assign(found)
+
+    def full(self, *shape: int) -> wp.array:
+        return wp.full(shape, UNTOUCHED, dtype=wp.float64, device=self.device)
+
+    def per_slot(self, values: tuple[float, ...]) -> wp.array:
+        every = np.full(SLOTS, UNTOUCHED)
+        every[list(PLACES)] = values
+        return wp.array(every, dtype=wp.float64, device=self.device)
+
+    def put(self, name: str) -> None:
+        for slot, case in zip(PLACES, self.cases, strict=True):
+            self.state.put(slot, getattr(case, name))
+
+    def run(self, listed: Listed, upto: str) -> list[SlotNumbers]:
+        """What Newton's method does, up to a stage, for the listed slots; the last numbers."""
+        equations, state = self.equations, self.state
+        self.put("first")
+        equations.correct_contact(state, listed)
+        equations.balance(state, listed)
+        if upto == "first":
+            return equations.numbers(state, listed)
+        equations.tangent(state, listed, self.values, elastic=listed, viscosity=self.viscosity)
+        if upto == "tangent":
+            return equations.numbers(state, listed)
+        self.put("second")
+        equations.balance(state, listed)
+        if upto == "second":
+            return equations.numbers(state, listed)
+        equations.targets(listed, self.change, 0)
+        self.start.copy_slots(state, listed.slots)
+        longest = np.zeros(SLOTS)
+        longest[listed.numbers] = equations.longest_move(listed, self.change, 0)
+        damping = self.per_slot(DAMPINGS).numpy()
+        fraction = np.minimum(damping, LARGEST_MOVE_M / np.maximum(longest, 1e-300))
+        pressures = self.per_slot((PRESSURE_CHANGE_PA,) * len(PLACES))
+        equations.move(state, self.start, listed, self.change, 0, fraction, pressures)
+        equations.balance(state, listed)
+        return equations.numbers(state, listed)
+
+    def nodal(self, array: wp.array, slot: int) -> Floats:
+        """Values of one slot."""
+        return np.asarray(array.numpy().reshape(SLOTS, -1)[slot])
+
+
+def same(found: Any, expected: Any, tolerance: float = 1e-12) -> None:
+    """Equal up to a share of the largest value."""
+    expected = np.asarray(expected)
+    size = float(np.abs(expected).max(initial=0.0))
+    found = np.asarray(found).reshape(expected.shape)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=tolerance * size)
+
+
+@pytest.fixture(scope="module")
+def finger(fill: Fill) -> Fingertip:
+    """For this module alone: its system keeps what belongs to the last tangent."""
+    return fill()
+
+
+@pytest.fixture(scope="module")
+def cases(finger: Fingertip) -> list[Case]:
+    return [press(finger, number) for number in range(len(PRESSES))]
+
+
+@pytest.fixture(scope="module", params=DEVICES)
+def batch(request: pytest.FixtureRequest, finger: Fingertip, cases: list[Case]) -> Batch:
+    if request.param != "cpu" and not wp.is_cuda_available():
+        pytest.skip("no CUDA")
+    return Batch(finger, cases, request.param)
+
+
+def test_the_cases_have_all_kinds_of_contact(cases: list[Case], finger: Fingertip) -> None:
+    for case in cases:
+        assert set(case.statuses.ravel()) >= {0.0, 3.0}
+        assert case.first.on_indenter.spread.nnz > 0
+        assert np.abs(case.vectors["coupled"]).max() > 0.0
+        assert np.abs(case.vectors["product"]).max() > 0.0
+    assert 2.0 in cases[0].statuses
+    assert (cases[0].first.core_pressure > 0.0).any()
+    assert cases[1].first.on_indenter.held.any()
+    assert not cases[2].first.on_indenter.held.any()
+    assert all(case.changed[0] for case in cases)
+    opened = [(case.second.indenter_pressure > case.moved.indenter_pressure) for case in cases]
+    assert any((more & (case.moved.indenter_pressure == 0.0)).any()
+               for more, case in zip(opened, cases, strict=True))  # fmt: skip
+    assert finger.settings.contact.mortar
+
+
+def test_states_come_back_as_they_were_put(batch: Batch) -> None:
+    batch.put("second")
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        found = batch.state.get(slot)
+        for name in FIELDS:
+            np.testing.assert_array_equal(getattr(found, name), getattr(case.second, name))
+
+
+@pytest.mark.parametrize("stage", ["first", "second", "moved"])
+def test_forces_and_errors(batch: Batch, stage: str) -> None:
+    numbers = batch.run(batch.all, stage)
+    which = ("first", "second", "moved").index(stage)
+    equations = batch.equations
+    on_indenter, on_core = equations.nodal_forces(np.array(PLACES))
+    for k, (slot, case, found) in enumerate(zip(PLACES, batch.cases, numbers, strict=True)):
+        balance, state = case.balances[which], getattr(case, stage)
+        same(on_indenter[k], balance.indenter)
+        same(on_core[k], balance.core)
+        same(batch.nodal(equations._internal, slot), balance.internal)
+        same(batch.nodal(equations._gradient_of_volume, slot), balance.volume_gradient)
+        # The largest forces of contact cancel those of the skin, so it is a share of these.
+        unbalanced = batch.nodal(equations._unbalanced, slot)[equations.system.pattern.free]
+        largest = np.abs(balance.internal).max() + np.abs(balance.indenter).max()
+        assert np.abs(unbalanced - balance.unbalanced).max() < 1e-12 * largest
+        assert found.residual == pytest.approx(balance.residual, rel=1e-11)
+        for name in ("volume", "strain_error", "gap_error_m", "traction_error"):
+            assert getattr(found, name) == pytest.approx(getattr(balance, name), rel=1e-11)
+        assert found.smallest_jacobian == pytest.approx(balance.smallest_jacobian, rel=1e-12)
+        assert found.fluid_pressure == pytest.approx(state.fluid_pressure, rel=1e-15)
+        same(found.net_force, -balance.indenter.sum(axis=0), 1e-11)
+        if which:
+            assert found.sets_changed == case.changed[which - 1]
+
+
+def test_no_number_has_changed_where_the_tangent_is_that_of_the_state(batch: Batch) -> None:
+    batch.run(batch.all, "tangent")
+    batch.equations.balance(batch.state, batch.all)
+    assert not any(one.sets_changed for one in batch.equations.numbers(batch.state, batch.all))
+
+
+def test_mortar_corrections(batch: Batch) -> None:
+    batch.run(batch.all, "first")
+    equations = batch.equations
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        outer, inner = case.first.on_indenter, case.first.on_core
+        # A gap less its mean: both are as large as the margin.
+        for surface, expected in ((equations.outer, outer.gap), (equations.inner, inner.gap)):
+            found = batch.nodal(surface.offset, slot).reshape(expected.shape)
+            np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
+        same(batch.nodal(equations.outer.held, slot), outer.held)
+
+
+def test_tangents(batch: Batch) -> None:
+    batch.run(batch.all, "tangent")
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        values_agree(batch, slot, case.values[0])
+
+
+def test_a_tangent_of_contact_only_keeps_that_of_the_skin(batch: Batch) -> None:
+    batch.run(batch.all, "moved")
+    none = batch.per_slot((0.0, 0.0, 0.0))
+    batch.equations.tangent(batch.state, batch.all, batch.values, elastic=None, viscosity=none)
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        values_agree(batch, slot, case.values[1])
+
+
+def test_skin_is_evaluated_anew_where_it_is_asked_for(batch: Batch) -> None:
+    batch.run(batch.all, "moved")
+    none = batch.per_slot((0.0, 0.0, 0.0))
+    anew = batch.equations.listed(np.array(PLACES[1:2]))
+    batch.equations.tangent(batch.state, batch.all, batch.values, elastic=anew, viscosity=none)
+    values_agree(batch, PLACES[0], batch.cases[0].values[1])
+    values_agree(batch, PLACES[2], batch.cases[2].values[1])
+    case, system = batch.cases[1], batch.equations.system
+    system.balance(case.moved, case.indenter)
+    values_agree(batch, PLACES[1], system.tangent_values())
+
+
+def values_agree(batch: Batch, slot: int, expected: Floats) -> None:
+    """Entry by entry, relative to the diagonal: contact is so much stiffer than skin."""
+    pattern = batch.equations.system.pattern
+    rows = np.repeat(np.arange(batch.size), np.diff(pattern.indptr))
+    diagonal = np.abs(expected[pattern.indptr[:-1]])
+    size = np.sqrt(diagonal[rows] * diagonal[pattern.indices])
+    apart = np.abs(batch.values.numpy()[slot] - expected)
+    assert (apart / np.maximum(size, 1e-3 * np.median(diagonal))).max() < 1e-12
+
+
+def test_vectors_of_the_linear_system(batch: Batch) -> None:
+    batch.run(batch.all, "second")
+    equations, state, listed = batch.equations, batch.state, batch.all
+    found = {}
+    equations.right_hand_side(state, listed, batch.vectors, 0)
+    equations.volume_gradient(listed, batch.vectors, 1)
+    found["right"], found["border"] = batch.vectors.numpy().copy().swapaxes(0, 1)
+    equations.coupled(state, listed, batch.vectors, 1)
+    found["coupled"] = batch.vectors.numpy()[:, 1].copy()
+    equations.subtract_unsymmetric_product(state, listed, batch.change, 0, batch.vectors, 1)
+    found["product"] = found["coupled"] - batch.vectors.numpy()[:, 1]
+    np.testing.assert_array_equal(batch.vectors.numpy()[:, 0], found["right"])
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        for name in ("right", "border", "coupled"):
+            same(found[name][slot], case.vectors[name])
+        largest = max(np.abs(case.vectors[name]).max() for name in ("coupled", "product"))
+        apart = np.abs(found["product"][slot] - case.vectors["product"])
+        assert apart.max() < 1e-12 * largest
+
+
+def test_targets_of_the_condensed_unknowns(batch: Batch) -> None:
+    batch.run(batch.all, "second")
+    equations = batch.equations
+    equations.targets(batch.all, batch.change, 0)
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        arrays = (
+            equations._target,
+            equations.inner.target,
+            equations.outer.target,
+            equations.outer.target_traction,
+        )
+        for array, expected in zip(arrays, case.targets, strict=True):
+            same(batch.nodal(array, slot), expected)
+
+
+def test_longest_moves(batch: Batch) -> None:
+    longest = batch.equations.longest_move(batch.all, batch.change, 0)
+    for found, case in zip(longest, batch.cases, strict=True):
+        move = np.zeros(batch.equations.system.mesh.nodes.shape)
+        move.reshape(-1)[batch.equations.system.pattern.free] = case.change
+        assert found == pytest.approx(np.linalg.norm(move, axis=1).max(), rel=1e-14)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_move_that_is_no_number_is_infinite_and_is_that_slots_alone(
+    batch: Batch, value: float
+) -> None:
+    broken = batch.change.numpy().copy()
+    broken[PLACES[1], 0, 5] = value
+    change = wp.array(broken, dtype=wp.float64, device=batch.device)
+    longest = batch.equations.longest_move(batch.all, change, 0)
+    np.testing.assert_array_equal(np.isfinite(longest), [True, False, True])
+
+
+def test_steps_of_newtons_method(batch: Batch) -> None:
+    batch.run(batch.all, "moved")
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        found = batch.state.get(slot)
+        for name in FIELDS:
+            same(getattr(found, name), getattr(case.moved, name))
+        touches = case.moved.indenter_pressure > 0.0
+        np.testing.assert_array_equal(found.indenter_pressure > 0.0, touches)
+
+
+def test_anchors_and_corrections_after_an_increment(batch: Batch) -> None:
+    batch.put("moved")
+    batch.equations.update_anchors(batch.state, batch.all)
+    batch.equations.correct_contact(batch.state, batch.all)
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        same(batch.state.get(slot).anchor, case.corrected.anchor)
+        found = batch.nodal(batch.equations.outer.offset, slot)
+        expected = case.corrected.on_indenter.gap
+        np.testing.assert_allclose(found, expected.ravel(), rtol=0.0, atol=1e-15)
+        same(batch.nodal(batch.equations.outer.held, slot), case.corrected.on_indenter.held)
+
+
+def test_extrapolation_of_the_last_increment(batch: Batch, finger: Fingertip) -> None:
+    now, before, trial = (BatchedState(finger.geometry.mesh, SLOTS, batch.device) for _ in range(3))
+    for slot, case in zip(PLACES, batch.cases, strict=True):
+        assert case.run.at.previous is not None
+        now.put(slot, case.run.at.state)
+        before.put(slot, case.run.at.previous)
+    trial.extrapolate(now, before, batch.per_slot(RATIOS), batch.all.slots)
+    for slot, case, ratio in zip(PLACES, batch.cases, RATIOS, strict=True):
+        expected = case.run._predicted(ratio * case.run.at.previous_length)
+        found = trial.get(slot)
+        for name in FIELDS:
+            same(getattr(found, name), getattr(expected, name))
+    for slot in BYSTANDERS:
+        assert not trial.get(slot).position.any()
+
+
+def arrays_of(batch: Batch) -> dict[str, wp.array]:
+    """All arrays that hold something of each slot."""
+    equations, found = batch.equations, {}
+    owners = {"": equations, "outer.": equations.outer, "inner.": equations.inner,
+              "state.": batch.state, "start.": batch.start, "batch.": batch}  # fmt: skip
+    for prefix, owner in owners.items():
+        for name, value in vars(owner).items():
+            for k, array in enumerate(value if isinstance(value, list) else [value]):
+                if isinstance(array, wp.array) and name not in SCRATCH:
+                    found[f"{prefix}{name}{k}"] = array
+    return found
+
+
+def test_slots_that_are_not_listed_stay_as_they_are(batch: Batch) -> None:
+    equations, state = batch.equations, batch.state
+    batch.run(batch.all, "moved")
+    batch.put("first")  # later puts are of the same states, in all slots but the one
+    arrays = arrays_of(batch)
+    before = {name: array.numpy().copy() for name, array in arrays.items()}
+    slot = PLACES[1]
+    some = equations.listed(np.array([slot]))
+    case = batch.cases[1]
+    state.put(slot, case.second)
+    for _ in range(2):
+        equations.pose(
+            np.array([slot]), np.array([2]), case.indenter.tip[None], case.indenter.rotation[None]
+        )
+        equations.correct_contact(state, some)
+        equations.balance(state, some)
+        equations.tangent(state, some, batch.values, elastic=some, viscosity=batch.viscosity)
+        equations.right_hand_side(state, some, batch.vectors, 0)
+        equations.volume_gradient(some, batch.vectors, 1)
+        equations.coupled(state, some, batch.vectors, 1)
+        equations.subtract_unsymmetric_product(state, some, batch.change, 0, batch.vectors, 1)
+        equations.targets(some, batch.change, 0)
+        batch.start.copy_slots(state, some.slots)
+        fraction = np.full(SLOTS, 0.5)
+        pressures = batch.per_slot((PRESSURE_CHANGE_PA,) * len(PLACES))
+        equations.move(state, batch.start, some, batch.change, 0, fraction, pressures)
+        equations.update_anchors(state, some)
+    touched = set()
+    for name, array in arrays.items():
+        now, was = array.numpy(), before[name]
+        if np.array_equal(now, was, equal_nan=True):
+            continue
+        touched.add(name)
+        assert len(now) % SLOTS == 0, name
+        others = [k for k in range(SLOTS) if k != slot]
+        np.testing.assert_array_equal(
+            now.reshape(SLOTS, -1)[others], was.reshape(SLOTS, -1)[others], err_msg=name
+        )
+    assert len(touched) > 20
+    # Back, for the tests that follow.
+    equations.pose(
+        np.array([slot]), np.array([1]), case.indenter.tip[None], case.indenter.rotation[None]
+    )
+
+
+@pytest.mark.parametrize("places", [(3,), (4, 0)])
+def test_slots_do_not_know_of_one_another(batch: Batch, places: tuple[int, ...]) -> None:
+    """Alone or in another order: the same to the last bits."""
+    together = dict(zip(PLACES, batch.run(batch.all, "moved"), strict=True))
+    values = batch.values.numpy().copy()
+    some = batch.equations.listed(np.array(places))
+    alone = batch.run(some, "moved")
+    for slot, found in zip(places, alone, strict=True):
+        assert found.residual == pytest.approx(together[slot].residual, rel=1e-11)
+        same(found.net_force, together[slot].net_force, 1e-11)
+        same(batch.values.numpy()[slot], values[slot])
+
+
+@pytest.mark.parametrize("mortar", [True, False])
+@pytest.mark.parametrize("core", [True, False])
+def test_contact_without_mortar_and_without_a_core(
+    finger: Fingertip, mortar: bool, core: bool
+) -> None:
+    mesh, parameters = finger.geometry.mesh, finger.parameters
+    system = EquilibriumSystem(
+        mesh,
+        finger.geometry.core.grid if core else None,
+        shear_modulus_pa=parameters.shear_modulus_pa,
+        bulk_ratio=parameters.bulk_ratio,
+        contact=ContactSettings(mortar=mortar),
+    )
+    ball, low = make_indenter("sphere_medium"), finger.nodes[:, 2].min()
+    pose = np.array([0.0, 0.0, low + 0.2e-3, 1.0, 0.0, 0.0, 0.0])
+    indenter = PosedIndenter(ball, pose, parameters.friction_coefficient)
+    state = finger.state.copy()
+    inside = indenter.distance(state.position)[0][mesh.outer_faces] < 0.0
+    state.indenter_pressure[:] = 1e4 * inside
+    state.traction[:] = 2e3 * inside[..., None]
+    system.update_anchors(state, indenter)
+    system.correct_contact(state, indenter)
+    expected, values = system.balance(state, indenter), system.tangent_values()
+    load = -system.coupled_force()
+    equations = BatchedEquations(system, [ball], slots=2, device="cpu", friction=indenter.friction)
+    batched, listed = BatchedState(mesh, 2, "cpu"), equations.listed(np.array([1]))
+    batched.put(1, state)
+    equations.pose(listed.numbers, np.array([0]), indenter.tip[None], indenter.rotation[None])
+    equations.correct_contact(batched, listed)
+    equations.balance(batched, listed)
+    (found,) = equations.numbers(batched, listed)
+    assert found.residual == pytest.approx(expected.residual, rel=1e-11)
+    on_indenter, on_core = equations.nodal_forces(np.array([1]))
+    same(on_indenter[0], expected.indenter)
+    same(on_core[0], expected.core)
+    tangent = wp.zeros((2, len(values)), dtype=wp.float64, device="cpu")
+    none = wp.zeros(2, dtype=wp.float64, device="cpu")
+    equations.tangent(batched, listed, tangent, elastic=listed, viscosity=none)
+    same(tangent.numpy()[1], values)
+    vectors = wp.zeros((2, 1, equations.size), dtype=wp.float64, device="cpu")
+    equations.coupled(batched, listed, vectors, 0)
+    assert np.abs(load).max() > 0.0
+    same(vectors.numpy()[1, 0], load)
+
+
+def test_a_state_without_numbers_stays_in_its_slot(batch: Batch) -> None:
+    together = batch.run(batch.all, "second")
+    broken = batch.cases[1].second.copy()
+    broken.position[7] = np.nan
+    batch.state.put(PLACES[1], broken)
+    batch.equations.balance(batch.state, batch.all)
+    found = batch.equations.numbers(batch.state, batch.all)
+    assert not np.isfinite(largest_error(found[1], 1e-7))
+    for k in (0, 2):
+        assert found[k].residual == pytest.approx(together[k].residual, rel=1e-11)
+        assert found[k].smallest_jacobian == pytest.approx(together[k].smallest_jacobian)
