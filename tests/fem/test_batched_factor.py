@@ -223,6 +223,7 @@ def test_a_matrix_that_is_not_definite_harms_no_other(grids: Bench, broken: str)
     bench.put(1, matrix)
     assert bench.factorise() == [0, 1, 0]
     np.testing.assert_array_equal(bench.solve(right)[[0, 2]], before[[0, 2]])
+    assert bench.factorise(1, 2) == [0, 1, 0]  # by slot, not by place in the list
     restored(bench)
     assert bench.factorise(0) == [0, 1, 0]  # told until the slot is factorised again
     assert bench.factorise(1) == [0, 0, 0]

@@ -16,7 +16,12 @@ from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics import newton as newton_module
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver, damping_after
+from palpate_fem.mechanics.newton import (
+    NewtonSettings,
+    NewtonSolver,
+    damping_after,
+    has_converged,
+)
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
@@ -374,3 +379,13 @@ def test_settings_are_those_that_results_were_made_with() -> None:
         3.0,
         0.8,
     )
+
+
+@pytest.mark.parametrize("wrong", ["residual", "volume", "strain_error"])
+def test_what_is_not_a_number_has_not_converged(wrong: str) -> None:
+    errors = {
+        "residual": 0.0, "volume": 1.0, "strain_error": 0.0, "gap_error_m": 0.0,
+        "traction_error": 0.0,
+    }  # fmt: skip
+    assert has_converged(SimpleNamespace(**errors), 1.0, NewtonSettings())
+    assert not has_converged(SimpleNamespace(**{**errors, wrong: np.nan}), 1.0, NewtonSettings())

@@ -94,9 +94,10 @@ class BatchedEquations:
         self._parts.append(room(wp.vec2d, total, points))
         self._elastic = room(wp.mat33d, slots * pattern.blocks)
         self._sum = room(wp.mat33d, slots * pattern.blocks)
-        self._internal, self._gradient_of_volume, self._unbalanced, self._field = (
-            room(wp.vec3d, slots * self._nodes) for _ in range(4)
+        self._internal, self._gradient_of_volume, self._unbalanced = (
+            room(wp.vec3d, slots * self._nodes) for _ in range(3)
         )
+        self._field, self._product = (room(wp.vec3d, slots * self._nodes) for _ in range(2))
         self.outer = BatchedSurface(system.outer, self._nodes, slots, device)
         self.inner = BatchedSurface(system.inner, self._nodes, slots, device)
         self._form = numbers(volume_form(system.inner.points))
@@ -423,7 +424,8 @@ class BatchedEquations:
     ) -> None:  # fmt: skip
         """Subtract `EquilibriumSystem.unsymmetric_product` of a change of the free unknowns."""
         moved = self._as_field(listed, change, of)
-        field, outer = self._unbalanced_field(listed), self.outer
+        field, outer = self._product, self.outer
+        self._clear(listed, field)
         self._launch(
             contact_kernels.unsymmetric_product,
             len(listed.outer),
@@ -547,11 +549,6 @@ class BatchedEquations:
     def _cleared_field(self, listed: Listed) -> wp.array:
         self._clear(listed, self._field)
         return self._field
-
-    def _unbalanced_field(self, listed: Listed) -> wp.array:
-        """Room for another nodal field: the unbalanced force has been read by then."""
-        self._clear(listed, self._unbalanced)
-        return self._unbalanced
 
     def _as_field(self, listed: Listed, vectors: wp.array, lane: int) -> wp.array:
         """A vector of the free unknowns as a nodal field."""

@@ -131,9 +131,15 @@ def factorise_diagonal(
     one = wp.tile_load(identity, shape=(TILE, TILE))
     lower = wp.tile_cholesky(total)
     good = wp.int32(1)
+    sums = wp.tile_sum(wp.tile_map(wp.mul, lower, lower), axis=1)
     for k in range(TILE):
         pivot = lower[k, k]
         if not (pivot > wp.float64(0.0)) or not wp.isfinite(pivot):
+            good = wp.int32(0)
+        # What the row leaves of the diagonal: a Cholesky that has failed on CUDA may leave a
+        # positive number there that is no pivot.
+        rest = total[k, k] - sums[k] + wp.float64(0.5) * pivot * pivot
+        if not (rest > wp.float64(0.0)):
             good = wp.int32(0)
     inverse = wp.tile_lower_solve(lower, one)
     if good == 1:

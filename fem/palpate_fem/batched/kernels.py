@@ -1,13 +1,17 @@
 # mypy: ignore-errors
-"""Kernels for many copies of one fingertip: lists, moves and reductions.
+"""Kernels for many copies of one fingertip: lists, moves, reductions, and sums over vectors.
 
-Arrays of the copies follow one another: node k of slot s is at ``s * nodes + k``, and so on. The
-equations' own kernels (``mechanics``) work on such arrays as they are.
+Arrays of the copies follow one another: node k of slot s is at ``s * nodes + k``, and so on.
+Vectors of the free unknowns have the shape (slots, lanes, n). The equations' own kernels
+(``mechanics``) work on such arrays as they are.
 """
 
 from __future__ import annotations
 
 import warp as wp
+
+STRETCH = 512
+"""Entries of a vector that one block of threads adds up."""
 
 wp.set_module_options({"enable_backward": False})
 
@@ -316,6 +320,7 @@ def sum_nodes(
         wp.atomic_add(numbers_out, slot, FLUID, by_fluid)
     if by_indenter != wp.float64(0.0):
         wp.atomic_add(numbers_out, slot, INDENTER, by_indenter)
+    if wp.length_sq(indenter_in[at]) > wp.float64(0.0):
         for c in range(3):
             wp.atomic_add(numbers_out, slot, NET + c, indenter_in[at][c])
     if by_core != wp.float64(0.0):
@@ -396,3 +401,68 @@ def longest_moves(
             wp.atomic_max(longest_out, slot, size)
     else:
         wp.atomic_max(longest_out, slot, wp.float64(1.0e300))
+
+
+@wp.kernel
+def clear_sums(listed: wp.array(dtype=wp.int32), sums_out: wp.array(dtype=wp.float64)):
+    """Set the sums of the listed slots to zero."""
+    sums_out[listed[wp.tid()]] = wp.float64(0.0)
+
+
+@wp.kernel
+def add_products(
+    listed: wp.array(dtype=wp.int32),
+    first_in: wp.array3d(dtype=wp.float64),
+    first_lane: int,
+    second_in: wp.array3d(dtype=wp.float64),
+    second_lane: int,
+    sums_out: wp.array(dtype=wp.float64),
+):
+    """Add the scalar product of two vectors of each listed slot."""
+    i, part = wp.tid()
+    slot = listed[i]
+    first = wp.tile_load(first_in[slot, first_lane], shape=STRETCH, offset=part * STRETCH)
+    second = wp.tile_load(second_in[slot, second_lane], shape=STRETCH, offset=part * STRETCH)
+    wp.tile_atomic_add(sums_out, wp.tile_sum(wp.tile_map(wp.mul, first, second)), offset=slot)
+
+
+@wp.kernel
+def copy_lane(
+    listed: wp.array(dtype=wp.int32),
+    vector_in: wp.array3d(dtype=wp.float64),
+    lane_in: int,
+    vector_out: wp.array3d(dtype=wp.float64),
+    lane_out: int,
+):
+    """Copy one lane of the listed slots to a lane of another array."""
+    i, k = wp.tid()
+    slot = listed[i]
+    vector_out[slot, lane_out, k] = vector_in[slot, lane_in, k]
+
+
+@wp.kernel
+def add_scaled_lane(
+    listed: wp.array(dtype=wp.int32),
+    vector_in: wp.array3d(dtype=wp.float64),
+    lane_in: int,
+    factor_in: wp.array(dtype=wp.float64),
+    vector_out: wp.array3d(dtype=wp.float64),
+    lane_out: int,
+):
+    """Add a lane, times the slot's factor, to a lane of another array."""
+    i, k = wp.tid()
+    slot = listed[i]
+    vector_out[slot, lane_out, k] += factor_in[slot] * vector_in[slot, lane_in, k]
+
+
+@wp.kernel
+def fluid_pressure_change(
+    listed: wp.array(dtype=wp.int32),
+    missing_in: wp.array(dtype=wp.float64),
+    moved_in: wp.array(dtype=wp.float64),
+    stiffness_in: wp.array(dtype=wp.float64),
+    change_out: wp.array(dtype=wp.float64),
+):
+    """Pressure by which the change of the skin has the volume that is missing."""
+    slot = listed[wp.tid()]
+    change_out[slot] = (missing_in[slot] - moved_in[slot]) / stiffness_in[slot]

@@ -12,15 +12,16 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats
-from palpate_fem.batched import linear_kernels
+from palpate_fem.batched import kernels
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.factor import BatchedFactor
 from palpate_fem.batched.state import BatchedState, Listed
 
 Flags = NDArray[np.bool_]
 
-THREADS = 128
-"""Threads of a block that adds up a stretch of a vector."""
+THREADS = 256
+"""Threads of a block that adds up a stretch of a vector: as in other launches, so that the kernels
+are compiled once."""
 
 CHANGE, MORE = 0, 1
 """Lanes of the vectors: the solution, and the border or the correction."""
@@ -117,7 +118,7 @@ class BatchedLinearSystem:
         self._missing.assign(missing)
         self._product(listed, self._border, GRADIENT, self.change, CHANGE, self._moved)
         wp.launch(
-            linear_kernels.fluid_pressure_change,
+            kernels.fluid_pressure_change,
             dim=len(listed.numbers),
             inputs=[slots, self._missing, self._moved, self._stiffness],
             outputs=[self.pressure_change],
@@ -135,10 +136,10 @@ class BatchedLinearSystem:
         out: wp.array,
     ) -> None:
         count, device = len(listed.numbers), self.equations.device
-        wp.launch(linear_kernels.clear_sums, dim=count, inputs=[listed.slots, out], device=device)
-        parts = -(-self._size // linear_kernels.STRETCH)
+        wp.launch(kernels.clear_sums, dim=count, inputs=[listed.slots, out], device=device)
+        parts = -(-self._size // kernels.STRETCH)
         wp.launch_tiled(
-            linear_kernels.add_products,
+            kernels.add_products,
             dim=[count, parts],
             inputs=[listed.slots, first, lane, second, other],
             outputs=[out],
@@ -148,7 +149,7 @@ class BatchedLinearSystem:
 
     def _copy(self, listed: Listed, source: wp.array, lane: int, out: wp.array, to: int) -> None:
         wp.launch(
-            linear_kernels.copy_lane,
+            kernels.copy_lane,
             dim=(len(listed.numbers), self._size),
             inputs=[listed.slots, source, lane],
             outputs=[out, to],
@@ -159,7 +160,7 @@ class BatchedLinearSystem:
         self, listed: Listed, source: wp.array, lane: int, factor: wp.array, out: wp.array, to: int
     ) -> None:
         wp.launch(
-            linear_kernels.add_scaled_lane,
+            kernels.add_scaled_lane,
             dim=(len(listed.numbers), self._size),
             inputs=[listed.slots, source, lane, factor],
             outputs=[out, to],

@@ -180,15 +180,14 @@ def largest_error(balance: BalanceErrors, volume: float | None) -> float:
 
 def has_converged(balance: BalanceErrors, volume: float | None, settings: NewtonSettings) -> bool:
     """Whether all errors are within their tolerances; see `largest_error`."""
-    if balance.residual > settings.tolerance:
-        return False
-    if volume is not None and abs(balance.volume - volume) > settings.volume_tolerance * volume:
-        return False
-    if balance.gap_error_m > settings.gap_tolerance_m:
-        return False
-    if balance.traction_error > settings.traction_tolerance:
-        return False
-    return balance.strain_error <= settings.volume_tolerance
+    # Written so that what is not a number has not converged.
+    return (
+        balance.residual <= settings.tolerance
+        and (volume is None or abs(balance.volume - volume) <= settings.volume_tolerance * volume)
+        and balance.gap_error_m <= settings.gap_tolerance_m
+        and balance.traction_error <= settings.traction_tolerance
+        and balance.strain_error <= settings.volume_tolerance
+    )
 
 
 def damping_after(errors: Sequence[float]) -> float:
