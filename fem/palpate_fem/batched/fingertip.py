@@ -107,7 +107,7 @@ class BatchedFingertip:
         self.equations = BatchedEquations(
             system, self.indenters, slots=slots, device=device, friction=friction
         )
-        self.linear = BatchedLinearSystem(self.equations, tip.cavity_m3)
+        self.linear = BatchedLinearSystem(self.equations)
         self._now, self._before, self._trial, self._start = (
             BatchedState(tip.geometry.mesh, slots, device) for _ in range(4)
         )

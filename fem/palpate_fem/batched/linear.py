@@ -38,16 +38,11 @@ class BatchedLinearSystem:
         pressure_change: Change of the fluid pressure [Pa], (slots,).
     """
 
-    def __init__(self, equations: BatchedEquations, cavity_m3: float) -> None:
-        """Make room for all slots.
-
-        Args:
-            equations: Of all slots.
-            cavity_m3: Volume that the cavities have to take [m^3].
-        """
+    def __init__(self, equations: BatchedEquations) -> None:
+        """Make room for all slots."""
         pattern, device = equations.system.pattern, equations.device
         slots = equations.slots
-        self.equations, self.cavity_m3 = equations, cavity_m3
+        self.equations = equations
         self._size = len(pattern.free)
         self.factor = BatchedFactor(
             pattern.indptr, pattern.indices, pattern.free // 3, slots=slots, device=device
