@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.batched import kernels, mortar_kernels
@@ -105,6 +106,9 @@ class BatchedEquations:
         self._kinds(indenters)
         self._kind, self._tip = room(wp.int32, slots), room(wp.vec3d, slots)
         self._rotation = room(wp.mat33d, slots)
+        self._posed: list[NDArray[Any]] = [
+            np.zeros(slots, np.int32), np.zeros((slots, 3)), np.zeros((slots, 3, 3))
+        ]  # fmt: skip
         core = system.on_core.core
         self._core: list[Any] = []
         if core is not None:
@@ -149,8 +153,8 @@ class BatchedEquations:
 
     def pose(self, slots: Ints, kind: Ints, tip: Floats, rotation: Floats) -> None:
         """Put indenters: their kinds (m,), tips [m], (m, 3), and rotations (m, 3, 3)."""
-        for array, values in ((self._kind, kind), (self._tip, tip), (self._rotation, rotation)):
-            now = array.numpy()
+        arrays = self._kind, self._tip, self._rotation
+        for array, now, values in zip(arrays, self._posed, (kind, tip, rotation), strict=True):
             now[slots] = values
             array.assign(now)
 

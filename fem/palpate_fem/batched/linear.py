@@ -108,7 +108,7 @@ class BatchedLinearSystem:
         every = self.pressure_change
         every.fill_(1.0)
         self._add(listed, self._load, 0, every, self.change, CHANGE)
-        missing = self._missing.numpy()
+        missing = np.zeros(equations.slots)
         missing[listed.numbers] = missing_m3
         self._missing.assign(missing)
         self._product(listed, self._border, GRADIENT, self.change, CHANGE, self._moved)

@@ -347,7 +347,10 @@ class IndenterContact:
                 surface.count,
                 [
                     *surface.quadrature,
-                    *indenter.model,
+                    primitives,
+                    kind,
+                    tip,
+                    rotation,
                     surface.nodes,
                     surface.items,
                     position,
