@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 
 Floats = NDArray[np.float64]
+
+DEVICE = os.environ.get("PALPATE_TEST_DEVICE", "cpu")
+"""Where the batches of these tests run: also ``cuda:0``, where there is one."""
 
 SLOTS = 5
 PLACES = (3, 0, 4)  # of the cases; slots 1 and 2 stay as they are

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from tests.fem.batched_cases import (
     BYSTANDERS,
+    DEVICE,
     PLACES,
     PRESSES,
     PRESSURE_CHANGE_PA,
@@ -23,11 +25,14 @@ from tests.fem.batched_cases import (
 
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.state import FIELDS, BatchedState
+from palpate_fem.batched.steps import BatchedSteps
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.load_stepping import indentation_step
 from palpate_fem.mechanics.newton import largest_error
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.system import EquilibriumSystem
+from palpate_fem.result import Convergence
 
 Floats = NDArray[np.float64]
 Fill = Callable[..., Fingertip]
@@ -49,7 +54,7 @@ def cases(finger: Fingertip) -> list[Case]:
 
 @pytest.fixture(scope="module")
 def batch(finger: Fingertip, cases: list[Case]) -> Batch:
-    return Batch(finger, cases, "cpu")
+    return Batch(finger, cases, DEVICE)
 
 
 def test_the_cases_have_all_kinds_of_contact(cases: list[Case], finger: Fingertip) -> None:
@@ -77,16 +82,63 @@ def test_states_come_back_as_they_were_put(batch: Batch) -> None:
             np.testing.assert_array_equal(getattr(found, name), getattr(case.second, name))
 
 
+def test_steps(batch: Batch, finger: Fingertip) -> None:
+    """Made of the states of two slots; a touching corner, forces and stresses are all there."""
+    some = batch.equations.listed(np.array(PLACES[1:]))
+    batch.run(batch.all, "second")
+    steps = BatchedSteps(batch.equations, finger.nodes)
+    poses = [np.arange(7.0) + k for k in range(2)]
+    blank = Convergence(3, 9, 4, 1e-7, 1e-8, np.nan, 0.5)
+    made = steps.make(batch.state, some, poses, [900.0, 800.0], [blank, blank])
+    for found, case, pose, fluid in zip(made, batch.cases[1:], poses, (900.0, 800.0), strict=True):
+        state, balance = replace(case.second, fluid_pressure=fluid), case.balances[1]
+        wanted = indentation_step(
+            finger.system, finger.state, state, pose, -balance.indenter, -balance.core, blank
+        )
+        for one in fields(found):
+            if one.name != "convergence":
+                same(getattr(found, one.name), getattr(wanted, one.name))
+        assert found.contact_area_m2 > 0.0
+        deepest = max(state.indenter_pressure.max(), state.core_pressure.max())
+        stiffness = finger.system.contact.stiffness
+        assert found.convergence.penetration_m == pytest.approx(deepest / stiffness, rel=1e-12)
+        assert replace(found.convergence, penetration_m=0.0) == replace(blank, penetration_m=0.0)
+
+
+def test_a_step_without_contact_has_no_centre(batch: Batch, finger: Fingertip) -> None:
+    away = finger.state.copy()
+    batch.state.put(PLACES[0], away)
+    only = batch.equations.listed(np.array(PLACES[:1]))
+    batch.equations.pose(
+        only.numbers, np.array([0]), np.array([[0.0, 0.0, -0.05]]), np.eye(3)[None]
+    )
+    batch.equations.correct_contact(batch.state, only)
+    batch.equations.balance(batch.state, only)
+    steps = BatchedSteps(batch.equations, finger.nodes)
+    blank = Convergence(1, 1, 1, 0.0, 0.0, 0.0, 0.0)
+    (found,) = steps.make(batch.state, only, [np.zeros(7)], [1.0], [blank])
+    case = batch.cases[0]
+    batch.equations.pose(
+        only.numbers,
+        np.array([len(PRESSES) - 1]),
+        case.indenter.tip[None],
+        case.indenter.rotation[None],
+    )
+    assert np.isnan(found.centre_of_pressure).all()
+    assert found.contact_area_m2 == 0.0
+    assert not found.force.any()
+    assert not found.displacement.any()
+
+
 @pytest.mark.parametrize("stage", ["first", "second", "moved"])
 def test_forces_and_errors(batch: Batch, stage: str) -> None:
     numbers = batch.run(batch.all, stage)
     which = ("first", "second", "moved").index(stage)
     equations = batch.equations
-    on_indenter, on_core = equations.nodal_forces(np.array(PLACES))
-    for k, (slot, case, found) in enumerate(zip(PLACES, batch.cases, numbers, strict=True)):
+    for slot, case, found in zip(PLACES, batch.cases, numbers, strict=True):
         balance, state = case.balances[which], getattr(case, stage)
-        same(on_indenter[k], balance.indenter)
-        same(on_core[k], balance.core)
+        same(batch.nodal(equations.outer.force, slot), balance.indenter)
+        same(batch.nodal(equations.inner.force, slot), balance.core)
         same(batch.nodal(equations._internal, slot), balance.internal)
         same(batch.nodal(equations._gradient_of_volume, slot), balance.volume_gradient)
         # The largest forces of contact cancel those of the skin, so it is a share of these.
@@ -352,22 +404,21 @@ def test_contact_without_mortar_and_without_a_core(
     system.correct_contact(state, indenter)
     expected, values = system.balance(state, indenter), system.tangent_values()
     load = -system.coupled_force()
-    equations = BatchedEquations(system, [ball], slots=2, device="cpu", friction=indenter.friction)
-    batched, listed = BatchedState(mesh, 2, "cpu"), equations.listed(np.array([1]))
+    equations = BatchedEquations(system, [ball], slots=2, device=DEVICE, friction=indenter.friction)
+    batched, listed = BatchedState(mesh, 2, DEVICE), equations.listed(np.array([1]))
     batched.put(1, state)
     equations.pose(listed.numbers, np.array([0]), indenter.tip[None], indenter.rotation[None])
     equations.correct_contact(batched, listed)
     equations.balance(batched, listed)
     (found,) = equations.numbers(batched, listed)
     assert found.residual == pytest.approx(expected.residual, rel=1e-11)
-    on_indenter, on_core = equations.nodal_forces(np.array([1]))
-    same(on_indenter[0], expected.indenter)
-    same(on_core[0], expected.core)
-    tangent = wp.zeros((2, len(values)), dtype=wp.float64, device="cpu")
-    none = wp.zeros(2, dtype=wp.float64, device="cpu")
+    same(equations.outer.force.numpy().reshape(2, -1, 3)[1], expected.indenter)
+    same(equations.inner.force.numpy().reshape(2, -1, 3)[1], expected.core)
+    tangent = wp.zeros((2, len(values)), dtype=wp.float64, device=DEVICE)
+    none = wp.zeros(2, dtype=wp.float64, device=DEVICE)
     equations.tangent(batched, listed, tangent, elastic=listed, viscosity=none)
     same(tangent.numpy()[1], values)
-    vectors = wp.zeros((2, 1, equations.size), dtype=wp.float64, device="cpu")
+    vectors = wp.zeros((2, 1, equations.size), dtype=wp.float64, device=DEVICE)
     equations.coupled(batched, listed, vectors, 0)
     assert np.abs(load).max() > 0.0
     same(vectors.numpy()[1, 0], load)

@@ -10,9 +10,10 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
+from tests.fem.batched_cases import DEVICE
 
+from palpate_fem.batched.dense_tiles import TILE
 from palpate_fem.batched.factor import BatchedFactor
-from palpate_fem.batched.factor_kernels import TILE
 from palpate_fem.mechanics.contact import ContactSettings
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
@@ -74,13 +75,15 @@ class Bench:
         self.rows = np.repeat(np.arange(self.size), np.diff(self.indptr))
         groups = np.arange(self.size, dtype=np.int32) if groups is None else groups
         self.factor = BatchedFactor(
-            self.indptr, self.indices, groups, slots=self.slots, device="cpu"
+            self.indptr, self.indices, groups, slots=self.slots, device=DEVICE
         )
         for slot, matrix in enumerate(matrices):
             self.put(slot, matrix)
 
     def put(self, slot: int, matrix: Floats) -> None:
-        self.factor.values.numpy()[slot] = matrix[self.rows, self.indices]  # the CPU's own memory
+        values = self.factor.values.numpy()
+        values[slot] = matrix[self.rows, self.indices]
+        self.factor.values.assign(values)
 
     def factorise(self, *slots: int) -> list[int]:
         """Factorise; which of all slots are bad."""
@@ -89,7 +92,7 @@ class Bench:
 
     def solve(self, right: Floats, *slots: int) -> Floats:
         """Right-hand sides and solutions (slots, lanes, n)."""
-        vectors = wp.array(right, dtype=wp.float64, device="cpu")
+        vectors = wp.array(right, dtype=wp.float64, device=DEVICE)
         self.factor.solve(listed(slots or range(self.slots)), vectors, right.shape[1])
         return np.array(vectors.numpy())
 
@@ -98,7 +101,7 @@ class Bench:
 
 
 def listed(slots: tuple[int, ...] | range) -> wp.array:
-    return wp.array(np.array(slots, np.int32), dtype=wp.int32, device="cpu")
+    return wp.array(np.array(slots, np.int32), dtype=wp.int32, device=DEVICE)
 
 
 def assert_solves(matrix: Floats, answers: Floats, rights: Floats) -> None:
@@ -158,20 +161,41 @@ def test_lanes_do_not_mix(grids: Bench) -> None:
     bench.factorise()
     right = bench.right(2)
     both = bench.solve(right)
-    vectors = wp.array(right, dtype=wp.float64, device="cpu")
+    vectors = wp.array(right, dtype=wp.float64, device=DEVICE)
     bench.factor.solve(listed(range(3)), vectors, 1)
     np.testing.assert_array_equal(vectors.numpy()[:, 0], both[:, 0])
     np.testing.assert_array_equal(vectors.numpy()[:, 1], right[:, 1])
 
 
-def test_a_factor_made_twice_has_the_same_bits(grids: Bench) -> None:
-    bench = restored(grids)
-    right = bench.right(2)
+def test_a_factor_made_twice_has_the_same_bits() -> None:
     answers = []
     for _ in range(2):
+        bench = Bench([grid(20, 30, seed) for seed in range(3)])
         bench.factorise()
-        answers.append(bench.solve(right))
+        answers.append(bench.solve(bench.right(2)))
     np.testing.assert_array_equal(answers[0], answers[1])
+
+
+def test_only_what_has_changed_is_factorised_again(grids: Bench) -> None:
+    """And gives the bits of a factorisation of everything."""
+    bench = restored(grids)
+    bench.factorise()
+    fronts = bench.factor.marked.shape[1]
+    matrix = grid(20, 30, 1)
+    matrix[[44, 45], [44, 45]] += 0.5
+    bench.put(1, matrix)
+    bench.factorise()
+    worked_on = bench.factor.marked.numpy().sum(axis=1)
+    assert worked_on[[0, 2]].tolist() == [0, 0]
+    assert 0 < worked_on[1] < fronts / 2
+    fresh = Bench([grid(20, 30, 0), matrix, grid(20, 30, 2)])
+    fresh.factorise()
+    assert fresh.factor.marked.numpy().all()
+    right = bench.right(2)
+    np.testing.assert_array_equal(bench.solve(right), fresh.solve(right))
+    bench.put(1, grid(20, 30, 1))  # and back again
+    bench.factorise(1)
+    assert_solves(grid(20, 30, 1), bench.solve(right)[1], right[1])
 
 
 def test_order_and_company_of_slots_change_nothing(grids: Bench) -> None:
@@ -257,13 +281,13 @@ def test_solves_for_a_tangent(shell: Callable[..., SolidMesh]) -> None:
     system.balance(SolutionState.at_rest(mesh), None)
     pattern, values = system.pattern, np.asarray(system.tangent_values())
     factor = BatchedFactor(
-        pattern.indptr, pattern.indices, pattern.free // 3, slots=2, device="cpu"
+        pattern.indptr, pattern.indices, pattern.free // 3, slots=2, device=DEVICE
     )
-    factor.values.numpy()[:] = np.stack((values, 3.0 * values))
+    factor.values.assign(np.stack((values, 3.0 * values)))
     factor.factorise(listed((0, 1)))
     assert not factor.bad.numpy().any()
     right = np.random.default_rng(6).normal(size=(2, 2, len(pattern.free)))
-    vectors = wp.array(right, dtype=wp.float64, device="cpu")
+    vectors = wp.array(right, dtype=wp.float64, device=DEVICE)
     factor.solve(listed((0, 1)), vectors, 2)
     size = len(pattern.free)
     upper = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(size, size))

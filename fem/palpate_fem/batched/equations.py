@@ -22,7 +22,6 @@ from palpate_fem.batched.state import (
     SlotNumbers,
     flat,
     on_device,
-    rows_of_slots,
     rows_of_three,
 )
 from palpate_fem.batched.surface import BatchedSurface
@@ -35,6 +34,9 @@ from palpate_fem.mechanics.system import EquilibriumSystem
 
 FAR_BELOW_M = -1.0
 """Height of the primitives that fill the rows of simpler indenters [m]: beyond any margin."""
+
+KEPT_LISTS = 16
+"""Lists of slots that are kept: more than a sweep asks for."""
 
 
 class BatchedEquations:
@@ -59,6 +61,7 @@ class BatchedEquations:
             friction: Coulomb coefficient of the skin on the indenters.
         """
         self.system, self.slots, self.device = system, slots, device
+        self._lists: dict[bytes, Listed] = {}
         mesh, pattern, skin = system.mesh, system.pattern, system.skin
         self._law, self._core_law = system.contact.law(friction), system.contact.law(0.0)
         self._nodes, self._elements_each = len(mesh.nodes), len(mesh.elements)
@@ -135,20 +138,30 @@ class BatchedEquations:
         self._hanging = on_device(np.array(hanging), wp.float64, self.device)
 
     def listed(self, numbers: Ints) -> Listed:
-        """The lists of some slots."""
+        """The lists of some slots; kept, as the same slots often ask for several things in turn."""
+        key = np.asarray(numbers, np.int32).tobytes()
+        if key not in self._lists:
+            if len(self._lists) == KEPT_LISTS:
+                self._lists.pop(next(iter(self._lists)))
+            self._lists[key] = self._make_list(np.array(numbers))
+        return self._lists[key]
+
+    def _make_list(self, numbers: Ints) -> Listed:
         slots = on_device(np.asarray(numbers, np.int32), wp.int32, self.device)
 
-        def items(count: int) -> wp.array:
+        def items(kernel: Any, count: int) -> wp.array:
             found = wp.empty(len(numbers) * count, dtype=wp.int32, device=self.device)
-            self._launch(kernels.expand, (len(numbers), count), [slots, count], [found])
+            self._launch(kernel, (len(numbers), count), [slots, count], [found])
             return found
 
         return Listed(
-            np.asarray(numbers),
+            numbers,
             slots,
-            items(self._elements_each),
-            items(self.outer.count),
-            items(self.inner.count),
+            # One element of all slots after the other: neighbouring threads share its constants.
+            items(kernels.expand_across, self._elements_each),
+            # One slot after the other: where a face touches, its neighbours do.
+            items(kernels.expand, self.outer.count),
+            items(kernels.expand, self.inner.count),
         )
 
     def pose(self, slots: Ints, kind: Ints, tip: Floats, rotation: Floats) -> None:
@@ -316,13 +329,14 @@ class BatchedEquations:
             )
         return found
 
-    def nodal_forces(self, slots: Ints) -> tuple[Floats, Floats]:
-        """Minus the nodal forces of indenter and core on the skin [N], (m, V, 3), read back."""
-        on_indenter, on_core = (
-            rows_of_slots(rows_of_three(surface.force), slots, self._nodes)
-            for surface in (self.outer, self.inner)
+    def stress(self, state: BatchedState, listed: Listed, stress: wp.array) -> None:
+        """Cauchy stresses of the elements [Pa], (slots * E,) matrices; see `Skin.stress`."""
+        self._launch(
+            element_kernels.element_stress,
+            len(listed.elements),
+            [*self._model, listed.elements, state.position, state.pressure],
+            [stress],
         )
-        return on_indenter, on_core
 
     def tangent(
         self,
@@ -344,6 +358,7 @@ class BatchedEquations:
         """
         inner = self.inner
         if elastic is not None:
+            corners = self._volume_gradient.shape[1]
             self._launch(
                 kernels.clear_matrices,
                 (len(elastic.slots), self._blocks_each),
@@ -357,8 +372,8 @@ class BatchedEquations:
                 self._parts,
             )
             self._launch(
-                element_kernels.element_tangent,
-                len(elastic.elements),
+                element_kernels.element_tangent_by_pair,
+                (len(elastic.elements), corners, corners),
                 [self._pairs, self._gradient, self._bulk, self._blocks_each, elastic.elements,
                  *self._parts, self._volume_gradient],
                 [self._elastic],
@@ -370,7 +385,6 @@ class BatchedEquations:
                  elastic.inner, state.fluid_pressure, state.position],
                 [self._elastic],
             )  # fmt: skip
-            corners = self._volume_gradient.shape[1]
             self._copy(
                 elastic, 3 * corners * self._elements_each, self._volume_gradient,
                 self._frozen_gradient,

@@ -1,8 +1,11 @@
 """Cholesky factors of many matrices of one pattern at once: multifrontal, in tiles, on a GPU.
 
 The elimination tree is that of the CPU's solver (``ordering``). Its fronts are worked on level by
-level, leaves first, for all listed matrices together: a block of threads for each tile. Double
-precision, and no pivoting: a matrix that is not positive definite is reported (ADR 0026).
+level, leaves first, for all listed matrices together. Double precision, and no pivoting: a matrix
+that is not positive definite is reported (ADR 0026).
+
+A front whose entries, and whose children, are what they were at the last factorisation is left as
+it is. Where only contact has changed, that is most of them.
 """
 
 from __future__ import annotations
@@ -16,11 +19,13 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.batched import factor_kernels as kernels
-from palpate_fem.batched.factor_kernels import LANES, TILE
+from palpate_fem.batched import solve_kernels
+from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE
+from palpate_fem.batched.factor_kernels import GATHERED
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
-THREADS = 128
-"""Threads of a block that works on a tile."""
+FACTOR_THREADS = 128
+"""Threads of a block while matrices are factorised: those that gather a tile."""
 
 
 class _List:
@@ -93,12 +98,13 @@ class FrontTiles:
         self.levels = int(self.level.max(initial=-1)) + 1
         self.children = np.argsort(self.parent, kind="stable")
         begins = np.searchsorted(self.parent[self.children], np.arange(count + 1))
-        self.fronts = np.zeros((count, 8), np.int64)
+        self.fronts = np.zeros((count, 9), np.int64)
         self.fronts[:, 0], self.fronts[:, 1] = own, o
         self.fronts[:, 2], self.fronts[:, 3] = begins[:-1], begins[1:]
         self.fronts[:, 4] = np.cumsum(share) - share
         self.fronts[:, 6] = np.cumsum((o + b) * TILE) - (o + b) * TILE
         self.fronts[:, 7] = np.cumsum(panel) - panel
+        self.fronts[:, 8] = o + b
         self._match_children(count)
         products = o * (o - 1) * (o + 1) // 6 + o * (o + 1) // 2  # of the own triangle
         products += b * o * (o + 1) // 2 + share * o
@@ -137,6 +143,7 @@ class BatchedFactor:
     Attributes:
         values: Upper triangles (slots, nnz), in the pattern's order; the caller writes them.
         bad: 1 where the last factorisation of a slot met a pivot that is not positive, (slots,).
+        marked: 1 for the fronts that the last factorisation of a slot worked on, (slots, fronts).
     """
 
     def __init__(
@@ -162,7 +169,10 @@ class BatchedFactor:
         )
         self.tiles, self.slots, self.size, self._device = tiles, slots, len(indptr) - 1, device
         self.values = wp.zeros((slots, len(indices)), dtype=wp.float64, device=device)
+        # No number is what it was before the first factorisation.
+        self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
+        self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
         self._panels = wp.zeros(
             (slots * tiles.panel_tiles, *square), dtype=wp.float64, device=device
@@ -175,6 +185,7 @@ class BatchedFactor:
         self._fronts = self._ints(tiles.fronts)
         self._children = self._ints(tiles.children)
         self._rows_in_child = self._ints(tiles.rows_in_child)
+        self._parent = self._ints(tiles.parent)
         self._plan_tiles()
         self._plan_entries(np.asarray(indptr), np.asarray(indices))
         self._plan_factor()
@@ -196,46 +207,80 @@ class BatchedFactor:
     def factorise(self, slots: wp.array) -> None:
         """Factorise the matrices of the listed slots, (m,) int32; others keep their factors."""
         count, tiles = len(slots), self.tiles
-        self._launch(kernels.clear, count, [slots], [self.bad])
+        self._mark(slots)
         sizes = [tiles.panel_tiles, tiles.share_tiles]
+        both = [self._panels, self._shares]
         for level in range(tiles.levels):
             first, last = self._tile_begins[level : level + 2]
             self._launch(
                 kernels.gather_shares,
-                (count, last - first, TILE * TILE),
-                [slots, *self._tile_arrays, self._fronts, self._rows_in_child, first, *sizes],
-                [self._panels, self._shares],
+                (count, last - first, TILE * TILE // GATHERED),
+                [slots, self.marked, *self._tile_arrays, self._fronts, self._rows_in_child, first,
+                 *sizes],
+                both,
             )  # fmt: skip
             first, last = self._entry_begins[level : level + 2]
             self._launch(
                 kernels.add_entries,
                 (count, last - first),
-                [slots, self._source, self._place, first, tiles.panel_tiles, self.values],
+                [slots, self.marked, self._entry_front, self._source, self._place, first,
+                 tiles.panel_tiles, self.values],
                 [self._panels],
-            )
+            )  # fmt: skip
             for column in range(int(self._columns[level])):
                 group = level * self._most + column
+                if column:
+                    self._subtract(slots, self._column, group, column)
                 works, first, number = self._diagonal.of(group)
-                self._blocks(
+                wp.launch_tiled(
                     kernels.factorise_diagonal,
-                    (count, number),
-                    [slots, works, first, column, tiles.panel_tiles, self._identity],
-                    [self._panels, self.bad],
+                    dim=[count, number],
+                    inputs=[slots, self.marked, works, first, tiles.panel_tiles, self._identity],
+                    outputs=[self._panels, self.bad],
+                    block_dim=FACTOR_THREADS,
+                    device=self._device,
                 )
                 works, first, number = self._below.of(group)
-                self._blocks(
-                    kernels.factorise_below,
-                    (count, number),
-                    [slots, works, first, column, tiles.panel_tiles],
+                self._launch(
+                    kernels.divide_by_diagonal,
+                    (count, number, TILE),
+                    [slots, self.marked, works, first, tiles.panel_tiles],
                     [self._panels],
                 )
-            works, first, number = self._products.of(level)
-            self._blocks(
-                kernels.subtract_products,
-                (count, number),
-                [slots, works, first, *sizes],
-                [self._panels, self._shares],
+            self._subtract(slots, self._products, level, 0)
+
+    def _mark(self, slots: wp.array) -> None:
+        """Mark the fronts that have to be worked on."""
+        count, tiles = len(slots), self.tiles
+        self._launch(
+            kernels.begin_marks, (count, len(tiles.fronts)), [slots, self.bad], [self.marked]
+        )
+        self._launch(kernels.clear, count, [slots], [self.bad])
+        self._launch(
+            kernels.mark_changed,
+            (count, self.values.shape[1]),
+            [slots, self._entry_front, self.values],
+            [self._known, self.marked],
+        )
+        for level in range(tiles.levels - 1):
+            first, last = self._front_begins[level : level + 2]
+            self._launch(
+                kernels.mark_parents,
+                (count, last - first),
+                [slots, self._by_level, self._parent, first],
+                [self.marked],
             )
+
+    def _subtract(self, slots: wp.array, listed: _Works, group: int, column: int) -> None:
+        """Subtract products from tiles of the panel, of ``column`` tiles each, or of the share."""
+        works, first, number = listed.of(group)
+        self._launch(
+            kernels.subtract_products,
+            (len(slots), number, TILE),
+            [slots, self.marked, works, first, column, self.tiles.panel_tiles,
+             self.tiles.share_tiles],
+            [self._panels, self._shares],
+        )  # fmt: skip
 
     def solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
         """Solve in place for the listed slots, (m,) int32.
@@ -246,55 +291,48 @@ class BatchedFactor:
             lanes: How many of them, at most `LANES`.
         """
         count, tiles = len(slots), self.tiles
-        sizes = [tiles.panel_tiles, tiles.rows]
-        data = [self._panels, self._work]
+        place = [tiles.panel_tiles, tiles.rows, THREADS]
         for level in range(tiles.levels):
             first, last = self._row_begins[level : level + 2]
             self._launch(
-                kernels.gather_right,
+                solve_kernels.gather_right,
                 (count, last - first, LANES),
                 [slots, *self._row_arrays, self._fronts, self._children, self._rows_in_child,
                  first, tiles.rows, lanes, vectors],
                 [self._work],
+                THREADS,
             )  # fmt: skip
             first, last = self._front_begins[level : level + 2]
-            self._blocks(
-                kernels.substitute_forward,
-                (count, last - first),
-                [slots, self._by_level, self._fronts, first, *sizes],
-                data,
-            )
-            works, first, number = self._border.of(level)
-            self._blocks(
-                kernels.subtract_border, (count, number), [slots, works, first, *sizes], data
+            self._launch(
+                solve_kernels.substitute_forward,
+                (count, last - first, THREADS),
+                [slots, self._by_level, self._fronts, first, *place],
+                [self._panels, self._work],
+                THREADS,
             )
         for level in reversed(range(tiles.levels)):
             first, last = self._border_begins[level : level + 2]
             self._launch(
-                kernels.gather_border,
+                solve_kernels.gather_border,
                 (count, last - first, LANES),
                 [slots, self._border_place, self._border_source, first, tiles.rows],
                 [self._work],
-            )
-            works, first, number = self._transposed.of(level)
-            self._blocks(
-                kernels.subtract_border_transposed,
-                (count, number),
-                [slots, works, self._transposed_places, first, *sizes],
-                data,
+                THREADS,
             )
             first, last = self._front_begins[level : level + 2]
-            self._blocks(
-                kernels.substitute_backward,
-                (count, last - first),
-                [slots, self._by_level, self._fronts, first, *sizes],
-                data,
+            self._launch(
+                solve_kernels.substitute_backward,
+                (count, last - first, THREADS),
+                [slots, self._by_level, self._fronts, first, *place],
+                [self._panels, self._work],
+                THREADS,
             )
         self._launch(
-            kernels.scatter_solution,
+            solve_kernels.scatter_solution,
             (count, lanes, self.size),
             [slots, self._row_of, tiles.rows, self._work],
             [vectors],
+            THREADS,
         )
 
     def _plan_tiles(self) -> None:
@@ -353,6 +391,7 @@ class BatchedFactor:
         levels = np.concatenate(level)
         order = np.argsort(levels, kind="stable")
         self._entry_begins = np.searchsorted(levels[order], np.arange(tiles.levels + 1)).tolist()
+        self._entry_front = self._ints(front)
         self._source = self._ints(np.concatenate(source)[order])
         self._place = self._ints(np.concatenate(place)[order])
 
@@ -362,23 +401,26 @@ class BatchedFactor:
         self._most = int(tiles.own_tiles.max())
         self._columns = np.zeros(tiles.levels, np.int64)
         np.maximum.at(self._columns, tiles.level, tiles.own_tiles)
-        diagonal, below, products = _List(), _List(), _List()
+        diagonal, column, below, products = _List(), _List(), _List(), _List()
         for k in range(len(tiles.fronts)):
             level, o, b = int(tiles.level[k]), int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
             first = tiles.row_tile(k, np.arange(o + b)).tolist()
             for c in range(o):
                 group = level * self._most + c
-                diagonal.add(group, first[c] + c, first[c])
+                diagonal.add(group, k, first[c] + c)
+                for r in range(c, o + b):
+                    column.add(group, k, first[r] + c, first[r], first[c], 0)
                 for r in range(c + 1, o + b):
-                    below.add(group, first[r] + c, first[r], first[c] + c, first[c])
+                    below.add(group, k, first[r] + c, first[c] + c)
             for r in range(b):
                 for c in range(r + 1):
                     tile = int(tiles.fronts[k, 4]) + r * (r + 1) // 2 + c
-                    products.add(level, tile, first[o + r], first[o + c], o)
+                    products.add(level, k, tile, first[o + r], first[o + c], o)
         groups = tiles.levels * self._most
         self._diagonal = diagonal.done(groups, 2, self._ints)
-        self._below = below.done(groups, 4, self._ints)
-        self._products = products.done(tiles.levels, 4, self._ints)
+        self._column = column.done(groups, 5, self._ints)
+        self._below = below.done(groups, 3, self._ints)
+        self._products = products.done(tiles.levels, 5, self._ints)
 
     def _plan_solve(self) -> None:
         """Rows of the fronts, level after level, and where their solutions come from."""
@@ -395,8 +437,6 @@ class BatchedFactor:
         levels = np.arange(tiles.levels + 1)
         self._front_begins = np.searchsorted(tiles.level[order], levels).tolist()
         rows, borders = [], []
-        border, transposed = _List(), _List()
-        places: list[int] = []
         for k in order:
             front = tree.fronts[k]
             level, o, b = int(tiles.level[k]), int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
@@ -410,48 +450,30 @@ class BatchedFactor:
             source[: len(front.border)] = own_row[front.border]
             at = begin + o * TILE + np.arange(b * TILE)
             borders.append(np.stack((at, source, np.full(b * TILE, level))))
-            first = tiles.row_tile(k, np.arange(o + b)).tolist()
-            for r in range(b):
-                border.add(level, first[o + r], o, begin, begin + (o + r) * TILE)
-            for c in range(o):
-                transposed.add(
-                    level, begin + c * TILE, len(places), len(places) + b, begin + o * TILE
-                )
-                places += [first[o + r] + c for r in range(b)]
         found, far = np.concatenate(rows, axis=1), np.concatenate(borders, axis=1)
         self._row_begins = np.searchsorted(found[3], levels).tolist()
         self._row_arrays = [self._ints(row) for row in found[:3]]
         self._border_begins = np.searchsorted(far[2], levels).tolist()
         self._border_place, self._border_source = self._ints(far[0]), self._ints(far[1])
-        self._border = border.done(tiles.levels, 4, self._ints)
-        self._transposed = transposed.done(tiles.levels, 4, self._ints)
-        self._transposed_places = self._ints(np.array(places, np.int64))
 
     def _ints(self, values: NDArray[Any]) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self._device)
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[wp.array]) -> None:
-        """Run a kernel; blocks are as large as those of tiles, so that it is compiled once."""
+    def _launch(
+        self,
+        kernel: Any,
+        dim: Any,
+        inputs: list[Any],
+        outputs: list[wp.array],
+        threads: int = FACTOR_THREADS,
+    ) -> None:
+        """Run a kernel; all of a module have blocks of one size, so that it is compiled once."""
         if np.prod(dim):
             wp.launch(
                 kernel,
                 dim=dim,
                 inputs=inputs,
                 outputs=outputs,
-                block_dim=THREADS,
-                device=self._device,
-            )
-
-    def _blocks(
-        self, kernel: Any, dim: tuple[int, int], inputs: list[Any], outputs: list[wp.array]
-    ) -> None:
-        """Run a kernel with a block of threads for each piece of work."""
-        if dim[1]:
-            wp.launch_tiled(
-                kernel,
-                dim=list(dim),
-                inputs=inputs,
-                outputs=outputs,
-                block_dim=THREADS,
+                block_dim=threads,
                 device=self._device,
             )

@@ -1,23 +1,29 @@
 # mypy: ignore-errors
-"""Kernels of the batched multifrontal factor: square tiles, one block of threads each.
+"""Kernels of the batched multifrontal factor: fronts in square tiles.
 
 A front is a dense lower triangle of tiles: its own columns first, padded to whole tiles with ones
 on the diagonal, then its border, padded with zeros. The tiles of its own columns are the *panel*,
 those of border and border the *share* for its parent. A diagonal tile of a factorised panel holds
 the inverse of its Cholesky factor.
 
-Nothing is added by atomics, so results do not depend on the order of the threads.
+Only marked fronts of a slot are worked on: those of which an entry has changed since they were
+factorised, and all above them. Nothing is added by atomics, so results depend neither on the order
+of the threads nor on which fronts are marked.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-TILE = 32
-"""Rows and columns of a tile."""
+from palpate_fem.batched import dense_tiles
+from palpate_fem.batched.dense_tiles import TILE
 
-LANES = 2
-"""Right-hand sides that are solved for together."""
+GATHERED = 8
+"""Entries of a tile that one thread gathers: all at once, so that none waits for another."""
+
+EVERY = wp.constant(TILE // GATHERED)
+
+Entries = wp.types.vector(length=GATHERED, dtype=wp.float64)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,14 +35,58 @@ def lower_tile(row: int, column: int):
 
 
 @wp.kernel
+def begin_marks(
+    slots: wp.array(dtype=wp.int32),
+    bad: wp.array(dtype=wp.int32),
+    marked_out: wp.array2d(dtype=wp.int32),
+):
+    """Mark all fronts of the listed slots whose last factorisation failed, and none of others."""
+    i, front = wp.tid()
+    marked_out[slots[i], front] = bad[slots[i]]
+
+
+@wp.kernel
 def clear(slots: wp.array(dtype=wp.int32), bad_out: wp.array(dtype=wp.int32)):
     """Call the listed matrices good."""
     bad_out[slots[wp.tid()]] = 0
 
 
 @wp.kernel
+def mark_changed(
+    slots: wp.array(dtype=wp.int32),
+    front: wp.array(dtype=wp.int32),
+    values_in: wp.array2d(dtype=wp.float64),
+    known: wp.array2d(dtype=wp.float64),
+    marked_out: wp.array2d(dtype=wp.int32),
+):
+    """Mark the fronts of entries that are not what they were, and remember what they are."""
+    i, k = wp.tid()
+    slot = slots[i]
+    value = values_in[slot, k]
+    if value != known[slot, k]:
+        known[slot, k] = value
+        marked_out[slot, front[k]] = 1
+
+
+@wp.kernel
+def mark_parents(
+    slots: wp.array(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
+    first: int,
+    marked: wp.array2d(dtype=wp.int32),
+):
+    """Mark the parents of marked fronts."""
+    i, number = wp.tid()
+    front = listed[first + number]
+    if marked[slots[i], front] != 0 and parent[front] >= 0:
+        marked[slots[i], parent[front]] = 1
+
+
+@wp.kernel
 def gather_shares(
     slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
     tile_front: wp.array(dtype=wp.int32),
     tile_row: wp.array(dtype=wp.int32),
     tile_column: wp.array(dtype=wp.int32),
@@ -54,39 +104,53 @@ def gather_shares(
 ):
     """Set tiles to what the children's shares add up to, and ones where columns are padding.
 
-    ``sharing`` lists, tile after tile, the children with rows and columns in it.
+    ``sharing`` lists, tile after tile, the children with rows and columns in it. A thread has one
+    column of a tile, and every `EVERY`-th row of it.
 
     ``fronts`` has a row for each: own unknowns, own tiles, begin and end of its children, begin of
     its shares, begin of its rows in its parent (see `FrontTiles`).
     """
-    i, number, entry = wp.tid()
+    i, number, thread = wp.tid()
     slot = slots[i]
     work = first + number
     front = tile_front[work]
-    row = tile_row[work] * TILE + entry // TILE
-    column = tile_column[work] * TILE + entry % TILE
-    total = wp.float64(0.0)
-    if row == column and row >= fronts[front, 0] and row < fronts[front, 1] * TILE:
-        total = wp.float64(1.0)
-    for k in range(sharing_begin[work], sharing_end[work]):
-        child = sharing[k]
-        a = rows_in_child[fronts[child, 5] + row]
-        b = rows_in_child[fronts[child, 5] + column]
-        if a >= 0 and b >= 0:
-            low = wp.min(a, b)
-            high = wp.max(a, b)
-            tile = slot * share_tiles + fronts[child, 4] + lower_tile(high // TILE, low // TILE)
-            total += shares[tile, high % TILE, low % TILE]
-    place = tile_place[work]
-    if tile_column[work] < fronts[front, 1]:
-        panels[slot * panel_tiles + place, entry // TILE, entry % TILE] = total
-    else:
-        shares[slot * share_tiles + place, entry // TILE, entry % TILE] = total
+    if marked[slot, front] != 0:
+        top = tile_row[work] * TILE + thread // TILE
+        column = tile_column[work] * TILE + thread % TILE
+        total = Entries()
+        for j in range(GATHERED):
+            row = top + j * EVERY
+            if row == column and row >= fronts[front, 0] and row < fronts[front, 1] * TILE:
+                total[j] = wp.float64(1.0)
+        for k in range(sharing_begin[work], sharing_end[work]):
+            child = sharing[k]
+            place = fronts[child, 5]
+            tile = slot * share_tiles + fronts[child, 4]
+            b = rows_in_child[place + column]
+            if b >= 0:
+                for j in range(GATHERED):
+                    a = rows_in_child[place + top + j * EVERY]
+                    low = wp.min(wp.max(a, 0), b)
+                    high = wp.max(a, b)
+                    at = tile + lower_tile(high // TILE, low // TILE)
+                    value = shares[at, high % TILE, low % TILE]
+                    if a >= 0:
+                        total[j] += value
+        at = slot * panel_tiles + tile_place[work]
+        if tile_column[work] < fronts[front, 1]:
+            for j in range(GATHERED):
+                panels[at, thread // TILE + j * EVERY, thread % TILE] = total[j]
+        else:
+            at = slot * share_tiles + tile_place[work]
+            for j in range(GATHERED):
+                shares[at, thread // TILE + j * EVERY, thread % TILE] = total[j]
 
 
 @wp.kernel
 def add_entries(
     slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    front: wp.array(dtype=wp.int32),
     source: wp.array(dtype=wp.int32),
     place: wp.array(dtype=wp.int32),
     first: int,
@@ -97,18 +161,75 @@ def add_entries(
     """Add the matrix's entries; each place of a panel takes one."""
     i, number = wp.tid()
     slot = slots[i]
-    at = place[first + number]
-    tile = slot * panel_tiles + at // (TILE * TILE)
-    within = at % (TILE * TILE)
-    panels[tile, within // TILE, within % TILE] += values_in[slot, source[first + number]]
+    entry = source[first + number]
+    if marked[slot, front[entry]] != 0:
+        at = place[first + number]
+        tile = slot * panel_tiles + at // (TILE * TILE)
+        within = at % (TILE * TILE)
+        panels[tile, within // TILE, within % TILE] += values_in[slot, entry]
+
+
+@wp.kernel
+def subtract_products(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    works: wp.array2d(dtype=wp.int32),
+    first: int,
+    count: int,
+    panel_tiles: int,
+    share_tiles: int,
+    panels: wp.array3d(dtype=wp.float64),
+    shares: wp.array3d(dtype=wp.float64),
+):
+    """Subtract the product of the first tiles of two rows of the panel from a tile.
+
+    A row of ``works``: the front, the tile, both rows' first tiles, and how many tiles of them.
+    ``count`` is how many if that is 0; the tile is then one of the panel, else of the share.
+    """
+    i, number, lane = wp.tid()
+    slot = slots[i]
+    work = first + number
+    if marked[slot, works[work, 0]] != 0:
+        base = slot * panel_tiles
+        left = base + works[work, 2]
+        right = base + works[work, 3]
+        own = works[work, 4]
+        if own == 0:
+            tile = base + works[work, 1]
+            dense_tiles.subtract_product(panels, left, right, count, panels, tile, lane)
+        else:
+            tile = slot * share_tiles + works[work, 1]
+            dense_tiles.subtract_product(panels, left, right, own, shares, tile, lane)
+
+
+@wp.kernel
+def divide_by_diagonal(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    works: wp.array2d(dtype=wp.int32),
+    first: int,
+    panel_tiles: int,
+    panels: wp.array3d(dtype=wp.float64),
+):
+    """Multiply a tile below the diagonal by the transposed inverse of the diagonal's factor.
+
+    A row of ``works``: the front, the tile, the diagonal tile.
+    """
+    i, number, lane = wp.tid()
+    slot = slots[i]
+    work = first + number
+    if marked[slot, works[work, 0]] != 0:
+        base = slot * panel_tiles
+        tile = base + works[work, 1]
+        dense_tiles.multiply_transposed(panels, tile, base + works[work, 2], lane)
 
 
 @wp.kernel
 def factorise_diagonal(
     slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
     works: wp.array2d(dtype=wp.int32),
     first: int,
-    column: int,
     panel_tiles: int,
     identity: wp.array2d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
@@ -116,18 +237,15 @@ def factorise_diagonal(
 ):
     """Replace a diagonal tile by the inverse of its Cholesky factor.
 
-    A row of ``works`` is a tile: place of its row's first tile and step to the next of them.
+    A row of ``works``: the front, the tile.
     """
     i, number = wp.tid()
     slot = slots[i]
-    base = slot * panel_tiles
     work = first + number
-    tile = base + works[work, 0]
-    row = base + works[work, 1]
+    if marked[slot, works[work, 0]] == 0:
+        return
+    tile = slot * panel_tiles + works[work, 1]
     total = wp.tile_load(panels[tile], shape=(TILE, TILE))
-    for k in range(column):
-        left = wp.tile_load(panels[row + k], shape=(TILE, TILE))
-        wp.tile_matmul(left, wp.tile_transpose(left), total, alpha=wp.float64(-1.0))
     one = wp.tile_load(identity, shape=(TILE, TILE))
     lower = wp.tile_cholesky(total)
     good = wp.int32(1)
@@ -147,248 +265,3 @@ def factorise_diagonal(
     else:
         wp.tile_store(panels[tile], wp.tile_load(identity, shape=(TILE, TILE)))
         bad[slot] = 1
-
-
-@wp.kernel
-def factorise_below(
-    slots: wp.array(dtype=wp.int32),
-    works: wp.array2d(dtype=wp.int32),
-    first: int,
-    column: int,
-    panel_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
-):
-    """Replace a tile below the diagonal by that of the factor.
-
-    A row of ``works``: the tile, its row's first tile, the diagonal tile, the diagonal's row.
-    """
-    i, number = wp.tid()
-    base = slots[i] * panel_tiles
-    work = first + number
-    tile = base + works[work, 0]
-    row = base + works[work, 1]
-    above = base + works[work, 3]
-    total = wp.tile_load(panels[tile], shape=(TILE, TILE))
-    for k in range(column):
-        left = wp.tile_load(panels[row + k], shape=(TILE, TILE))
-        right = wp.tile_load(panels[above + k], shape=(TILE, TILE))
-        wp.tile_matmul(left, wp.tile_transpose(right), total, alpha=wp.float64(-1.0))
-    inverse = wp.tile_load(panels[base + works[work, 2]], shape=(TILE, TILE))
-    answer = wp.tile_zeros(shape=(TILE, TILE), dtype=wp.float64)
-    wp.tile_matmul(total, wp.tile_transpose(inverse), answer)
-    wp.tile_store(panels[tile], answer)
-
-
-@wp.kernel
-def subtract_products(
-    slots: wp.array(dtype=wp.int32),
-    works: wp.array2d(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    share_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
-    shares: wp.array3d(dtype=wp.float64),
-):
-    """Subtract the product of two rows of the panel from a tile of the share.
-
-    A row of ``works``: the tile, both rows' first tiles, the number of own tiles.
-    """
-    i, number = wp.tid()
-    slot = slots[i]
-    base = slot * panel_tiles
-    work = first + number
-    tile = slot * share_tiles + works[work, 0]
-    total = wp.tile_load(shares[tile], shape=(TILE, TILE))
-    for k in range(works[work, 3]):
-        left = wp.tile_load(panels[base + works[work, 1] + k], shape=(TILE, TILE))
-        right = wp.tile_load(panels[base + works[work, 2] + k], shape=(TILE, TILE))
-        wp.tile_matmul(left, wp.tile_transpose(right), total, alpha=wp.float64(-1.0))
-    wp.tile_store(shares[tile], total)
-
-
-@wp.kernel
-def gather_right(
-    slots: wp.array(dtype=wp.int32),
-    row_front: wp.array(dtype=wp.int32),
-    row_in_front: wp.array(dtype=wp.int32),
-    row_unknown: wp.array(dtype=wp.int32),
-    fronts: wp.array2d(dtype=wp.int32),
-    children: wp.array(dtype=wp.int32),
-    rows_in_child: wp.array(dtype=wp.int32),
-    first: int,
-    rows: int,
-    lanes: int,
-    right_in: wp.array3d(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
-):
-    """Set the rows of fronts to their right-hand sides and what the children's borders add up to.
-
-    A front has its own rows and those of its border in one stretch of ``work``, whose begin is the
-    sixth of its numbers (``fronts``).
-    """
-    i, number, lane = wp.tid()
-    slot = slots[i]
-    at = first + number
-    front = row_front[at]
-    total = wp.float64(0.0)
-    if lane < lanes:
-        if row_unknown[at] >= 0:
-            total = right_in[slot, lane, row_unknown[at]]
-        for k in range(fronts[front, 2], fronts[front, 3]):
-            child = children[k]
-            a = rows_in_child[fronts[child, 5] + row_in_front[at]]
-            if a >= 0:
-                border = fronts[child, 6] + fronts[child, 1] * TILE
-                total += work[slot * rows + border + a, lane]
-    work[slot * rows + fronts[front, 6] + row_in_front[at], lane] = total
-
-
-@wp.kernel
-def substitute_forward(
-    slots: wp.array(dtype=wp.int32),
-    listed: wp.array(dtype=wp.int32),
-    fronts: wp.array2d(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    rows: int,
-    panels: wp.array3d(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
-):
-    """Solve with the lower triangle of a front's own columns."""
-    i, number = wp.tid()
-    slot = slots[i]
-    front = listed[first + number]
-    begin = slot * rows + fronts[front, 6]
-    row = slot * panel_tiles + fronts[front, 7]
-    for c in range(fronts[front, 1]):
-        total = wp.tile_load(work, shape=(TILE, LANES), offset=(begin + c * TILE, 0))
-        for k in range(c):
-            tile = wp.tile_load(panels[row + k], shape=(TILE, TILE))
-            known = wp.tile_load(work, shape=(TILE, LANES), offset=(begin + k * TILE, 0))
-            wp.tile_matmul(tile, known, total, alpha=wp.float64(-1.0))
-        inverse = wp.tile_load(panels[row + c], shape=(TILE, TILE))
-        answer = wp.tile_zeros(shape=(TILE, LANES), dtype=wp.float64)
-        wp.tile_matmul(inverse, total, answer)
-        wp.tile_store(work, answer, offset=(begin + c * TILE, 0))
-        row += c + 1
-
-
-@wp.kernel
-def subtract_border(
-    slots: wp.array(dtype=wp.int32),
-    works: wp.array2d(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    rows: int,
-    panels: wp.array3d(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
-):
-    """Subtract a border row's tiles times the own solution from that row.
-
-    A row of ``works``: the row's first tile, number of own tiles, begin of the front's rows, begin
-    of the border row.
-    """
-    i, number = wp.tid()
-    slot = slots[i]
-    at = first + number
-    base = slot * panel_tiles + works[at, 0]
-    begin = slot * rows + works[at, 2]
-    total = wp.tile_load(work, shape=(TILE, LANES), offset=(slot * rows + works[at, 3], 0))
-    for k in range(works[at, 1]):
-        tile = wp.tile_load(panels[base + k], shape=(TILE, TILE))
-        known = wp.tile_load(work, shape=(TILE, LANES), offset=(begin + k * TILE, 0))
-        wp.tile_matmul(tile, known, total, alpha=wp.float64(-1.0))
-    wp.tile_store(work, total, offset=(slot * rows + works[at, 3], 0))
-
-
-@wp.kernel
-def gather_border(
-    slots: wp.array(dtype=wp.int32),
-    row_place: wp.array(dtype=wp.int32),
-    row_source: wp.array(dtype=wp.int32),
-    first: int,
-    rows: int,
-    work: wp.array2d(dtype=wp.float64),
-):
-    """Copy the solution of the fronts above to the border rows of a level."""
-    i, number, lane = wp.tid()
-    base = slots[i] * rows
-    source = row_source[first + number]
-    value = wp.float64(0.0)
-    if source >= 0:
-        value = work[base + source, lane]
-    work[base + row_place[first + number], lane] = value
-
-
-@wp.kernel
-def subtract_border_transposed(
-    slots: wp.array(dtype=wp.int32),
-    works: wp.array2d(dtype=wp.int32),
-    places: wp.array(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    rows: int,
-    panels: wp.array3d(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
-):
-    """Subtract a column's border tiles, transposed, times the border's solution from own rows.
-
-    A row of ``works``: the own rows, begin and end among ``places`` of the border tiles, begin of
-    the border's rows.
-    """
-    i, number = wp.tid()
-    slot = slots[i]
-    at = first + number
-    base = slot * panel_tiles
-    begin = slot * rows + works[at, 3]
-    total = wp.tile_load(work, shape=(TILE, LANES), offset=(slot * rows + works[at, 0], 0))
-    for k in range(works[at, 2] - works[at, 1]):
-        tile = wp.tile_load(panels[base + places[works[at, 1] + k]], shape=(TILE, TILE))
-        known = wp.tile_load(work, shape=(TILE, LANES), offset=(begin + k * TILE, 0))
-        wp.tile_matmul(wp.tile_transpose(tile), known, total, alpha=wp.float64(-1.0))
-    wp.tile_store(work, total, offset=(slot * rows + works[at, 0], 0))
-
-
-@wp.kernel
-def substitute_backward(
-    slots: wp.array(dtype=wp.int32),
-    listed: wp.array(dtype=wp.int32),
-    fronts: wp.array2d(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    rows: int,
-    panels: wp.array3d(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
-):
-    """Solve with the transposed lower triangle of a front's own columns."""
-    i, number = wp.tid()
-    slot = slots[i]
-    front = listed[first + number]
-    begin = slot * rows + fronts[front, 6]
-    start = slot * panel_tiles + fronts[front, 7]
-    count = fronts[front, 1]
-    for back in range(count):
-        c = count - 1 - back
-        total = wp.tile_load(work, shape=(TILE, LANES), offset=(begin + c * TILE, 0))
-        for k in range(c + 1, count):
-            tile = wp.tile_load(panels[start + lower_tile(k, c)], shape=(TILE, TILE))
-            known = wp.tile_load(work, shape=(TILE, LANES), offset=(begin + k * TILE, 0))
-            wp.tile_matmul(wp.tile_transpose(tile), known, total, alpha=wp.float64(-1.0))
-        inverse = wp.tile_load(panels[start + lower_tile(c, c)], shape=(TILE, TILE))
-        answer = wp.tile_zeros(shape=(TILE, LANES), dtype=wp.float64)
-        wp.tile_matmul(wp.tile_transpose(inverse), total, answer)
-        wp.tile_store(work, answer, offset=(begin + c * TILE, 0))
-
-
-@wp.kernel
-def scatter_solution(
-    slots: wp.array(dtype=wp.int32),
-    row_of: wp.array(dtype=wp.int32),
-    rows: int,
-    work_in: wp.array2d(dtype=wp.float64),
-    solution_out: wp.array3d(dtype=wp.float64),
-):
-    """Write the solution in the caller's order."""
-    i, lane, k = wp.tid()
-    slot = slots[i]
-    solution_out[slot, lane, k] = work_in[slot * rows + row_of[k], lane]

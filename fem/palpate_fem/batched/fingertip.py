@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
@@ -19,12 +18,8 @@ from palpate.errors import ConfigError
 from palpate_fem.arrays import Floats
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.linear import CHANGE, BatchedLinearSystem
-from palpate_fem.batched.state import (
-    BatchedState,
-    SlotNumbers,
-    rows_of_slots,
-    rows_of_three,
-)
+from palpate_fem.batched.state import BatchedState, SlotNumbers
+from palpate_fem.batched.steps import BatchedSteps
 from palpate_fem.batched.trajectory import (
     Accept,
     BatchedTrajectory,
@@ -41,15 +36,12 @@ from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.path import check_path
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import PosedIndenter
-from palpate_fem.mechanics.load_stepping import indentation_step, moves_in
+from palpate_fem.mechanics.load_stepping import moves_in
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
 
 HALVINGS = 8
 """How often a Newton step is halved where an element would turn inside out."""
-
-HOST_THREADS = 4
-"""Threads that make steps of what the device has solved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +70,7 @@ class _Live:
     wanted: Request | None = None
     pose: Floats = field(default_factory=lambda: np.zeros(7))
     numbers: SlotNumbers | None = None
-    steps: list[Future[IndentationStep]] = field(default_factory=list)
+    steps: list[IndentationStep] = field(default_factory=list)
 
 
 class BatchedFingertip:
@@ -111,6 +103,7 @@ class BatchedFingertip:
         self._now, self._before, self._trial, self._start = (
             BatchedState(tip.geometry.mesh, slots, device) for _ in range(4)
         )
+        self._steps = BatchedSteps(self.equations, tip.nodes)
         self._viscosity = np.zeros(slots)
         self._device = device
         self._skin = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
@@ -137,22 +130,21 @@ class BatchedFingertip:
         hard: list[_Live] = []
         waiting = iter(enumerate(presses))
         live: dict[int, _Live] = {}
-        with ThreadPoolExecutor(HOST_THREADS, thread_name_prefix="palpate-steps") as pool:
-            while True:
-                self._fill(live, waiting)
-                if not live:
-                    break
-                if on_sweep is not None:
-                    on_sweep(len(live))
-                self._evaluate(live, pool)
-                self._factorise(live)
-                self._step(live, pool)
-                for slot in [slot for slot, one in live.items() if one.wanted is None]:
-                    one = live.pop(slot)
-                    if one.trajectory.unsolved:
-                        hard.append(one)
-                    else:
-                        yield one.number, self._result(one)
+        while True:
+            self._fill(live, waiting)
+            if not live:
+                break
+            if on_sweep is not None:
+                on_sweep(len(live))
+            self._evaluate(live)
+            self._factorise(live)
+            self._step(live)
+            for slot in [slot for slot, one in live.items() if one.wanted is None]:
+                one = live.pop(slot)
+                if one.trajectory.unsolved:
+                    hard.append(one)
+                else:
+                    yield one.number, self._result(one)
         for one in hard:
             stepping = self.tip.load_stepping(self._indenter(one), one.press.path)
             yield one.number, stepping.run()
@@ -215,7 +207,7 @@ class BatchedFingertip:
     def _asking(live: dict[int, _Live], *kinds: type) -> list[int]:
         return [slot for slot, one in live.items() if isinstance(one.wanted, kinds)]
 
-    def _evaluate(self, live: dict[int, _Live], pool: ThreadPoolExecutor) -> None:
+    def _evaluate(self, live: dict[int, _Live]) -> None:
         """Serve starts of increments and mortar corrections, until none is asked for."""
         while slots := self._asking(live, Begin, Correct):
             begin = [slot for slot in slots if isinstance(live[slot].wanted, Begin)]
@@ -236,7 +228,7 @@ class BatchedFingertip:
             for slot, found in zip(slots, numbers, strict=True):
                 live[slot].numbers = found
                 self._go_on(live[slot], found)
-            self._end_increments(live, pool)
+            self._end_increments(live)
 
     def _factorise(self, live: dict[int, _Live]) -> None:
         """Serve factorisations, again where a viscosity has to rise."""
@@ -255,7 +247,7 @@ class BatchedFingertip:
             for slot, fine in zip(slots, definite, strict=True):
                 self._go_on(live[slot], bool(fine))
 
-    def _step(self, live: dict[int, _Live], pool: ThreadPoolExecutor) -> None:
+    def _step(self, live: dict[int, _Live]) -> None:
         """Serve Newton steps; see `NewtonSolver._step`."""
         slots = self._asking(live, Step)
         if not slots:
@@ -291,9 +283,9 @@ class BatchedFingertip:
         for slot in slots:
             live[slot].numbers = answers.get(slot, live[slot].numbers)
             self._go_on(live[slot], answers.get(slot))
-        self._end_increments(live, pool)
+        self._end_increments(live)
 
-    def _end_increments(self, live: dict[int, _Live], pool: ThreadPoolExecutor) -> None:
+    def _end_increments(self, live: dict[int, _Live]) -> None:
         """Serve what ends an increment: snaps, the new solution, and the steps that are kept."""
         for slot in self._asking(live, MovesIn):
             self._go_on(live[slot], self._moves_in(slot, live[slot]))
@@ -306,7 +298,7 @@ class BatchedFingertip:
                 live[slot].accepted = live[slot].pose
                 self._go_on(live[slot], None)
         if slots := self._asking(live, Reach):
-            self._keep_steps(slots, live, pool)
+            self._keep_steps(slots, live)
             for slot in slots:
                 self._go_on(live[slot], None)
 
@@ -320,57 +312,41 @@ class BatchedFingertip:
         load = -system.balance(state, at).indenter
         return moves_in(state.position, load, at, at.at(wanted.pose))
 
-    def _keep_steps(
-        self, slots: list[int], live: dict[int, _Live], pool: ThreadPoolExecutor
-    ) -> None:
-        """Steps of solutions: fetched from the device now, made by other threads."""
-        tip, now, wanted = self.tip, self._now, np.array(slots)
-        mesh = tip.geometry.mesh
-        position = rows_of_slots(rows_of_three(now.position), wanted, len(mesh.nodes))
-        pressure = rows_of_slots(now.pressure, wanted, len(mesh.elements))
-        contact = rows_of_slots(now.indenter_pressure, wanted, len(mesh.outer_faces))
-        on_core = rows_of_slots(now.core_pressure, wanted, len(mesh.inner_faces))
-        indenter_force, core_force = self.equations.nodal_forces(wanted)
-        for k, slot in enumerate(slots):
-            one, reach = live[slot], live[slot].wanted
+    def _keep_steps(self, slots: list[int], live: dict[int, _Live]) -> None:
+        """Keep the steps that slots have reached."""
+        reached, convergences, now = [], [], time.perf_counter()
+        for slot in slots:
+            reach = live[slot].wanted
             assert isinstance(reach, Reach)
-            numbers = reach.numbers
-            deepest = max(contact[k].max(initial=0.0), on_core[k].max(initial=0.0))
-            convergence = Convergence(
-                increments=reach.increments,
-                iterations=reach.iterations,
-                factorisations=reach.factorisations,
-                residual=numbers.residual,
-                volume_error=abs(numbers.volume - tip.cavity_m3) / tip.cavity_m3,
-                penetration_m=float(deepest) / tip.system.contact.stiffness,
-                seconds=time.perf_counter() - one.started,
-            )
-            state = replace(
-                tip.state,
-                position=position[k],
-                pressure=pressure[k],
-                indenter_pressure=contact[k],
-                fluid_pressure=numbers.fluid_pressure,
-            )
-            one.steps.append(
-                pool.submit(
-                    indentation_step,
-                    tip.system,
-                    tip.state,
-                    state,
-                    reach.pose,
-                    -indenter_force[k],
-                    -core_force[k],
-                    convergence,
+            reached.append(reach)
+            error = abs(reach.numbers.volume - self.tip.cavity_m3) / self.tip.cavity_m3
+            convergences.append(
+                Convergence(
+                    increments=reach.increments,
+                    iterations=reach.iterations,
+                    factorisations=reach.factorisations,
+                    residual=reach.numbers.residual,
+                    volume_error=error,
+                    penetration_m=np.nan,
+                    seconds=now - live[slot].started,
                 )
             )
+        steps = self._steps.make(
+            self._now,
+            self.equations.listed(np.array(slots)),
+            [reach.pose for reach in reached],
+            [reach.numbers.fluid_pressure for reach in reached],
+            convergences,
+        )
+        for slot, step in zip(slots, steps, strict=True):
+            live[slot].steps.append(step)
 
     def _result(self, one: _Live) -> IndentationResult:
         trajectory = one.trajectory
         return IndentationResult(
             indenter=self._indenter(one).name,
             path=one.press.path,
-            steps=tuple(step.result() for step in one.steps),
+            steps=tuple(one.steps),
             outcome=trajectory.outcome or IndentationOutcome.DIVERGED,
             reason=trajectory.reason,
             travel_m=trajectory.travel_m,

@@ -31,6 +31,13 @@ def expand(slots: wp.array(dtype=wp.int32), count: int, items_out: wp.array(dtyp
 
 
 @wp.kernel
+def expand_across(slots: wp.array(dtype=wp.int32), count: int, items_out: wp.array(dtype=wp.int32)):
+    """`expand`, with the first item of all slots first."""
+    i, k = wp.tid()
+    items_out[k * slots.shape[0] + i] = slots[i] * count + k
+
+
+@wp.kernel
 def clear_vectors(
     slots: wp.array(dtype=wp.int32), count: int, vectors_out: wp.array(dtype=wp.vec3d)
 ):
@@ -46,18 +53,6 @@ def clear_matrices(
     """Set ``count`` matrices of each listed slot to zero."""
     i, k = wp.tid()
     matrices_out[slots[i] * count + k] = wp.mat33d()
-
-
-@wp.kernel
-def pack_rows(
-    slots: wp.array(dtype=wp.int32),
-    count: int,
-    source_in: wp.array(dtype=wp.float64),
-    packed_out: wp.array2d(dtype=wp.float64),
-):
-    """Copy ``count`` numbers of each listed slot side by side."""
-    i, k = wp.tid()
-    packed_out[i, k] = source_in[slots[i] * count + k]
 
 
 @wp.kernel

@@ -156,25 +156,3 @@ def rows_of_three(array: wp.array) -> wp.array:
 def on_device(values: Floats | Ints, kind: type, device: str) -> wp.array:
     """A copy of an array on a device."""
     return wp.array(np.ascontiguousarray(values), dtype=kind, device=device)
-
-
-def rows_of_slots(array: wp.array, slots: Ints, each: int) -> Floats:
-    """The ``each`` rows of every listed slot, read back at once, (m, each, ...).
-
-    Args:
-        array: Numbers of all slots, (slots * each,) or more dimensions.
-        slots: Which, (m,).
-        each: Rows of a slot.
-    """
-    numbers = flat(array)
-    width = each * len(numbers) // len(array)
-    packed = wp.empty((len(slots), width), dtype=wp.float64, device=array.device)
-    listed = on_device(np.asarray(slots, np.int32), wp.int32, str(array.device))
-    wp.launch(
-        kernels.pack_rows,
-        dim=packed.shape,
-        inputs=[listed, width, numbers],
-        outputs=[packed],
-        device=array.device,
-    )
-    return np.asarray(packed.numpy().reshape(len(slots), each, *array.shape[1:]))

@@ -151,6 +151,38 @@ def point_state(
         scale_out[e, q] = wp.vec2d(c, ci1 / wp.float64(3.0) - wpj)
 
 
+@wp.func
+def tangent_block(
+    e: int,
+    element: int,
+    a: int,
+    b: int,
+    gradient: wp.array3d(dtype=wp.vec3d),
+    stiff: wp.float64,
+    spatial_in: wp.array3d(dtype=wp.vec3d),
+    left_in: wp.array3d(dtype=wp.vec3d),
+    right_in: wp.array3d(dtype=wp.vec3d),
+    scale_in: wp.array2d(dtype=wp.vec2d),
+    volume_gradient_in: wp.array2d(dtype=wp.vec3d),
+) -> wp.mat33d:
+    """Condensed tangent of nodes a and b of an element.
+
+    K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga, plus kappa/v0 dv dv.
+    """
+    # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
+    k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
+    diagonal = wp.float64(0.0)
+    for q in range(spatial_in.shape[1]):
+        ga = spatial_in[e, q, a]
+        gb = spatial_in[e, q, b]
+        s = scale_in[e, q]
+        diagonal += s[0] * wp.dot(gradient[element, q, a], gradient[element, q, b])
+        k += wp.outer(ga, right_in[e, q, b])
+        k += wp.outer(left_in[e, q, a], gb)
+        k += wp.outer(s[1] * gb, ga)
+    return k + diagonal * wp.identity(n=3, dtype=wp.float64)
+
+
 @wp.kernel
 def element_tangent(
     pair: wp.array3d(dtype=wp.int32),
@@ -165,33 +197,46 @@ def element_tangent(
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
-    """Add the condensed tangent to the upper node-pair blocks; ``pair`` < 0 is below the diagonal.
-
-    K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga, plus kappa/v0 dv dv.
-    """
+    """Add the condensed tangent to the upper node-pair blocks; a ``pair`` below 0 has none."""
     e = items[wp.tid()]
     element = e % pair.shape[0]
     begin = (e // pair.shape[0]) * blocks
-    n = pair.shape[1]
-    points = spatial_in.shape[1]
-    stiff = bulk_over_volume[element]
-    for a in range(n):
-        for b in range(n):
+    for a in range(pair.shape[1]):
+        for b in range(pair.shape[1]):
             block = pair[element, a, b]
             if block >= 0:
-                # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
-                k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
-                diagonal = wp.float64(0.0)
-                for q in range(points):
-                    ga = spatial_in[e, q, a]
-                    gb = spatial_in[e, q, b]
-                    s = scale_in[e, q]
-                    diagonal += s[0] * wp.dot(gradient[element, q, a], gradient[element, q, b])
-                    k += wp.outer(ga, right_in[e, q, b])
-                    k += wp.outer(left_in[e, q, a], gb)
-                    k += wp.outer(s[1] * gb, ga)
-                k += diagonal * wp.identity(n=3, dtype=wp.float64)
+                k = tangent_block(
+                    e, element, a, b, gradient, bulk_over_volume[element], spatial_in, left_in,
+                    right_in, scale_in, volume_gradient_in,
+                )  # fmt: skip
                 wp.atomic_add(block_out, begin + block, k)
+
+
+@wp.kernel
+def element_tangent_by_pair(
+    pair: wp.array3d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    bulk_over_volume: wp.array(dtype=wp.float64),
+    blocks: int,
+    items: wp.array(dtype=wp.int32),
+    spatial_in: wp.array3d(dtype=wp.vec3d),
+    left_in: wp.array3d(dtype=wp.vec3d),
+    right_in: wp.array3d(dtype=wp.vec3d),
+    scale_in: wp.array2d(dtype=wp.vec2d),
+    volume_gradient_in: wp.array2d(dtype=wp.vec3d),
+    block_out: wp.array(dtype=wp.mat33d),
+):
+    """`element_tangent` with a thread for each pair of nodes, for a GPU, which has so many."""
+    item, a, b = wp.tid()
+    e = items[item]
+    element = e % pair.shape[0]
+    block = pair[element, a, b]
+    if block >= 0:
+        k = tangent_block(
+            e, element, a, b, gradient, bulk_over_volume[element], spatial_in, left_in, right_in,
+            scale_in, volume_gradient_in,
+        )  # fmt: skip
+        wp.atomic_add(block_out, (e // pair.shape[0]) * blocks + block, k)
 
 
 @wp.kernel

@@ -1,0 +1,171 @@
+"""Steps of many solutions at once, made on the device and fetched in one copy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from palpate_fem.arrays import Floats
+from palpate_fem.batched import step_kernels
+from palpate_fem.batched.equations import BatchedEquations
+from palpate_fem.batched.state import BatchedState, Listed, flat, on_device
+from palpate_fem.batched.step_kernels import (
+    AREA,
+    FORCE,
+    MOMENT,
+    ON_CORE,
+    ON_INDENTER,
+    SUMS,
+    TORQUE,
+    WEIGHT,
+)
+from palpate_fem.mechanics.load_stepping import CONTACT_SHARE
+from palpate_fem.mechanics.reference_element import face_element
+from palpate_fem.result import Convergence, IndentationStep
+
+
+class BatchedSteps:
+    """Makes `IndentationStep` of converged solutions; see `indentation_step`, which does of one."""
+
+    def __init__(self, equations: BatchedEquations, rest: Floats) -> None:
+        """Make room.
+
+        Args:
+            equations: Of the slots.
+            rest: Nodal positions from which displacements count [m], (V, 3).
+        """
+        self._equations, self._rest, device = equations, rest, equations.device
+        mesh, slots = equations.system.mesh, equations.slots
+        self._nodes, self._elements = len(mesh.nodes), len(mesh.elements)
+        self._stress = wp.zeros(slots * self._elements, dtype=wp.mat33d, device=device)
+        self._sums = wp.zeros((slots, SUMS), dtype=wp.float64, device=device)
+        face = face_element(equations.system.outer.points)
+        self._face = [
+            on_device(values, wp.float64, device)
+            for values in (face.shape, face.gradient, face.weight)
+        ]
+        width = 9 * self._nodes + 6 * self._elements + SUMS
+        # What the device writes and what the host reads, which copies fast only from locked pages.
+        self._packed = wp.zeros((slots, width), dtype=wp.float64, device=device)
+        locked = wp.get_device(device).is_cuda
+        self._fetched = wp.zeros((slots, width), dtype=wp.float64, device="cpu", pinned=locked)
+
+    def make(
+        self,
+        state: BatchedState,
+        listed: Listed,
+        poses: Sequence[Floats],
+        fluid_pa: Sequence[float],
+        convergences: Sequence[Convergence],
+    ) -> list[IndentationStep]:
+        """Steps of the listed slots.
+
+        Args:
+            state: Converged solutions, at which the last `BatchedEquations.balance` was.
+            listed: Slots, m of them.
+            poses: Of their indenters, (7,) each.
+            fluid_pa: Fluid pressures [Pa].
+            convergences: How they were solved; penetrations are filled in.
+        """
+        self._sum(state, listed)
+        rows = self._fetch(state, listed)
+        stiffness = self._equations.system.contact.stiffness
+        steps = []
+        for row, pose, fluid, convergence in zip(rows, poses, fluid_pa, convergences, strict=True):
+            fields, sums = row[:-SUMS], row[-SUMS:]
+            position, on_indenter, on_core = (
+                fields[k * 3 * self._nodes : (k + 1) * 3 * self._nodes].reshape(-1, 3)
+                for k in range(3)
+            )
+            centre = np.full(3, np.nan)
+            if sums[AREA] > 0.0:
+                centre = sums[MOMENT : MOMENT + 3] / sums[WEIGHT]
+            deepest = float(max(sums[ON_INDENTER], sums[ON_CORE]))
+            steps.append(
+                IndentationStep(
+                    pose=np.array(pose),
+                    displacement=position - self._rest,
+                    fluid_pressure_pa=fluid,
+                    force=sums[FORCE : FORCE + 3].copy(),
+                    torque=sums[TORQUE : TORQUE + 3].copy(),
+                    indenter_force=on_indenter.copy(),
+                    core_force=on_core.copy(),
+                    contact_area_m2=float(sums[AREA]),
+                    centre_of_pressure=centre,
+                    stress=fields[9 * self._nodes :].reshape(-1, 6).copy(),
+                    convergence=replace(convergence, penetration_m=deepest / stiffness),
+                )
+            )
+        return steps
+
+    def _sum(self, state: BatchedState, listed: Listed) -> None:
+        """Sums of the listed slots."""
+        outer, inner = self._equations.outer, self._equations.inner
+        slots, count, sums = listed.slots, len(listed.slots), [self._sums]
+        self._launch(step_kernels.clear_sums, (count, SUMS), [slots], sums)
+        self._launch(
+            step_kernels.sum_forces,
+            (count, self._nodes),
+            [slots, self._nodes, state.position, outer.force],
+            sums,
+        )
+        for items, surface, pressure, place in (
+            (listed.outer, outer, state.indenter_pressure, ON_INDENTER),
+            (listed.inner, inner, state.core_pressure, ON_CORE),
+        ):
+            self._launch(
+                step_kernels.largest_pressure,
+                len(items),
+                [items, surface.count, pressure, place],
+                sums,
+            )
+        self._launch(
+            step_kernels.sum_contact_area,
+            len(listed.outer),
+            [outer.faces, *self._face, outer.area, self._nodes, listed.outer,
+             wp.float64(CONTACT_SHARE), state.position, state.indenter_pressure],
+            sums,
+        )  # fmt: skip
+
+    def _fetch(self, state: BatchedState, listed: Listed) -> Floats:
+        """Rows of the listed slots: positions, forces of indenter and core, stresses, sums.
+
+        They are overwritten by the next call.
+        """
+        equations = self._equations
+        equations.stress(state, listed, self._stress)
+        slots, count, at = listed.slots, len(listed.slots), 0
+        for factor, array in (
+            (1.0, state.position),
+            (-1.0, equations.outer.force),
+            (-1.0, equations.inner.force),
+        ):
+            self._launch(
+                step_kernels.pack,
+                (count, 3 * self._nodes),
+                [slots, 3 * self._nodes, wp.float64(factor), flat(array), at],
+                [self._packed],
+            )
+            at += 3 * self._nodes
+        self._launch(
+            step_kernels.pack_stress,
+            (count, self._elements),
+            [slots, self._elements, self._stress, at],
+            [self._packed],
+        )
+        self._launch(
+            step_kernels.pack,
+            (count, SUMS),
+            [slots, SUMS, wp.float64(1.0), flat(self._sums), at + 6 * self._elements],
+            [self._packed],
+        )
+        wp.copy(self._fetched, self._packed, count=count * self._packed.shape[1])
+        wp.synchronize_device(equations.device)
+        return np.asarray(self._fetched.numpy()[:count])
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._equations.device)
