@@ -40,6 +40,12 @@ from palpate_fem.service.batch import (
 )
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.service.config import DEFAULT_FACTORY
+from palpate_fem.service.device_batch import (
+    SLOTS,
+    DeviceBatch,
+    check_devices,
+    threads_and_packers,
+)
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.content import StoredFingertip
@@ -257,16 +263,28 @@ class FemSimulator:
         threads: int,
         stop: threading.Event,
         on_progress: OnProgress,
+        devices: tuple[str, ...] = (),
+        slots: int | None = None,
     ) -> bool:
         """Fill the store on this host; what it holds is not run again.
 
         Raises:
             DatasetError: The store is another fingertip's or damaged, or the disk refuses.
             RemoteError: The solver does not start.
+            ConfigError: There is no such device.
         """
         setup = WorkerSetup(DEFAULT_FACTORY, _mesh_options(spec), parameters_of(spec), 1)
-        batch = SimulationBatch(setup, workers=workers, threads=threads, limit_s=LIMIT_S)
-        try:
+        batch: SimulationBatch | DeviceBatch
+        if devices:
+            check_devices(devices)
+            threads, packers = threads_and_packers(devices)
+            batch = DeviceBatch(
+                setup, devices, slots=slots or SLOTS, threads=threads, limit_s=LIMIT_S
+            )
+        else:
+            packers = 0
+            batch = SimulationBatch(setup, workers=workers, threads=threads, limit_s=LIMIT_S)
+        with batch:
             fingertip = batch.fingertip(stop)
             if fingertip is None:
                 return False
@@ -278,11 +296,15 @@ class FemSimulator:
                 on_progress(report.done + present, len(plans), word)
 
             report, _ = sweep_into_store(
-                batch, plans, store, stop=stop, on_report=on_report, command=COMMAND
+                batch,
+                plans,
+                store,
+                stop=stop,
+                on_report=on_report,
+                command=COMMAND,
+                packers=packers,
             )
             return not report.stopped
-        finally:
-            batch.close()
 
     def simulate_on_cluster(
         self, spec: ExperimentSpec, store: Path, cluster: RayCluster, *, on_progress: OnProgress

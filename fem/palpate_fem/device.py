@@ -73,3 +73,13 @@ def mat33s(array: NDArray[np.float64]) -> wp.array:
 def launch(kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
     """Run a kernel with ``count`` threads; none = nothing happens."""
     wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=DEVICE)
+
+
+def known_devices() -> tuple[str, ...]:
+    """Names of the devices that Warp sees: ``cpu``, and ``cuda:0`` and so on."""
+    return tuple(str(device.alias) for device in wp.get_devices())
+
+
+def use_device(name: str) -> None:
+    """Make a device the usual one of this process, so that it takes no memory of another."""
+    wp.set_device(name)

@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError, LinkError
 from palpate.files.tape import read_tape
+from palpate_deploy.cli.data import twin_app
 from palpate_deploy.experiment import FemSimulator, specimens_of
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.population.members import PAPER, Member
@@ -160,6 +162,45 @@ def test_a_cluster_gives_the_same_rows(generated: GeneratedExperiment, tmp_path:
     same = here.row_trajectory == here.trajectories.index("sphere_medium/00/normal")
     # The same solver on the same processor; threads may be shared out otherwise.
     np.testing.assert_allclose(there.force, here.force[same], atol=1e-3)
+
+
+def test_devices_fill_the_same_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mechanics by processes of devices, on a finger that solves a formula."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
+    monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
+    told: list[tuple[int, int]] = []
+    for devices, slots in (("cpu", "cpu"), 2), (("cpu",), None):
+        assert FemSimulator().simulate(
+            SPEC,
+            tmp_path / STORE,
+            workers=1,
+            threads=1,
+            stop=threading.Event(),
+            on_progress=lambda done, total, _: told.append((done, total)),
+            devices=devices,
+            slots=slots,
+        )
+    assert told == [(1, 2), (2, 2)], "the second finds all there"
+    assert len(SimulationStore.open(tmp_path / STORE).done()) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--slots", "4"), "--slots without --device"),
+        (("--device", "cuda:77"), "cuda:77"),
+        (("--device", "cpu", "--ray", "auto"), "exclude"),
+    ],
+)
+def test_devices_that_cannot_be_meant_are_refused(
+    tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
+    folder = tmp_path / "twin"
+    with pytest.raises(ConfigError, match=said):
+        CliRunner().invoke(twin_app, ["generate", str(folder), *words], catch_exceptions=False)
+    with pytest.raises(ConfigError, match="cluster"):
+        generate(folder, SPEC, specimens(), FemSimulator(), workers=1, ray="auto", devices=("cpu",))
+    assert not folder.exists()
 
 
 def test_paths_that_slide_twist_and_go_back_become_rows_too(

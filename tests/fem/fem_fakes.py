@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,7 @@ QUICK, SLOW, STUBBORN, DIES, SEGFAULTS, DIVERGES, REFUSES, DEFECTIVE, PINCHES, N
     round(0.01 * k, 2) for k in range(10, 20)
 )
 SLOW_STEP_S = 0.12
+MOST_SLOTS = 100
 HALF = 0.007  # the finger is a cube of 14 mm
 
 
@@ -125,6 +126,19 @@ class FakeTip:
             seconds=time.monotonic() - began,
         )
 
+    def on_device(
+        self,
+        indenters: Sequence[str],
+        *,
+        slots: int,
+        device: str,
+        friction_coefficient: float,
+        limit_s: float,
+    ) -> FakeSolver:
+        if slots > MOST_SLOTS:
+            raise RuntimeError("Failed to allocate 30064771072 bytes")
+        return FakeSolver(self, tuple(indenters), slots, friction_coefficient)
+
     def step(self, pose: Floats, kind: float) -> IndentationStep:
         """Numbers that no float32 holds, so that rounding would show."""
         nodes = self.mesh.nodes
@@ -158,6 +172,31 @@ def misbehave(kind: float) -> None:
         raise SimulationError("the mesh is folded", remedy="make the skin thicker")
     elif kind == DEFECTIVE:
         raise ZeroDivisionError("a defect")
+
+
+class FakeSolver:
+    """Ends one of the trajectories in its slots in every sweep, the last one first."""
+
+    def __init__(self, tip: FakeTip, indenters: tuple[str, ...], slots: int, kind: float) -> None:
+        self.tip, self.indenters, self.slots, self.kind = tip, indenters, slots, kind
+
+    def indent(
+        self, presses: Iterator[Any], *, on_sweep: Callable[[int], None]
+    ) -> Iterator[tuple[int, IndentationResult]]:
+        waiting = iter(enumerate(presses))
+        live: list[tuple[int, Any]] = []
+        while True:
+            while len(live) < self.slots:
+                number, press = next(waiting, (-1, None))
+                if press is None:
+                    break
+                live.append((number, press))
+            if not live:
+                return
+            on_sweep(len(live))
+            number, press = live.pop()
+            name = self.indenters[press.indenter]
+            yield number, self.tip.indent(name, press.path, friction_coefficient=self.kind)
 
 
 class RoundTip(FakeTip):
@@ -221,3 +260,15 @@ def request(name: str, kind: float = QUICK, *, steps: int = 5, **more: Any) -> S
     path = straight_path((0.0, 0.0, -0.009), (0.0, 0.0, -0.005), steps)
     parameters = SimulationParameters(friction_coefficient=kind)
     return SimulationRequest(name, "sphere_medium", path, parameters, **more)
+
+
+class BareTip:
+    """A fingertip that no device takes."""
+
+    def __init__(self, tip: FakeTip) -> None:
+        self.describe, self.indent = tip.describe, tip.indent
+
+
+def without_device() -> Callable[[FingertipParameters, OnFraction], BareTip]:
+    """A factory of such."""
+    return lambda parameters, on_fraction: BareTip(FakeTip(parameters, 40))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.result import IndentationOutcome
+from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.trajectory import press_path
 
 TARGET_M = (-4e-3, 0.0, -7.5e-3)
@@ -87,6 +88,42 @@ def test_what_has_no_equilibrium_on_the_device_is_computed_on_the_cpu(
     assert number == 0
     assert found.outcome is wanted.outcome is IndentationOutcome.DIVERGED
     assert found.reason == wanted.reason
+
+
+def test_steps_are_told_presses_come_late_and_one_is_stopped(
+    tip: Fingertip, presses: list[BatchedPress]
+) -> None:
+    """The iterator ends after each press, and has more when it is asked again."""
+    batched = BatchedFingertip(
+        tip, [make_indenter(name) for name, _ in KINDS], slots=2, device=DEVICE
+    )
+    late = [presses[0], None, presses[2], presses[0]]
+    told: dict[int, list[IndentationStep]] = defaultdict(list)
+
+    class Late:
+        def __iter__(self) -> Late:
+            return self
+
+        def __next__(self) -> BatchedPress:
+            if not late or (press := late.pop(0)) is None:
+                raise StopIteration
+            return press
+
+    def stop_the_second(number: int) -> IndentationOutcome | None:
+        return IndentationOutcome.CANCELLED if number == 1 and told[1] else None
+
+    results = dict(
+        batched.solve(
+            Late(), on_step=lambda k, step: told[k].append(step), should_stop=stop_the_second
+        )
+    )
+    found = {k: one for k, one in results.items() if isinstance(one, IndentationResult)}
+    assert sorted(found) == [0, 1, 2]
+    assert found[1].outcome is IndentationOutcome.CANCELLED
+    assert len(found[1].steps) == 1
+    assert found[0].outcome is found[2].outcome is IndentationOutcome.COMPLETE
+    assert all(tuple(told[k]) == found[k].steps for k in found)
+    assert np.array_equal(found[0].forces, found[2].forces)
 
 
 def test_no_slots_are_refused(tip: Fingertip) -> None:

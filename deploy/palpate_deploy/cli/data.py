@@ -131,6 +131,18 @@ def data_generate(
         str | None,
         typer.Option(metavar="ADDRESS", help="Work on a Ray cluster: HOST:PORT, auto or local."),
     ] = None,
+    device: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--device",
+            metavar="NAME",
+            help="Solve many trajectories at once on this device: cuda:0, ..., or cpu; repeatable.",
+        ),
+    ] = None,
+    slots: Annotated[
+        int | None,
+        typer.Option(min=1, help="--device: trajectories at once [default: 128], 0.25 GB each."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Press nine indenters on three simulated BioTacs; write both of the paper's data sets."""
@@ -140,9 +152,21 @@ def data_generate(
     from palpate_fem.config import LIMITS
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_fem.indenter.path import parse_segments, show_segments
+    from palpate_fem.service.device_batch import check_devices
     from palpate_training.experiment.generate.pipeline import generate as run
     from palpate_training.experiment.generate.simulator import ExperimentSpec
 
+    if slots is not None and not device:
+        raise ConfigError(
+            "--slots without --device", remedy="name the device, e.g. --device cuda:0"
+        )
+    if device and ray is not None:
+        raise ConfigError(
+            "--ray and --device exclude each other: a cluster computes on its CPUs",
+            remedy="give one",
+        )
+    if device:
+        check_devices(device)
     low, high = LIMITS["fluid_volume_m3"]
     if not low < fill_ml * 1e-6 <= high:
         raise typer.BadParameter(f"{fill_ml} ml is not within {low * 1e6:g} to {high * 1e6:g}")
@@ -173,6 +197,8 @@ def data_generate(
             workers=count,
             threads=threads,
             ray=ray,
+            devices=tuple(device or ()),
+            slots=slots,
             stop=stop,
             on_stage=on_stage,
             command=typed_command(),

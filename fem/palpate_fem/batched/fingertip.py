@@ -46,7 +46,7 @@ HALVINGS = 8
 
 @dataclass(frozen=True, slots=True)
 class BatchedPress:
-    """A trajectory to compute.
+    """A trajectory to compute on a device.
 
     Attributes:
         indenter: Number of the indenter, among those of the `BatchedFingertip`.
@@ -104,12 +104,18 @@ class BatchedFingertip:
             BatchedState(tip.geometry.mesh, slots, device) for _ in range(4)
         )
         self._steps = BatchedSteps(self.equations, tip.nodes)
+        self._on_step: Callable[[int, IndentationStep], None] | None = None
         self._viscosity = np.zeros(slots)
         self._device = device
         self._skin = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
 
     def indent(
-        self, presses: Iterable[BatchedPress], *, on_sweep: Callable[[int], None] | None = None
+        self,
+        presses: Iterable[BatchedPress],
+        *,
+        on_sweep: Callable[[int], None] | None = None,
+        on_step: Callable[[int, IndentationStep], None] | None = None,
+        should_stop: Callable[[int], IndentationOutcome | None] | None = None,
     ) -> Iterator[tuple[int, IndentationResult]]:
         """Compute trajectories, in whatever order they end.
 
@@ -119,6 +125,8 @@ class BatchedFingertip:
         Args:
             presses: Any number, taken and checked one by one.
             on_sweep: Called with the number of trajectories at work on the device.
+            on_step: See `solve`.
+            should_stop: See `solve`.
 
         Yields:
             Number of the trajectory, and its result, as `Fingertip.indent` returns it.
@@ -127,27 +135,64 @@ class BatchedFingertip:
             ConfigError: A press names no indenter, or its path is not valid, see `check_path`.
             SimulationError: A press starts inside the skin.
         """
-        hard: list[_Live] = []
+        unsolved: list[tuple[int, BatchedPress]] = []
+        found = self.solve(presses, on_sweep=on_sweep, on_step=on_step, should_stop=should_stop)
+        for number, result in found:
+            if isinstance(result, BatchedPress):
+                unsolved.append((number, result))
+            else:
+                yield number, result
+        for number, press in unsolved:
+            stepping = self.tip.load_stepping(self.indenters[press.indenter], press.path)
+            yield number, stepping.run()
+
+    def solve(
+        self,
+        presses: Iterable[BatchedPress],
+        *,
+        on_sweep: Callable[[int], None] | None = None,
+        on_step: Callable[[int, IndentationStep], None] | None = None,
+        should_stop: Callable[[int], IndentationOutcome | None] | None = None,
+    ) -> Iterator[tuple[int, IndentationResult | BatchedPress]]:
+        """Compute on the device what can be computed there.
+
+        Args:
+            presses: Any number, taken and checked one by one. While others are at work, an iterator
+                that has ended is asked again in each sweep: there may be more by then.
+            on_sweep: Called with the number of trajectories at work on the device.
+            on_step: Called with the number of a trajectory and each of its steps. One that then
+                finds no equilibrium begins anew on the CPU, with steps of its own.
+            should_stop: Called with the number of each trajectory at work in each sweep; an outcome
+                ends it.
+
+        Yields:
+            Number of the trajectory, in the order in which they were taken, and its result; the
+            press itself if it finds no equilibrium on the device.
+
+        Raises:
+            ConfigError: A press names no indenter, or its path is not valid, see `check_path`.
+            SimulationError: A press starts inside the skin.
+        """
         waiting = iter(enumerate(presses))
         live: dict[int, _Live] = {}
+        self._on_step = on_step
         while True:
             self._fill(live, waiting)
             if not live:
-                break
+                return
             if on_sweep is not None:
                 on_sweep(len(live))
+            if should_stop is not None:
+                for one in live.values():
+                    if (outcome := should_stop(one.number)) is not None:
+                        one.trajectory.outcome, one.wanted = outcome, None
             self._evaluate(live)
             self._factorise(live)
             self._step(live)
             for slot in [slot for slot, one in live.items() if one.wanted is None]:
                 one = live.pop(slot)
-                if one.trajectory.unsolved:
-                    hard.append(one)
-                else:
-                    yield one.number, self._result(one)
-        for one in hard:
-            stepping = self.tip.load_stepping(self._indenter(one), one.press.path)
-            yield one.number, stepping.run()
+                unsolved = one.trajectory.unsolved
+                yield one.number, one.press if unsolved else self._result(one)
 
     def _fill(self, live: dict[int, _Live], waiting: Iterator[tuple[int, BatchedPress]]) -> None:
         """Give free slots their next trajectories."""
@@ -340,6 +385,8 @@ class BatchedFingertip:
         )
         for slot, step in zip(slots, steps, strict=True):
             live[slot].steps.append(step)
+            if self._on_step is not None:
+                self._on_step(live[slot].number, step)
 
     def _result(self, one: _Live) -> IndentationResult:
         trajectory = one.trajectory

@@ -58,6 +58,23 @@ FillOption = Annotated[
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=0, help="Solver processes; 0 = one for each core.")
 ]
+DeviceOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--device",
+        metavar="NAME",
+        help="--sweep: solve many trajectories at once on this device (cuda:0, ..., or cpu); "
+        "repeatable. --workers are then the processes that make files.",
+    ),
+]
+SlotsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--slots",
+        min=1,
+        help="--device: trajectories at once [default: 128], 0.25 GB each.",
+    ),
+]
 SlopesOption = Annotated[
     bool,
     typer.Option(
@@ -109,6 +126,7 @@ def _example(*lines: str) -> str:
         "palpate fem run --indenter sphere_7mm --depth-mm 2 --png press.png",
         'palpate fem run --path "press 2 mm, slide 1.5 mm towards +y, twist 20 deg, unload"',
         "palpate fem run --sweep --points 2 --store runs/paper.sim",
+        "palpate fem run --sweep --store runs/paper.sim --device cuda:0 --device cuda:1",
     )
 )
 def run(
@@ -159,9 +177,15 @@ def run(
     stress: Annotated[bool, typer.Option("--stress", help="Keep stress in the store.")] = False,
     png: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the result.")] = None,
     limit_s: Annotated[
-        float, typer.Option(min=1, help="Time limit for one trajectory [s].")
+        float,
+        typer.Option(
+            min=1,
+            help="Time limit for one trajectory [s]; --device: for one that the CPU has to solve.",
+        ),
     ] = 600.0,
     workers: WorkersOption = 0,
+    device: DeviceOption = None,
+    slots: SlotsOption = None,
     mesh: MeshOption = "biotac",
     edge_mm: EdgeOption = None,
     layers: LayersOption = 2,
@@ -197,6 +221,8 @@ def run(
                 png=png,
                 limit_s=limit_s,
                 as_json=json_,
+                devices=tuple(device or ()),
+                slots=slots,
             ),
             model_of(
                 mesh=mesh,

@@ -1,15 +1,18 @@
-"""The fingertip of a command line: mesh, parameters, and number of workers."""
+"""The fingertip of a command line: mesh, parameters, and the processes that press it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
+from palpate_fem.service.batch import SimulationBatch
 from palpate_fem.service.config import DEFAULT_FACTORY
+from palpate_fem.service.device_batch import SLOTS, DeviceBatch, threads_and_packers
 from palpate_fem.service.jobs import WorkerSetup
 
 PARAMETRIC = "biotac"
@@ -32,6 +35,32 @@ class FingertipModel:
     def setup(self, *, keep: int = 1) -> WorkerSetup:
         """Setup of worker processes."""
         return WorkerSetup(self.factory, self.options, self.parameters, keep)
+
+    def batch(
+        self,
+        workers: int,
+        *,
+        jobs: int | None,
+        limit_s: float,
+        devices: Sequence[str] = (),
+        slots: int | None = None,
+    ) -> tuple[Callable[[], SimulationBatch | DeviceBatch], int]:
+        """What starts the processes that run trajectories, and how many make files of them.
+
+        Args:
+            workers: Requested number, as in `workers_for`; with devices, of those that make files.
+            jobs: Number of trajectories, if it is known.
+            limit_s: Longest time for one [s].
+            devices: Warp devices that solve many trajectories at once; none = the CPU.
+            slots: Trajectories at once on each device; None = the usual number.
+        """
+        setup = self.setup()
+        if devices:
+            threads, packers = threads_and_packers(devices, workers)
+            make = partial(DeviceBatch, setup, devices, slots=slots or SLOTS)
+            return partial(make, threads=threads, limit_s=limit_s), packers
+        count, threads = workers_for(workers, jobs)
+        return partial(SimulationBatch, setup, workers=count, threads=threads, limit_s=limit_s), 0
 
 
 def model_of(

@@ -41,10 +41,10 @@ from palpate_fem.result import IndentationOutcome, IndentationResult, Indentatio
 from palpate_fem.service.batch import (
     FAILED,
     BatchReport,
-    SimulationBatch,
     TrajectoryPlan,
     sweep_into_store,
 )
+from palpate_fem.service.device_batch import check_devices
 from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.read import SimulationStore
@@ -91,6 +91,8 @@ class RunOptions:
     png: Path | None
     limit_s: float
     as_json: bool
+    devices: tuple[str, ...] = ()
+    slots: int | None = None
 
     def check(self) -> None:
         """Refuse what can be refused before a fingertip is built.
@@ -108,6 +110,18 @@ class RunOptions:
             raise ConfigError(
                 "a sweep takes long and its results must be stored", remedy="give --store NAME.sim"
             )
+        for name, value in (("--device", self.devices), ("--slots", self.slots)):
+            if value and not self.sweep:
+                raise ConfigError(
+                    f"{name} without --sweep: a device pays for many trajectories at once",
+                    remedy="add --sweep, or leave it out",
+                )
+        if self.slots is not None and not self.devices:
+            raise ConfigError(
+                "--slots without --device", remedy="name the device, e.g. --device cuda:0"
+            )
+        if self.devices:
+            check_devices(self.devices)
         if self.store is not None and self.store.suffix != SUFFIX:
             raise ConfigError(
                 f"--store {self.store} does not end in {SUFFIX}",
@@ -172,14 +186,18 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
     """
     options.check()
     sweep, store = options.sweep, options.store
-    count, threads = workers_for(workers, None if sweep else 1)
+    make_batch, packers = model.batch(
+        workers,
+        jobs=None if sweep else 1,
+        limit_s=options.limit_s,
+        devices=options.devices,
+        slots=options.slots,
+    )
     done: list[IndentationResult] = []
     present = 0
     with (
         stop_on_signal() as stop,
-        SimulationBatch(
-            model.setup(), workers=count, threads=threads, limit_s=options.limit_s
-        ) as batch,
+        make_batch() as batch,
         progress_bar() as bar,
     ):
         task = bar.add_task("pressurise", total=None)
@@ -212,20 +230,21 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
                 on_report=on_report,
                 stress=options.stress,
                 command=typed_command(),
+                packers=packers,
             )
     if store is not None and not sweep:
         opened = SimulationStore.open(store)
         there = set(opened.ids())
         done = [opened.trajectory(plan.name) for plan in plans if plan.name in there]
     if options.as_json:
-        write_json(fingertip, done, report, present)
+        write_json(fingertip, done, report, present, options.devices)
     else:
         if sweep:
             assert store is not None
             show_summaries(store, [plan.name for plan in plans])
         for trajectory in done:
             show_trajectory(fingertip, trajectory)
-        show_report(report, present, store)
+        show_report(report, present, store, options.devices)
     if options.png is not None:
         _draw(options.png, fingertip, done, store if sweep else None)
     return 0 if not report.stopped and all(early.how in GOOD for early in report.early) else 1
@@ -361,8 +380,10 @@ def show_summaries(store: Path, names: Sequence[str]) -> None:
     print_table(headings, rows, title=str(store), numbers_from=1)
 
 
-def show_report(report: BatchReport, present: int, store: Path | None) -> None:
-    """Print every early end, and a summary."""
+def show_report(
+    report: BatchReport, present: int, store: Path | None, devices: Sequence[str] = ()
+) -> None:
+    """Print every early end, and a summary; with devices also how quick they were."""
     if report.early:
         more = len(report.early) - _SHOWN_EARLY
         print_table(
@@ -378,6 +399,9 @@ def show_report(report: BatchReport, present: int, store: Path | None) -> None:
     parts = [f"{report.done} of {report.total} run" + (f": {outcomes}" if outcomes else "")]
     if present:
         parts.append(f"{present} were there already")
+    if devices and report.done:
+        each_ms = report.wall_s / report.done * 1e3
+        parts.append(f"{each_ms:.0f} ms a trajectory on {', '.join(devices)}")
     if report.stopped:
         parts.append("stopped early; the same command goes on" if store else "stopped early")
     if report.failed and store:
@@ -390,6 +414,7 @@ def write_json(
     trajectories: Sequence[IndentationResult],
     report: BatchReport,
     present: int,
+    devices: Sequence[str],
 ) -> None:
     """Print everything except nodal fields as JSON on stdout."""
     content = {
@@ -405,6 +430,8 @@ def write_json(
         "outcomes": dict(report.outcomes),
         "present": present,
         "stopped": report.stopped,
+        "devices": list(devices),
+        "wall_s": report.wall_s,
         "early": [asdict(early) for early in report.early],
         "trajectories": [
             {

@@ -1,4 +1,4 @@
-"""Many trajectories over worker processes: into a store, or as the simulator of a calibration.
+"""Many trajectories over processes: into a store, or as the simulator of a calibration.
 
 What has converged is kept, and every early end is reported.
 """
@@ -9,13 +9,16 @@ import contextlib
 import itertools
 import math
 import queue
+import resource
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
-from palpate.errors import RemoteError, SimulationError
+from palpate.errors import ConfigError, RemoteError, SimulationError
 from palpate.process import Closing
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
@@ -32,6 +35,7 @@ from palpate_fem.service.jobs import (
     StepConverged,
     WorkerSetup,
 )
+from palpate_fem.service.packing import PackingProcesses
 from palpate_fem.service.pool import WorkerPool
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
@@ -39,6 +43,7 @@ from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
 from palpate_fem.trajectory import PlannedIndentation
 
 _POLL_S = 0.1
+_OWN_FILES = 256  # of libraries, processes and results on their way
 FAILED = "failed"
 """Outcome, in a report, of a trajectory that could not be run or whose worker died."""
 
@@ -77,6 +82,7 @@ class BatchReport:
         running: Converged steps of the trajectories that run now.
         seconds: Computing time of each trajectory that ended [s].
         stopped: Whether it was stopped before all were run.
+        wall_s: Time from the first to the last of them [s].
     """
 
     total: int
@@ -85,6 +91,7 @@ class BatchReport:
     running: dict[str, int] = field(default_factory=dict)
     seconds: list[float] = field(default_factory=list)
     stopped: bool = False
+    wall_s: float = 0.0
 
     @property
     def done(self) -> int:
@@ -99,6 +106,47 @@ class BatchReport:
 
 OnTrajectory = Callable[[TrajectoryPlan, IndentationResult], None]
 OnReport = Callable[[BatchReport], None]
+
+
+class TrajectoryBatch(Protocol):
+    """Runs many trajectories on fingertips with one set of parameters."""
+
+    @property
+    def ahead(self) -> int:
+        """Most trajectories that are taken and have not ended."""
+        ...
+
+    def fingertip(self, stop: threading.Event) -> StoredFingertip | None:
+        """Wait for the first pressurised fingertip; None if ``stop`` is set before.
+
+        Raises:
+            RemoteError: No process starts; says why.
+        """
+        ...
+
+    def run(
+        self,
+        plans: Iterable[TrajectoryPlan],
+        total: int,
+        *,
+        stop: threading.Event,
+        on_trajectory: OnTrajectory,
+        on_report: OnReport | None = None,
+    ) -> BatchReport:
+        """Run trajectories, as many at once as there is room for.
+
+        Args:
+            plans: What to run, with unique names. The next one is taken when there is room.
+            total: Number of plans, for the report.
+            stop: Set it to end early: what runs then is cancelled and dropped.
+            on_trajectory: Called in this thread with every trajectory that was not cancelled,
+                complete or not. An exception from it ends the batch.
+            on_report: Called in this thread after every event.
+
+        Raises:
+            RemoteError: The processes cannot run any more; says why.
+        """
+        ...
 
 
 class SimulationBatch(Closing):
@@ -134,13 +182,10 @@ class SimulationBatch(Closing):
             grace_s=grace_s,
             on_fingertip=self._fingertip.put,
         )
+        self.ahead = workers + 1
 
     def fingertip(self, stop: threading.Event) -> StoredFingertip | None:
-        """Wait for the first pressurised fingertip; None if ``stop`` is set before.
-
-        Raises:
-            RemoteError: No worker starts; says why.
-        """
+        """See ``TrajectoryBatch.fingertip``."""
         while self._first is None and not stop.is_set():
             if self._pool.broken is not None:
                 raise self._pool.broken
@@ -157,22 +202,10 @@ class SimulationBatch(Closing):
         on_trajectory: OnTrajectory,
         on_report: OnReport | None = None,
     ) -> BatchReport:
-        """Run trajectories, as many at once as there are workers.
-
-        Args:
-            plans: What to run, with unique names. The next one is taken when a worker is free.
-            total: Number of plans, for the report.
-            stop: Set it to end early: what runs then is cancelled and dropped.
-            on_trajectory: Called in this thread with every trajectory that was not cancelled,
-                complete or not. An exception from it ends the batch.
-            on_report: Called in this thread after every event.
-
-        Raises:
-            RemoteError: The workers cannot run any more; says why.
-        """
+        """See ``TrajectoryBatch.run``; as many at once as there are workers."""
         pending: Iterator[TrajectoryPlan] = iter(plans)
         ahead = next(pending, None)
-        report = BatchReport(total)
+        report, began = BatchReport(total), time.monotonic()
         steps: dict[str, list[IndentationStep]] = {}
         while True:
             # Cancelled jobs still end with an event; the loop goes on until all of them have.
@@ -186,6 +219,7 @@ class SimulationBatch(Closing):
                 self._submit(ahead, steps)
                 ahead = next(pending, None)
             if ahead is None and not steps:
+                report.wall_s = time.monotonic() - began
                 return report
             if self._pool.broken is not None:
                 raise self._pool.broken
@@ -198,7 +232,7 @@ class SimulationBatch(Closing):
                 report.running[plan.name] = len(steps[plan.name])
             elif isinstance(event, JobEnded | JobFailed):
                 report.running.pop(plan.name, None)
-                _account(report, plan, event, steps.pop(plan.name), on_trajectory)
+                account_for(report, plan, event, steps.pop(plan.name), on_trajectory)
             if on_report is not None:
                 on_report(report)
 
@@ -215,14 +249,22 @@ class SimulationBatch(Closing):
             self._events.put((plan, JobFailed.of(error)))
 
 
-def _account(
+def account_for(
     report: BatchReport,
     plan: TrajectoryPlan,
     event: JobEnded | JobFailed,
     steps: Sequence[IndentationStep],
     on_trajectory: OnTrajectory,
 ) -> None:
-    """Count the end of a trajectory, and pass it on unless the batch was stopped."""
+    """Count the end of a trajectory, and pass it on unless the batch was stopped.
+
+    Args:
+        report: Where it counts.
+        plan: The trajectory.
+        event: Its end.
+        steps: What converged of it.
+        on_trajectory: Called with its result if it has one.
+    """
     total = len(plan.path) - 1
     if isinstance(event, JobFailed):
         report.outcomes[FAILED] += 1
@@ -243,7 +285,7 @@ def _account(
 
 
 def sweep_into_store(
-    batch: SimulationBatch,
+    batch: TrajectoryBatch,
     plans: Sequence[TrajectoryPlan],
     path: Path,
     *,
@@ -251,6 +293,7 @@ def sweep_into_store(
     on_report: OnReport | None = None,
     stress: bool = False,
     command: str = "",
+    packers: int = 0,
 ) -> tuple[BatchReport, int]:
     """Run the trajectories that a store does not hold yet; each is on the disk when it has ended.
 
@@ -265,6 +308,8 @@ def sweep_into_store(
         on_report: Called after every event.
         stress: Whether to keep stress.
         command: Command line that runs it, for provenance.
+        packers: Processes that make the files, for a batch which is quicker than one core packs;
+            a trajectory is then on the disk soon after it was reported. 0 = this process does.
 
     Returns:
         The report, and the number of trajectories that the store held before.
@@ -273,13 +318,21 @@ def sweep_into_store(
         DatasetError: The store belongs to another fingertip, is damaged or in use, or the disk
             refuses.
         RemoteError: The solver does not start.
+        ConfigError: The batch takes more trajectories at once than this process may open files.
     """
+    allow_open_files(batch.ahead)  # each claim is one
     fingertip = batch.fingertip(stop)
     if fingertip is None:
         return BatchReport(len(plans), stopped=True), 0
-    with StoreWriter(
-        path, fingertip, shared=True, outline=outline_of, stress=stress, command=command
-    ) as store:
+    with contextlib.ExitStack() as stack:
+        store = stack.enter_context(
+            StoreWriter(
+                path, fingertip, shared=True, outline=outline_of, stress=stress, command=command
+            )
+        )
+        packing = (
+            stack.enter_context(PackingProcesses(store.images, packers)) if packers > 0 else None
+        )
         done = store.done()
         left = [plan for plan in plans if plan.name not in done]
         claims: dict[str, TrajectoryClaim] = {}
@@ -291,17 +344,41 @@ def sweep_into_store(
                     yield plan
 
         def keep(plan: TrajectoryPlan, trajectory: IndentationResult) -> None:
-            with claims.pop(plan.name) as claim:
+            claim = claims.pop(plan.name)
+            if packing is not None:
+                packing.put(claim, trajectory)
+                return
+            with claim:
                 claim.write(trajectory)
 
         try:
             report = batch.run(
                 claimed(), len(left), stop=stop, on_trajectory=keep, on_report=on_report
             )
+            if packing is not None:
+                packing.finish()
         finally:
             for claim in claims.values():
                 claim.close()  # releases what was not written
     return report, len(plans) - len(left)
+
+
+def allow_open_files(count: int) -> None:
+    """Let this process open so many files beside its own, if the system does.
+
+    Raises:
+        ConfigError: It does not.
+    """
+    wanted = count + _OWN_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return
+    if hard != resource.RLIM_INFINITY and hard < wanted:
+        raise ConfigError(
+            f"{count} trajectories at once need as many open files; {hard} are allowed",
+            remedy="give fewer --slots, or raise the limit: ulimit -Hn",
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 class PoolSimulator(Closing):

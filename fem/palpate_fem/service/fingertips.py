@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import importlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 from palpate.errors import ConfigError, SimulationError
 from palpate_fem.arrays import Floats
@@ -19,6 +19,9 @@ from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
+
+if TYPE_CHECKING:  # workers on the CPU do without it
+    from palpate_fem.batched.fingertip import BatchedPress
 
 OnFraction = Callable[[float], None]
 """Called with the completed fraction of the pressurisation; an exception from it ends that."""
@@ -41,6 +44,51 @@ class PressurisedTip(Protocol):
         should_stop: Callable[[], IndentationOutcome | None] | None = None,
     ) -> IndentationResult:
         """Follow a path of poses, shape (K, 7); see ``Fingertip.indent``."""
+        ...
+
+
+class SlottedSolver(Protocol):
+    """Solves many trajectories of one fingertip at once, in slots."""
+
+    def indent(
+        self, presses: Iterator[BatchedPress], *, on_sweep: Callable[[int], None]
+    ) -> Iterator[tuple[int, IndentationResult]]:
+        """Solve presses, in whatever order they end; see ``BatchedFingertip.indent``.
+
+        Args:
+            presses: Asked in every sweep if slots are free: when it ends, there is none at the
+                moment. Checked before.
+            on_sweep: Called with the number of trajectories at work, and with 0 at every iteration
+                of one that is computed on the CPU.
+
+        Yields:
+            Number of the press in the order in which they were taken, and its result.
+        """
+        ...
+
+
+@runtime_checkable
+class SlottedTip(PressurisedTip, Protocol):
+    """A pressurised fingertip that can be put on a device many times."""
+
+    def on_device(
+        self,
+        indenters: Sequence[str],
+        *,
+        slots: int,
+        device: str,
+        friction_coefficient: float,
+        limit_s: float,
+    ) -> SlottedSolver:
+        """Make room on a device.
+
+        Args:
+            indenters: Names of all that presses may have, by number.
+            slots: Trajectories at once.
+            device: A Warp device, for example ``cuda:0``.
+            friction_coefficient: Of indenters and skin.
+            limit_s: Longest time for a trajectory that has to be computed on the CPU [s].
+        """
         ...
 
 

@@ -1,9 +1,12 @@
-"""Messages between a pool and its worker processes: plain values, pickled on a private socket."""
+"""Messages between a process and the workers that it starts: plain values on a private channel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from palpate.errors import ErrorCode, PalpateError, RemoteError
 from palpate_fem.arrays import Floats
@@ -131,3 +134,80 @@ class JobFailed:
 
 JobEvent = JobWaiting | Pressurising | JobStarted | StepConverged | JobEnded | JobFailed
 """Event of a job; ``JobEnded`` or ``JobFailed`` is the last one and comes exactly once."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSetup:
+    """First message to the process of a device.
+
+    Attributes:
+        worker: How it makes the fingertip.
+        device: Warp device, for example ``cuda:0``.
+        slots: Trajectories at once.
+        indenters: Names of all that presses may have.
+        limit_s: Longest time for a trajectory that has to be computed on the CPU [s].
+    """
+
+    worker: WorkerSetup
+    device: str
+    slots: int
+    indenters: tuple[str, ...]
+    limit_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class NumberedPress:
+    """A trajectory for a device: number, unique for its process; indenter; poses (K, 7)."""
+
+    number: int
+    indenter: str
+    path: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class ResultTaken:
+    """To the process of a device: there is room for another result."""
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """From the process of a device: it is alive; so many trajectories are at work."""
+
+    at_work: int
+
+
+@dataclass(frozen=True, slots=True)
+class PressEnded:
+    """Last event of a trajectory on a device."""
+
+    number: int
+    result: IndentationResult
+
+
+@dataclass(frozen=True, slots=True)
+class PressRefused:
+    """Likewise of one that cannot be run."""
+
+    number: int
+    failed: JobFailed
+
+
+DeviceEvent = JobStarted | Swept | PressEnded | PressRefused | JobFailed
+"""Message from the process of a device; ``JobFailed`` says why the process ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageJob:
+    """To a process that makes files: a trajectory, by its id."""
+
+    number: int
+    trajectory: str
+    result: IndentationResult
+
+
+@dataclass(frozen=True, slots=True)
+class ImageMade:
+    """From it: the content of the file, bytes as an array."""
+
+    number: int
+    image: NDArray[np.uint8]

@@ -7,27 +7,21 @@ killed. Each job's owner gets exactly one last event, whatever happens.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
-import os
-import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from multiprocessing.connection import Connection
 
 from palpate.errors import ErrorCode, RemoteError
 from palpate.heartbeat import Turns
 from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome
+from palpate_fem.service.channel import ChildProcess
 from palpate_fem.service.fingertips import without_friction
 from palpate_fem.service.jobs import (
     CancelJob,
@@ -45,13 +39,6 @@ _log = logging.getLogger(__name__)
 
 OnEvent = Callable[[JobEvent], None]
 
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-)
-_END_WAIT_S = 5.0
 _TICK_S = 0.05
 _TURN_S = 2.0  # the upkeep takes far less for a turn
 _STARTS_BEFORE_GIVING_UP = 3
@@ -68,11 +55,8 @@ class WorkerState(Enum):
     BUSY = "busy"
 
 
-class WorkerProcess:
+class WorkerProcess(ChildProcess):
     """One worker process, as its pool sees it.
-
-    Not ``multiprocessing.Process``: that imports the caller's main script again in the child, so
-    the script would have to be written for it (``if __name__ == "__main__"``).
 
     Args:
         setup: How it makes fingertips.
@@ -92,76 +76,22 @@ class WorkerProcess:
         on_gone: Callable[[WorkerProcess], None],
     ) -> None:
         self.state = WorkerState.STARTING
-        self._killed = False
-        self._on_event = on_event
-        self._on_gone = on_gone
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "palpate_fem.service.worker", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(threads))},
-            )
-        self._connection = Connection(ours.detach())
-        self._sending = threading.Lock()
-        self._send(setup)
-        self._reader = threading.Thread(target=self._read, name=f"worker {self.pid}", daemon=True)
-        self._reader.start()
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self._process.pid
+        super().__init__(
+            "palpate_fem.service.worker",
+            setup,
+            threads=threads,
+            on_message=on_event,
+            on_gone=on_gone,
+        )
 
     def start(self, job: SimulationJob) -> None:
         """Send it a job."""
         self.state = WorkerState.BUSY
-        self._send(job)
+        self.send(job)
 
     def cancel(self, job_id: str) -> None:
         """Ask it to stop a job."""
-        self._send(CancelJob(job_id))
-
-    def kill(self) -> None:
-        """End it now."""
-        self._killed = True
-        self._process.kill()
-
-    def join(self) -> None:
-        """Wait until it has ended."""
-        self._reader.join(_END_WAIT_S)
-
-    def how_it_ended(self) -> str:
-        """The end of an error message, e.g. ``ended with exit status 7``."""
-        status = self._process.poll()
-        if self._killed:
-            return "was ended because it did not stop by itself"
-        if status is None:
-            return "lost its connection"
-        if status >= 0:
-            return f"ended with exit status {status}"
-        name = signal.Signals(-status).name
-        hint = " (out of memory?)" if -status == signal.SIGKILL else ""
-        return f"was ended by {name}{hint}"
-
-    def _send(self, message: WorkerSetup | SimulationJob | CancelJob) -> None:
-        # The reader notices a process that is gone, and reports it to the pool.
-        with self._sending, contextlib.suppress(OSError):
-            self._connection.send(message)
-
-    def _read(self) -> None:
-        while True:
-            try:
-                event = self._connection.recv()
-            except (EOFError, OSError):
-                break
-            self._on_event(self, event)
-        self._process.kill()  # it may still run, but without a connection it is of no use
-        self._process.wait()
-        with self._sending:
-            self._connection.close()
-        self._on_gone(self)
+        self.send(CancelJob(job_id))
 
 
 @dataclass(slots=True, eq=False)

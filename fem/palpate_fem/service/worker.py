@@ -7,18 +7,16 @@ trajectory and not the service.
 
 from __future__ import annotations
 
-import faulthandler
 import math
 import os
 import queue
-import signal
 import sys
 import threading
 import time
-from multiprocessing.connection import Connection
 
 from palpate.errors import PalpateError
 from palpate_fem.result import IndentationOutcome
+from palpate_fem.service.channel import Channel, channel_to_parent
 from palpate_fem.service.fingertips import FingertipCache, check_start, load_factory
 from palpate_fem.service.jobs import (
     CancelJob,
@@ -40,16 +38,16 @@ class _Stopped(Exception):
 
 
 class Worker:
-    """Solves jobs and reports to the other end of the connection."""
+    """Solves jobs and reports to the other end of the channel."""
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
         self._jobs: queue.SimpleQueue[SimulationJob] = queue.SimpleQueue()
         self._cancelled: set[str] = set()
 
     def run(self) -> None:
         """Serve until the other end is closed."""
-        setup: WorkerSetup = self._connection.recv()
+        setup: WorkerSetup = self._channel.receive()
         threading.Thread(target=self._listen, daemon=True).start()
         try:
             tips = FingertipCache(load_factory(setup.factory)(**setup.options), setup.keep)
@@ -66,7 +64,7 @@ class Worker:
     def _listen(self) -> None:
         while True:
             try:
-                message = self._connection.recv()
+                message = self._channel.receive()
             except (EOFError, OSError):
                 os._exit(0)  # the pool is gone, and the solver's thread has no other end
             if isinstance(message, SimulationJob):
@@ -116,18 +114,14 @@ class Worker:
 
     def _report(self, event: JobEvent) -> None:
         try:
-            self._connection.send(event)
+            self._channel.send(event)
         except OSError:
             os._exit(0)
 
 
 def main() -> None:
     """Run as a worker until the socket closes."""
-    # Libraries print remarks to stdout, but a command's stdout may be JSON for machines.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    faulthandler.enable()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us handles Ctrl-C
-    Worker(Connection(int(sys.argv[1]))).run()
+    Worker(channel_to_parent()).run()
 
 
 if __name__ == "__main__":

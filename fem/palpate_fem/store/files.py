@@ -86,7 +86,7 @@ class FileClaim(Closing):
                 raise
             os.close(file)
 
-    def commit(self, image: bytes) -> None:
+    def commit(self, image: bytes | memoryview) -> None:
         """Make ``image`` the content of the file, on the disk, and end the claim.
 
         Raises:

@@ -6,6 +6,7 @@ folders are the business of ``store.writer`` and ``palpate.files.simulation_stor
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -38,6 +39,8 @@ MESH_UNITS = {
 }
 FINGERTIP_UNITS = {**MESH_UNITS, "pressurised_nodes": "m", "core_vertices": "m", "core_faces": "1"}
 
+_IMAGES = itertools.count()
+
 
 def file_image(fill: Callable[[Any], None], *, command: str) -> bytes:
     """Bytes of an HDF5 file with our header.
@@ -48,7 +51,8 @@ def file_image(fill: Callable[[Any], None], *, command: str) -> bytes:
         fill: Writes into the open file.
         command: Command line that makes it, for provenance.
     """
-    with h5py.File("image", "w", driver="core", backing_store=False, libver=LIBVER) as file:
+    name = f"image {next(_IMAGES)}"  # HDF5 refuses the name of a file that another thread has open
+    with h5py.File(name, "w", driver="core", backing_store=False, libver=LIBVER) as file:
         write_header(file, command=command)
         fill(file)
         file.flush()

@@ -75,6 +75,8 @@ def generate(
     workers: int,
     threads: int = 1,
     ray: str | None = None,
+    devices: tuple[str, ...] = (),
+    slots: int | None = None,
     stop: threading.Event | None = None,
     on_stage: OnStage = lambda *_: None,
     command: str = "palpate data generate",
@@ -92,6 +94,8 @@ def generate(
         workers: Processes.
         threads: Threads of each solver.
         ray: Address of a Ray cluster that works instead of this host's processes.
+        devices: Devices of this host that solve the trajectories, not ``workers``.
+        slots: Trajectories at once on each device; None = as many as the simulator thinks best.
         stop: Set it to end early.
         on_stage: Called with the progress of each stage.
         command: For provenance.
@@ -100,9 +104,13 @@ def generate(
         What came out; None = stopped.
 
     Raises:
-        ConfigError: The folder holds another experiment.
+        ConfigError: The folder holds another experiment, or both a cluster and devices are given.
         DatasetError: What is there is damaged, or the disk refuses.
     """
+    if ray is not None and devices:
+        raise ConfigError(
+            "a Ray cluster does not use the devices of this host", remedy="leave one of them out"
+        )
     stop = stop or threading.Event()
     keep_spec(folder, spec, specimens)
     seconds: dict[str, float] = {}
@@ -122,6 +130,8 @@ def generate(
                 threads=threads,
                 stop=stop,
                 on_progress=partial(on_stage, "mechanics"),
+                devices=devices,
+                slots=slots,
             )
         seconds["mechanics"] = time.monotonic() - began
         if not complete:

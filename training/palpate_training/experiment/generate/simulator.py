@@ -271,8 +271,21 @@ class TwinSimulator(Protocol):
         threads: int,
         stop: threading.Event,
         on_progress: OnProgress,
+        devices: tuple[str, ...] = (),
+        slots: int | None = None,
     ) -> bool:
         """Fill a store on this host; what it holds is not run again.
+
+        Args:
+            spec: The experiment.
+            store: The store; made if it is not there.
+            workers: Processes.
+            threads: Threads of each.
+            stop: Set it to end early.
+            on_progress: Called with the progress.
+            devices: Devices that solve ``slots`` trajectories at once each, instead of ``workers``
+                that solve one.
+            slots: None = as many as the simulator thinks best.
 
         Returns:
             Whether all is there; False = stopped.
