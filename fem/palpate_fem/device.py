@@ -70,7 +70,9 @@ def mat33s(array: NDArray[np.float64]) -> wp.array:
     return wp.array(array, dtype=wp.mat33d, device=DEVICE, copy=False)
 
 
-def launch(kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+def launch(
+    kernel: wp.Kernel, count: int | tuple[int, ...], inputs: list[Any], outputs: list[wp.array]
+) -> None:
     """Run a kernel with ``count`` threads; none = nothing happens."""
     wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=DEVICE)
 

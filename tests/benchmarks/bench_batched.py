@@ -15,6 +15,8 @@ import multiprocessing
 import sys
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +119,30 @@ def kernel_times(results: list[Any]) -> dict[str, float]:
     return dict(sorted(spent.items(), key=lambda pair: -pair[1]))
 
 
+@dataclass
+class Progress:
+    """How many slots were busy in each sweep, and when there was no press left to begin.
+
+    The end of a batch, when slots are empty as no press is left, is short in a long sweep and long
+    in a benchmark. So the time with all slots taken is told on its own.
+    """
+
+    at_work: list[int] = field(default_factory=list)
+    full_sweeps: int = 0
+    started: float = field(default_factory=time.perf_counter)
+    full_s: float = 0.0
+
+    def feed(self, presses: Sequence[BatchedPress]) -> Iterator[BatchedPress]:
+        """The presses; notes when the last one is taken."""
+        yield from presses
+        self.full_s, self.full_sweeps = time.perf_counter() - self.started, len(self.at_work)
+
+    def full_ms(self, presses: int) -> float:
+        """Time of a trajectory while all slots were taken [ms]: by its share of the sweeps."""
+        each = sum(self.at_work) / presses
+        return 1e3 * self.full_s * each / max(1, sum(self.at_work[: self.full_sweeps]))
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -148,12 +174,12 @@ def main() -> None:
         batched = BatchedFingertip(tip, indenters, slots=slots, device=options.device)
         for warm in (True, False):  # the first run compiles the kernels
             chosen = presses[: 1 if warm else max(int(options.rounds * slots), options.check)]
-            sweeps: list[int] = []
             if options.parts:
                 wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
-            started = time.perf_counter()
-            results = dict(batched.indent(chosen, on_sweep=sweeps.append))
-            seconds = time.perf_counter() - started
+            progress = Progress()
+            fed = progress.feed(chosen)
+            results = dict(batched.indent(fed, on_sweep=progress.at_work.append))
+            seconds = time.perf_counter() - progress.started
             spent = kernel_times(wp.timing_end()) if options.parts else {}
         found = {k: summary(result) for k, result in results.items()}
         for some in running if not cpu else ():
@@ -163,8 +189,10 @@ def main() -> None:
             "presses": len(chosen),
             "seconds": seconds,
             "ms_a_trajectory": 1e3 * seconds / len(chosen),
-            "sweeps": len(sweeps),
-            "busy": float(np.mean(sweeps)) / slots,
+            "ms_while_full": progress.full_ms(len(chosen)),
+            "sweeps": len(progress.at_work),
+            "full_sweeps": progress.full_sweeps,
+            "busy": float(np.mean(progress.at_work)) / slots,
             "outcomes": Counter(one["outcome"] for one in found.values()),
             "iterations": float(np.mean([one["iterations"] for one in found.values()])),
             "kernels_s": spent,

@@ -1,15 +1,15 @@
 # mypy: ignore-errors
-"""Products of dense tiles with tiles and with vectors, in CUDA and in plain C++ (ADR 0026).
+"""Dense fronts in tiles of 32 x 32: factorise, substitute, multiply; CUDA and C++ (ADR 0026).
 
-A warp of threads, or 32 threads one after the other on the CPU, works on a tile of 32 x 32 numbers
-in double precision. On a GPU from compute capability 8.0 it uses the tensor cores, and loads what
-they take from memory straight into registers: `warp.tile_matmul` goes through shared memory, whose
-banks conflict for rows of 256 bytes, and is 1.6 times slower than even its own padded variant.
+Double precision. On a GPU from compute capability 8.0 on a warp of threads works on a tile with the
+tensor cores and loads what they take from memory straight into registers: `warp.tile_matmul` goes
+through shared memory, whose banks conflict for rows of 256 bytes. On a CPU, and on older GPUs, a
+front is worked on by one thread.
 
-The tensor cores' product is C (8 x 8) += A (8 x 4) B (4 x 8). Of it thread t holds
-A[t / 4][t % 4], B[t % 4][t / 4], and C[t / 4][2 (t % 4)] with its right neighbour. Which four of
-the summed index's numbers meet in one product does not matter, so a thread loads two neighbours of
-them at once, for two products. Column 0 and 1 of B hold the two vectors where a tile meets vectors.
+What the tensor cores add is C (16 x 8) += A (16 x 8) B (8 x 8). Thread t of the warp holds, with
+g = t / 4 and s = t % 4: A in rows g and g + 8, B in column g, C in rows g and g + 8 and columns 2 s
+and 2 s + 1. Which eight of the summed numbers meet in one product does not matter, so a thread
+takes two neighbours of a row, which it loads at once. A GPU before 9.0 does it in four parts.
 """
 
 from __future__ import annotations
@@ -23,155 +23,268 @@ LANES = 2
 """Vectors that are multiplied together."""
 
 THREADS = 256
-"""Threads of a block; those that work on a front share it."""
+"""Threads of a block, which share a front."""
 
-_HELPERS = """
+_TENSOR_CORES = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
 #define PALPATE_TENSOR_CORES
-    auto add_product = [](double (&c)[2], double a, double b) {
-        asm("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1}, {%2}, {%3}, {%0,%1};"
-            : "+d"(c[0]), "+d"(c[1]) : "d"(a), "d"(b));
+    // Rows g (upper) and g + 8 (lower) of C += A B.
+    auto add_product = [](double (&upper)[2], double (&lower)[2], double2 a, double2 b, double2 k) {
+#if __CUDA_ARCH__ >= 900
+        asm("mma.sync.aligned.m16n8k8.row.col.f64.f64.f64.f64 "
+            "{%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+            : "+d"(upper[0]), "+d"(upper[1]), "+d"(lower[0]), "+d"(lower[1])
+            : "d"(a.x), "d"(b.x), "d"(a.y), "d"(b.y), "d"(k.x), "d"(k.y));
+#else
+        auto part = [](double (&c)[2], double x, double y) {
+            asm("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1}, {%2}, {%3}, {%0,%1};"
+                : "+d"(c[0]), "+d"(c[1]) : "d"(x), "d"(y));
+        };
+        part(upper, a.x, k.x);
+        part(upper, a.y, k.y);
+        part(lower, b.x, k.x);
+        part(lower, b.y, k.y);
+#endif
     };
+    auto pair_at = [](const double* p) { return *reinterpret_cast<const double2*>(p); };
 #endif
 """
 
-_SUBTRACT_PRODUCT = (
-    _HELPERS
+_PRODUCTS = (
+    _TENSOR_CORES
     + """
-    double* target = out.data + size_t(tile) * 1024;
-    const double* a = panels.data + size_t(left) * 1024;
-    const double* b = panels.data + size_t(right) * 1024;
 #ifdef PALPATE_TENSOR_CORES
     const int row = lane / 4, column = 2 * (lane % 4);
-    double sum[4][4][2] = {};
-    for (int i = 0; i < count; ++i, a += 1024, b += 1024) {
+    auto add_tiles = [=](double (&sum)[4][4][2], const double* a, const double* b) {
         #pragma unroll
         for (int k = 0; k < 32; k += 8) {
             double2 x[4], y[4];
             #pragma unroll
             for (int m = 0; m < 4; ++m) {
-                x[m] = *reinterpret_cast<const double2*>(a + (8 * m + row) * 32 + k + column);
-                y[m] = *reinterpret_cast<const double2*>(b + (8 * m + row) * 32 + k + column);
+                x[m] = pair_at(a + (8 * m + row) * 32 + k + column);
+                y[m] = pair_at(b + (8 * m + row) * 32 + k + column);
             }
             #pragma unroll
-            for (int m = 0; m < 4; ++m)
+            for (int m = 0; m < 4; m += 2)
                 #pragma unroll
-                for (int n = 0; n < 4; ++n) {
-                    add_product(sum[m][n], x[m].x, y[n].x);
-                    add_product(sum[m][n], x[m].y, y[n].y);
-                }
+                for (int n = 0; n < 4; ++n)
+                    add_product(sum[m][n], sum[m + 1][n], x[m], x[m + 1], y[n]);
         }
-    }
-    #pragma unroll
-    for (int m = 0; m < 4; ++m)
-        #pragma unroll
-        for (int n = 0; n < 4; ++n) {
-            double2* at = reinterpret_cast<double2*>(target + (8 * m + row) * 32 + 8 * n + column);
-            double2 value = *at;
-            value.x -= sum[m][n][0];
-            value.y -= sum[m][n][1];
-            *at = value;
-        }
-#else
-    for (int j = 0; j < 32; ++j) {
-        double sum = 0.0;
+    };
+    // target = target - sum over i of a_i times transposed b_i
+    auto subtract = [=](double* target, const double* a, const double* b, int count) {
+        double sum[4][4][2] = {};
         for (int i = 0; i < count; ++i)
-            for (int k = 0; k < 32; ++k)
-                sum += a[i * 1024 + lane * 32 + k] * b[i * 1024 + j * 32 + k];
-        target[lane * 32 + j] -= sum;
-    }
-#endif
-"""
-)
-
-_MULTIPLY_TRANSPOSED = (
-    _HELPERS
-    + """
-    double* a = panels.data + size_t(tile) * 1024;
-    const double* b = panels.data + size_t(factor) * 1024;
-#ifdef PALPATE_TENSOR_CORES
-    const int row = lane / 4, column = 2 * (lane % 4);
-    double sum[4][4][2] = {};
-    #pragma unroll
-    for (int k = 0; k < 32; k += 8) {
-        double2 x[4], y[4];
-        #pragma unroll
-        for (int m = 0; m < 4; ++m) {
-            x[m] = *reinterpret_cast<const double2*>(a + (8 * m + row) * 32 + k + column);
-            y[m] = *reinterpret_cast<const double2*>(b + (8 * m + row) * 32 + k + column);
-        }
+            add_tiles(sum, a + 1024 * i, b + 1024 * i);
         #pragma unroll
         for (int m = 0; m < 4; ++m)
             #pragma unroll
             for (int n = 0; n < 4; ++n) {
-                add_product(sum[m][n], x[m].x, y[n].x);
-                add_product(sum[m][n], x[m].y, y[n].y);
+                double* at = target + (8 * m + row) * 32 + 8 * n + column;
+                const double2 value = pair_at(at);
+                *reinterpret_cast<double2*>(at)
+                    = make_double2(value.x - sum[m][n][0], value.y - sum[m][n][1]);
             }
-    }
-    __syncwarp();  // all have read what is overwritten now
-    #pragma unroll
-    for (int m = 0; m < 4; ++m)
+    };
+    // target = target times transposed b
+    auto multiply = [=](double* target, const double* b) {
+        double sum[4][4][2] = {};
+        add_tiles(sum, target, b);
+        __syncwarp();  // all have read what is overwritten now
         #pragma unroll
-        for (int n = 0; n < 4; ++n)
-            *reinterpret_cast<double2*>(a + (8 * m + row) * 32 + 8 * n + column)
-                = make_double2(sum[m][n][0], sum[m][n][1]);
+        for (int m = 0; m < 4; ++m)
+            #pragma unroll
+            for (int n = 0; n < 4; ++n)
+                *reinterpret_cast<double2*>(target + (8 * m + row) * 32 + 8 * n + column)
+                    = make_double2(sum[m][n][0], sum[m][n][1]);
+    };
 #else
-    double answer[32];
-    for (int j = 0; j < 32; ++j) {
-        answer[j] = 0.0;
-        for (int k = 0; k < 32; ++k)
-            answer[j] += a[lane * 32 + k] * b[j * 32 + k];
-    }
-    for (int j = 0; j < 32; ++j)
-        a[lane * 32 + j] = answer[j];
+    auto subtract = [](double* target, const double* a, const double* b, int count) {
+        for (int i = 0; i < 32; ++i)
+            for (int j = 0; j < 32; ++j) {
+                double sum = 0.0;
+                for (int n = 0; n < count; ++n)
+                    for (int k = 0; k < 32; ++k)
+                        sum += a[1024 * n + 32 * i + k] * b[1024 * n + 32 * j + k];
+                target[32 * i + j] -= sum;
+            }
+    };
 #endif
 """
 )
 
-_VECTORS = (
-    _HELPERS
+_SUBTRACT_PRODUCT = (
+    _PRODUCTS
     + """
-    const double* tiles = panels.data + size_t(panel) * 1024;
-    double* x = work.data + size_t(begin) * 2;
+    double* target = out.data + size_t(tile) * 1024;
+    const double* a = panels.data + size_t(left) * 1024;
+    const double* b = panels.data + size_t(right) * 1024;
+#ifndef PALPATE_TENSOR_CORES
+    if (lane != 0)
+        return;
+#endif
+    subtract(target, a, b, count);
+"""
+)
+
+_FRONT = """
+    double* tiles = panels.data + size_t(panel) * 1024;
     // First tile of a row of tiles; below the triangle all rows are equally long.
     auto tiles_of = [=](int r) {
         const int above = r < own ? r * (r + 1) / 2 : own * (own + 1) / 2 + (r - own) * own;
         return tiles + size_t(above) * 1024;
     };
+"""
+
+_FACTORISE = (
+    """
+    const int lane = thread % 32;
+"""
+    + _PRODUCTS
+    + _FRONT
+    + """
+#ifdef PALPATE_TENSOR_CORES
+    __shared__ double exchange[2][2][32];
+    const int warp = thread / 32, warps = threads / 32;  // eight
+    bool all_good = true;
+    for (int c = 0; c < own; ++c) {
+        double* diagonal = tiles_of(c) + 1024 * c;
+        if (c > 0)
+            for (int r = c + warp; r < rows; r += warps)
+                subtract(tiles_of(r) + 1024 * c, tiles_of(r), tiles_of(c), c);
+        __syncthreads();
+        // Every thread has four numbers of a row. Up to column k they are the inverse factor's,
+        // which needs no room before; beyond, what elimination has left of the matrix.
+        double mine[4];
+        #pragma unroll
+        for (int t = 0; t < 4; ++t)
+            mine[t] = diagonal[32 * lane + warp + 8 * t];
+        bool good = true;
+        for (int k = 0; k < 32; ++k) {
+            double* of_column = exchange[k % 2][0];
+            double* of_row = exchange[k % 2][1];
+            #pragma unroll
+            for (int t = 0; t < 4; ++t) {
+                if (warp + 8 * t == k)
+                    of_column[lane] = mine[t];
+                if (lane == k)
+                    of_row[warp + 8 * t] = mine[t];
+            }
+            __syncthreads();
+            const double pivot = of_column[k];
+            good = good && pivot > 0.0 && pivot < 1e300;
+            const double scale = rsqrt(pivot), factor = of_column[lane] * scale;
+            #pragma unroll
+            for (int t = 0; t < 4; ++t) {
+                const int j = warp + 8 * t;
+                const double other = (j > k ? of_column[j] : j < k ? of_row[j] : 1.0) * scale;
+                const double before = j == k ? 0.0 : mine[t];
+                if (lane > k)
+                    mine[t] = before - factor * other;
+                else if (j <= k)
+                    mine[t] = lane == k ? other : before;
+            }
+        }
+        #pragma unroll
+        for (int t = 0; t < 4; ++t) {
+            const int j = warp + 8 * t;
+            diagonal[32 * lane + j] = good ? mine[t] : (j == lane ? 1.0 : 0.0);
+        }
+        all_good = all_good && good;
+        __syncthreads();
+        for (int r = c + 1 + warp; r < rows; r += warps)
+            multiply(tiles_of(r) + 1024 * c, diagonal);
+        __syncthreads();
+    }
+    if (thread == 0 && !all_good)
+        bad.data[slot] = 1;
+#else
+    if (thread != 0)
+        return;
+    for (int c = 0; c < own; ++c) {
+        double* diagonal = tiles_of(c) + 1024 * c;
+        double factor[1024] = {}, inverse[1024] = {};
+        bool good = true;
+        for (int r = c; r < rows && c > 0; ++r)
+            subtract(tiles_of(r) + 1024 * c, tiles_of(r), tiles_of(c), c);
+        for (int j = 0; j < 32; ++j)
+            for (int i = j; i < 32; ++i) {
+                double sum = diagonal[32 * i + j];
+                for (int k = 0; k < j; ++k)
+                    sum -= factor[32 * i + k] * factor[32 * j + k];
+                if (i == j)
+                    good = good && sum > 0.0 && sum < 1e300;
+                factor[32 * i + j] = i == j ? sqrt(sum) : sum / factor[32 * j + j];
+            }
+        for (int j = 0; j < 32; ++j)
+            for (int i = j; i < 32; ++i) {
+                double sum = i == j ? 1.0 : 0.0;
+                for (int k = j; k < i; ++k)
+                    sum -= factor[32 * i + k] * inverse[32 * k + j];
+                inverse[32 * i + j] = sum / factor[32 * i + i];
+            }
+        for (int i = 0; i < 1024; ++i)
+            diagonal[i] = good ? inverse[i] : (i % 33 == 0 ? 1.0 : 0.0);
+        if (!good)
+            bad.data[slot] = 1;
+        for (int r = c + 1; r < rows; ++r) {
+            double* tile = tiles_of(r) + 1024 * c;
+            for (int i = 0; i < 32; ++i) {
+                double answer[32] = {};
+                for (int j = 0; j < 32; ++j)
+                    for (int k = 0; k <= j; ++k)
+                        answer[j] += tile[32 * i + k] * diagonal[32 * j + k];
+                for (int j = 0; j < 32; ++j)
+                    tile[32 * i + j] = answer[j];
+            }
+        }
+    }
+#endif
+"""
+)
+
+_VECTORS = (
+    _TENSOR_CORES
+    + _FRONT
+    + """
+    double* x = work.data + size_t(begin) * 2;
 #ifdef PALPATE_TENSOR_CORES
     const int lane = thread % 32, warp = thread / 32, warps = threads / 32;
     const int row = lane / 4, column = 2 * (lane % 4);
-    // Add a tile times 32 rows of two numbers: row 8 m + t / 4 at the threads with t % 4 = 0.
+    // The threads of columns 0 and 1 of B hold 32 rows of two numbers, the others zeros.
+    auto number = [=](const double* known, int k) { return row < 2 ? known[2 * k + row] : 0.0; };
+    // Add a tile times them: row 8 m + g at the threads with s = 0.
     auto add_tile = [=](double (&sum)[4][2], const double* tile, const double* known) {
         #pragma unroll
         for (int k = 0; k < 32; k += 8) {
-            const double* from = known + 2 * (k + column) + row;
-            const double first = row < 2 ? from[0] : 0.0;
-            const double second = row < 2 ? from[2] : 0.0;
-            #pragma unroll
-            for (int m = 0; m < 4; ++m) {
-                const double2 t
-                    = *reinterpret_cast<const double2*>(tile + (8 * m + row) * 32 + k + column);
-                add_product(sum[m], t.x, first);
-                add_product(sum[m], t.y, second);
-            }
-        }
-    };
-    // Add a transposed tile times them: row 16 (m / 2) + 2 (t / 4) + m % 2.
-    auto add_transposed = [=](double (&sum)[4][2], const double* tile, const double* known) {
-        #pragma unroll
-        for (int i = 0; i < 8; ++i) {
-            const int k = 4 * i + lane % 4;
-            const double value = row < 2 ? known[2 * k + row] : 0.0;
+            const double2 factor
+                = make_double2(number(known, k + column), number(known, k + column + 1));
             #pragma unroll
             for (int m = 0; m < 4; m += 2) {
-                const double2 t
-                    = *reinterpret_cast<const double2*>(tile + k * 32 + 8 * m + 2 * row);
-                add_product(sum[m], t.x, value);
-                add_product(sum[m + 1], t.y, value);
+                const double* at = tile + (8 * m + row) * 32 + k + column;
+                add_product(sum[m], sum[m + 1], pair_at(at), pair_at(at + 256), factor);
             }
         }
     };
+    // Add a transposed tile times them: row 16 (m / 2) + 2 g + m % 2.
+    auto add_transposed = [=](double (&sum)[4][2], const double* tile, const double* known) {
+        #pragma unroll
+        for (int i = 0; i < 32; i += 8) {
+            const int k = i + lane % 4;
+            const double2 factor = make_double2(number(known, k), number(known, k + 4));
+            #pragma unroll
+            for (int m = 0; m < 4; m += 2) {
+                const double2 one = pair_at(tile + k * 32 + 8 * m + 2 * row);
+                const double2 other = pair_at(tile + (k + 4) * 32 + 8 * m + 2 * row);
+                add_product(
+                    sum[m], sum[m + 1], make_double2(one.x, other.x), make_double2(one.y, other.y),
+                    factor);
+            }
+        }
+    };
+#else
+    if (thread != 0)
+        return;
 #endif
 """
 )
@@ -184,50 +297,40 @@ _SUBSTITUTE_FORWARD = (
         double* known = x + 64 * c;
         if (warp == 0) {
             double sum[4][2] = {};
-            const double* tile = tiles_of(c) + 1024 * c;
-            add_tile(sum, tile, known);
+            add_tile(sum, tiles_of(c) + 1024 * c, known);
             __syncwarp();  // all have read what is overwritten now
             if (column == 0)
-                for (int m = 0; m < 4; ++m) {
-                    known[2 * (8 * m + row)] = sum[m][0];
-                    known[2 * (8 * m + row) + 1] = sum[m][1];
-                }
+                for (int m = 0; m < 4; ++m)
+                    for (int n = 0; n < 2; ++n)
+                        known[2 * (8 * m + row) + n] = sum[m][n];
         }
         __syncthreads();
         for (int r = c + 1 + warp; r < rows; r += warps) {
             double sum[4][2] = {};
-            const double* tile = tiles_of(r) + 1024 * c;
-            add_tile(sum, tile, known);
+            add_tile(sum, tiles_of(r) + 1024 * c, known);
             if (column == 0)
-                for (int m = 0; m < 4; ++m) {
-                    x[64 * r + 2 * (8 * m + row)] -= sum[m][0];
-                    x[64 * r + 2 * (8 * m + row) + 1] -= sum[m][1];
-                }
+                for (int m = 0; m < 4; ++m)
+                    for (int n = 0; n < 2; ++n)
+                        x[64 * r + 2 * (8 * m + row) + n] -= sum[m][n];
         }
         __syncthreads();
     }
 #else
-    if (thread != 0)
-        return;
     for (int c = 0; c < own; ++c) {
         double known[64];
         for (int r = c; r < rows; ++r) {
             const double* tile = tiles_of(r) + 1024 * c;
-            for (int i = 0; i < 32; ++i) {
-                double first = 0.0, second = 0.0;
-                const double* from = r == c ? x + 64 * c : known;
-                for (int k = 0; k < 32; ++k) {
-                    first += tile[32 * i + k] * from[2 * k];
-                    second += tile[32 * i + k] * from[2 * k + 1];
-                }
-                if (r == c) {
-                    known[2 * i] = first;
-                    known[2 * i + 1] = second;
-                } else {
-                    x[64 * r + 2 * i] -= first;
-                    x[64 * r + 2 * i + 1] -= second;
-                }
-            }
+            const double* from = r == c ? x + 64 * c : known;
+            double sum[64] = {};
+            for (int i = 0; i < 32; ++i)
+                for (int k = 0; k < 32; ++k)
+                    for (int n = 0; n < 2; ++n)
+                        sum[2 * i + n] += tile[32 * i + k] * from[2 * k + n];
+            for (int i = 0; i < 64; ++i)
+                if (r == c)
+                    known[i] = sum[i];
+                else
+                    x[64 * r + i] -= sum[i];
         }
         for (int i = 0; i < 64; ++i)
             x[64 * c + i] = known[i];
@@ -241,19 +344,15 @@ _SUBSTITUTE_BACKWARD = (
     + """
 #ifdef PALPATE_TENSOR_CORES
     __shared__ double part[8][64];
+    auto place = [=](int m) { return 2 * (8 * (m - m % 2) + 2 * row + m % 2); };
     for (int c = own - 1; c >= 0; --c) {
         double sum[4][2] = {};
-        for (int r = c + 1 + warp; r < rows; r += warps) {
-            const double* tile = tiles_of(r) + 1024 * c;
-            const double* known = x + 64 * r;
-            add_transposed(sum, tile, known);
-        }
+        for (int r = c + 1 + warp; r < rows; r += warps)
+            add_transposed(sum, tiles_of(r) + 1024 * c, x + 64 * r);
         if (column == 0)
-            for (int m = 0; m < 4; ++m) {
-                const int at = 2 * (8 * (m - m % 2) + 2 * row + m % 2);
-                part[warp][at] = sum[m][0];
-                part[warp][at + 1] = sum[m][1];
-            }
+            for (int m = 0; m < 4; ++m)
+                for (int n = 0; n < 2; ++n)
+                    part[warp][place(m) + n] = sum[m][n];
         __syncthreads();
         if (warp == 0) {
             double* answer = x + 64 * c;
@@ -261,46 +360,35 @@ _SUBSTITUTE_BACKWARD = (
                 double value = answer[i];
                 for (int w = 0; w < warps; ++w)
                     value -= part[w][i];
-                part[0][i] = value;  // its only reader so far
+                part[0][i] = value;  // nobody else has read this one
             }
             __syncwarp();
             double known[4][2] = {};
-            const double* tile = tiles_of(c) + 1024 * c;
-            add_transposed(known, tile, part[0]);
+            add_transposed(known, tiles_of(c) + 1024 * c, part[0]);
             if (column == 0)
-                for (int m = 0; m < 4; ++m) {
-                    const int at = 2 * (8 * (m - m % 2) + 2 * row + m % 2);
-                    answer[at] = known[m][0];
-                    answer[at + 1] = known[m][1];
-                }
+                for (int m = 0; m < 4; ++m)
+                    for (int n = 0; n < 2; ++n)
+                        answer[place(m) + n] = known[m][n];
         }
         __syncthreads();
     }
 #else
-    if (thread != 0)
-        return;
     for (int c = own - 1; c >= 0; --c) {
-        double known[64];
+        double known[64], sum[64] = {};
         for (int i = 0; i < 64; ++i)
             known[i] = x[64 * c + i];
-        for (int r = c + 1; r < rows; ++r) {
+        for (int r = rows - 1; r >= c; --r) {
             const double* tile = tiles_of(r) + 1024 * c;
             for (int k = 0; k < 32; ++k)
-                for (int i = 0; i < 32; ++i) {
-                    known[2 * i] -= tile[32 * k + i] * x[64 * r + 2 * k];
-                    known[2 * i + 1] -= tile[32 * k + i] * x[64 * r + 2 * k + 1];
-                }
+                for (int i = 0; i < 32; ++i)
+                    for (int n = 0; n < 2; ++n)
+                        if (r > c)
+                            known[2 * i + n] -= tile[32 * k + i] * x[64 * r + 2 * k + n];
+                        else
+                            sum[2 * i + n] += tile[32 * k + i] * known[2 * k + n];
         }
-        const double* tile = tiles_of(c) + 1024 * c;
-        for (int i = 0; i < 32; ++i) {
-            double first = 0.0, second = 0.0;
-            for (int k = 0; k < 32; ++k) {
-                first += tile[32 * k + i] * known[2 * k];
-                second += tile[32 * k + i] * known[2 * k + 1];
-            }
-            x[64 * c + 2 * i] = first;
-            x[64 * c + 2 * i + 1] = second;
-        }
+        for (int i = 0; i < 64; ++i)
+            x[64 * c + i] = sum[i];
     }
 #endif
 """
@@ -317,13 +405,30 @@ def subtract_product(
     tile: int,
     lane: int,
 ):
-    """Subtract a row of ``count`` tiles times another row, transposed, from a tile of ``out``."""
+    """Subtract a row of ``count`` tiles times another row, transposed, from a tile of ``out``.
+
+    All threads of a warp call it.
+    """
     ...
 
 
-@wp.func_native(_MULTIPLY_TRANSPOSED)
-def multiply_transposed(panels: wp.array3d(dtype=wp.float64), tile: int, factor: int, lane: int):
-    """Multiply a tile by another one, transposed, in place."""
+@wp.func_native(_FACTORISE)
+def factorise_panel(
+    panels: wp.array3d(dtype=wp.float64),
+    panel: int,
+    own: int,
+    rows: int,
+    slot: int,
+    bad: wp.array(dtype=wp.int32),
+    thread: int,
+    threads: int,
+):
+    """Factorise the own columns of a front, and divide the rows of its border.
+
+    ``panel`` is the front's first tile, ``rows`` its rows of tiles. A diagonal tile becomes the
+    inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a tile of ones
+    on the diagonal takes its place. All threads of a block call it.
+    """
     ...
 
 
@@ -340,8 +445,7 @@ def substitute_forward(
 ):
     """Solve with the lower triangle of a front's own columns, and subtract from its border.
 
-    ``panel`` is the front's first tile, ``rows`` its rows of tiles, ``begin`` its first row in
-    ``work``. All threads of a block call it.
+    ``begin`` is the front's first row in ``work``, the rest as for `factorise_panel`.
     """
     ...
 

@@ -94,6 +94,8 @@ class BatchedEquations:
         self._volume_gradient = room(wp.vec3d, total, corners)
         self._frozen_gradient = room(wp.vec3d, total, corners)
         self._target = room(wp.float64, total)
+        # Of quadrature points: J, w P and w J F^-T.
+        self._stresses = [room(kind, total, points) for kind in (wp.float64, wp.mat33d, wp.mat33d)]
         self._parts = [room(wp.vec3d, total, points, corners) for _ in range(3)]
         self._parts.append(room(wp.vec2d, total, points))
         self._elastic = room(wp.mat33d, slots * pattern.blocks)
@@ -217,12 +219,20 @@ class BatchedEquations:
         outer, inner = self.outer, self.inner
         for field in (self._internal, self._gradient_of_volume, outer.force, inner.force):
             self._clear(listed, field)
+        corners, points = self._elements.shape[1], self._weight.shape[1]
         self._launch(
-            element_kernels.element_state,
-            len(listed.elements),
+            element_kernels.point_stress,
+            (len(listed.elements), points),
             [*self._model, listed.elements, state.position, state.pressure],
-            [self._volume, self._jacobian, self._volume_gradient, self._internal],
+            self._stresses,
         )
+        self._launch(
+            element_kernels.corner_forces,
+            (len(listed.elements), corners),
+            [self._elements, self._gradient, self._weight, self._nodes, listed.elements,
+             *self._stresses],
+            [self._volume, self._jacobian, self._volume_gradient, self._internal],
+        )  # fmt: skip
         self._launch(
             element_kernels.cavity_volume,
             len(listed.inner),
@@ -367,7 +377,7 @@ class BatchedEquations:
             )
             self._launch(
                 element_kernels.point_state,
-                len(elastic.elements),
+                (len(elastic.elements), self._weight.shape[1]),
                 [*self._model, elastic.elements, state.position, state.pressure],
                 self._parts,
             )

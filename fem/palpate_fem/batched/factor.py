@@ -10,7 +10,6 @@ it is. Where only contact has changed, that is most of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,30 +22,6 @@ from palpate_fem.batched import solve_kernels
 from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE
 from palpate_fem.batched.factor_kernels import GATHERED
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
-
-FACTOR_THREADS = 128
-"""Threads of a block while matrices are factorised: those that gather a tile."""
-
-
-class _List:
-    """Pieces of work while they are listed, each a row of numbers, in groups."""
-
-    def __init__(self) -> None:
-        self._groups: list[int] = []
-        self._rows: list[tuple[int, ...]] = []
-
-    def add(self, group: int, *numbers: int) -> None:
-        """Append one."""
-        self._groups.append(group)
-        self._rows.append(numbers)
-
-    def done(self, groups: int, width: int, put: Callable[[NDArray[Any]], wp.array]) -> _Works:
-        """All of them, group after group."""
-        group = np.array(self._groups, np.int64)
-        order = np.argsort(group, kind="stable")
-        begins = np.searchsorted(group[order], np.arange(groups + 1)).tolist()
-        rows = np.array(self._rows, np.int64).reshape(-1, width)
-        return _Works(put(rows[order]), begins)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +156,6 @@ class BatchedFactor:
             (slots * tiles.share_tiles, *square), dtype=wp.float64, device=device
         )
         self._work = wp.zeros((slots * tiles.rows, LANES), dtype=wp.float64, device=device)
-        self._identity = wp.array(np.eye(TILE), dtype=wp.float64, device=device)
         self._fronts = self._ints(tiles.fronts)
         self._children = self._ints(tiles.children)
         self._rows_in_child = self._ints(tiles.rows_in_child)
@@ -227,27 +201,21 @@ class BatchedFactor:
                  tiles.panel_tiles, self.values],
                 [self._panels],
             )  # fmt: skip
-            for column in range(int(self._columns[level])):
-                group = level * self._most + column
-                if column:
-                    self._subtract(slots, self._column, group, column)
-                works, first, number = self._diagonal.of(group)
-                wp.launch_tiled(
-                    kernels.factorise_diagonal,
-                    dim=[count, number],
-                    inputs=[slots, self.marked, works, first, tiles.panel_tiles, self._identity],
-                    outputs=[self._panels, self.bad],
-                    block_dim=FACTOR_THREADS,
-                    device=self._device,
-                )
-                works, first, number = self._below.of(group)
-                self._launch(
-                    kernels.divide_by_diagonal,
-                    (count, number, TILE),
-                    [slots, self.marked, works, first, tiles.panel_tiles],
-                    [self._panels],
-                )
-            self._subtract(slots, self._products, level, 0)
+            first, last = self._front_begins[level : level + 2]
+            self._launch(
+                kernels.factorise_panels,
+                (count, last - first, THREADS),
+                [slots, self.marked, self._by_level, self._fronts, first, tiles.panel_tiles,
+                 THREADS],
+                [self._panels, self.bad],
+            )  # fmt: skip
+            works, first, number = self._products.of(level)
+            self._launch(
+                kernels.subtract_products,
+                (count, number, TILE),
+                [slots, self.marked, works, first, *sizes],
+                both,
+            )
 
     def _mark(self, slots: wp.array) -> None:
         """Mark the fronts that have to be worked on."""
@@ -271,17 +239,6 @@ class BatchedFactor:
                 [self.marked],
             )
 
-    def _subtract(self, slots: wp.array, listed: _Works, group: int, column: int) -> None:
-        """Subtract products from tiles of the panel, of ``column`` tiles each, or of the share."""
-        works, first, number = listed.of(group)
-        self._launch(
-            kernels.subtract_products,
-            (len(slots), number, TILE),
-            [slots, self.marked, works, first, column, self.tiles.panel_tiles,
-             self.tiles.share_tiles],
-            [self._panels, self._shares],
-        )  # fmt: skip
-
     def solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
         """Solve in place for the listed slots, (m,) int32.
 
@@ -300,7 +257,6 @@ class BatchedFactor:
                 [slots, *self._row_arrays, self._fronts, self._children, self._rows_in_child,
                  first, tiles.rows, lanes, vectors],
                 [self._work],
-                THREADS,
             )  # fmt: skip
             first, last = self._front_begins[level : level + 2]
             self._launch(
@@ -308,7 +264,6 @@ class BatchedFactor:
                 (count, last - first, THREADS),
                 [slots, self._by_level, self._fronts, first, *place],
                 [self._panels, self._work],
-                THREADS,
             )
         for level in reversed(range(tiles.levels)):
             first, last = self._border_begins[level : level + 2]
@@ -317,7 +272,6 @@ class BatchedFactor:
                 (count, last - first, LANES),
                 [slots, self._border_place, self._border_source, first, tiles.rows],
                 [self._work],
-                THREADS,
             )
             first, last = self._front_begins[level : level + 2]
             self._launch(
@@ -325,14 +279,12 @@ class BatchedFactor:
                 (count, last - first, THREADS),
                 [slots, self._by_level, self._fronts, first, *place],
                 [self._panels, self._work],
-                THREADS,
             )
         self._launch(
             solve_kernels.scatter_solution,
             (count, lanes, self.size),
             [slots, self._row_of, tiles.rows, self._work],
             [vectors],
-            THREADS,
         )
 
     def _plan_tiles(self) -> None:
@@ -396,31 +348,27 @@ class BatchedFactor:
         self._place = self._ints(np.concatenate(place)[order])
 
     def _plan_factor(self) -> None:
-        """Tiles that are worked on together: of one column of all fronts of a level."""
-        tiles = self.tiles
-        self._most = int(tiles.own_tiles.max())
-        self._columns = np.zeros(tiles.levels, np.int64)
-        np.maximum.at(self._columns, tiles.level, tiles.own_tiles)
-        diagonal, column, below, products = _List(), _List(), _List(), _List()
-        for k in range(len(tiles.fronts)):
-            level, o, b = int(tiles.level[k]), int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
-            first = tiles.row_tile(k, np.arange(o + b)).tolist()
-            for c in range(o):
-                group = level * self._most + c
-                diagonal.add(group, k, first[c] + c)
-                for r in range(c, o + b):
-                    column.add(group, k, first[r] + c, first[r], first[c], 0)
-                for r in range(c + 1, o + b):
-                    below.add(group, k, first[r] + c, first[c] + c)
-            for r in range(b):
-                for c in range(r + 1):
-                    tile = int(tiles.fronts[k, 4]) + r * (r + 1) // 2 + c
-                    products.add(level, k, tile, first[o + r], first[o + c], o)
-        groups = tiles.levels * self._most
-        self._diagonal = diagonal.done(groups, 2, self._ints)
-        self._column = column.done(groups, 5, self._ints)
-        self._below = below.done(groups, 3, self._ints)
-        self._products = products.done(tiles.levels, 5, self._ints)
+        """Tiles of the shares, level after level."""
+        tiles, products = self.tiles, []
+        levels = np.argsort(tiles.level, kind="stable")
+        for k in levels:
+            o, b = int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
+            first = tiles.row_tile(k, np.arange(o + b))
+            row, column = np.tril_indices(b)
+            place = tiles.fronts[k, 4] + row * (row + 1) // 2 + column
+            same = np.full(len(row), 1)
+            rows = (
+                k * same,
+                place,
+                first[o + row],
+                first[o + column],
+                o * same,
+                tiles.level[k] * same,
+            )
+            products.append(np.stack(rows, axis=1))
+        found = np.concatenate(products)
+        begins = np.searchsorted(found[:, 5], np.arange(tiles.levels + 1)).tolist()
+        self._products = _Works(self._ints(found[:, :5]), begins)
 
     def _plan_solve(self) -> None:
         """Rows of the fronts, level after level, and where their solutions come from."""
@@ -465,15 +413,14 @@ class BatchedFactor:
         dim: Any,
         inputs: list[Any],
         outputs: list[wp.array],
-        threads: int = FACTOR_THREADS,
     ) -> None:
-        """Run a kernel; all of a module have blocks of one size, so that it is compiled once."""
+        """Run a kernel; all have blocks of one size, so that each module is compiled once."""
         if np.prod(dim):
             wp.launch(
                 kernel,
                 dim=dim,
                 inputs=inputs,
                 outputs=outputs,
-                block_dim=threads,
+                block_dim=THREADS,
                 device=self._device,
             )

@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import TILE
+from palpate_fem.batched.dense_tiles import THREADS, TILE
 
 GATHERED = 8
 """Entries of a tile that one thread gathers: all at once, so that none waits for another."""
@@ -169,99 +169,50 @@ def add_entries(
         panels[tile, within // TILE, within % TILE] += values_in[slot, entry]
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(THREADS, 2))
+def factorise_panels(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    first: int,
+    panel_tiles: int,
+    threads: int,
+    panels: wp.array3d(dtype=wp.float64),
+    bad: wp.array(dtype=wp.int32),
+):
+    """Factorise the own columns of fronts: a block of threads for each."""
+    i, number, thread = wp.tid()
+    slot = slots[i]
+    front = listed[first + number]
+    if marked[slot, front] != 0:
+        panel = slot * panel_tiles + fronts[front, 7]
+        own = fronts[front, 1]
+        rows = fronts[front, 8]
+        dense_tiles.factorise_panel(panels, panel, own, rows, slot, bad, thread, threads)
+
+
+@wp.kernel(launch_bounds=(THREADS, 2))
 def subtract_products(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
     works: wp.array2d(dtype=wp.int32),
     first: int,
-    count: int,
     panel_tiles: int,
     share_tiles: int,
     panels: wp.array3d(dtype=wp.float64),
     shares: wp.array3d(dtype=wp.float64),
 ):
-    """Subtract the product of the first tiles of two rows of the panel from a tile.
+    """Subtract the product of two rows of the panel from a tile of the share: a warp for each.
 
-    A row of ``works``: the front, the tile, both rows' first tiles, and how many tiles of them.
-    ``count`` is how many if that is 0; the tile is then one of the panel, else of the share.
+    A row of ``works``: the front, the tile, both rows' first tiles, and how many tiles they have.
     """
     i, number, lane = wp.tid()
     slot = slots[i]
     work = first + number
     if marked[slot, works[work, 0]] != 0:
-        base = slot * panel_tiles
-        left = base + works[work, 2]
-        right = base + works[work, 3]
+        tile = slot * share_tiles + works[work, 1]
+        left = slot * panel_tiles + works[work, 2]
+        right = slot * panel_tiles + works[work, 3]
         own = works[work, 4]
-        if own == 0:
-            tile = base + works[work, 1]
-            dense_tiles.subtract_product(panels, left, right, count, panels, tile, lane)
-        else:
-            tile = slot * share_tiles + works[work, 1]
-            dense_tiles.subtract_product(panels, left, right, own, shares, tile, lane)
-
-
-@wp.kernel
-def divide_by_diagonal(
-    slots: wp.array(dtype=wp.int32),
-    marked: wp.array2d(dtype=wp.int32),
-    works: wp.array2d(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
-):
-    """Multiply a tile below the diagonal by the transposed inverse of the diagonal's factor.
-
-    A row of ``works``: the front, the tile, the diagonal tile.
-    """
-    i, number, lane = wp.tid()
-    slot = slots[i]
-    work = first + number
-    if marked[slot, works[work, 0]] != 0:
-        base = slot * panel_tiles
-        tile = base + works[work, 1]
-        dense_tiles.multiply_transposed(panels, tile, base + works[work, 2], lane)
-
-
-@wp.kernel
-def factorise_diagonal(
-    slots: wp.array(dtype=wp.int32),
-    marked: wp.array2d(dtype=wp.int32),
-    works: wp.array2d(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    identity: wp.array2d(dtype=wp.float64),
-    panels: wp.array3d(dtype=wp.float64),
-    bad: wp.array(dtype=wp.int32),
-):
-    """Replace a diagonal tile by the inverse of its Cholesky factor.
-
-    A row of ``works``: the front, the tile.
-    """
-    i, number = wp.tid()
-    slot = slots[i]
-    work = first + number
-    if marked[slot, works[work, 0]] == 0:
-        return
-    tile = slot * panel_tiles + works[work, 1]
-    total = wp.tile_load(panels[tile], shape=(TILE, TILE))
-    one = wp.tile_load(identity, shape=(TILE, TILE))
-    lower = wp.tile_cholesky(total)
-    good = wp.int32(1)
-    sums = wp.tile_sum(wp.tile_map(wp.mul, lower, lower), axis=1)
-    for k in range(TILE):
-        pivot = lower[k, k]
-        if not (pivot > wp.float64(0.0)) or not wp.isfinite(pivot):
-            good = wp.int32(0)
-        # What the row leaves of the diagonal: a Cholesky that has failed on CUDA may leave a
-        # positive number there that is no pivot.
-        rest = total[k, k] - sums[k] + wp.float64(0.5) * pivot * pivot
-        if not (rest > wp.float64(0.0)):
-            good = wp.int32(0)
-    inverse = wp.tile_lower_solve(lower, one)
-    if good == 1:
-        wp.tile_store(panels[tile], inverse)
-    else:
-        wp.tile_store(panels[tile], wp.tile_load(identity, shape=(TILE, TILE)))
-        bad[slot] = 1
+        dense_tiles.subtract_product(panels, left, right, own, shares, tile, lane)

@@ -90,17 +90,16 @@ class BatchedLinearSystem:
         equations.right_hand_side(state, listed, self.change, CHANGE)
         new = listed.numbers[~self._has_border[listed.numbers]]
         if len(new):
+            # With those whose border's solution is known, too: one factor's tiles serve two lanes.
+            equations.volume_gradient(listed, self.change, MORE)
             fresh = listed if len(new) == len(listed.numbers) else equations.listed(new)
-            equations.volume_gradient(fresh, self.change, MORE)
             self._copy(fresh, self.change, MORE, self._border, GRADIENT)
-            self.factor.solve(fresh.slots, self.change, 2)
+            self.factor.solve(slots, self.change, 2)
             self._copy(fresh, self.change, MORE, self._border, ANSWER)
             self._product(fresh, self._border, GRADIENT, self._border, ANSWER, self._stiffness)
             self._has_border[new] = True
-        old = np.setdiff1d(listed.numbers, new)
-        if len(old):
-            kept = listed if not len(new) else equations.listed(old)
-            self.factor.solve(kept.slots, self.change, 1)
+        else:
+            self.factor.solve(slots, self.change, 1)
         # (S + U) x = S answer + coupled, by one correction.
         equations.coupled(state, listed, self._load, 0)
         equations.subtract_unsymmetric_product(state, listed, self.change, CHANGE, self._load, 0)

@@ -51,6 +51,39 @@ def beyond(j: wp.float64):
     return wp.sign(logarithm) * wp.max(wp.abs(logarithm) - FROM, wp.float64(0.0))
 
 
+@wp.func
+def deformation(
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    position_in: wp.array(dtype=wp.vec3d),
+    s: int,
+    q: int,
+    begin: int,
+) -> wp.mat33d:
+    """F = sum_a x_a (x) grad N_a at a quadrature point, by gradients on the undeformed element."""
+    f = wp.mat33d()
+    for a in range(elements.shape[1]):
+        f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
+    return f
+
+
+@wp.func
+def nominal_stress(
+    f: wp.mat33d,
+    j: wp.float64,
+    inverse_t: wp.mat33d,
+    w: wp.float64,
+    mu: wp.float64,
+    barrier: wp.float64,
+    pressure: wp.float64,
+) -> wp.mat33d:
+    """Weighted: w P = scale (F - I1/3 F^-T) + w (p J + mu barrier b sign(ln J)) F^-T."""
+    scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+    i1 = wp.ddot(f, f)
+    along = w * (pressure * j + mu * barrier * beyond(j)) - scale * i1 / wp.float64(3.0)
+    return scale * f + along * inverse_t
+
+
 @wp.kernel
 def element_state(
     elements: wp.array2d(dtype=wp.int32),
@@ -78,20 +111,13 @@ def element_state(
     for a in range(n):
         volume_gradient_out[e, a] = wp.vec3d()
     for q in range(weight.shape[1]):
-        # F = sum_a x_a (x) grad N_a, by the gradients on the undeformed element.
-        f = wp.mat33d()
-        for a in range(n):
-            f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
+        f = deformation(elements, gradient, position_in, s, q, begin)
         j = wp.determinant(f)
         smallest = wp.min(smallest, j)
         w = weight[s, q]
         volume += w * j
         inverse_t = wp.transpose(wp.inverse(f))
-        scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
-        i1 = wp.ddot(f, f)
-        # w P = scale (F - I1/3 F^-T) + w (p J + mu barrier b sign(ln J)) F^-T
-        along = w * (pressure * j + mu * barrier * beyond(j)) - scale * i1 / wp.float64(3.0)
-        stress = scale * f + along * inverse_t
+        stress = nominal_stress(f, j, inverse_t, w, mu, barrier, pressure)
         for a in range(n):
             g = gradient[s, q, a]
             wp.atomic_add(force_out, begin + elements[s, a], stress * g)
@@ -99,6 +125,72 @@ def element_state(
             volume_gradient_out[e, a] = volume_gradient_out[e, a] + (w * j) * (inverse_t * g)
     volume_out[e] = volume
     smallest_jacobian_out[e] = smallest
+
+
+@wp.kernel
+def point_stress(
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    weight: wp.array2d(dtype=wp.float64),
+    mu: wp.float64,
+    barrier: wp.float64,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array(dtype=wp.float64),
+    jacobian_out: wp.array2d(dtype=wp.float64),
+    stress_out: wp.array2d(dtype=wp.mat33d),
+    cofactor_out: wp.array2d(dtype=wp.mat33d),
+):
+    """First half of `element_state` on a GPU, with a thread for each quadrature point.
+
+    Sets J, w P and w J F^-T.
+    """
+    item, q = wp.tid()
+    e = items[item]
+    s = e % elements.shape[0]
+    f = deformation(elements, gradient, position_in, s, q, (e // elements.shape[0]) * nodes)
+    j = wp.determinant(f)
+    w = weight[s, q]
+    inverse_t = wp.transpose(wp.inverse(f))
+    jacobian_out[e, q] = j
+    stress_out[e, q] = nominal_stress(f, j, inverse_t, w, mu, barrier, pressure_in[e])
+    cofactor_out[e, q] = (w * j) * inverse_t
+
+
+@wp.kernel
+def corner_forces(
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    weight: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    jacobian_in: wp.array2d(dtype=wp.float64),
+    stress_in: wp.array2d(dtype=wp.mat33d),
+    cofactor_in: wp.array2d(dtype=wp.mat33d),
+    volume_out: wp.array(dtype=wp.float64),
+    smallest_jacobian_out: wp.array(dtype=wp.float64),
+    volume_gradient_out: wp.array2d(dtype=wp.vec3d),
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Second half of `element_state` on a GPU, with a thread for each corner."""
+    item, a = wp.tid()
+    e = items[item]
+    s = e % elements.shape[0]
+    force = wp.vec3d()
+    slope = wp.vec3d()
+    volume = wp.float64(0.0)
+    smallest = wp.float64(1.0e30)
+    for q in range(weight.shape[1]):
+        force += stress_in[e, q] * gradient[s, q, a]
+        slope += cofactor_in[e, q] * gradient[s, q, a]
+        volume += weight[s, q] * jacobian_in[e, q]
+        smallest = wp.min(smallest, jacobian_in[e, q])
+    wp.atomic_add(force_out, (e // elements.shape[0]) * nodes + elements[s, a], force)
+    volume_gradient_out[e, a] = slope
+    if a == 0:
+        volume_out[e] = volume
+        smallest_jacobian_out[e] = smallest
 
 
 @wp.kernel
@@ -121,34 +213,30 @@ def point_state(
 
     With g = F^-T grad N and h = F grad N: spatial = g, left = -2/3 c h, right = left + (2/9 c I1 +
     w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J)),
-    c = w mu J^(-2/3).
+    c = w mu J^(-2/3). A thread for each point.
     """
-    e = items[wp.tid()]
+    item, q = wp.tid()
+    e = items[item]
     s = e % elements.shape[0]
-    begin = (e // elements.shape[0]) * nodes
-    n = elements.shape[1]
     pressure = pressure_in[e]
-    for q in range(weight.shape[1]):
-        f = wp.mat33d()
-        for a in range(n):
-            f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
-        j = wp.determinant(f)
-        w = weight[s, q]
-        inverse_t = wp.transpose(wp.inverse(f))
-        c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
-        ci1 = c * wp.ddot(f, f)
-        b = beyond(j)
-        wpj = w * (pressure * j + mu * barrier * b)
-        along = ci1 * wp.float64(2.0) / wp.float64(9.0) + w * pressure * j
-        if b != wp.float64(0.0):
-            along += w * mu * barrier
-        for a in range(n):
-            g = inverse_t * gradient[s, q, a]
-            left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[s, q, a])
-            spatial_out[e, q, a] = g
-            left_out[e, q, a] = left
-            right_out[e, q, a] = left + along * g
-        scale_out[e, q] = wp.vec2d(c, ci1 / wp.float64(3.0) - wpj)
+    f = deformation(elements, gradient, position_in, s, q, (e // elements.shape[0]) * nodes)
+    j = wp.determinant(f)
+    w = weight[s, q]
+    inverse_t = wp.transpose(wp.inverse(f))
+    c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+    ci1 = c * wp.ddot(f, f)
+    b = beyond(j)
+    wpj = w * (pressure * j + mu * barrier * b)
+    along = ci1 * wp.float64(2.0) / wp.float64(9.0) + w * pressure * j
+    if b != wp.float64(0.0):
+        along += w * mu * barrier
+    for a in range(elements.shape[1]):
+        g = inverse_t * gradient[s, q, a]
+        left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[s, q, a])
+        spatial_out[e, q, a] = g
+        left_out[e, q, a] = left
+        right_out[e, q, a] = left + along * g
+    scale_out[e, q] = wp.vec2d(c, ci1 / wp.float64(3.0) - wpj)
 
 
 @wp.func
@@ -306,9 +394,7 @@ def element_stress(
     total = wp.mat33d()
     volume = wp.float64(0.0)
     for q in range(weight.shape[1]):
-        f = wp.mat33d()
-        for a in range(elements.shape[1]):
-            f += wp.outer(position_in[begin + elements[s, a]], gradient[s, q, a])
+        f = deformation(elements, gradient, position_in, s, q, begin)
         j = wp.determinant(f)
         b = f * wp.transpose(f)
         third = wp.trace(b) / wp.float64(3.0)

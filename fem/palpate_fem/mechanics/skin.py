@@ -82,9 +82,10 @@ class SkinElements:
         self, items: wp.array, position: wp.array, pressure: wp.array, blocks: wp.array
     ) -> None:
         """Add the tangent of the listed elements; `add_forces` comes first, at the same state."""
+        points = self._parts[3].shape[1]
         launch(
             element_kernels.point_state,
-            len(items),
+            (len(items), points),
             [*self._model, items, position, pressure],
             self._parts,
         )
