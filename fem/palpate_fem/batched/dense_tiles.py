@@ -55,47 +55,44 @@ _PRODUCTS = (
     + """
 #ifdef PALPATE_TENSOR_CORES
     const int row = lane / 4, column = 2 * (lane % 4);
-    auto add_tiles = [=](double (&sum)[4][4][2], const double* a, const double* b) {
-        #pragma unroll
-        for (int k = 0; k < 32; k += 8) {
-            double2 x[4], y[4];
+    // A warp works on half a tile, 16 rows of it: the sums of a whole one take too many registers.
+    auto add_tiles = [=](double (&sum)[2][4][2], const double* a, const double* b) {
+        a += row * 32 + column;
+        b += row * 32 + column;
+        #pragma unroll 2
+        for (int k = 0; k < 32; k += 8, a += 8, b += 8) {
+            const double2 upper = pair_at(a), lower = pair_at(a + 256);
             #pragma unroll
-            for (int m = 0; m < 4; ++m) {
-                x[m] = pair_at(a + (8 * m + row) * 32 + k + column);
-                y[m] = pair_at(b + (8 * m + row) * 32 + k + column);
-            }
-            #pragma unroll
-            for (int m = 0; m < 4; m += 2)
-                #pragma unroll
-                for (int n = 0; n < 4; ++n)
-                    add_product(sum[m][n], sum[m + 1][n], x[m], x[m + 1], y[n]);
+            for (int n = 0; n < 4; ++n)
+                add_product(sum[0][n], sum[1][n], upper, lower, pair_at(b + 256 * n));
         }
     };
-    // target = target - sum over i of a_i times transposed b_i
-    auto subtract = [=](double* target, const double* a, const double* b, int count) {
-        double sum[4][4][2] = {};
+    // Half of: target = target - sum over i of a_i times transposed b_i
+    auto subtract = [=](double* target, const double* a, const double* b, int count, int half) {
+        double sum[2][4][2] = {};
         for (int i = 0; i < count; ++i)
-            add_tiles(sum, a + 1024 * i, b + 1024 * i);
+            add_tiles(sum, a + 1024 * i + 512 * half, b + 1024 * i);
         #pragma unroll
-        for (int m = 0; m < 4; ++m)
+        for (int m = 0; m < 2; ++m)
             #pragma unroll
             for (int n = 0; n < 4; ++n) {
-                double* at = target + (8 * m + row) * 32 + 8 * n + column;
+                double* at = target + 512 * half + (8 * m + row) * 32 + 8 * n + column;
                 const double2 value = pair_at(at);
                 *reinterpret_cast<double2*>(at)
                     = make_double2(value.x - sum[m][n][0], value.y - sum[m][n][1]);
             }
     };
-    // target = target times transposed b
-    auto multiply = [=](double* target, const double* b) {
-        double sum[4][4][2] = {};
-        add_tiles(sum, target, b);
+    // Half of: target = target times transposed b
+    auto multiply = [=](double* target, const double* b, int half) {
+        double sum[2][4][2] = {};
+        add_tiles(sum, target + 512 * half, b);
         __syncwarp();  // all have read what is overwritten now
         #pragma unroll
-        for (int m = 0; m < 4; ++m)
+        for (int m = 0; m < 2; ++m)
             #pragma unroll
             for (int n = 0; n < 4; ++n)
-                *reinterpret_cast<double2*>(target + (8 * m + row) * 32 + 8 * n + column)
+                *reinterpret_cast<double2*>(
+                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
                     = make_double2(sum[m][n][0], sum[m][n][1]);
     };
 #else
@@ -114,16 +111,20 @@ _PRODUCTS = (
 )
 
 _SUBTRACT_PRODUCT = (
-    _PRODUCTS
+    """
+    const int lane = thread % 32;
+"""
+    + _PRODUCTS
     + """
     double* target = out.data + size_t(tile) * 1024;
     const double* a = panels.data + size_t(left) * 1024;
     const double* b = panels.data + size_t(right) * 1024;
-#ifndef PALPATE_TENSOR_CORES
-    if (lane != 0)
-        return;
+#ifdef PALPATE_TENSOR_CORES
+    subtract(target, a, b, count, thread / 32);
+#else
+    if (thread == 0)
+        subtract(target, a, b, count);
 #endif
-    subtract(target, a, b, count);
 """
 )
 
@@ -150,8 +151,10 @@ _FACTORISE = (
     for (int c = 0; c < own; ++c) {
         double* diagonal = tiles_of(c) + 1024 * c;
         if (c > 0)
-            for (int r = c + warp; r < rows; r += warps)
-                subtract(tiles_of(r) + 1024 * c, tiles_of(r), tiles_of(c), c);
+            for (int half = 2 * c + warp; half < 2 * rows; half += warps) {
+                double* first = tiles_of(half / 2);
+                subtract(first + 1024 * c, first, tiles_of(c), c, half % 2);
+            }
         __syncthreads();
         // Every thread has four numbers of a row. Up to column k they are the inverse factor's,
         // which needs no room before; beyond, what elimination has left of the matrix.
@@ -173,7 +176,11 @@ _FACTORISE = (
             __syncthreads();
             const double pivot = of_column[k];
             good = good && pivot > 0.0 && pivot < 1e300;
-            const double scale = rsqrt(pivot), factor = of_column[lane] * scale;
+            double scale;  // 1 / sqrt(pivot): 20 bits, doubled twice
+            asm("rsqrt.approx.ftz.f64 %0, %1;" : "=d"(scale) : "d"(pivot));
+            scale *= 1.5 - 0.5 * pivot * scale * scale;
+            scale *= 1.5 - 0.5 * pivot * scale * scale;
+            const double factor = of_column[lane] * scale;
             #pragma unroll
             for (int t = 0; t < 4; ++t) {
                 const int j = warp + 8 * t;
@@ -192,8 +199,8 @@ _FACTORISE = (
         }
         all_good = all_good && good;
         __syncthreads();
-        for (int r = c + 1 + warp; r < rows; r += warps)
-            multiply(tiles_of(r) + 1024 * c, diagonal);
+        for (int half = 2 * c + 2 + warp; half < 2 * rows; half += warps)
+            multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
         __syncthreads();
     }
     if (thread == 0 && !all_good)
@@ -403,11 +410,11 @@ def subtract_product(
     count: int,
     out: wp.array3d(dtype=wp.float64),
     tile: int,
-    lane: int,
+    thread: int,
 ):
     """Subtract a row of ``count`` tiles times another row, transposed, from a tile of ``out``.
 
-    All threads of a warp call it.
+    All threads of two warps call it.
     """
     ...
 

@@ -212,7 +212,7 @@ class BatchedFactor:
             works, first, number = self._products.of(level)
             self._launch(
                 kernels.subtract_products,
-                (count, number, TILE),
+                (count, number, 2 * TILE),
                 [slots, self.marked, works, first, *sizes],
                 both,
             )
@@ -355,6 +355,9 @@ class BatchedFactor:
             o, b = int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
             first = tiles.row_tile(k, np.arange(o + b))
             row, column = np.tril_indices(b)
+            # Neighbours share rows of the panel: eight tiles have six rows.
+            near = np.lexsort((column, row, column // 2, row // 4))
+            row, column = row[near], column[near]
             place = tiles.fronts[k, 4] + row * (row + 1) // 2 + column
             same = np.full(len(row), 1)
             rows = (

@@ -169,7 +169,7 @@ def add_entries(
         panels[tile, within // TILE, within % TILE] += values_in[slot, entry]
 
 
-@wp.kernel(launch_bounds=(THREADS, 2))
+@wp.kernel(launch_bounds=(THREADS, 3))
 def factorise_panels(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
@@ -192,7 +192,7 @@ def factorise_panels(
         dense_tiles.factorise_panel(panels, panel, own, rows, slot, bad, thread, threads)
 
 
-@wp.kernel(launch_bounds=(THREADS, 2))
+@wp.kernel(launch_bounds=(THREADS, 3))
 def subtract_products(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
@@ -203,11 +203,11 @@ def subtract_products(
     panels: wp.array3d(dtype=wp.float64),
     shares: wp.array3d(dtype=wp.float64),
 ):
-    """Subtract the product of two rows of the panel from a tile of the share: a warp for each.
+    """Subtract the product of two rows of the panel from a tile of the share: two warps for each.
 
     A row of ``works``: the front, the tile, both rows' first tiles, and how many tiles they have.
     """
-    i, number, lane = wp.tid()
+    i, number, thread = wp.tid()
     slot = slots[i]
     work = first + number
     if marked[slot, works[work, 0]] != 0:
@@ -215,4 +215,4 @@ def subtract_products(
         left = slot * panel_tiles + works[work, 2]
         right = slot * panel_tiles + works[work, 3]
         own = works[work, 4]
-        dense_tiles.subtract_product(panels, left, right, own, shares, tile, lane)
+        dense_tiles.subtract_product(panels, left, right, own, shares, tile, thread)
