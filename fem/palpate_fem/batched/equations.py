@@ -317,27 +317,29 @@ class BatchedEquations:
 
     def numbers(self, state: BatchedState, listed: Listed) -> list[SlotNumbers]:
         """Numbers of the last `balance`, read back, for each listed slot."""
-        rows, fluid = self._numbers.numpy(), state.fluid_pressure.numpy()
-        found = []
-        for slot in listed.numbers:
-            row = rows[slot]
-            norms = np.sqrt(row[[kernels.FLUID, kernels.INDENTER, kernels.CORE, kernels.INTERNAL]])
-            scale = max(float(norms.sum()), FORCE_FLOOR_N)
-            largest = max(float(row[kernels.LARGEST]), TRACTION_FLOOR_PA)
-            found.append(
-                SlotNumbers(
-                    residual=float(np.sqrt(row[kernels.UNBALANCED])) / scale,
-                    volume=float(row[kernels.VOLUME]),
-                    strain_error=float(row[kernels.STRAIN]),
-                    gap_error_m=float(row[kernels.GAP]) / self.system.contact.stiffness,
-                    traction_error=float(row[kernels.TRACTION]) / largest,
-                    smallest_jacobian=float(row[kernels.JACOBIAN]),
-                    net_force=-row[kernels.NET : kernels.NET + 3],
-                    fluid_pressure=float(fluid[slot]),
-                    sets_changed=bool(row[kernels.CHANGED]),
-                )
+        rows = self._numbers.numpy()[listed.numbers]
+        fluid = state.fluid_pressure.numpy()[listed.numbers].tolist()
+        sizes = rows[:, [kernels.FLUID, kernels.INDENTER, kernels.CORE, kernels.INTERNAL]]
+        scale = np.maximum(np.sqrt(sizes).sum(axis=1), FORCE_FLOOR_N)
+        residual = (np.sqrt(rows[:, kernels.UNBALANCED]) / scale).tolist()
+        largest = np.maximum(rows[:, kernels.LARGEST], TRACTION_FLOOR_PA)
+        traction = (rows[:, kernels.TRACTION] / largest).tolist()
+        gap = (rows[:, kernels.GAP] / self.system.contact.stiffness).tolist()
+        forces = -rows[:, kernels.NET : kernels.NET + 3]
+        return [
+            SlotNumbers(
+                residual=residual[k],
+                volume=row[kernels.VOLUME],
+                strain_error=row[kernels.STRAIN],
+                gap_error_m=gap[k],
+                traction_error=traction[k],
+                smallest_jacobian=row[kernels.JACOBIAN],
+                net_force=forces[k],
+                fluid_pressure=fluid[k],
+                sets_changed=bool(row[kernels.CHANGED]),
             )
-        return found
+            for k, row in enumerate(rows.tolist())
+        ]
 
     def stress(self, state: BatchedState, listed: Listed, stress: wp.array) -> None:
         """Cauchy stresses of the elements [Pa], (slots * E,) matrices; see `Skin.stress`."""

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from palpate.errors import ConfigError
+from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.linear import CHANGE, BatchedLinearSystem
@@ -229,12 +230,12 @@ class BatchedFingertip:
 
     def _pose(self, live: dict[int, _Live], slots: list[int]) -> None:
         """Put the indenters of slots where they are wanted."""
-        posed = [PosedIndenter(self._indenter(live[k]), live[k].pose, 0.0) for k in slots]
+        poses = np.array([live[k].pose for k in slots])
         self.equations.pose(
             np.array(slots),
             np.array([live[k].press.indenter for k in slots]),
-            np.array([one.tip for one in posed]),
-            np.array([one.rotation for one in posed]),
+            poses[:, :3],
+            rotation_matrices(poses[:, 3:]),
         )
 
     def _indenter(self, one: _Live) -> Indenter:

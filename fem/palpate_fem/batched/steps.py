@@ -76,11 +76,13 @@ class BatchedSteps:
         stiffness = self._equations.system.contact.stiffness
         steps = []
         for row, pose, fluid, convergence in zip(rows, poses, fluid_pa, convergences, strict=True):
-            fields, sums = row[:-SUMS], row[-SUMS:]
-            position, on_indenter, on_core = (
+            own = row.copy()  # at once: pages are slow to get
+            fields, sums = own[:-SUMS], own[-SUMS:]
+            displacement, on_indenter, on_core = (
                 fields[k * 3 * self._nodes : (k + 1) * 3 * self._nodes].reshape(-1, 3)
                 for k in range(3)
             )
+            displacement -= self._rest
             centre = np.full(3, np.nan)
             if sums[AREA] > 0.0:
                 centre = sums[MOMENT : MOMENT + 3] / sums[WEIGHT]
@@ -88,15 +90,15 @@ class BatchedSteps:
             steps.append(
                 IndentationStep(
                     pose=np.array(pose),
-                    displacement=position - self._rest,
+                    displacement=displacement,
                     fluid_pressure_pa=fluid,
-                    force=sums[FORCE : FORCE + 3].copy(),
-                    torque=sums[TORQUE : TORQUE + 3].copy(),
-                    indenter_force=on_indenter.copy(),
-                    core_force=on_core.copy(),
+                    force=sums[FORCE : FORCE + 3],
+                    torque=sums[TORQUE : TORQUE + 3],
+                    indenter_force=on_indenter,
+                    core_force=on_core,
                     contact_area_m2=float(sums[AREA]),
                     centre_of_pressure=centre,
-                    stress=fields[9 * self._nodes :].reshape(-1, 6).copy(),
+                    stress=fields[9 * self._nodes :].reshape(-1, 6),
                     convergence=replace(convergence, penetration_m=deepest / stiffness),
                 )
             )
