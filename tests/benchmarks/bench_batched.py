@@ -1,10 +1,12 @@
 """Many presses at once on a GPU: time a trajectory, and agreement with the CPU.
 
-    python tests/benchmarks/bench_batched.py --device cuda:0 --slots 1 16 64 128 --out batched.json
+    python tests/benchmarks/bench_batched.py --slots 1 16 64 192 --out batched.json
+    ... --edge-mm 0.47 0.6 0.38      other meshes, one after the other
 
 Presses are the twin's: points of the pad in turn with the nine indenters, one 3 mm deep along the
-normal and one 1.5 mm deep at 30 degrees to it, in 20 steps. ``--check N`` computes the first N on
-the CPU, too, in ``--processes`` processes. Results are written after each size.
+normal and one 1.5 mm deep at 30 degrees to it, in 20 steps. ``--check N`` computes N of the first
+mesh on the CPU, too, in ``--processes`` processes. Results are written after each size.
+``docs/make_fem_batched.py`` makes a page of them.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import shlex
 import sys
 import time
 from collections import Counter, defaultdict
@@ -29,7 +32,7 @@ from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.result import IndentationResult
 from palpate_fem.trajectory import (
     ANGLE_RAD,
     ANGLED_DEPTH_M,
@@ -143,72 +146,76 @@ class Progress:
         return 1e3 * self.full_s * each / max(1, sum(self.at_work[: self.full_sweeps]))
 
 
+def time_slots(
+    tip: Fingertip, presses: list[BatchedPress], slots: int, device: str, *, parts: bool
+) -> tuple[dict[str, Any], dict[int, IndentationResult]]:
+    """Solve presses in so many slots, twice: kernels are compiled for the first one."""
+    indenters = [make_indenter(name) for name in indenter_names()]
+    batched = BatchedFingertip(tip, indenters, slots=slots, device=device)
+    for chosen in (presses[:1], presses):
+        if parts:
+            wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
+        progress = Progress()
+        fed = progress.feed(chosen)
+        results = dict(batched.indent(fed, on_sweep=progress.at_work.append))
+        seconds = time.perf_counter() - progress.started
+        spent = kernel_times(wp.timing_end()) if parts else {}
+    found = [summary(result) for result in results.values()]
+    run = {
+        "unknowns": len(tip.system.pattern.free),
+        "slots": slots,
+        "presses": len(presses),
+        "seconds": seconds,
+        "ms_a_trajectory": 1e3 * seconds / len(presses),
+        "ms_while_full": progress.full_ms(len(presses)),
+        "sweeps": len(progress.at_work),
+        "full_sweeps": progress.full_sweeps,
+        "outcomes": Counter(one["outcome"] for one in found),
+        "iterations": float(np.mean([one["iterations"] for one in found])),
+        "factorisations": float(np.mean([one["factorisations"] for one in found])),
+        "kernels_s": spent,
+    }
+    return run, results
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--slots", type=int, nargs="+", default=[64])
     parser.add_argument("--rounds", type=float, default=2.0, help="presses for each slot")
-    parser.add_argument("--edge-mm", type=float, default=0.47)
+    parser.add_argument("--edge-mm", type=float, nargs="+", default=[0.47])
     parser.add_argument("--parts", action="store_true", help="time each kernel")
-    parser.add_argument("--check", type=int, default=0)
+    parser.add_argument("--check", type=int, default=0, help="presses to compare with the CPU's")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    edge = options.edge_mm * 1e-3
-    tip = Fingertip.pressurised(biotac(edge_m=edge))
-    most = max(options.check, *(int(options.rounds * slots) for slots in options.slots))
-    presses = presses_on(tip, most)
     pool = multiprocessing.get_context("spawn").Pool(options.processes)
-    shares = [list(range(k, options.check, options.processes)) for k in range(options.processes)]
-    running = [pool.apply_async(on_cpu, (edge, most, share)) for share in shares if share]
+    edge, checked = 1e-3 * options.edge_mm[0], options.check
+    shares = [list(range(k, checked, options.processes)) for k in range(options.processes)]
+    running = [pool.apply_async(on_cpu, (edge, checked, share)) for share in shares if share]
     report: dict[str, Any] = {
-        "device": options.device,
-        "edge_mm": options.edge_mm,
-        "unknowns": len(tip.system.pattern.free),
+        "schema": "palpate.batched-benchmark 1",
+        "device": wp.get_device(options.device).name,
+        "command": "python tests/benchmarks/bench_batched.py " + shlex.join(sys.argv[1:]),
         "runs": [],
+        "against_cpu": [],
     }
-    cpu: dict[int, dict[str, Any]] = {}
-    indenters = [make_indenter(name) for name in indenter_names()]
-    for slots in options.slots:
-        batched = BatchedFingertip(tip, indenters, slots=slots, device=options.device)
-        for warm in (True, False):  # the first run compiles the kernels
-            chosen = presses[: 1 if warm else max(int(options.rounds * slots), options.check)]
-            if options.parts:
-                wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
-            progress = Progress()
-            fed = progress.feed(chosen)
-            results = dict(batched.indent(fed, on_sweep=progress.at_work.append))
-            seconds = time.perf_counter() - progress.started
-            spent = kernel_times(wp.timing_end()) if options.parts else {}
-        found = {k: summary(result) for k, result in results.items()}
-        for some in running if not cpu else ():
-            cpu |= some.get()
-        run = {
-            "slots": slots,
-            "presses": len(chosen),
-            "seconds": seconds,
-            "ms_a_trajectory": 1e3 * seconds / len(chosen),
-            "ms_while_full": progress.full_ms(len(chosen)),
-            "sweeps": len(progress.at_work),
-            "full_sweeps": progress.full_sweeps,
-            "busy": float(np.mean(progress.at_work)) / slots,
-            "outcomes": Counter(one["outcome"] for one in found.values()),
-            "iterations": float(np.mean([one["iterations"] for one in found.values()])),
-            "kernels_s": spent,
-            "diverged": [
-                [k, one["indenter"], one["reason"]]
-                for k, one in found.items()
-                if one["outcome"] == str(IndentationOutcome.DIVERGED)
-            ],
-            "against_cpu": [differences(found[k], cpu[k]) for k in sorted(cpu) if k in found],
-        }
-        report["runs"].append(run)
-        say({k: v for k, v in run.items() if k != "against_cpu"})
-        for one in run["against_cpu"]:
-            say(one)
-        options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        del batched
+    for edge_mm in options.edge_mm:
+        tip = Fingertip.pressurised(biotac(edge_m=1e-3 * edge_mm))
+        for slots in options.slots:
+            count = max(3, int(options.rounds * slots), 0 if report["against_cpu"] else checked)
+            run, results = time_slots(
+                tip, presses_on(tip, count), slots, options.device, parts=options.parts
+            )
+            report["runs"].append(run | {"edge_mm": edge_mm})
+            say(report["runs"][-1])
+            if running and not report["against_cpu"]:
+                cpu = {k: one for some in running for k, one in some.get().items()}
+                for k in sorted(cpu):
+                    report["against_cpu"].append(differences(summary(results[k]), cpu[k]))
+                    say(report["against_cpu"][-1])
+            options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

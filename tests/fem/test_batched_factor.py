@@ -155,6 +155,20 @@ def test_slots_have_their_own_matrices(grids: Bench, lanes: int) -> None:
         assert_solves(grid(20, 30, slot), answer, right[slot])
 
 
+def test_a_load_at_one_place_is_solved_for_like_any_other(grids: Bench) -> None:
+    bench = restored(grids)
+    bench.factorise()
+    for place in (0, 311, 599):
+        right = np.zeros((3, 2, bench.size))
+        right[1, 1, place] = 2.0
+        answers = bench.solve(right)
+        assert not answers[[0, 2]].any()
+        assert not answers[1, 0].any()
+        assert_solves(grid(20, 30, 1), answers[1, 1:], right[1, 1:])
+    right = bench.right(2)  # and nothing of it is left
+    assert_solves(grid(20, 30, 0), bench.solve(right)[0], right[0])
+
+
 def test_lanes_do_not_mix(grids: Bench) -> None:
     """A second lane, and lanes that nobody asked for, change no bit of the first."""
     bench = restored(grids)

@@ -147,6 +147,7 @@ class BatchedFactor:
         # No number is what it was before the first factorisation.
         self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
+        self._loaded = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
         self._panels = wp.zeros(
@@ -249,6 +250,9 @@ class BatchedFactor:
         """
         count, tiles = len(slots), self.tiles
         place = [tiles.panel_tiles, tiles.rows, THREADS]
+        self._launch(
+            solve_kernels.forget_loads, (count, len(tiles.fronts)), [slots], [self._loaded]
+        )
         for level in range(tiles.levels):
             first, last = self._row_begins[level : level + 2]
             self._launch(
@@ -256,13 +260,13 @@ class BatchedFactor:
                 (count, last - first, LANES),
                 [slots, *self._row_arrays, self._fronts, self._children, self._rows_in_child,
                  first, tiles.rows, lanes, vectors],
-                [self._work],
+                [self._work, self._loaded],
             )  # fmt: skip
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 solve_kernels.substitute_forward,
                 (count, last - first, THREADS),
-                [slots, self._by_level, self._fronts, first, *place],
+                [slots, self._by_level, self._fronts, first, *place, self._loaded],
                 [self._panels, self._work],
             )
         for level in reversed(range(tiles.levels)):

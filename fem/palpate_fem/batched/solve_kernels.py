@@ -10,9 +10,16 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import TILE
+from palpate_fem.batched.dense_tiles import THREADS, TILE
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def forget_loads(slots: wp.array(dtype=wp.int32), loaded_out: wp.array2d(dtype=wp.int32)):
+    """Call all fronts of the listed slots free of loads."""
+    i, front = wp.tid()
+    loaded_out[slots[i], front] = 0
 
 
 @wp.kernel
@@ -29,8 +36,13 @@ def gather_right(
     lanes: int,
     right_in: wp.array3d(dtype=wp.float64),
     work: wp.array2d(dtype=wp.float64),
+    loaded_out: wp.array2d(dtype=wp.int32),
 ):
-    """Set the rows of fronts to right-hand sides and what the children's borders add up to."""
+    """Set the rows of fronts to right-hand sides and what the children's borders add up to.
+
+    Fronts with a row that is not zero are called loaded: the load of a correction, at the contact
+    alone, loads few.
+    """
     i, number, lane = wp.tid()
     slot = slots[i]
     at = first + number
@@ -46,9 +58,11 @@ def gather_right(
                 border = fronts[child, 6] + fronts[child, 1] * TILE
                 total += work[slot * rows + border + a, lane]
     work[slot * rows + fronts[front, 6] + row_in_front[at], lane] = total
+    if total != wp.float64(0.0):
+        loaded_out[slot, front] = 1
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(THREADS, 2))
 def substitute_forward(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array(dtype=wp.int32),
@@ -57,17 +71,19 @@ def substitute_forward(
     panel_tiles: int,
     rows: int,
     threads: int,
+    loaded: wp.array2d(dtype=wp.int32),
     panels: wp.array3d(dtype=wp.float64),
     work: wp.array2d(dtype=wp.float64),
 ):
-    """Solve with the lower triangles of fronts, and subtract from their borders."""
+    """Solve with the lower triangles of loaded fronts, and subtract from their borders."""
     i, number, thread = wp.tid()
     front = listed[first + number]
-    panel = slots[i] * panel_tiles + fronts[front, 7]
-    begin = slots[i] * rows + fronts[front, 6]
-    own = fronts[front, 1]
-    count = fronts[front, 8]
-    dense_tiles.substitute_forward(panels, panel, own, count, work, begin, thread, threads)
+    if loaded[slots[i], front] != 0:
+        panel = slots[i] * panel_tiles + fronts[front, 7]
+        begin = slots[i] * rows + fronts[front, 6]
+        own = fronts[front, 1]
+        count = fronts[front, 8]
+        dense_tiles.substitute_forward(panels, panel, own, count, work, begin, thread, threads)
 
 
 @wp.kernel

@@ -1,0 +1,162 @@
+"""Write docs/results/fem-batched.md and its picture from what the benchmark has measured on a GPU.
+
+    python tests/benchmarks/bench_batched.py ... --out docs/results/fem-batched/h100.json
+    python docs/make_fem_batched.py
+
+``sweeps.json`` beside it holds what ``palpate fem run --sweep --device`` said, command by command.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate_training.figures.style import (
+    finish,
+    grid,
+    label,
+    markdown_table,
+    new_figure,
+    unit_colour,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "docs" / "results" / "fem-batched"
+PAGE = FOLDER.with_suffix(".md")
+MOST_KERNELS = 12
+
+HEAD = """# Many indentations at once on a GPU
+
+Made by `python docs/make_fem_batched.py` of what the commands below measured;
+how it works: [ADR 26](../adr/0026-many-at-once.md). Presses are the twin's: nine indenters, 3 mm
+along the normal and 1.5 mm at 30 degrees to it, 20 steps, friction and core contact. At the end of
+a batch slots stand empty, as no press is left; in a long sweep that end is short, so the time with
+all slots taken is told, too.
+"""
+
+
+def read(name: str) -> dict[str, Any]:
+    """What a program wrote."""
+    values: dict[str, Any] = json.loads((FOLDER / name).read_text(encoding="utf-8"))
+    return values
+
+
+def outcomes(run: dict[str, Any]) -> str:
+    """How the presses of a run ended."""
+    return ", ".join(f"{count} {how}" for how, count in sorted(run["outcomes"].items()))
+
+
+def times(runs: list[dict[str, Any]]) -> str:
+    """A row for each number of slots and each mesh."""
+    head = ["mesh [mm]", "unknowns", "slots", "presses", "ms a trajectory", "with all slots taken",
+            "iterations", "factorisations", "outcomes"]  # fmt: skip
+    return markdown_table(
+        head,
+        [
+            [
+                f"{run['edge_mm']:g}", f"{run['unknowns']:,}", str(run["slots"]),
+                str(run["presses"]), f"{run['ms_a_trajectory']:.0f}",
+                f"**{run['ms_while_full']:.0f}**", f"{run['iterations']:.0f}",
+                f"{run['factorisations']:.0f}", outcomes(run),
+            ]
+            for run in runs
+        ],
+    )  # fmt: skip
+
+
+def agreement(rows: list[dict[str, Any]], folder: Path) -> str:
+    """How far the GPU and the CPU are apart."""
+    force = np.array([row["force_relative"] for row in rows])
+    field = 1e6 * np.array([row["last_field_m"] for row in rows])
+    equal = sum(row["outcome"][0] == row["outcome"][1] for row in rows)
+    cpu_s = float(np.mean([row["cpu_s"] for row in rows]))
+    figure = new_figure(7.0, 2.6)
+    for axes, values, name in zip(
+        figure.subplots(1, 2),
+        (force, field),
+        ("force, share of the largest", "skin [um]"),
+        strict=True,
+    ):
+        axes.semilogx(np.sort(values), np.arange(1, len(values) + 1) / len(values),
+                      color=unit_colour(0), drawstyle="steps-post")  # fmt: skip
+        label(axes, f"difference of {name}", "share of presses", "")
+        grid(axes)
+    told = (
+        f"{len(rows)} presses, computed on a core, too ({cpu_s:.0f} s of it each), both with "
+        f"default tolerances: outcomes equal in {equal}; net forces differ by "
+        f"{np.median(force):.1e} of the press's largest in the median, {force.max():.1e} at most; "
+        f"skins after the last step by {np.median(field):.3f} um, {field.max():.3f} at most."
+    )
+    finish(figure, folder / "agreement.png", "GPU against CPU", told)
+    return f"{told}\n\n![agreement](fem-batched/agreement.png)"
+
+
+def kernels(run: dict[str, Any]) -> str:
+    """Where the time goes."""
+    spent = run["kernels_s"]
+    whole = sum(spent.values())
+    rows = [
+        [name.rsplit("_", 1)[0], f"{1e3 * value / run['presses']:.1f}", f"{value / whole:.0%}"]
+        for name, value in list(spent.items())[:MOST_KERNELS]
+    ]
+    told = (
+        f"{run['slots']} slots, {run['presses']} presses: {1e3 * whole / run['presses']:.0f} ms a "
+        f"trajectory on the GPU of {run['ms_a_trajectory']:.0f} in all"
+    )
+    return f"{told}.\n\n" + markdown_table(["kernel", "ms a trajectory", "share"], rows)
+
+
+def draw(runs: list[dict[str, Any]], path: Path) -> None:
+    """Time against slots and against the size of the mesh."""
+    figure = new_figure(8.0, 3.0)
+    by_slots, by_size = figure.subplots(1, 2)
+    first = [run for run in runs if run["edge_mm"] == runs[0]["edge_mm"]]
+    by_slots.loglog([run["slots"] for run in first], [run["ms_while_full"] for run in first], "o-",
+                    color=unit_colour(0), ms=4)  # fmt: skip
+    by_slots.axhline(100.0, color="0.3", lw=0.9, ls="--")
+    label(by_slots, "slots", "ms a trajectory", f"{runs[0]['unknowns']:,} unknowns")
+    slots = [run["slots"] for run in runs if run["edge_mm"] != runs[0]["edge_mm"]]
+    same = sorted(
+        (run["unknowns"], run["ms_while_full"])
+        for run in runs
+        if slots and run["slots"] == slots[0]
+    )
+    by_size.loglog(*np.array(same).T, "o-", color=unit_colour(1), ms=4)
+    label(by_size, "unknowns", "", f"{slots[0]} slots")
+    for axes in (by_slots, by_size):
+        grid(axes)
+    finish(figure, path, "Time of a trajectory with all slots taken", "Dashed: the goal.")
+
+
+def main() -> None:
+    """Write page and pictures."""
+    report, parts, sweeps = read("h100.json"), read("parts.json"), read("sweeps.json")
+    draw(report["runs"], FOLDER / "time.png")
+    sections = [
+        HEAD,
+        f"## Time\n\n{report['device']}: `{report['command']}`\n",
+        times(report["runs"]),
+        "\n![time](fem-batched/time.png)\n",
+        "## Agreement with the solver on a core\n",
+        agreement(report["against_cpu"], FOLDER),
+        "\n## Where the time goes\n",
+        f"`{parts['command']}`, each kernel timed:\n",
+        kernels(parts["runs"][-1]),
+        "\n## Sweeps\n",
+        sweeps["told"] + "\n",
+        markdown_table(
+            ["command", "presses", "ms a trajectory", "outcomes"],
+            [
+                [f"`{run['command']}`", str(run["presses"]), f"{run['ms']:.0f}", run["outcomes"]]
+                for run in sweeps["runs"]
+            ],
+        ),
+    ]
+    PAGE.write_text("\n".join(sections) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
