@@ -25,6 +25,11 @@ Floats = NDArray[np.float64]
 DEVICE = os.environ.get("PALPATE_TEST_DEVICE", "cpu")
 """Where the batches of these tests run: also ``cuda:0``, where there is one."""
 
+REPEATED = 0.0 if DEVICE == "cpu" else 1e-9
+"""How far forces computed twice may be apart: a GPU adds up in whatever order."""
+
+ROUNDING = 1e-12 if DEVICE == "cpu" else 1e-10
+
 SLOTS = 5
 PLACES = (3, 0, 4)  # of the cases; slots 1 and 2 stay as they are
 BYSTANDERS = (1, 2)

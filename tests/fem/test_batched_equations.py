@@ -15,6 +15,7 @@ from tests.fem.batched_cases import (
     PLACES,
     PRESSES,
     PRESSURE_CHANGE_PA,
+    ROUNDING,
     SLOTS,
     Batch,
     Case,
@@ -226,7 +227,7 @@ def test_vectors_of_the_linear_system(batch: Batch) -> None:
             same(found[name][slot], case.vectors[name])
         largest = max(np.abs(case.vectors[name]).max() for name in ("coupled", "product"))
         apart = np.abs(found["product"][slot] - case.vectors["product"])
-        assert apart.max() < 1e-12 * largest
+        assert apart.max() < ROUNDING * largest
 
 
 def test_targets_of_the_condensed_unknowns(batch: Batch) -> None:
