@@ -40,12 +40,8 @@ from palpate_fem.service.batch import (
 )
 from palpate_fem.service.biotac import BiotacTip, biotac
 from palpate_fem.service.config import DEFAULT_FACTORY
-from palpate_fem.service.device_batch import (
-    SLOTS,
-    DeviceBatch,
-    check_devices,
-    threads_and_packers,
-)
+from palpate_fem.service.device_batch import SLOTS, DeviceBatch, threads_and_packers
+from palpate_fem.service.device_process import check_devices
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.content import StoredFingertip

@@ -10,25 +10,23 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.fem.batched_cases import DEVICE
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError, RemoteError
-from palpate_fem.batched.fingertip import BatchedPress
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli import model as cli_model
 from palpate_fem.cli.app import fem_app
+from palpate_fem.cli.run import show_report
 from palpate_fem.config import FingertipParameters
-from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics.solver import Fingertip
-from palpate_fem.mesh.parametric import biotac
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.service import device_batch
 from palpate_fem.service.batch import (
@@ -37,9 +35,9 @@ from palpate_fem.service.batch import (
     allow_open_files,
     sweep_into_store,
 )
-from palpate_fem.service.biotac import BiotacTip
 from palpate_fem.service.channel import Channel, Outbox
-from palpate_fem.service.device_batch import DeviceBatch, check_devices, threads_and_packers
+from palpate_fem.service.device_batch import DeviceBatch, threads_and_packers
+from palpate_fem.service.device_process import check_devices
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.service.packing import PackingProcesses
@@ -107,7 +105,7 @@ def into_store(path: Path, batch: DeviceBatch, plans: Any, **more: Any) -> tuple
 
 def test_the_store_of_a_device_is_that_of_the_cpu(tmp_path: Path) -> None:
     """The real solver, on two devices; both share the work, and one press begins in the skin."""
-    with DeviceBatch(REAL, ["cpu", "cpu"], slots=2, threads=1) as batch:
+    with DeviceBatch(REAL, [DEVICE, DEVICE], slots=2, threads=1) as batch:
         tip = batch.fingertip(threading.Event())
         assert tip is not None
         plans: list[PlannedPath] = []
@@ -137,30 +135,70 @@ def test_the_store_of_a_device_is_that_of_the_cpu(tmp_path: Path) -> None:
         assert found.outline(name) is not None
 
 
-def test_what_the_cpu_has_to_solve_is_seen_to_be_alive_and_ends_in_time() -> None:
-    """With one iteration no increment has an equilibrium on the device."""
-    tip = Fingertip.pressurised(biotac(edge_m=1.4e-3))
-    settings = replace(
-        tip.settings,
-        newton=replace(tip.settings.newton, iterations=1, pseudo_transient_iterations=1),
-        smallest_increment=0.5,
+def hard(count: int) -> list[PlannedPath]:
+    """Plans of three steps, which devices of the kind UNSOLVED do not solve."""
+    return [
+        PlannedPath(f"hard/{k}", one.indenter, one.path[:4])
+        for k, one in enumerate(sweeps.plans(count))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("limit_s", "outcomes", "steps"),
+    [(600.0, {"complete": 7}, [3, 3, 3]), (0.0, {"complete": 4, "deadline": 3}, [0, 0, 0])],
+)
+def test_what_devices_do_not_solve_the_cpu_does(
+    limit_s: float, outcomes: dict[str, int], steps: list[int]
+) -> None:
+    """Once, from its first step on, and in the time that it may take."""
+    told: list[int] = []
+    report, kept = run(
+        batch_of(fakes.UNSOLVED, devices=2, limit_s=limit_s),
+        [*hard(3), *short(4)],
+        lambda report: told.append(report.done),
     )
-    hasty = Fingertip(tip.geometry, tip.parameters, settings)
-    hasty.state, hasty.cavity_m3 = tip.state, tip.cavity_m3
-    name = "sphere_medium"
-    path = press_path(
-        make_indenter(name), (-4e-3, 0.0, -7.5e-3), (0.0, 0.0, 1.0),
-        OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces), depth_m=0.4e-3, steps=2,
-    )  # fmt: skip
-    for limit_s, outcome in ((600.0, "diverged"), (0.0, "deadline")):
-        solver = BiotacTip(hasty).on_device(
-            [name], slots=1, device="cpu", friction_coefficient=0.4, limit_s=limit_s
+    assert (dict(report.outcomes), report.on_cpu) == (outcomes, 3)
+    assert told == [1, 2, 3, 4, 5, 6, 7]
+    assert [len(kept[f"hard/{k}"].steps) for k in range(3)] == steps
+    assert len(kept) == 7
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"), [("no such mesh", "no such mesh"), ("dies", "exit status 9")]
+)
+def test_only_what_needs_the_cpu_fails_without_it(broken: str, said: str) -> None:
+    batch = batch_of(fakes.UNSOLVED, options={"broken": broken, "broken_in": "worker"})
+    report, kept = run(batch, [*hard(2), *short(3)])
+    assert (report.failed, report.outcomes["complete"], len(kept)) == (2, 3, 3)
+    assert report.on_cpu == 0
+    assert all(said in early.reason for early in report.early)
+
+
+def test_hard_ones_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Devices get no new ones while too many wait for the CPU: each has a file open."""
+    monkeypatch.setattr(device_batch, "_ON_CPU_MOST", 1)
+    batch, taken, most = batch_of(fakes.UNSOLVED, slots=1), 0, 0
+
+    def supplied() -> Any:
+        nonlocal taken
+        for plan in hard(9):
+            taken += 1
+            yield plan
+
+    def on_report(report: BatchReport) -> None:
+        nonlocal most
+        most = max(most, taken - report.done)
+
+    with batch:
+        report = batch.run(
+            supplied(),
+            9,
+            stop=threading.Event(),
+            on_trajectory=lambda *_: None,
+            on_report=on_report,
         )
-        at_work: list[int] = []
-        ((_, result),) = solver.indent(iter([BatchedPress(0, path)]), on_sweep=at_work.append)
-        assert result.outcome.value == outcome
-        assert {at_work[0], at_work[-1]} == {1, 0}
-    assert hasty.parameters.friction_coefficient == 0.4
+    assert report.on_cpu == 9
+    assert most <= batch.ahead == 3
 
 
 def test_several_devices_share_the_work() -> None:
@@ -441,9 +479,16 @@ def test_the_command_says_what_ran_where(tmp_path: Path, monkeypatch: pytest.Mon
     said = " ".join(done.stdout.split())
     assert "5 of 5 run: 5 complete;" in said
     assert "ms a trajectory on cpu, cpu" in said
+    assert "on the CPU" not in said
     again = " ".join(command(*words).stdout.split())
     assert "5 were there already" in again
     assert "ms a trajectory" not in again
+
+
+def test_the_summary_says_what_the_cpu_had_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    show_report(BatchReport(5, Counter(complete=5), on_cpu=2, wall_s=1.0), 0, None, ["cuda:0"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "200 ms a trajectory on cuda:0; 2 of them on the CPU" in said
 
 
 def test_as_many_files_may_be_open_as_trajectories_run() -> None:

@@ -152,7 +152,7 @@ def data_generate(
     from palpate_fem.config import LIMITS
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_fem.indenter.path import parse_segments, show_segments
-    from palpate_fem.service.device_batch import check_devices
+    from palpate_fem.service.device_process import check_devices
     from palpate_training.experiment.generate.pipeline import generate as run
     from palpate_training.experiment.generate.simulator import ExperimentSpec
 

@@ -403,7 +403,9 @@ def validate(
     )
 
 
-@fem_app.command(epilog=_example("palpate fem serve --workers 2"))
+@fem_app.command(
+    epilog=_example("palpate fem serve --workers 2", "palpate fem serve --device cuda:0 --slots 16")
+)
 def serve(
     connect: Annotated[
         str,
@@ -425,6 +427,18 @@ def serve(
     ] = "lab",
     sensor: Annotated[str, typer.Option("--sensor", help="Sensor name of the service.")] = "twin",
     workers: WorkersOption = 0,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|auto",
+            help="Solve requests with the parameters of this command together on a GPU (cuda:0, "
+            "...); auto = the first one, if there is one. --workers do all else.",
+        ),
+    ] = None,
+    slots: Annotated[
+        int | None,
+        typer.Option(min=1, help="--device: requests at once [default: 16], 0.25 GB each."),
+    ] = None,
     waiting: Annotated[int, typer.Option(min=0, help="Most requests that wait.")] = 8,
     max_deadline_s: Annotated[
         float, typer.Option(min=1, help="Time limit for a request [s].")
@@ -459,6 +473,8 @@ def serve(
         station=station,
         sensor=sensor,
         workers=workers,
+        device=device,
+        slots=slots,
         waiting=waiting,
         max_deadline_s=max_deadline_s,
     )

@@ -44,7 +44,7 @@ from palpate_fem.service.batch import (
     TrajectoryPlan,
     sweep_into_store,
 )
-from palpate_fem.service.device_batch import check_devices
+from palpate_fem.service.device_process import check_devices, wanted_device
 from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.read import SimulationStore
@@ -63,6 +63,7 @@ GOOD = ("complete", "force limit")
 
 EXPORT_SUFFIX = ".h5"
 _ROUTER_WAIT_S = 5.0
+_NAME_THE_DEVICE = "name the device, e.g. --device cuda:0"
 _COLUMNS = (
     "pose", "force", "torque", "centre_of_pressure", "fluid_pressure_pa", "contact_area_m2",
 )  # fmt: skip
@@ -117,9 +118,7 @@ class RunOptions:
                     remedy="add --sweep, or leave it out",
                 )
         if self.slots is not None and not self.devices:
-            raise ConfigError(
-                "--slots without --device", remedy="name the device, e.g. --device cuda:0"
-            )
+            raise ConfigError("--slots without --device", remedy=_NAME_THE_DEVICE)
         if self.devices:
             check_devices(self.devices)
         if self.store is not None and self.store.suffix != SUFFIX:
@@ -282,14 +281,23 @@ def serve_command(
     station: str,
     sensor: str,
     workers: int,
+    device: str | None,
+    slots: int | None,
     waiting: int,
     max_deadline_s: float,
 ) -> None:
-    """Serve until ``SIGINT`` or ``SIGTERM``."""
+    """Serve until ``SIGINT`` or ``SIGTERM``.
+
+    Raises:
+        ConfigError: An option makes no sense, or there is no such device.
+    """
     # Only this command needs the bus.
     from palpate_fem.service import node
     from palpate_fem.service.config import FemConfig
 
+    if slots is not None and device is None:
+        raise ConfigError("--slots without --device", remedy=_NAME_THE_DEVICE)
+    device = wanted_device(device)
     count, threads = workers_for(workers)
     config = parse_config(
         FemConfig,
@@ -297,6 +305,8 @@ def serve_command(
             "sensor": sensor,
             "workers": count,
             "threads": threads,
+            "device": device,
+            **({} if slots is None else {"slots": slots}),
             "waiting": waiting,
             "max_deadline_s": max_deadline_s,
             "factory": model.factory,
@@ -315,7 +325,8 @@ def serve_command(
         signal.signal(number, on_signal)
     print_lines(
         f"fem serves {sensor!r} at station {station!r} through {connect}: {count} workers, "
-        f"{waiting} may wait",
+        + (f"{config.slots} slots on {device}, " if device else "")
+        + f"{waiting} may wait",
         "`palpate status` shows when it is ready; Ctrl-C stops it",
         to=console,
     )
@@ -402,6 +413,8 @@ def show_report(
     if devices and report.done:
         each_ms = report.wall_s / report.done * 1e3
         parts.append(f"{each_ms:.0f} ms a trajectory on {', '.join(devices)}")
+    if report.on_cpu:
+        parts.append(f"{report.on_cpu} of them on the CPU, as the device did not solve them")
     if report.stopped:
         parts.append("stopped early; the same command goes on" if store else "stopped early")
     if report.failed and store:
@@ -431,6 +444,7 @@ def write_json(
         "present": present,
         "stopped": report.stopped,
         "devices": list(devices),
+        "on_cpu": report.on_cpu,
         "wall_s": report.wall_s,
         "early": [asdict(early) for early in report.early],
         "trajectories": [

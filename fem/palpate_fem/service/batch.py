@@ -81,6 +81,7 @@ class BatchReport:
         early: Every trajectory that did not complete.
         running: Converged steps of the trajectories that run now.
         seconds: Computing time of each trajectory that ended [s].
+        on_cpu: Trajectories that a device did not solve and the CPU did.
         stopped: Whether it was stopped before all were run.
         wall_s: Time from the first to the last of them [s].
     """
@@ -90,6 +91,7 @@ class BatchReport:
     early: list[EarlyEnd] = field(default_factory=list)
     running: dict[str, int] = field(default_factory=dict)
     seconds: list[float] = field(default_factory=list)
+    on_cpu: int = 0
     stopped: bool = False
     wall_s: float = 0.0
 

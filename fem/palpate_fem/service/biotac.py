@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +11,7 @@ from palpate.errors import ConfigError
 from palpate_fem.arrays import Floats
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.indenter.shape import Indenter
-from palpate_fem.mechanics.load_stepping import LoadStepping, SolverSettings
+from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
@@ -21,7 +19,7 @@ from palpate_fem.service.fingertips import BuildTip, OnFraction
 from palpate_fem.store.content import Setting, StoredFingertip
 
 if TYPE_CHECKING:  # workers on the CPU do without it
-    from palpate_fem.batched.fingertip import BatchedFingertip, BatchedPress
+    from palpate_fem.batched.fingertip import BatchedFingertip
 
 PARAMETRIC = "biotac"
 """Name of the open parametric mesh; anything else is a folder with the public meshes."""
@@ -64,48 +62,15 @@ class BiotacTip:
         return tip.indent(make_indenter(indenter), path, on_step=on_step, should_stop=should_stop)
 
     def on_device(
-        self,
-        indenters: Sequence[str],
-        *,
-        slots: int,
-        device: str,
-        friction_coefficient: float,
-        limit_s: float,
-    ) -> SlottedBiotac:
+        self, indenters: Sequence[str], *, slots: int, device: str, friction_coefficient: float
+    ) -> BatchedFingertip:
         """See ``SlottedTip.on_device``."""
         from palpate_fem.batched.fingertip import BatchedFingertip
 
         tip = self._solved
         tip.parameters = replace(tip.parameters, friction_coefficient=friction_coefficient)
         made = [make_indenter(name) for name in indenters]
-        return SlottedBiotac(BatchedFingertip(tip, made, slots=slots, device=device), limit_s)
-
-
-class SlottedBiotac:
-    """The batched solver as ``SlottedSolver``."""
-
-    def __init__(self, batched: BatchedFingertip, limit_s: float) -> None:
-        self._batched, self._limit_s = batched, limit_s
-
-    def indent(
-        self, presses: Iterator[BatchedPress], *, on_sweep: Callable[[int], None]
-    ) -> Iterator[tuple[int, IndentationResult]]:
-        """See ``SlottedSolver.indent``."""
-        tip = self._batched.tip
-
-        def load_stepping(indenter: Indenter, path: Floats) -> LoadStepping:
-            deadline = time.monotonic() + self._limit_s
-
-            def should_stop() -> IndentationOutcome | None:
-                on_sweep(0)
-                return IndentationOutcome.DEADLINE if time.monotonic() > deadline else None
-
-            return Fingertip.load_stepping(tip, indenter, path, should_stop=should_stop)
-
-        # What the device does not solve is computed with this, for up to minutes: it must be seen
-        # to be alive, and must end.
-        tip.load_stepping = load_stepping  # type: ignore[method-assign,assignment]
-        return self._batched.indent(presses, on_sweep=on_sweep)
+        return BatchedFingertip(tip, made, slots=slots, device=device)
 
 
 def biotac(

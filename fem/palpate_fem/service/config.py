@@ -43,6 +43,9 @@ class FemConfig(StrictConfig):
         max_steps: Most steps of a request.
         max_deadline_s: Longest time for a request, waiting included [s].
         grace_s: Time after its deadline at which a solver that still runs is killed [s].
+        device: Device that solves many requests at once, e.g. ``cuda:0``, if their parameters are
+            those of ``fingertip``; ``auto`` = the first GPU if there is one; None = workers alone.
+        slots: Requests at once on it; as many as ``waiting`` more may wait for it.
         keep: Number of pressurised fingertips that each worker keeps.
         fingertip: Default parameters of requests.
         factory: ``module:function`` that makes fingertips.
@@ -56,6 +59,8 @@ class FemConfig(StrictConfig):
     max_steps: int = Field(default=200, ge=1, lt=10_000)
     max_deadline_s: float = Field(default=600.0, gt=0, le=86_400)
     grace_s: float = Field(default=5.0, ge=0.1, le=60)
+    device: str | None = None
+    slots: int = Field(default=16, ge=1, le=1024)
     keep: int = Field(default=2, ge=1, le=32)
     fingertip: FingertipTable = FingertipTable()
     factory: str = DEFAULT_FACTORY

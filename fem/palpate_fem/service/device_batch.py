@@ -1,7 +1,7 @@
 """Many trajectories on GPUs: a process for each device, which solves them in slots.
 
 A process that dies or hangs costs nobody's trajectories: the other devices get them; the last one
-is started once more.
+is started once more. What a device does not solve goes to worker processes on the CPU.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 from palpate.errors import ConfigError, ErrorCode, RemoteError
-from palpate.heartbeat import Turns
 from palpate.process import Closing
 from palpate_fem.indenter.catalogue import indenter_names
+from palpate_fem.result import IndentationStep
 from palpate_fem.service.batch import (
     BatchReport,
     OnReport,
@@ -27,20 +28,24 @@ from palpate_fem.service.batch import (
     TrajectoryPlan,
     account_for,
 )
-from palpate_fem.service.channel import ChildProcess
+from palpate_fem.service.device_process import HANG_S, START_S, DeviceProcess
 from palpate_fem.service.jobs import (
     DeviceEvent,
     DeviceSetup,
     JobEnded,
+    JobEvent,
     JobFailed,
     JobStarted,
     NumberedPress,
     PressEnded,
     PressRefused,
+    PressUnsolved,
     ResultTaken,
-    Swept,
+    SimulationJob,
+    StepConverged,
     WorkerSetup,
 )
+from palpate_fem.service.pool import WorkerPool
 from palpate_fem.store.content import StoredFingertip
 
 _log = logging.getLogger(__name__)
@@ -48,33 +53,11 @@ _log = logging.getLogger(__name__)
 SLOTS = 128
 """Trajectories at once on a device: more gain little there, and each takes 232 MiB."""
 
-HANG_S = 120.0
-"""Longest time between two sweeps of slots [s]; they take seconds."""
-
-START_S = 900.0
-"""The same before a process has solved its first trajectory [s]: kernels are compiled until then,
-which takes minutes."""
-
 _SLOTFULS = 2  # of trajectories that a device has: one at work, one that waits
 _POLL_S = 0.1
 _THREADS_MOST = 4  # the fingertip is made on the CPU, and takes little more
-
-
-def check_devices(names: Sequence[str]) -> None:
-    """Check that Warp sees these devices, e.g. ``cuda:0``.
-
-    Raises:
-        ConfigError: It does not see one of them; lists those that it sees.
-    """
-    from palpate_fem.device import known_devices
-
-    known = known_devices()
-    for name in names:
-        if name not in known:
-            raise ConfigError(
-                f"there is no device {name!r}",
-                remedy=f"give one of: {', '.join(known)}; if a GPU is missing, see nvidia-smi",
-            )
+_WORKERS_MOST = 16  # few trajectories need the CPU
+_ON_CPU_MOST = 256  # that run or wait there; then devices get no new ones
 
 
 def threads_and_packers(devices: Sequence[str], packers: int = 0) -> tuple[int, int]:
@@ -88,70 +71,6 @@ def threads_and_packers(devices: Sequence[str], packers: int = 0) -> tuple[int, 
     cores = os.cpu_count() or 1
     threads = max(1, min(_THREADS_MOST, cores // len(devices)))
     return threads, packers or min(cores, 2 * len(devices))
-
-
-class DeviceProcess(ChildProcess):
-    """The process of a device, as its batch sees it.
-
-    Attributes:
-        device: Its Warp device.
-        open: The trajectories that it has, by number.
-        ready: Whether its fingertip is there.
-        last_words: Why it ends, if it said so.
-        hung: Whether it was ended because it was silent.
-    """
-
-    def __init__(
-        self,
-        setup: DeviceSetup,
-        threads: int,
-        events: queue.SimpleQueue[tuple[DeviceProcess, DeviceEvent | None]],
-        *,
-        hang_s: float,
-        start_s: float,
-    ) -> None:
-        self.device = setup.device
-        self.open: dict[int, TrajectoryPlan] = {}
-        self.ready = self.hung = False
-        self.last_words: JobFailed | None = None
-        self._events, self._hang_s, self._patience_s = events, hang_s, start_s
-        self._turns = Turns()
-        self._turns.next(start_s)
-        super().__init__(
-            "palpate_fem.service.device_worker",
-            setup,
-            threads=threads,
-            on_message=DeviceProcess._on_event,
-            on_gone=lambda process: events.put((process, None)),
-        )
-
-    def give(self, number: int, plan: TrajectoryPlan) -> None:
-        """Give it a trajectory."""
-        if not self.open:  # it need not have said anything while it had nothing to do
-            self._turns.next(self._patience_s)
-        self.open[number] = plan
-        self.send(NumberedPress(number, plan.indenter, plan.path))
-
-    def end_if_hung(self) -> None:
-        """End it if it should be at work and has been silent for too long."""
-        if not self.hung and (self.open or not self.ready) and self._turns.are_late():
-            self.hung = True
-            self.kill()
-
-    def why_it_ended(self) -> str:
-        """The end of an error message."""
-        if self.last_words is not None:
-            return f"ended: {self.last_words.problem}"
-        if self.hung:
-            return f"was ended as it had been silent for {self._patience_s:g} s"
-        return self.how_it_ended()
-
-    def _on_event(self, event: DeviceEvent) -> None:
-        if isinstance(event, PressEnded):
-            self._patience_s = self._hang_s  # everything is compiled
-        self._turns.next(self._patience_s)
-        if not isinstance(event, Swept):
-            self._events.put((self, event))
 
 
 class _Supply:
@@ -174,18 +93,88 @@ class _Supply:
         return next(self._numbers), plan
 
 
+@dataclass(frozen=True, slots=True)
+class _PlanEnded:
+    """The end of a trajectory, its steps, and the device that has solved it; None = another end."""
+
+    plan: TrajectoryPlan
+    end: JobEnded | JobFailed
+    steps: Sequence[IndentationStep] = ()
+    device: DeviceProcess[TrajectoryPlan] | None = None
+
+
+class CpuShare(Closing):
+    """What devices do not solve: in worker processes, which start when there is something.
+
+    Args:
+        setup: How workers make the fingertip.
+        limit_s: Longest time for a trajectory [s].
+        on_end: Called with each end, from threads of its own.
+
+    Attributes:
+        open: Trajectories that run or wait; who takes their ends counts them down.
+    """
+
+    def __init__(
+        self, setup: WorkerSetup, limit_s: float, on_end: Callable[[_PlanEnded], None]
+    ) -> None:
+        self._setup, self._limit_s, self._on_end = setup, limit_s, on_end
+        self._waiting: deque[TrajectoryPlan] = deque()
+        self._pool: WorkerPool | None = None
+        self.open = 0
+
+    def put(self, plan: TrajectoryPlan) -> None:
+        """Solve a trajectory when a worker is free."""
+        if self._pool is None:
+            workers = max(1, min(_WORKERS_MOST, (os.cpu_count() or 1) - 1))
+            self._pool = WorkerPool(self._setup, workers=workers, threads=1, waiting=workers)
+        self._waiting.append(plan)
+        self.open += 1
+
+    def hand_out(self) -> None:
+        """Start what waits, if workers are free; to be called often."""
+        pool = self._pool
+        # A trajectory's time runs from its submission, so it must not wait in the pool.
+        while (
+            pool is not None
+            and self._waiting
+            and (pool.broken is not None or pool.busy + pool.waiting < pool.ready)
+        ):
+            self._submit(pool, self._waiting.popleft())
+
+    def close(self) -> None:
+        """End the workers; what runs or waits is dropped."""
+        if self._pool is not None:
+            self._pool.close()
+
+    def _submit(self, pool: WorkerPool, plan: TrajectoryPlan) -> None:
+        steps: list[IndentationStep] = []
+
+        def on_event(event: JobEvent) -> None:
+            if isinstance(event, StepConverged):
+                steps.append(event.step)
+            elif isinstance(event, JobEnded | JobFailed):
+                self._on_end(_PlanEnded(plan, event, steps))
+
+        job = SimulationJob(plan.name, self._setup.warm, plan.indenter, plan.path, self._limit_s)
+        try:
+            pool.submit(job, on_event)
+        except RemoteError as error:
+            self._on_end(_PlanEnded(plan, JobFailed.of(error)))
+
+
 class DeviceBatch(Closing):
     """Runs trajectories on fingertips with one set of parameters, on devices; a `TrajectoryBatch`.
 
     Args:
         setup: How the fingertip is made; all trajectories use its ``warm`` parameters. What it
             makes is a ``SlottedTip``.
-        devices: Warp devices, see `check_devices`; a process for each.
+        devices: Warp devices, see ``check_devices``; a process for each.
         slots: Trajectories at once on each.
         threads: Threads that the libraries of each process may use.
         limit_s: Longest time for a trajectory that has to be computed on the CPU [s].
         hang_s: A process that should be at work and is silent for so long is ended [s].
-        start_s: The same before it has solved its first trajectory [s].
+        start_s: The same before its device is ready [s].
 
     Raises:
         ConfigError: There are no devices or no slots.
@@ -206,17 +195,18 @@ class DeviceBatch(Closing):
             raise ConfigError(
                 f"{len(devices)} devices with {slots} slots", remedy="give one or more of each"
             )
-        self.ahead = _SLOTFULS * slots * len(devices)
-        self._setup, self._slots, self._threads, self._limit_s = setup, slots, threads, limit_s
+        self.ahead = _SLOTFULS * slots * len(devices) + _ON_CPU_MOST
+        self._setup, self._slots, self._threads = setup, slots, threads
         self._hang_s, self._start_s = hang_s, start_s
         self._first: StoredFingertip | None = None
         self._supply = _Supply(())
         self._again = False  # whether the last one was started once more
         self._closing = False
-        self._events: queue.SimpleQueue[tuple[DeviceProcess, DeviceEvent | None]] = (
-            queue.SimpleQueue()
-        )
-        self._processes: list[DeviceProcess] = []
+        self._events: queue.SimpleQueue[
+            tuple[DeviceProcess[TrajectoryPlan], DeviceEvent | None] | _PlanEnded
+        ] = queue.SimpleQueue()
+        self._cpu = CpuShare(setup, limit_s, self._events.put)
+        self._processes: list[DeviceProcess[TrajectoryPlan]] = []
         for device in devices:
             self._start(device)
 
@@ -253,20 +243,16 @@ class DeviceBatch(Closing):
                 self.close()
                 break
             self._hand_out(total)
-            if supply.used_up and not any(process.open for process in self._processes):
+            if supply.used_up and not self._open:
                 break
             ended = self._next()
             if ended is None:
                 continue
-            process, event = ended
-            plan = process.open.pop(event.number)
-            if isinstance(event, PressEnded):
-                result = event.result
-                end = JobEnded(result.outcome, result.reason, result.travel_m, result.seconds)
-                account_for(report, plan, end, result.steps, on_trajectory)
-                process.send(ResultTaken())
-            else:
-                account_for(report, plan, event.failed, (), on_trajectory)
+            account_for(report, ended.plan, ended.end, ended.steps, on_trajectory)
+            if ended.device is not None:
+                ended.device.send(ResultTaken())
+            elif isinstance(ended.end, JobEnded):
+                report.on_cpu += 1
             if on_report is not None:
                 on_report(report)
         report.wall_s = time.monotonic() - began
@@ -279,28 +265,41 @@ class DeviceBatch(Closing):
             process.kill()
         for process in self._processes:
             process.join()
+        self._cpu.close()
+
+    @property
+    def _open(self) -> int:
+        """Trajectories that are taken and have not ended, but for those given back."""
+        return sum(len(process.open) for process in self._processes) + self._cpu.open
 
     def _start(self, device: str) -> None:
-        setup = DeviceSetup(self._setup, device, self._slots, indenter_names(), self._limit_s)
+        setup = DeviceSetup(self._setup, device, self._slots, indenter_names())
         self._processes.append(
             DeviceProcess(
-                setup, self._threads, self._events, hang_s=self._hang_s, start_s=self._start_s
+                setup,
+                self._threads,
+                lambda process, event: self._events.put((process, event)),
+                hang_s=self._hang_s,
+                start_s=self._start_s,
             )
         )
 
     def _hand_out(self, total: int) -> None:
-        """Fill the devices, the emptiest first."""
+        """Fill the devices, the emptiest first, and the CPU."""
+        self._cpu.hand_out()
         # What one has in store another cannot solve: a small batch is shared evenly.
         share = math.ceil(total / max(1, len(self._processes)))
         most = max(1, min(_SLOTFULS * self._slots, share))
-        while True:
+        while self._open < self.ahead:
             free = [one for one in self._processes if one.ready and len(one.open) < most]
             found = self._supply.next() if free else None
             if found is None:
                 return
-            min(free, key=lambda one: len(one.open)).give(*found)
+            number, plan = found
+            emptiest = min(free, key=lambda one: len(one.open))
+            emptiest.give(NumberedPress(number, plan.indenter, plan.path), plan)
 
-    def _next(self) -> tuple[DeviceProcess, PressEnded | PressRefused] | None:
+    def _next(self) -> _PlanEnded | None:
         """Wait a moment for the end of a trajectory, and see to the processes.
 
         Raises:
@@ -309,21 +308,31 @@ class DeviceBatch(Closing):
         for process in self._processes:
             process.end_if_hung()
         try:
-            process, event = self._events.get(timeout=_POLL_S)
+            found = self._events.get(timeout=_POLL_S)
         except queue.Empty:
             return None
-        if isinstance(event, PressEnded | PressRefused):
-            return process, event
-        if isinstance(event, JobStarted):
-            process.ready = True
-            self._first = self._first or event.fingertip
-        elif isinstance(event, JobFailed):
-            process.last_words = event
-        elif event is None:
-            self._on_gone(process)
+        if isinstance(found, _PlanEnded):
+            self._cpu.open -= 1
+            return found
+        process, event = found
+        match event:
+            case PressEnded(number, result):
+                plan = process.open.pop(number)
+                return _PlanEnded(plan, JobEnded.of(result), result.steps, process)
+            case PressRefused(number, failed):
+                return _PlanEnded(process.open.pop(number), failed)
+            case PressUnsolved(number):
+                self._cpu.put(process.open.pop(number))
+            case JobStarted(fingertip):
+                process.ready = True
+                self._first = self._first or fingertip
+            case JobFailed():
+                process.last_words = event
+            case None:
+                self._on_gone(process)
         return None
 
-    def _on_gone(self, process: DeviceProcess) -> None:
+    def _on_gone(self, process: DeviceProcess[TrajectoryPlan]) -> None:
         """Give back what a process had; start it again if it was the last."""
         self._processes.remove(process)
         self._supply.given_back.extend(process.open.items())
@@ -334,7 +343,7 @@ class DeviceBatch(Closing):
         if self._processes:
             return
         # One that says why it does not start would say it again.
-        if self._again or (said is not None and not process.ready):
+        if self._again or (said is not None and not process.warm):
             raise RemoteError(
                 f"the solver on {process.device} {why}" + ", again" * self._again,
                 remedy=said.remedy

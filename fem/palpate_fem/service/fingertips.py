@@ -50,20 +50,15 @@ class PressurisedTip(Protocol):
 class SlottedSolver(Protocol):
     """Solves many trajectories of one fingertip at once, in slots."""
 
-    def indent(
-        self, presses: Iterator[BatchedPress], *, on_sweep: Callable[[int], None]
-    ) -> Iterator[tuple[int, IndentationResult]]:
-        """Solve presses, in whatever order they end; see ``BatchedFingertip.indent``.
-
-        Args:
-            presses: Asked in every sweep if slots are free: when it ends, there is none at the
-                moment. Checked before.
-            on_sweep: Called with the number of trajectories at work, and with 0 at every iteration
-                of one that is computed on the CPU.
-
-        Yields:
-            Number of the press in the order in which they were taken, and its result.
-        """
+    def solve(
+        self,
+        presses: Iterator[BatchedPress],
+        *,
+        on_sweep: Callable[[int], None] | None = None,
+        on_step: Callable[[int, IndentationStep], None] | None = None,
+        should_stop: Callable[[int], IndentationOutcome | None] | None = None,
+    ) -> Iterator[tuple[int, IndentationResult | BatchedPress]]:
+        """Solve presses, in whatever order they end; see ``BatchedFingertip.solve``."""
         ...
 
 
@@ -72,13 +67,7 @@ class SlottedTip(PressurisedTip, Protocol):
     """A pressurised fingertip that can be put on a device many times."""
 
     def on_device(
-        self,
-        indenters: Sequence[str],
-        *,
-        slots: int,
-        device: str,
-        friction_coefficient: float,
-        limit_s: float,
+        self, indenters: Sequence[str], *, slots: int, device: str, friction_coefficient: float
     ) -> SlottedSolver:
         """Make room on a device.
 
@@ -87,7 +76,6 @@ class SlottedTip(PressurisedTip, Protocol):
             slots: Trajectories at once.
             device: A Warp device, for example ``cuda:0``.
             friction_coefficient: Of indenters and skin.
-            limit_s: Longest time for a trajectory that has to be computed on the CPU [s].
         """
         ...
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -95,6 +96,11 @@ class JobEnded:
     travel_m: float = 0.0
     seconds: float = 0.0
 
+    @classmethod
+    def of(cls, result: IndentationResult) -> JobEnded:
+        """The end of a result."""
+        return cls(result.outcome, result.reason, result.travel_m, result.seconds)
+
     def trajectory(
         self, indenter: str, path: Floats, steps: Sequence[IndentationStep]
     ) -> IndentationResult:
@@ -145,23 +151,38 @@ class DeviceSetup:
         device: Warp device, for example ``cuda:0``.
         slots: Trajectories at once.
         indenters: Names of all that presses may have.
-        limit_s: Longest time for a trajectory that has to be computed on the CPU [s].
+        streams: Whether each step is sent as it is made; results then come without steps.
     """
 
     worker: WorkerSetup
     device: str
     slots: int
     indenters: tuple[str, ...]
-    limit_s: float
+    streams: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class NumberedPress:
-    """A trajectory for a device: number, unique for its process; indenter; poses (K, 7)."""
+    """A trajectory for a device.
+
+    Attributes:
+        number: Unique for its process.
+        indenter: Name of the indenter.
+        path: Poses, shape (K, 7).
+        deadline_s: Time that it may take from now on [s].
+    """
 
     number: int
     indenter: str
     path: Floats
+    deadline_s: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class StopPress:
+    """To the process of a device: end this trajectory as cancelled."""
+
+    number: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,11 +198,31 @@ class Swept:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceReady:
+    """From the process of a device: all is compiled and in its memory; comes once."""
+
+
+@dataclass(frozen=True, slots=True)
+class PressStep:
+    """A step of a trajectory has converged on a device."""
+
+    number: int
+    step: IndentationStep
+
+
+@dataclass(frozen=True, slots=True)
 class PressEnded:
     """Last event of a trajectory on a device."""
 
     number: int
     result: IndentationResult
+
+
+@dataclass(frozen=True, slots=True)
+class PressUnsolved:
+    """Likewise of one that finds no equilibrium there; the CPU may find one."""
+
+    number: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +233,18 @@ class PressRefused:
     failed: JobFailed
 
 
-DeviceEvent = JobStarted | Swept | PressEnded | PressRefused | JobFailed
-"""Message from the process of a device; ``JobFailed`` says why the process ends."""
+DeviceEvent = (
+    JobStarted
+    | DeviceReady
+    | Swept
+    | PressStep
+    | PressEnded
+    | PressUnsolved
+    | PressRefused
+    | JobFailed
+)
+"""Message from the process of a device; ``JobStarted`` when the fingertip is there and presses may
+come, ``JobFailed`` says why the process ends."""
 
 
 @dataclass(frozen=True, slots=True)

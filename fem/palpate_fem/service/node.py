@@ -1,7 +1,7 @@
 """The finite-element service: requests in, converged steps out as they come.
 
-A request is checked, then waits for one of a few worker processes. It always gets an answer: its
-steps and how it ended, or a typed error.
+A request is checked, then waits for one of a few worker processes or for a slot on a GPU. It always
+gets an answer: its steps and how it ended, or a typed error.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 
 from palpate.bus import Presence, Publisher, QueryAnswer, Session, endpoints
 from palpate.bus.topics import SIMULATION_PROGRESS, caller_key
@@ -37,6 +38,8 @@ from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.config import FemConfig
+from palpate_fem.service.device_pool import DevicePool
+from palpate_fem.service.device_process import wanted_device
 from palpate_fem.service.fingertips import without_friction
 from palpate_fem.service.jobs import (
     JobEnded,
@@ -172,17 +175,23 @@ class ActiveSimulation:
 
 
 class SimulationService(Closing):
-    """Answers simulation requests with a pool of workers.
+    """Answers simulation requests with a pool of workers, and with a device if there is one.
 
     Args:
         session: The bus.
         config: What is served.
         default: Parameters where a request gives none.
         health: Counts requests and results.
+        device: Solves many requests at once; None = workers alone.
     """
 
     def __init__(
-        self, session: Session, config: FemConfig, default: FingertipParameters, health: Health
+        self,
+        session: Session,
+        config: FemConfig,
+        default: FingertipParameters,
+        health: Health,
+        device: str | None,
     ) -> None:
         self._station = session.station
         self._config = config
@@ -192,14 +201,7 @@ class SimulationService(Closing):
         self._active: dict[str, ActiveSimulation] = {}
         self._fingertips: OrderedDict[FingertipParameters, StoredFingertip] = OrderedDict()
         self._progress = session.publisher(SIMULATION_PROGRESS, sensor=config.sensor)
-        self.pool = WorkerPool(
-            WorkerSetup(config.factory, config.options, default, config.keep),
-            workers=config.workers,
-            threads=config.threads_each(),
-            waiting=config.waiting,
-            grace_s=config.grace_s,
-            on_fingertip=self._remember,
-        )
+        self.pool = _pool_of(config, default, device, self._remember)
 
     def simulate(self, request: SimulationRequest, answer: QueryAnswer[SimulationReply]) -> None:
         """Accept a request; the pool's threads send the answer.
@@ -259,7 +261,7 @@ class SimulationService(Closing):
         self._health.gauge("busy_workers", self.pool.busy)
         self._health.gauge("ready_workers", self.pool.ready)
         self._health.gauge("waiting_requests", self.pool.waiting)
-        self._health.set_counts({"worker_restarts": self.pool.restarts})
+        self._health.set_counts(self.pool.counts)
 
     def close(self) -> None:
         """Answer whatever waits or runs with UNAVAILABLE, and end the workers."""
@@ -302,6 +304,44 @@ class SimulationService(Closing):
                 self._fingertips.popitem(last=False)
 
 
+def _pool_of(
+    config: FemConfig,
+    default: FingertipParameters,
+    device: str | None,
+    on_fingertip: Callable[[StoredFingertip], None],
+) -> WorkerPool | DevicePool:
+    """The pool of a configuration; it starts its processes.
+
+    Args:
+        config: Numbers, limits, and how fingertips are made.
+        default: Parameters of the warm fingertip.
+        device: Device in front of the workers; None = workers alone.
+        on_fingertip: Called with every fingertip that a process has built.
+    """
+    setup = WorkerSetup(config.factory, config.options, default, config.keep)
+    threads = config.threads_each()
+    workers = WorkerPool(
+        setup,
+        workers=config.workers,
+        threads=threads,
+        waiting=config.waiting,
+        grace_s=config.grace_s,
+        on_fingertip=on_fingertip,
+    )
+    if device is None:
+        return workers
+    return DevicePool(
+        setup,
+        device,
+        workers,
+        slots=config.slots,
+        waiting=config.waiting,
+        threads=threads,
+        grace_s=config.grace_s,
+        on_fingertip=on_fingertip,
+    )
+
+
 def run(
     config: FemConfig,
     link: LinkConfig,
@@ -320,17 +360,17 @@ def run(
         instance: Name of this process among several of its kind.
 
     Raises:
-        ConfigError: A parameter is out of range.
+        ConfigError: A parameter is out of range, or there is no such device.
         LinkError: The bus cannot be joined.
         RemoteError: The workers do not start; says why.
     """
-    default = config.fingertip.parameters()
+    default, device = config.fingertip.parameters(), wanted_device(config.device)
     health = Health(SERVICE, instance)
     health.set_sensors((config.sensor,))
     with Session.open(link, station=station) as session:
         presence = session.presence(SERVICE, instance=instance)
         with (
-            SimulationService(session, config, default, health) as service,
+            SimulationService(session, config, default, health, device) as service,
             HealthReporter(session, health, refresh=service.refresh_health),
         ):
             session.watch_callers(service.caller_gone)
@@ -347,21 +387,30 @@ def run(
                 served.close()
 
 
-def _serve(pool: WorkerPool, health: Health, presence: Presence, stop: threading.Event) -> None:
+def _serve(
+    pool: WorkerPool | DevicePool, health: Health, presence: Presence, stop: threading.Event
+) -> None:
     """Show as ready while a worker is; requests that come earlier wait for one.
 
     Raises:
         RemoteError: No worker will ever be ready.
     """
+    told: tuple[ServiceState, str] | None = None
     while not stop.wait(_POLL_S):
-        if not pool.turns.are_late():
+        if not pool.hangs():
             beat()
         if pool.broken is not None:
             raise pool.broken
         if pool.ready:
             presence.ready()
-            if health.state is not ServiceState.READY:
-                health.set_state(ServiceState.READY, "")
-        elif health.state is ServiceState.READY:
+            trouble = pool.trouble
+            state = ServiceState.DEGRADED if trouble else ServiceState.READY
+            found = state, trouble or pool.serves
+        elif told is None:
+            continue
+        else:
             presence.not_ready()
-            health.set_state(ServiceState.DEGRADED, "no worker is left; they are being started")
+            found = ServiceState.DEGRADED, "no worker is left; they are being started"
+        if found != told:
+            told = found
+            health.set_state(*found)

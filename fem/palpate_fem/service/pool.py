@@ -183,13 +183,33 @@ class WorkerPool(Closing):
         with self._lock:
             return len(self._waiting)
 
-    def submit(self, job: SimulationJob, on_event: OnEvent) -> None:
+    @property
+    def counts(self) -> dict[str, int]:
+        """What has happened so far, for the health report."""
+        return {"worker_restarts": self.restarts}
+
+    @property
+    def serves(self) -> str:
+        """Where jobs run, if that has to be said."""
+        return ""
+
+    @property
+    def trouble(self) -> str:
+        """Why jobs take longer than they should; empty = they do not."""
+        return ""
+
+    def hangs(self) -> bool:
+        """Whether a thread of the pool hangs; to be asked at every turn of the caller's loop."""
+        return self.turns.are_late()
+
+    def submit(self, job: SimulationJob, on_event: OnEvent, *, accepted: bool = False) -> None:
         """Run a job as soon as a worker is free.
 
         Args:
             job: What to run.
             on_event: Called with its events, from the pool's threads. ``JobEnded`` or ``JobFailed``
                 comes last, exactly once.
+            accepted: Whether its owner was promised an answer: then it may wait however many do.
 
         Raises:
             RemoteError: Too many wait (RESOURCE_EXHAUSTED, with the time to wait), or the pool is
@@ -198,11 +218,11 @@ class WorkerPool(Closing):
         now = time.monotonic()
         with self._lock:
             if self._closing.is_set() or self.broken is not None:
-                raise self.broken or _stopping()
+                raise self.broken or pool_stopping()
             free = sum(worker.state is WorkerState.IDLE for worker in self._workers)
-            if len(self._waiting) >= self._capacity + free:
+            if not accepted and len(self._waiting) >= self._capacity + free:
                 wait_s = self._typical_s * (len(self._waiting) + 1) / max(1, len(self._workers))
-                raise _full(len(self._running), len(self._waiting), wait_s)
+                raise pool_full(len(self._running), len(self._waiting), wait_s)
             self._waiting.append(PoolTask(job, on_event, now + job.deadline_s))
         self._dispatch()
 
@@ -240,7 +260,7 @@ class WorkerPool(Closing):
         for worker in workers:
             worker.kill()
         for task in tasks:
-            self._finish(task, JobFailed.of(_stopping()))
+            self._finish(task, JobFailed.of(pool_stopping()))
         self._upkeep.join(timeout=5)
         for worker in workers:
             worker.join()
@@ -337,7 +357,7 @@ class WorkerPool(Closing):
             _log.warning("worker %d %s", worker.pid, how)
         if task is not None:
             self._finish(
-                task, JobFailed.of(_stopping()) if closing else self._last_event(task, how)
+                task, JobFailed.of(pool_stopping()) if closing else self._last_event(task, how)
             )
 
     def _last_event(self, task: PoolTask, how: str) -> JobEnded | JobFailed:
@@ -416,7 +436,8 @@ class WorkerPool(Closing):
         self._report(task, event)
 
 
-def _stopping() -> RemoteError:
+def pool_stopping() -> RemoteError:
+    """Error of a job that a pool does not finish, as it is closed."""
     return RemoteError(
         "the finite-element service is stopping",
         remedy="ask again when it is back: palpate status",
@@ -425,7 +446,8 @@ def _stopping() -> RemoteError:
     )
 
 
-def _full(running: int, waiting: int, retry_after_s: float) -> RemoteError:
+def pool_full(running: int, waiting: int, retry_after_s: float) -> RemoteError:
+    """Error of a job that finds no room; says when to ask again [s]."""
     return RemoteError(
         f"{running} simulations run and {waiting} wait",
         remedy="ask again later, or start the service with more workers",
