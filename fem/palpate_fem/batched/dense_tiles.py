@@ -260,24 +260,17 @@ _VECTORS = (
     const int row = lane / 4, column = 2 * (lane % 4);
     // The threads of columns 0 and 1 of B hold 32 rows of two numbers, the others zeros.
     auto number = [=](const double* known, int k) { return row < 2 ? known[2 * k + row] : 0.0; };
-    // A tile, loaded before what it is to be multiplied with is there.
-    auto load = [=](double2 (&numbers)[4][4], const double* tile) {
+    // Add a tile times them: row 8 m + g at the threads with s = 0.
+    auto add_tile = [=](double (&sum)[4][2], const double* tile, const double* known) {
         #pragma unroll
-        for (int k = 0; k < 4; ++k)
+        for (int k = 0; k < 32; k += 8) {
+            const double2 factor
+                = make_double2(number(known, k + column), number(known, k + column + 1));
             #pragma unroll
-            for (int m = 0; m < 4; ++m)
-                numbers[k][m] = pair_at(tile + (8 * m + row) * 32 + 8 * k + column);
-    };
-    // Add it times them: row 8 m + g at the threads with s = 0.
-    auto add_loaded
-        = [=](double (&sum)[4][2], const double2 (&numbers)[4][4], const double* known) {
-        #pragma unroll
-        for (int k = 0; k < 4; ++k) {
-            const int at = 8 * k + column;
-            const double2 factor = make_double2(number(known, at), number(known, at + 1));
-            #pragma unroll
-            for (int m = 0; m < 4; m += 2)
-                add_product(sum[m], sum[m + 1], numbers[k][m], numbers[k][m + 1], factor);
+            for (int m = 0; m < 4; m += 2) {
+                const double* at = tile + (8 * m + row) * 32 + k + column;
+                add_product(sum[m], sum[m + 1], pair_at(at), pair_at(at + 256), factor);
+            }
         }
     };
     // Add a transposed tile times them: row 16 (m / 2) + 2 g + m % 2.
@@ -309,32 +302,23 @@ _SUBSTITUTE_FORWARD = (
 #ifdef PALPATE_TENSOR_CORES
     for (int c = 0; c < own; ++c) {
         double* known = x + 64 * c;
-        double2 tile[4][4];
         if (warp == 0) {
             double sum[4][2] = {};
-            load(tile, tiles_of(c) + 1024 * c);
-            add_loaded(sum, tile, known);
+            add_tile(sum, tiles_of(c) + 1024 * c, known);
             __syncwarp();  // all have read what is overwritten now
             if (column == 0)
                 for (int m = 0; m < 4; ++m)
                     for (int n = 0; n < 2; ++n)
                         known[2 * (8 * m + row) + n] = sum[m][n];
         }
-        int r = c + 1 + (warp + warps - 1) % warps;  // the first warp has had its share
-        if (r < rows)
-            load(tile, tiles_of(r) + 1024 * c);
         __syncthreads();
-        while (r < rows) {
+        for (int r = c + 1 + warp; r < rows; r += warps) {
             double sum[4][2] = {};
-            add_loaded(sum, tile, known);
-            double* target = x + 64 * r;
-            r += warps;
-            if (r < rows)
-                load(tile, tiles_of(r) + 1024 * c);
+            add_tile(sum, tiles_of(r) + 1024 * c, known);
             if (column == 0)
                 for (int m = 0; m < 4; ++m)
                     for (int n = 0; n < 2; ++n)
-                        target[2 * (8 * m + row) + n] -= sum[m][n];
+                        x[64 * r + 2 * (8 * m + row) + n] -= sum[m][n];
         }
         __syncthreads();
     }

@@ -169,7 +169,7 @@ def add_entries(
         panels[tile, within // TILE, within % TILE] += values_in[slot, entry]
 
 
-@wp.kernel(launch_bounds=(THREADS, 3))
+@wp.kernel(launch_bounds=(THREADS, 2))
 def factorise_panels(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
@@ -192,7 +192,7 @@ def factorise_panels(
         dense_tiles.factorise_panel(panels, panel, own, rows, slot, bad, thread, threads)
 
 
-@wp.kernel(launch_bounds=(THREADS, 3))
+@wp.kernel(launch_bounds=(THREADS, 2))
 def subtract_products(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import THREADS, TILE
+from palpate_fem.batched.dense_tiles import TILE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,7 +62,7 @@ def gather_right(
         loaded_out[slot, front] = 1
 
 
-@wp.kernel(launch_bounds=(THREADS, 2))
+@wp.kernel
 def substitute_forward(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array(dtype=wp.int32),
