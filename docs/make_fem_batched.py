@@ -1,9 +1,12 @@
 """Write docs/results/fem-batched.md and its picture from what the benchmark has measured on a GPU.
 
-    python tests/benchmarks/bench_batched.py ... --out docs/results/fem-batched/h100.json
+    python tests/benchmarks/bench_batched.py ... --out h100.json
+    python tests/benchmarks/bench_batched.py --edge-mm ... --out meshes.json
+    python tests/benchmarks/bench_batched_factor.py ... --out factor.json
     python docs/make_fem_batched.py
 
-``sweeps.json`` beside it holds what ``palpate fem run --sweep --device`` said, command by command.
+These files are in docs/results/fem-batched. ``sweeps.json`` beside them holds what ``palpate fem
+run --sweep --device`` said, command by command.
 """
 
 from __future__ import annotations
@@ -26,7 +29,6 @@ from palpate_training.figures.style import (
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "results" / "fem-batched"
 PAGE = FOLDER.with_suffix(".md")
-MOST_KERNELS = 12
 
 HEAD = """# Many indentations at once on a GPU
 
@@ -94,19 +96,21 @@ def agreement(rows: list[dict[str, Any]], folder: Path) -> str:
     return f"{told}\n\n![agreement](fem-batched/agreement.png)"
 
 
-def kernels(run: dict[str, Any]) -> str:
-    """Where the time goes."""
-    spent = run["kernels_s"]
-    whole = sum(spent.values())
-    rows = [
-        [name.rsplit("_", 1)[0], f"{1e3 * value / run['presses']:.1f}", f"{value / whole:.0%}"]
-        for name, value in list(spent.items())[:MOST_KERNELS]
+def kernels(runs: list[dict[str, Any]]) -> str:
+    """Where the time of a factorisation and of a solve goes."""
+    names = list(runs[-1]["kernels_ms"])
+    head = ["kernel", *(f"slots: {run['slots']} [ms]" for run in runs)]
+    rows = [[name, *(show(run["kernels_ms"].get(name)) for run in runs)] for name in names]
+    whole = [
+        [f"**{what}, a slot**", *(f"**{run[key]:.2f}**" for run in runs)]
+        for what, key in (("factorisation", "factor_ms_a_slot"), ("solve", "solve_ms_a_slot"))
     ]
-    told = (
-        f"{run['slots']} slots, {run['presses']} presses: {1e3 * whole / run['presses']:.0f} ms a "
-        f"trajectory on the GPU of {run['ms_a_trajectory']:.0f} in all"
-    )
-    return f"{told}.\n\n" + markdown_table(["kernel", "ms a trajectory", "share"], rows)
+    return markdown_table(head, [*whole, *rows])
+
+
+def show(value: float | None) -> str:
+    """A time [ms]; nothing where it was not noted."""
+    return "" if value is None else f"{value:.2f}"
 
 
 def draw(runs: list[dict[str, Any]], path: Path) -> None:
@@ -124,8 +128,14 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
         for run in runs
         if slots and run["slots"] == slots[0]
     )
-    by_size.loglog(*np.array(same).T, "o-", color=unit_colour(1), ms=4)
+    by_size.plot(*np.array(same).T, "o-", color=unit_colour(1), ms=4)
     label(by_size, "unknowns", "", f"{slots[0]} slots")
+    by_slots.set_xticks([run["slots"] for run in first], [str(run["slots"]) for run in first])
+    by_slots.set_yticks([round(run["ms_while_full"]) for run in first])
+    by_slots.yaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
+    by_slots.minorticks_off()
+    by_size.set_ylim(0.0)
+    by_size.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     for axes in (by_slots, by_size):
         grid(axes)
     finish(figure, path, "Time of a trajectory with all slots taken", "Dashed: the goal.")
@@ -133,20 +143,21 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     """Write page and pictures."""
-    report, parts, sweeps = read("h100.json"), read("parts.json"), read("sweeps.json")
-    draw(report["runs"], FOLDER / "time.png")
+    report, meshes = read("h100.json"), read("meshes.json")
+    factor, sweeps = read("factor.json"), read("sweeps.json")
+    runs = sorted(report["runs"], key=lambda run: int(run["slots"])) + meshes["runs"]
+    draw(runs, FOLDER / "time.png")
     sections = [
         HEAD,
-        f"## Time\n\n{report['device']}: `{report['command']}`\n",
-        times(report["runs"]),
+        f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`\n",
+        times(runs),
         "\n![time](fem-batched/time.png)\n",
         "## Agreement with the solver on a core\n",
         agreement(report["against_cpu"], FOLDER),
-        "\n## Where the time goes\n",
-        f"`{parts['command']}`, each kernel timed:\n",
-        kernels(parts["runs"][-1]),
-        "\n## Sweeps\n",
-        sweeps["told"] + "\n",
+        "\n## A factorisation and a solve\n",
+        f"All fronts: `{factor['command']}`. {factor['told']}\n",
+        kernels(factor["runs"]),
+        f"\n## Sweeps\n\n{sweeps['told']}\n",
         markdown_table(
             ["command", "presses", "ms a trajectory", "outcomes"],
             [
