@@ -160,7 +160,8 @@ def time_slots(
         results = dict(batched.indent(fed, on_sweep=progress.at_work.append))
         seconds = time.perf_counter() - progress.started
         spent = kernel_times(wp.timing_end()) if parts else {}
-    found = [summary(result) for result in results.values()]
+    found = [summary(result) for _, result in sorted(results.items())]
+    slowest = sorted(range(len(found)), key=lambda k: -found[k]["iterations"])[:5]
     run = {
         "unknowns": len(tip.system.pattern.free),
         "slots": slots,
@@ -173,6 +174,9 @@ def time_slots(
         "outcomes": Counter(one["outcome"] for one in found),
         "iterations": float(np.mean([one["iterations"] for one in found])),
         "factorisations": float(np.mean([one["factorisations"] for one in found])),
+        "slowest": [
+            [k, found[k]["indenter"], found[k]["outcome"], found[k]["iterations"]] for k in slowest
+        ],
         "kernels_s": spent,
     }
     return run, results
