@@ -25,8 +25,8 @@ from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import PathSegment, parse_segments, show_segments
 from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.iteration import NewtonReport, NewtonSettings
 from palpate_fem.mechanics.load_stepping import LoadStepping, SolverSettings
-from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mesh.parametric import biotac

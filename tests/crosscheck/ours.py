@@ -10,7 +10,8 @@ from tests.crosscheck.problem import Bools, Floats, Ints, Problem, Solution
 
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.iteration import NewtonSettings
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh

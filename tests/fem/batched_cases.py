@@ -15,8 +15,9 @@ from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.state import BatchedState, Listed, SlotNumbers
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.load_stepping import LoadStepping
-from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 

@@ -21,8 +21,8 @@ from palpate.client import Client
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
 from palpate_fem.config import FingertipParameters
+from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.load_stepping import SolverSettings
-from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.core import DistanceGrid, RigidCore

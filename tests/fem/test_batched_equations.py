@@ -29,8 +29,8 @@ from palpate_fem.batched.state import FIELDS, BatchedState
 from palpate_fem.batched.steps import BatchedSteps
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.iteration import largest_error
 from palpate_fem.mechanics.load_stepping import indentation_step
-from palpate_fem.mechanics.newton import largest_error
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.result import Convergence

@@ -18,8 +18,8 @@ from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics import solver
 from palpate_fem.mechanics.adjoint import OutputGradients, gradients, sensitivities
 from palpate_fem.mechanics.contact import ContactSettings
+from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.load_stepping import ConvergedIncrement, SolverSettings
-from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.parametric import biotac

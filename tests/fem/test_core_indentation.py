@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.load_stepping import SolverSettings
-from palpate_fem.mechanics.newton import NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep

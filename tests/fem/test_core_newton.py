@@ -14,14 +14,10 @@ from tests.fem.numpy_mechanics import NeoHooke, cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.mechanics import newton as newton_module
+from palpate_fem.mechanics import iteration as iteration_module
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.newton import (
-    NewtonSettings,
-    NewtonSolver,
-    damping_after,
-    has_converged,
-)
+from palpate_fem.mechanics.iteration import NewtonSettings, damping_after, has_converged
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
@@ -372,9 +368,13 @@ def test_settings_are_those_that_results_were_made_with() -> None:
     assert (settings.largest_move_m, settings.keep_factor, settings.keep_elastic) == (
         0.25e-3, 0.3, 0.15,
     )  # fmt: skip
-    assert (newton_module.FIRST_VISCOSITY, newton_module.NO_VISCOSITY) == (1.0, 3e-3)
-    assert (newton_module.LEAST_VISCOSITY, newton_module.MOST_VISCOSITY) == (1e-2, 100.0)
-    assert (newton_module.VISCOSITY_FALL, newton_module.VISCOSITY_RISE, newton_module.STALLED) == (
+    assert (iteration_module.FIRST_VISCOSITY, iteration_module.NO_VISCOSITY) == (1.0, 3e-3)
+    assert (iteration_module.LEAST_VISCOSITY, iteration_module.MOST_VISCOSITY) == (1e-2, 100.0)
+    assert (
+        iteration_module.VISCOSITY_FALL,
+        iteration_module.VISCOSITY_RISE,
+        iteration_module.STALLED,
+    ) == (
         0.3,
         3.0,
         0.8,

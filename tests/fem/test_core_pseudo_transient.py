@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.load_stepping import SolverSettings, moves_in
-from palpate_fem.mechanics.newton import (
+from palpate_fem.mechanics.iteration import (
     FIRST_VISCOSITY,
     LEAST_VISCOSITY,
     MOST_VISCOSITY,
     NewtonSettings,
-    NewtonSolver,
     PseudoTransient,
 )
+from palpate_fem.mechanics.load_stepping import SolverSettings, moves_in
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem

@@ -14,8 +14,8 @@ from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import distance
+from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.load_stepping import VOIGT, LoadStepping, SolverSettings
-from palpate_fem.mechanics.newton import NewtonSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats
 from palpate_fem.batched.equations import BatchedEquations
@@ -25,18 +25,16 @@ from palpate_fem.batched.trajectory import (
     Accept,
     BatchedTrajectory,
     Begin,
-    Correct,
-    Factorise,
     MovesIn,
     Reach,
     Request,
     Requests,
-    Step,
 )
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.path import check_path
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.iteration import Correct, Factorise, Step
 from palpate_fem.mechanics.load_stepping import moves_in
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
@@ -245,7 +243,10 @@ class BatchedFingertip:
     def _go_on(one: _Live, answer: object) -> None:
         """Resume a trajectory with an answer; ``wanted`` is None when it has ended."""
         try:
-            one.wanted = one.requests.send(answer)
+            if isinstance(answer, SimulationError):
+                one.wanted = one.requests.throw(answer)
+            else:
+                one.wanted = one.requests.send(answer)
         except StopIteration:
             one.wanted = None
 
@@ -273,7 +274,8 @@ class BatchedFingertip:
             numbers = self.equations.numbers(self._trial, listed)
             for slot, found in zip(slots, numbers, strict=True):
                 live[slot].numbers = found
-                self._go_on(live[slot], found)
+                begins = isinstance(live[slot].wanted, Begin)
+                self._go_on(live[slot], found if begins else (found, found.sets_changed))
             self._end_increments(live)
 
     def _factorise(self, live: dict[int, _Live]) -> None:
@@ -283,7 +285,7 @@ class BatchedFingertip:
             for slot in slots:
                 wanted = live[slot].wanted
                 assert isinstance(wanted, Factorise)
-                self._viscosity[slot] = wanted.viscosity
+                self._viscosity[slot] = wanted.viscosity or 0.0
                 if wanted.elastic:
                     elastic.append(slot)
             listed = self.equations.listed(np.array(slots))
@@ -291,7 +293,11 @@ class BatchedFingertip:
             viscosity = wp.array(self._viscosity, dtype=wp.float64, device=self._device)
             definite = self.linear.factorise(self._trial, listed, anew, viscosity)
             for slot, fine in zip(slots, definite, strict=True):
-                self._go_on(live[slot], bool(fine))
+                wanted = live[slot].wanted
+                assert isinstance(wanted, Factorise)
+                # A factor that met a pivot that is not positive is of no use.
+                lost = not fine and not wanted.can_rise
+                self._go_on(live[slot], _failed("a direction is unstable") if lost else bool(fine))
 
     def _step(self, live: dict[int, _Live]) -> None:
         """Serve Newton steps; see `NewtonSolver._step`."""
@@ -327,8 +333,11 @@ class BatchedFingertip:
             left = [slot for slot in left if slot not in answers]
             fraction[left] *= 0.5
         for slot in slots:
-            live[slot].numbers = answers.get(slot, live[slot].numbers)
-            self._go_on(live[slot], answers.get(slot))
+            if (answer := answers.get(slot)) is None:
+                self._go_on(live[slot], _failed("an element turns inside out"))
+            else:
+                live[slot].numbers = answer
+                self._go_on(live[slot], (answer, answer.sets_changed))
         self._end_increments(live)
 
     def _end_increments(self, live: dict[int, _Live]) -> None:
@@ -400,6 +409,10 @@ class BatchedFingertip:
             travel_m=trajectory.travel_m,
             seconds=time.perf_counter() - one.started,
         )
+
+
+def _failed(problem: str) -> SimulationError:
+    return SimulationError(problem, remedy="use smaller increments")
 
 
 def _known(one: _Live) -> SlotNumbers:

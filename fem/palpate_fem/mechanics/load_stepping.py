@@ -17,7 +17,8 @@ from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
 from palpate_fem.mechanics.element_kernels import VOLUME_BARRIER
-from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.iteration import NewtonReport, NewtonSettings
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep

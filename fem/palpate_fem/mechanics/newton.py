@@ -1,15 +1,14 @@
-"""Newton's method for one increment of the load.
+"""Newton's method for one state: an iteration's linear system, and the step along its solution.
 
-The linear system of an iteration is the sparse symmetric tangent, bordered by the fluid pressure,
-plus the unsymmetric share of friction, which corrects the solution of the symmetric part. Where
-skin is pinched so hard that this does not converge, pseudo-transient continuation takes its place.
+The linear system is the sparse symmetric tangent, bordered by the fluid pressure, plus the
+unsymmetric share of friction, which corrects the solution of the symmetric part. When to do what is
+decided by ``iteration``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+import contextlib
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
@@ -17,192 +16,18 @@ from scipy.sparse.linalg import LinearOperator, gmres
 from palpate.errors import SimulationError
 from palpate_fem.arrays import Floats
 from palpate_fem.mechanics.contact import PosedIndenter
+from palpate_fem.mechanics.iteration import (
+    Correct,
+    Factorise,
+    NewtonReport,
+    NewtonSettings,
+    PseudoTransient,
+    newton_iterations,
+)
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import SparseFactor
-
-DAMP_FROM = 6
-"""Iterations after which an error that does not decrease is taken for a cycle."""
-
-MORTAR_FROM = 1e-2
-"""Error from which on the mortar correction is evaluated again: near enough to the solution."""
-
-HOPELESS = 0.3
-"""Error at which Newton's method, after some iterations, gives up; continuation takes over."""
-
-FIRST_VISCOSITY = 1.0
-VISCOSITY_FALL, VISCOSITY_RISE = 0.3, 3.0
-NO_VISCOSITY, LEAST_VISCOSITY, MOST_VISCOSITY = 3e-3, 1e-2, 100.0
-
-STALLED = 0.8
-"""Residual over that two iterations before from which the iteration is taken to stall."""
-
-
-@dataclass(frozen=True, slots=True)
-class NewtonSettings:
-    """Tolerances and limits of an increment.
-
-    Attributes:
-        tolerance: Unbalanced force over the scale of the forces that cancel.
-        volume_tolerance: Relative error of the cavity's volume and of each element's.
-        gap_tolerance_m: Error of the gap that belongs to a contact pressure [m].
-        traction_tolerance: Error of a point's friction over the largest traction.
-        iterations: Most iterations of Newton's method.
-        patience: Iterations of Newton's method after which an error above `HOPELESS` ends it.
-        pseudo_transient_iterations: Most iterations of pseudo-transient continuation.
-        mortar_updates: How often the mortar correction of contact, which is first evaluated at the
-            start, is evaluated again near the solution. Each time leaves a tenth of its error or
-            less.
-        linear_tolerance: Share of a linear solution below which one correction for the unsymmetric
-            tangent is enough; else GMRES goes on until a third of this share of it is left over.
-        largest_move_m: Displacement of any node in one iteration; longer moves are shortened [m].
-        keep_factor: The factorised matrix is used again while each iteration shrinks the error to
-            this share of it or less, and the active set of contact does not change.
-        keep_elastic: The tangent of skin and fluid is used again within an increment while each
-            iteration shrinks the error to this share of it or less.
-    """
-
-    tolerance: float = 1e-6
-    volume_tolerance: float = 1e-6
-    gap_tolerance_m: float = 0.1e-6
-    traction_tolerance: float = 0.01
-    iterations: int = 20
-    patience: int = 10
-    pseudo_transient_iterations: int = field(default=40, metadata={"stored_as": "creep_iterations"})
-    mortar_updates: int = 2
-    linear_tolerance: float = 0.3
-    largest_move_m: float = 0.25e-3
-    keep_factor: float = 0.3
-    keep_elastic: float = 0.15
-
-
-@dataclass(slots=True)
-class NewtonReport:
-    """How an increment went; ``reason`` says why it did not converge."""
-
-    iterations: int = 0
-    factorisations: int = 0
-    residuals: list[float] = field(default_factory=list)
-    converged: bool = False
-    reason: str = ""
-
-
-@dataclass(slots=True)
-class PseudoTransient:
-    """Pseudo-transient continuation (Kelley and Keyes 1998): the viscosity of each iteration.
-
-    Skin that is pinched between a hard indenter and the core may have an unstable direction: a node
-    of its inner surface moves *into* the core when its contact is released, and its contact pulls
-    when it is kept. The active set of contact then never comes to rest. Real skin is viscous and
-    flows to its next stable state. So does this one, by implicit Euler steps of one Newton
-    iteration each::
-
-        (K + eta M) dx = -r(x)
-
-    with the tangent K, the unbalanced force r and a diagonal M of the size of the skin's stiffness.
-    The viscosity eta (over the time step) is in the tangent only, not in the forces, so the limit
-    is an equilibrium without viscosity.
-
-    eta rises until K + eta M has no negative eigenvalue, which the inertia of its factor tells, and
-    falls from iteration to iteration. It must not be steered by the residual, as usual elsewhere:
-    the residual grows while the skin leaves an unstable state.
-
-    Attributes:
-        viscosity: eta of the next iteration.
-    """
-
-    viscosity: float = FIRST_VISCOSITY
-    _residuals: list[float] = field(default_factory=list)
-
-    @property
-    def can_rise(self) -> bool:
-        """Whether the viscosity is below its limit."""
-        return self.viscosity < MOST_VISCOSITY
-
-    def rise(self) -> None:
-        """Raise the viscosity, because a direction is unstable."""
-        self.viscosity = min(MOST_VISCOSITY, max(LEAST_VISCOSITY, VISCOSITY_RISE * self.viscosity))
-
-    def after(self, residual: float) -> None:
-        """Lower the viscosity after an iteration; begin again where it is 0 and nothing is won."""
-        stalled = len(self._residuals) >= 2 and residual > STALLED * self._residuals[-2]
-        if stalled and self.viscosity == 0.0:
-            self.viscosity = FIRST_VISCOSITY
-        else:
-            lower = VISCOSITY_FALL * self.viscosity
-            self.viscosity = lower if lower > NO_VISCOSITY else 0.0
-        self._residuals.append(residual)
-
-
-class BalanceErrors(Protocol):
-    """How far a state is from equilibrium; see `ForceBalance`."""
-
-    @property
-    def residual(self) -> float:
-        """Unbalanced force over the scale of the forces that cancel."""
-
-    @property
-    def volume(self) -> float:
-        """Of the cavity [m^3]."""
-
-    @property
-    def strain_error(self) -> float:
-        """Largest relative error of an element's volume."""
-
-    @property
-    def gap_error_m(self) -> float:
-        """Largest error of a contact point's gap [m]."""
-
-    @property
-    def traction_error(self) -> float:
-        """Largest error of a traction, over the largest one."""
-
-
-def largest_error(balance: BalanceErrors, volume: float | None) -> float:
-    """Largest of the relative errors, weighted by their tolerances.
-
-    Args:
-        balance: At some state.
-        volume: Volume that the cavity has to take [m^3]; None = any.
-    """
-    error = balance.residual
-    if volume is not None:
-        error = max(error, abs(balance.volume - volume) / volume)
-    # A micrometre of gap counts as much as a hundredth of the force, and as all of friction.
-    return max(
-        error,
-        balance.strain_error,
-        balance.gap_error_m * 1e4,
-        balance.traction_error * 1e-2,
-    )
-
-
-def has_converged(balance: BalanceErrors, volume: float | None, settings: NewtonSettings) -> bool:
-    """Whether all errors are within their tolerances; see `largest_error`."""
-    # Written so that what is not a number has not converged.
-    return (
-        balance.residual <= settings.tolerance
-        and (volume is None or abs(balance.volume - volume) <= settings.volume_tolerance * volume)
-        and balance.gap_error_m <= settings.gap_tolerance_m
-        and balance.traction_error <= settings.traction_tolerance
-        and balance.strain_error <= settings.volume_tolerance
-    )
-
-
-def damping_after(errors: Sequence[float]) -> float:
-    """Share of the next step: less than 1 where the error cycles.
-
-    The sets of sticking and sliding points may alternate between two. Steps of half and three
-    quarters, in turn, end between them.
-
-    Args:
-        errors: Since the last mortar correction, the first before any iteration.
-    """
-    done = len(errors) - 1
-    if done < DAMP_FROM or errors[-1] < 0.3 * min(errors[-4:-1]):
-        return 1.0
-    return 0.5 if done % 2 else 0.75
 
 
 class NewtonSolver:
@@ -236,88 +61,64 @@ class NewtonSolver:
             pseudo_transient: Whether to use pseudo-transient continuation: slower, but it converges
                 where the active set of plain Newton iterations cycles.
         """
-        continuation = PseudoTransient() if pseudo_transient else None
-        settings, system, report = self.settings, self.system, NewtonReport()
-        limit = settings.pseudo_transient_iterations if continuation else settings.iterations
-        fits, elastic = False, not (self._has_elastic and settings.keep_elastic)
-        updates, done = 0, 0  # of the mortar correction, and the iterations before the last one
+        report, system = NewtonReport(), self.system
         system.correct_contact(state, indenter)
         balance = system.balance(state, indenter)
-        error = largest_error(balance, volume)
-        report.residuals.append(error)
-        while True:
-            moved = report.iterations > done
-            if moved and updates < settings.mortar_updates and error < MORTAR_FROM:
-                system.correct_contact(state, indenter)
-                balance = system.balance(state, indenter)
-                error = largest_error(balance, volume)
-                updates, done = updates + 1, report.iterations
-                # The state hardly moves any more, so the factor fits as it did.
-                fits = fits and not system.sets_changed
-            if has_converged(balance, volume, settings):
-                report.converged = True
-                return report, balance
-            hopeless = report.iterations == settings.patience and error > HOPELESS
-            if report.iterations >= limit or (hopeless and not continuation):
-                report.reason = f"no equilibrium after {report.iterations} iterations"
-                return report, balance
-            if should_stop is not None and should_stop():
-                report.reason = "stopped"
-                return report, balance
+        requests = newton_iterations(
+            report,
+            balance,
+            volume,
+            self.settings,
+            has_elastic=self._has_elastic,
+            continuation=PseudoTransient() if pseudo_transient else None,
+        )
+        wanted, asked = next(requests, None), -1
+        while wanted is not None:
+            answer: object = None
+            if not isinstance(wanted, Correct) and asked < report.iterations:
+                asked = report.iterations
+                if should_stop is not None and should_stop():
+                    report.reason = "stopped"
+                    break
             try:
-                if continuation:
-                    report.factorisations += self._factorise_stable(continuation)
-                elif not fits:
-                    self._factorise(elastic=elastic)
-                    report.factorisations += 1
-                damping = 1.0 if continuation else damping_after(report.residuals[done:])
-                balance = self._step(state, indenter, balance, volume, damping)
+                if isinstance(wanted, Factorise):
+                    answer = self._factorise(wanted)
+                else:
+                    if isinstance(wanted, Correct):
+                        system.correct_contact(state, indenter)
+                        balance = system.balance(state, indenter)
+                    else:
+                        balance = self._step(state, indenter, balance, volume, wanted.damping)
+                    answer = balance, system.sets_changed
             except SimulationError as failure:
-                report.reason = failure.problem
-                return report, balance
-            report.iterations += 1
-            before, error = error, largest_error(balance, volume)
-            report.residuals.append(error)
-            if not np.isfinite(error):
-                report.reason = "the equations gave no number"
-                return report, balance
-            # The active set of contact changes from one iteration to the next, the skin's own
-            # tangent little within an increment: it is evaluated again after the first iteration,
-            # which brings the state near, and then only where convergence is slow.
-            elastic = report.iterations == 1 or error > settings.keep_elastic * before
-            fits = error < settings.keep_factor * before and not system.sets_changed
-            if continuation:
-                continuation.after(balance.residual)
+                with contextlib.suppress(StopIteration):
+                    requests.throw(failure)
+                break
+            try:
+                wanted = requests.send(answer)
+            except StopIteration:
+                break
+        return report, balance
 
     def forget(self) -> None:
         """Drop the last tangent, so that the next solution does not depend on earlier ones."""
         self._border, self._has_elastic = None, False
 
-    def _factorise(self, *, elastic: bool, viscosity: float = 0.0) -> None:
-        self._border = None
-        self.factor.factorise(self.system.tangent_values(elastic=elastic, viscosity=viscosity))
-        self._has_elastic = True
-
-    def _factorise_stable(self, continuation: PseudoTransient) -> int:
-        """Factorise with a viscosity that leaves no unstable direction; returns how often.
+    def _factorise(self, wanted: Factorise) -> bool:
+        """Factorise the present tangent; whether it has no unstable direction.
 
         By Sylvester's law of inertia the signs of the pivots are those of the eigenvalues, so the
         factor tells the number of unstable directions at no cost.
         """
         self._border = None
-        elastic, count = True, 0
-        while True:
-            values = self.system.tangent_values(elastic=elastic, viscosity=continuation.viscosity)
-            elastic, count = False, count + 1
-            if continuation.viscosity and continuation.can_rise:
-                stable = self.factor.factorise_definite(values)
-            else:  # single precision may doubt a tangent that is definite
-                self.factor.factorise(values)
-                stable = self.factor.negative == 0
-            if stable or not continuation.can_rise:
-                self._has_elastic = True
-                return count
-            continuation.rise()
+        values = self.system.tangent_values(
+            elastic=wanted.elastic, viscosity=wanted.viscosity or 0.0
+        )
+        self._has_elastic = True
+        if wanted.viscosity and wanted.can_rise:
+            return self.factor.factorise_definite(values)
+        self.factor.factorise(values)  # single precision may doubt a tangent that is definite
+        return self.factor.negative == 0
 
     def _step(
         self,

@@ -1,7 +1,8 @@
 """A fingertip in finite elements: pressurised once, then indented again and again.
 
 Reading order of this folder: `reference_element`, `skin` (with ``element_kernels``),
-`contact` (with ``contact_kernels``), `state`, `system`, `newton`, `load_stepping`, and this module.
+`contact` (with ``contact_kernels``), `state`, `system`, `iteration`, `newton`, `load_stepping`, and
+this module.
 """
 
 from __future__ import annotations

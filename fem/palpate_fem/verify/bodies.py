@@ -17,8 +17,9 @@ from palpate.errors import SimulationError
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
+from palpate_fem.mechanics.iteration import NewtonReport, NewtonSettings
 from palpate_fem.mechanics.load_stepping import SolverSettings
-from palpate_fem.mechanics.newton import NewtonReport, NewtonSettings, NewtonSolver
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.skin import energy_density
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState

@@ -16,7 +16,7 @@ from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics.contact import ContactSettings, PosedIndenter
-from palpate_fem.mechanics.newton import NewtonSettings
+from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.state import ForceBalance
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.verify.bodies import (
