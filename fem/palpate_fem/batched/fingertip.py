@@ -66,6 +66,7 @@ class _Live:
     requests: Requests
     accepted: Floats
     started: float = field(default_factory=time.perf_counter)
+    reached: float = field(default_factory=time.perf_counter)
     wanted: Request | None = None
     pose: Floats = field(default_factory=lambda: np.zeros(7))
     numbers: SlotNumbers | None = None
@@ -383,9 +384,10 @@ class BatchedFingertip:
                     residual=reach.numbers.residual,
                     volume_error=error,
                     penetration_m=np.nan,
-                    seconds=now - live[slot].started,
+                    seconds=now - live[slot].reached,
                 )
             )
+            live[slot].reached = now
         steps = self._steps.make(
             self._now,
             self.equations.listed(np.array(slots)),
