@@ -228,17 +228,9 @@ class BatchedFactor:
         self._launch(
             kernels.mark_changed,
             (count, self.values.shape[1]),
-            [slots, self._entry_front, self.values],
+            [slots, self._entry_front, self._parent, self.values],
             [self._known, self.marked],
         )
-        for level in range(tiles.levels - 1):
-            first, last = self._front_begins[level : level + 2]
-            self._launch(
-                kernels.mark_parents,
-                (count, last - first),
-                [slots, self._by_level, self._parent, first],
-                [self.marked],
-            )
 
     def solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
         """Solve in place for the listed slots, (m,) int32.

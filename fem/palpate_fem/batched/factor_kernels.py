@@ -54,33 +54,25 @@ def clear(slots: wp.array(dtype=wp.int32), bad_out: wp.array(dtype=wp.int32)):
 @wp.kernel
 def mark_changed(
     slots: wp.array(dtype=wp.int32),
-    front: wp.array(dtype=wp.int32),
+    front_of: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
     values_in: wp.array2d(dtype=wp.float64),
     known: wp.array2d(dtype=wp.float64),
-    marked_out: wp.array2d(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
 ):
-    """Mark the fronts of entries that are not what they were, and remember what they are."""
+    """Mark the fronts of entries that are not what they were, and all above; remember the entries.
+
+    Whoever finds a front marked may stop there: who marked it goes on upwards.
+    """
     i, k = wp.tid()
     slot = slots[i]
     value = values_in[slot, k]
     if value != known[slot, k]:
         known[slot, k] = value
-        marked_out[slot, front[k]] = 1
-
-
-@wp.kernel
-def mark_parents(
-    slots: wp.array(dtype=wp.int32),
-    listed: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    first: int,
-    marked: wp.array2d(dtype=wp.int32),
-):
-    """Mark the parents of marked fronts."""
-    i, number = wp.tid()
-    front = listed[first + number]
-    if marked[slots[i], front] != 0 and parent[front] >= 0:
-        marked[slots[i], parent[front]] = 1
+        front = front_of[k]
+        while front >= 0 and marked[slot, front] == 0:
+            marked[slot, front] = 1
+            front = parent[front]
 
 
 @wp.kernel
